@@ -253,7 +253,7 @@ def run(blender, environment, extension_zip):
     installed = run("-b", "--command", "extension", "install-file", "-r", "user_default",
                     "--enable", extension_zip)
     assert installed.returncode == 0, installed.stdout + installed.stderr
-    # Not Blender's message: it is lost where the installer ends between Blender's read and its poll.
+    # Not Blender's message: it is lost where the installer ends between a read and a poll.
     folder = Path(environment["BLENDER_USER_RESOURCES"]) / "extensions" / "user_default" / "limber"
     assert (folder / "blender_manifest.toml").is_file(), installed.stdout + installed.stderr
     return run

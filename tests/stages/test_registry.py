@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from limber.cli import main
 from limber.stages.command_line import command_line
+from limber.stages.inputs import PlacedInputs
 from limber.stages.registry import (
     all_schemas,
     stage_description,
@@ -114,6 +115,8 @@ def test_stages_pass_over_none_of_their_fields():
         lacking = {field for part in ("inputs", "settings", "options")
                    if part not in by_name[name]
                    for field in getattr(stage, part).model_fields} - by_name[name]
+        # by_name itself moves the positions.
+        lacking -= {*PlacedInputs.model_fields} if issubclass(stage.inputs, PlacedInputs) else {*()}
         assert not lacking, name
     assert len(by_name) > 10
 

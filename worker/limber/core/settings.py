@@ -33,6 +33,12 @@ Direction = Annotated[tuple[float, float, float], AfterValidator(_with_length)]
 """A direction: three numbers, not all 0; of any length."""
 
 
+POSITION = {"frame": "branch"}
+"""Extra of a field whose position a stage also takes in the scan's coordinates."""
+BOX = {"frame": "branch axes"}
+"""Extra of a field whose box has the axes of the branch's frame."""
+
+
 YOUNG_PA, DENSITY_KG_M3 = (1e3, 1e11), (50.0, 3000.0)
 MOST_FORCE_N = 1e5
 """Plausible ranges of the properties and loads of a branch or of a model of one."""

@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import Groups, Settings
+from limber.core.settings import BOX, POSITION, Groups, Settings
 
 
 class EnergySettings(Settings):
@@ -54,14 +54,17 @@ class PlanSettings(Settings):
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the grasp, in the branch's frame [m]. Without any goal, a distant pose "
-        "is chosen and stated."))
+        "is chosen and stated."),
+        json_schema_extra=POSITION)
     tip_goal: tuple[float, float, float] | None = Field(None, description=(
-        "Goal position of the branch's tip, or of --target, in the branch's frame [m]."))
+        "Goal position of the branch's tip, or of --target, in the branch's frame [m]."),
+        json_schema_extra=POSITION)
     target: str | None = Field(None, description=(
         "Named target (`limber target`) for --tip-goal, --target-box, --in-view and "
         "--second-arm. Default: the tip."))
     target_box: tuple[float, float, float, float, float, float] | None = Field(None, description=(
-        "Box that the target must reach: lower corner, upper corner, in the branch's frame [m]."))
+        "Box that the target must reach: lower corner, upper corner, in the branch's frame [m]."),
+        json_schema_extra=BOX)
     in_view: bool = Field(False, description=(
         "The target must be visible to the cell's camera: inside its image, within its range, and "
         "not hidden by the branch."))
@@ -72,7 +75,8 @@ class PlanSettings(Settings):
         "length, among sampled poses that are allowed and far from rest."))
     goal_tolerance: float = Field(0.01, gt=0, le=1, description="Radius of the goal region [m].")
     start: tuple[float, float, float] | None = Field(None, description=(
-        "Start position of the grasp [m]. Default: the rest pose."))
+        "Start position of the grasp [m]. Default: the rest pose."),
+        json_schema_extra=POSITION)
     start_seed: int | None = Field(None, ge=0, description=(
         "Seed of a random deformed start configuration, as in the paper's trials."))
     deformation_weight: float = Field(1.0, ge=0, description=(
@@ -103,9 +107,11 @@ class PlanSettings(Settings):
         "Largest principal stress anywhere in the branch at any pose [Pa], for the stiff end of "
         "the estimate's intervals."))
     workspace_low: tuple[float, float, float] | None = Field(None, description=(
-        "Lower corner of the box that the grasp must stay in, in the branch's frame [m]."))
+        "Lower corner of the box that the grasp must stay in, in the branch's frame [m]."),
+        json_schema_extra=BOX)
     workspace_high: tuple[float, float, float] | None = Field(None, description=(
-        "Upper corner of that box [m]."))
+        "Upper corner of that box [m]."),
+        json_schema_extra=BOX)
     clearance: float | None = Field(None, ge=0, le=0.5, description=(
         "Least distance of branch, gripper and arm from the cell's obstacles [m]. Default: twice "
         "the uncertainty of the robot's base in the cell file, but no more than the branch has at "

@@ -19,8 +19,8 @@ class ImportSettings(Settings):
     """Settings for reading a recording."""
 
     groups: ClassVar[Groups] = {
-        "input": ("kind", "robot", "unit", "force_unit", "rate_hz", "nominal", "coordinates",
-            "time_offset", "recorded", "yolo_weights", "yolo_prompt", "yolo_class"),
+        "input": ("kind", "robot", "unit", "force_unit", "rate_hz", "nominal", "marker_frame",
+            "coordinates", "time_offset", "recorded", "yolo_weights", "yolo_prompt", "yolo_class"),
         "bags and robot logs": ("cell", "frame_pose", "wrench_topic", "pose_topic",
             "points_topic", "bag_clock"),
         "grasp and loads": ("grasp_point", "grasp_radius", "grasp_mode", "weight", "load",
@@ -46,9 +46,13 @@ class ImportSettings(Settings):
     pull_toml: str | None = Field(
         None, description="TOML file whose entries replace those that the import writes to the "
         "pull's pull.toml, such as the table calibration, or tared in the table sensor.")
+    marker_frame: tuple[float, float, float, float, float, float] | None = Field(
+        None, description="Pose of the frame in which SOURCE gives the markers, such as that of a "
+        "motion capture system: [m] and rotation vector [rad]. Without it and without --nominal "
+        "they are in the branch's frame.")
     coordinates: Literal["branch", "scan"] = Field(
-        "branch", description="Coordinates of --nominal, --grasp-point and --load: the branch "
-        "folder's, or those of the scan's file.")
+        "branch", description="Coordinates of --nominal, --grasp-point, --load, --marker-frame and "
+        "--frame-pose: the branch folder's, or those of the scan's file in metres.")
     grasp_point: tuple[float, float, float] | None = Field(
         None, description="Position of the grasp or the load at rest [m]. Default: the robot's "
         "first pose.")
@@ -92,8 +96,8 @@ class ImportSettings(Settings):
         None, description="The robot's cell file: its base in the branch's frame, and its "
         "kinematics.")
     frame_pose: tuple[float, float, float, float, float, float] | None = Field(
-        None, description="Pose, in the branch's frame, of the frame of the gripper poses: [m] "
-        "and rotation vector [rad]. Default: the cell's base.")
+        None, description="Pose of the frame in which the gripper's poses, forces and torques are "
+        "given: [m] and rotation vector [rad]. Default: the cell's base, else the branch's frame.")
     wrench_topic: str | None = Field(None, description="Topic of the wrench, if there are several.")
     pose_topic: str | None = Field(
         None, description="Topic of the gripper's pose, or its TF frame, if there are several.")

@@ -3,10 +3,11 @@
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
+from limber.core.errors import InputError
 from limber.core.progress import Progress
 from limber.core.settings import Groups, Settings
 
@@ -39,6 +40,8 @@ def by_name(function: Callable[..., dict[str, Any]], **fields: str) -> Run:
 
     def run(inputs: Settings, settings: Settings, options: Settings, progress: Progress,
             ) -> dict[str, Any]:
+        if isinstance(inputs, PlacedInputs):
+            settings = inputs.in_branch(settings)
         values = {**dict(inputs), **dict(settings), **dict(options), "inputs": inputs,
                   "settings": settings, "options": options, "progress": progress}
         return function(**{name: values[field] for name, field in taken.items()})
@@ -56,6 +59,40 @@ class BranchInputs(Settings):
     groups: ClassVar[Groups] = {"input": ("branch_folder",)}
 
     branch_folder: Path = argument("The branch folder.")
+
+
+class PlacedInputs(BranchInputs):
+    """A branch folder, and the frame of the positions in the settings."""
+
+    groups: ClassVar[Groups] = {"input": ("coordinates",)}
+
+    coordinates: Literal["branch", "scan"] = Field(
+        "branch", description="Coordinates of the given positions: the branch folder's, or those "
+        "of the scan's file in metres.", json_schema_extra=NOT_KEPT)
+
+    def in_branch(self, settings: Settings) -> Settings:
+        """Return the settings with all positions in the branch's frame.
+
+        Raises:
+            InputError: a box is given in the scan's coordinates.
+        """
+        if self.coordinates == "branch":
+            return settings
+        import numpy as np
+
+        from limber.store import Branch
+
+        alignment = Branch.read(self.branch_folder).manifest.alignment
+        moved = {}
+        for name, field in type(settings).model_fields.items():
+            kind, value = (field.json_schema_extra or {}).get("frame"), getattr(settings, name)
+            if kind == "branch axes" and value is not None:
+                raise InputError(f"--{name.replace('_', '-')} is given in the scan's coordinates.",
+                                 "Its box has the axes of the branch's frame, which are others.",
+                                 "Give all positions with --coordinates branch.")
+            if kind == "branch" and value is not None:
+                moved[name] = tuple(alignment.apply(np.array(value) / alignment.scale).tolist())
+        return settings.model_copy(update=moved)
 
 
 class RunOptions(Settings):

@@ -49,6 +49,7 @@ def read_bag_pull(path: Path, request: ImportRequest) -> Pull:
 def _markers(seen: Observations, recorded: PullEntry | None, request: ImportRequest,
              ) -> tuple[Observations, np.ndarray]:
     """Markers with a known rest position, and those positions [m], shape [m, 3]."""
+    seen = replace(seen, positions=request.markers_in_branch(seen.positions))
     placed = request.registered(seen.positions[0], [f"m{k}" for k in range(seen.point_count)])
     at_rest = None if recorded is None or placed else recorded.rest_points_m
     known = at_rest is not None and len(at_rest) == seen.point_count

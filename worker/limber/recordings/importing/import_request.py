@@ -12,6 +12,7 @@ from limber.core.alignment import Alignment
 from limber.core.constants import GRAVITY
 from limber.core.errors import InputError
 from limber.core.files.reading import read_toml
+from limber.core.numerics.rigid import rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.recordings.bags.bag_pull import JointPoses
 from limber.recordings.cell_errors import CalibrationEntry
@@ -85,6 +86,22 @@ class ImportRequest:
         if self.settings.coordinates == "branch":
             return points
         return alignment.apply(points / alignment.scale)
+
+    def markers_in_branch(self, points: np.ndarray) -> np.ndarray:
+        """Transform markers [m] from their stated frame, if any; shape [..., 3].
+
+        Raises:
+            InputError: nominal positions are given as well.
+        """
+        pose = self.settings.marker_frame
+        if pose is None:
+            return points
+        if self.settings.nominal is not None:
+            raise InputError("Both --marker-frame and --nominal are given.",
+                             "Each determines where the markers are on the branch.",
+                             "Give --marker-frame if the pose of their frame was measured; else "
+                             "--nominal.")
+        return points @ rotation_matrix(np.array(pose[3:])).T + pose[:3]
 
     def grasp_or(self, otherwise: Callable[[], np.ndarray]) -> tuple[float, float, float]:
         """Return the grasp point in the branch's frame [m]; if none was given, the alternative."""
@@ -167,7 +184,8 @@ def require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:
             f"{name}: at rest a marker is {off.max() * 1e3:.0f} mm away from the branch, which is "
             f"{extent * 1e3:.0f} mm long.",
             "The recording has another frame of reference or another unit.",
-            "Give the markers' positions on the branch with --nominal, and check --unit.")
+            "Give the markers' positions on the branch with --nominal, or the pose of their frame "
+            "with --marker-frame, and check --unit.")
 
 
 def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:

@@ -60,7 +60,13 @@ def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
 
 
 def _read(chosen: RecordingFormat, request: ImportRequest) -> Any:
-    return RECORDINGS.read_as(chosen, request.source, request=request)
+    read = RECORDINGS.read_as(chosen, request.source, request=request)
+    if chosen.holds == "markers":
+        stream, labels = read
+        points = stream.values.reshape(len(stream), -1, 3)
+        moved = request.markers_in_branch(points).reshape(stream.values.shape)
+        return replace(stream, values=moved), labels
+    return read
 
 
 def _import_force(read: tuple[np.ndarray, np.ndarray, tuple[str, ...]], request: ImportRequest,

@@ -66,7 +66,8 @@ class RobotEntry(_Entry):
 class BaseEntry(_Entry):
     """The robot's base frame, as its pendant shows it, in the branch's frame."""
 
-    pose: Pose = Field(description="Position [m] and rotation vector [rad].")
+    pose: Pose = Field(description="Position [m] and rotation vector [rad]. ROS' base_link is "
+                       "turned by 180 degrees about z from the pendant's base.")
     position_sigma_m: float = Field(0.005, ge=0, le=0.5)
     rotation_sigma_rad: float = Field(0.01, ge=0, le=0.5)
     residual_m: float | None = Field(None, ge=0, le=0.5,
@@ -88,8 +89,9 @@ class ToolEntry(_Entry):
 
     grasp_pose: Pose = Field((0.0,) * 6, description="Frame of the grasp in the flange's frame.")
     mass_kg: float | None = Field(
-        None, ge=0, le=20, description="Payload [kg]; 0 for a bare flange. The robot does not "
-                                       "move without it.")
+        None, ge=0, le=20, description="Payload [kg]: all that the flange carries, with the "
+                                       "sensor; 0 for a bare flange. The robot does not move "
+                                       "without it.")
     centre_of_mass_m: Vector = Field((0.0, 0.0, 0.0), description="Position in the flange's frame "
                                                                   "[m].")
     parts: tuple[CapsuleEntry, ...] = ()
@@ -110,8 +112,9 @@ class ToolEntry(_Entry):
 class ApproachEntry(_Entry):
     """Approach and departure of the gripper."""
 
-    direction: Vector = Field((0.0, 0.0, 1.0), description="Direction in the grasp's frame.")
-    distance_m: float = Field(0.08, gt=0, le=1)
+    direction: Vector = Field((0.0, 0.0, 1.0), description="Direction in which the gripper moves "
+                              "to the branch, in the grasp's frame.")
+    distance_m: float = Field(0.08, gt=0, le=1, description="Length of that straight motion [m].")
 
     @field_validator("direction")
     @classmethod
@@ -126,8 +129,9 @@ class SensorEntry(_Entry):
     """The force-torque sensor that the guard and recordings use."""
 
     kind: Literal["controller", "ft300", "ft300_usb", "replay", "none"] = Field(
-        "controller", description="ft300: by its URCap's stream. ft300_usb: by Modbus on device. "
-        "replay reads a file and works only with the virtual robot.")
+        "controller", description="ft300: by its URCap's stream (port 63351 of the robot's "
+        "address). ft300_usb: by Modbus on device. replay reads a file and works only with the "
+        "virtual robot.")
     device: str | None = Field(None, description="Serial line of kind = \"ft300_usb\".")
     file: str | None = Field(None, description="CSV of a replay: t_s and six columns, in the "
                              "sensor's frame.")
@@ -193,7 +197,8 @@ class SecondArmEntry(_Entry):
 
     model: str
     base_pose: Pose = Field(description="Its base frame in the branch's frame.")
-    grasp_pose: Pose = (0.0,) * 6
+    grasp_pose: Pose = Field((0.0,) * 6, description="Its tool in its flange's frame: the point "
+                             "that must reach the target.")
 
     _known = field_validator("model")(_known_model)
     _near = field_validator("base_pose")(_in_metres)

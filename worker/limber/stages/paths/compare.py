@@ -13,9 +13,9 @@ from pydantic import Field
 
 from limber.core.errors import InputError, NoPathError
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
+from limber.core.settings import POSITION, Groups, Settings
 from limber.planning.settings import PlanSettings
-from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
+from limber.stages.inputs import ParallelOptions, PlacedInputs, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -28,7 +28,7 @@ _COLUMNS = ("trial", "planner", "length_m", "energy_sum_nmm", "energy_integral_j
             "peak_energy_j")
 
 
-class CompareInputs(BranchInputs):
+class CompareInputs(PlacedInputs):
     """A branch folder, and the comparison's name."""
 
     groups: ClassVar[Groups] = {"output": ("name",)}
@@ -45,7 +45,8 @@ class CompareSettings(Settings):
     trials: int = Field(10, ge=1, le=1000, description=(
         "Number of random deformed start configurations."))
     goal: tuple[float, float, float] | None = Field(None, description=(
-        "Goal position of the grasp, in the branch's frame [m]. Default: a distant pose."))
+        "Goal position of the grasp, in the branch's frame [m]. Default: a distant pose."),
+        json_schema_extra=POSITION)
     goal_tolerance: float = Field(0.01, gt=0, le=1, description="Radius of the goal region [m].")
     seed: int = Field(0, ge=0, description="Seed of the starts and the planners.")
     max_detour: float | None = Field(None, ge=0, le=1000, description=(

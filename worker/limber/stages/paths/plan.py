@@ -22,7 +22,7 @@ from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.planning.settings import PlanSettings
-from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
+from limber.stages.inputs import ParallelOptions, PlacedInputs, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
 
@@ -40,11 +40,11 @@ if TYPE_CHECKING:
 _FRAME_RATE = 24.0  # frames per second of the played motion; a pose is a frame
 
 
-class PlanInputs(BranchInputs):
+class PlanInputs(PlacedInputs):
     """A branch folder, and the plan's name."""
 
     groups: ClassVar[Groups] = {"input": ("cell", "break_tests"), "output": ("name",)}
-    common = ("cell", "name")
+    common = ("cell", "name", "coordinates")
 
     cell: Path | None = Field(None, description=(
         "The robot's cell file. Its workspace, force limit and obstacles apply, and its arm must "

@@ -58,7 +58,8 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
         raise InputError(f"There is no {source}.", "A recording was expected.", "Check the path.")
     kind = RECORDINGS.of(source).name if settings.kind == "auto" else settings.kind
     is_force = recording_format(kind).holds == "force"
-    settings, robot = _of_cell(settings)
+    given = settings
+    settings, robot = _of_cell(given)
     branch = (Branch.create if is_force else Branch.open)(branch_folder)
     key, digests = f"pull:{name}", {"source": _digest(source)}
     for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
@@ -74,10 +75,25 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
             stage.remove(old)
         folder = stage.path(prefix + "pull.toml").parent
         frame = BranchFrame() if is_force else _frame(branch, settings)
+        in_branch = settings.model_copy(update=_poses_in_branch(given, branch))
         stage.result.update(import_recording(kind, ImportRequest(
-            source, folder, name, settings, frame, robot, progress)))
+            source, folder, name, in_branch, frame, robot, progress)))
         stage.result |= {"pull": name, "kind": kind}
     return stage.result
+
+
+def _poses_in_branch(given: ImportSettings, branch: Branch) -> dict[str, tuple[float, ...]]:
+    """The poses of frames that the user gave, in the branch's frame."""
+    poses = {name: np.array(pose) for name in ("frame_pose", "marker_frame")
+             if (pose := getattr(given, name)) is not None}
+    if given.coordinates == "branch" or not poses:
+        return {}
+    from limber.core.numerics.rigid import composed, rotation_vector
+
+    alignment = branch.manifest.alignment
+    turn = rotation_vector(np.array(alignment.rotation))
+    return {name: (*alignment.apply(pose[:3] / alignment.scale).tolist(),
+                   *composed(turn, pose[3:]).tolist()) for name, pose in poses.items()}
 
 
 def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | None]:

@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from limber.core.errors import InputError
-from limber.core.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, RunOptions, argument, by_name
+from limber.core.settings import POSITION, Groups, Settings
+from limber.stages.inputs import PlacedInputs, RunOptions, argument, by_name
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FILE = "targets.json"
 
 
-class TargetInputs(BranchInputs):
+class TargetInputs(PlacedInputs):
     """A branch folder, and the target's name."""
 
     groups: ClassVar[Groups] = {"input": ("name",)}
@@ -37,7 +37,7 @@ class TargetSettings(Settings):
 
     at: tuple[float, float, float] | None = Field(
         None, description="Position on the branch at rest, in the branch's frame [m].",
-        json_schema_extra={"metavar": "X Y Z"})
+        json_schema_extra={"metavar": "X Y Z"} | POSITION)
     mass: float = Field(
         0.0, ge=0, le=100, description="Additional mass [kg] that hung there when the branch was "
         "scanned.")
