@@ -7,8 +7,8 @@ import pytest
 
 from benchmarks import table
 from benchmarks.budget import Budget, parsed_seconds, side_by_side
-from benchmarks.kept_trials import Numbers, numbers_of
 from benchmarks.table import Asked, Part, Row, Setting, allowance, rows_of, share_met
+from benchmarks.trial_log import Numbers, numbers_of
 from limber.core.progress import SILENT
 
 

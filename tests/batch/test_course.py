@@ -13,9 +13,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from limber.batch.batch_progress import Records, numbers_of, path_of_page
 from limber.batch.batch_summary import write_page
 from limber.batch.jobs.job_file import read_jobs
-from limber.batch.records import Records, numbers_of, path_of_page
 from limber.batch.run import run_jobs
 from limber.cli import main
 from limber.core.errors import BranchFolderError
@@ -169,22 +169,22 @@ def test_two_batches_exclude_each_other(orchard):
 
 def test_records_and_log_stay_short(orchard, monkeypatch):
     """Of many runs each task's last line is kept; the log's oldest lines go."""
-    from limber.batch import log, records
+    from limber.batch import batch_log, batch_progress
 
     jobs = read_jobs(orchard / "jobs.toml")
     held, branch = Records(jobs), jobs.branches[0]
     with held.writing():
         for number in range(40):
-            held.end(branch, branch.tasks[0], records.Record("done", seconds=float(number)))
+            held.end(branch, branch.tasks[0], batch_progress.Record("done", seconds=float(number)))
         held.begin(branch, branch.tasks[1])
     assert len(held.path.read_text().splitlines()) == 41
-    monkeypatch.setattr(records, "_LEAST_LINES", 10)
+    monkeypatch.setattr(batch_progress, "_LEAST_LINES", 10)
     again = Records(jobs)
     with again.writing():
         assert len(held.path.read_text().splitlines()) == 2
     assert Records(jobs).of(branch, branch.tasks[0]).seconds == 39.0
-    monkeypatch.setattr(log, "MOST_BYTES", 500)
-    with log.BatchLog(jobs) as lines:
+    monkeypatch.setattr(batch_log, "MOST_BYTES", 500)
+    with batch_log.BatchLog(jobs) as lines:
         for number in range(100):
             lines.tell("one", f"line {number}\nof %s text")
     files = sorted(jobs.out.glob("jobs.log*"))

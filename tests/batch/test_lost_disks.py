@@ -6,8 +6,8 @@ import os
 
 import pytest
 
+from limber.batch.batch_progress import Records
 from limber.batch.jobs.job_file import read_jobs
-from limber.batch.records import Records
 from limber.cli import main
 from limber.store import Branch, journal
 

@@ -10,12 +10,12 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.utils import infer_storage_options
 
-from limber.batch.addresses import checked_address, fetch, is_address, matching, plain_name
+from limber.batch.batch_progress import Records
 from limber.batch.jobs.branch_jobs import BranchJob, JobFile
 from limber.batch.jobs.job_file import read_jobs
 from limber.batch.jobs.scheduler_scripts import write_script
 from limber.batch.machines.staging import bring_in, put_out
-from limber.batch.records import Records
+from limber.batch.remote_files import checked_address, fetch, is_address, matching, plain_name
 from limber.batch.run import run_jobs
 from limber.cli import main
 from limber.core.errors import BranchFolderError, Cancelled, InputError, WorkError

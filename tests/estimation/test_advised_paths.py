@@ -12,8 +12,8 @@ from tests.estimation.test_nuisances import TRUTH, subject_of
 from benchmarks.paper_branches import FRACTIONS, measured
 from limber.core.errors import LimberError
 from limber.estimation.fit import fit_branch
+from limber.estimation.fit_assessment import judge_model, require_result
 from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.judgement import judge_model, require_result
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.model_error import total_interval
 from limber.estimation.virtual_cell import marked_points

@@ -11,10 +11,10 @@ from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
 from limber.mechanics import BranchModel
 from limber.mechanics.loads.loaded_branch import hang
+from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.certificate import lower_bound
 from limber.planning.field.energy_field import GraspSamples, fit_field
 from limber.planning.field.grasp_model import grasp_model_of
-from limber.planning.two_paths import PlanSettings
 from limber.stages.paths.energy import EnergySettings, sample_energy_field
 from limber.stages.paths.plan import plan as plan_paths
 from limber.store import Branch

@@ -8,8 +8,8 @@ import pytest
 from limber.planning.field import disagreeing_neighbours
 from limber.planning.field.chart import Chart
 from limber.planning.field.disagreeing_neighbours import ask_between, disagreeing, jump
-from limber.planning.field.solved import Solved
 from limber.planning.field.solver_pool import SolverPool
+from limber.planning.field.stored_states import Solved
 
 PLAIN = Chart.about(None, 0.0, np.zeros(3))
 LENGTH = 0.4

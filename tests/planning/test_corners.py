@@ -14,7 +14,7 @@ from limber.planning.field.energy_field import GraspSamples, fit_field
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.path_problem import GentleProblem
-from limber.planning.planners.gentle import plan_gentle
+from limber.planning.planners.eikonal import plan_gentle
 from limber.planning.planners.refine import refine
 
 RADIUS = 0.25  # [m] of the shell about the origin

@@ -7,7 +7,7 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.core.progress import Progress
-from limber.planning import two_paths
+from limber.planning import baseline_and_plan
 from limber.planning.certificate import feasibility
 from limber.planning.certificate.feasibility import judge
 from limber.planning.constraints.limits import Limits
@@ -78,7 +78,7 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
     """With the limit looser by that error, for the full model to decide; and it is said. What is
     proven is tried neither so nor without margins."""
     settings, limits, told, tried = PlanSettings(), Limits(strain=2.4), [], []
-    there = two_paths.plan_pair(rough_field, START, GraspGoal(tuple(START), 0.01), settings)
+    there = baseline_and_plan.plan_pair(rough_field, START, GraspGoal(tuple(START), 0.01), settings)
 
     def plan_pair(_field, _start, _goal, _settings, tried_limits, *, beyond, **_options):
         tried.append(tried_limits.max_loads[0])
@@ -88,16 +88,16 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
         return there
 
     uncertainty = limits.doubts(rough_field)["strain"]
-    monkeypatch.setattr(two_paths, "plan_pair", plan_pair)
+    monkeypatch.setattr(baseline_and_plan, "plan_pair", plan_pair)
     arguments = rough_field, START, GOAL, settings, limits
     progress = Progress(on_warning=told.append)
     if UNPROVEN in seen:
-        found = two_paths.plan_within(*arguments, progress=progress)
+        found = baseline_and_plan.plan_within(*arguments, progress=progress)
         assert not any(found.margins.values()) and tried[-1] == pytest.approx(2.4 + uncertainty)
         assert any("extended by the field's error (strain 0." in words for words in told)
     else:
         with pytest.raises(NoWayError, match="No path exists"):
-            two_paths.plan_within(*arguments, progress=progress)
+            baseline_and_plan.plan_within(*arguments, progress=progress)
         assert max(tried) <= 2.4 and len(tried) == 1, "without margins it is proven as well"
 
 

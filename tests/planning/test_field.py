@@ -12,7 +12,7 @@ from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, error_measures, fit_field
 from limber.planning.field.radial import RadialInterpolant
 from limber.planning.field.sampling import energy_inputs, is_sampled_on
-from limber.planning.field.trust import TrustRegion
+from limber.planning.field.valid_region import TrustRegion
 
 ELSEWHERE = np.random.default_rng(9).uniform(-0.1, 0.1, (80, 3))
 

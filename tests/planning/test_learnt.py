@@ -7,7 +7,7 @@ import pytest
 
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.reduced_grasp import CorrectedResult, LearntGraspModel
-from limber.planning.field.solved import taken
+from limber.planning.field.stored_states import taken
 from limber.reduced import model_cache
 from limber.reduced.model_cache import ReducedCache
 from limber.reduced.state import ReducedSettings
@@ -117,7 +117,7 @@ def test_a_field_says_which_model_it_came_from(small_model, small_mesh, small_sk
 
 def test_sessions_and_fields_learn_the_same():
     """So either finds what the other has learnt."""
-    from limber.session.opening import reduced_settings
+    from limber.session.session_start import reduced_settings
     from limber.session.settings import SessionSettings
 
     assert reduced_settings(SessionSettings()) == model_cache.SHARED

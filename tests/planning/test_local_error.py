@@ -18,7 +18,7 @@ from limber.planning.goals.regions import Ball
 from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.path_problem import GentleProblem, NoWayError
 from limber.planning.plan_file import read_plan
-from limber.planning.planners.easiest import EasiestWay
+from limber.planning.planners.least_violation import EasiestWay
 
 AT_REST = GraspGoal((0.0, 0.0, 0.0), 0.01)
 

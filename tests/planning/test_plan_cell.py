@@ -8,9 +8,9 @@ import pytest
 from limber.core.errors import InputError, NoPathError
 from limber.core.numerics.rigid import angle_between, pose_vectors
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.constraints.obstacles import Box
 from limber.planning.plan_file import read_plan
-from limber.planning.two_paths import PlanSettings
 from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.known_arms import arm_named
 from limber.stages.paths.execute import _stated_by_plan

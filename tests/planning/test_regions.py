@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
+from limber.planning.baseline_and_plan import plan_pair
 from limber.planning.field.energy_field import fit_field
 from limber.planning.goals.allowed_poses import goal_points
 from limber.planning.goals.camera_view import View
@@ -14,7 +15,6 @@ from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.goals.regions import Ball, BoxRegion
 from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.settings import PlanSettings
-from limber.planning.two_paths import plan_pair
 
 # A camera a metre along x that looks back at the origin; its picture is 0.6 m wide there.
 BACK = np.array([[0, 0, -1, 1], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)

@@ -13,7 +13,7 @@ from benchmarks.robot_faults import cell_for, new_robot, restored, straight
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.link import COLUMNS, RobotLink
-from limber.robot.observed import observe, show_before_motion
+from limber.robot.robot_state import observe, show_before_motion
 
 pytest.importorskip("rtde_control")
 pytestmark = pytest.mark.slow

@@ -20,10 +20,10 @@ from limber.robot.driver.real_time import claim_real_time
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.trajectory import Trajectory, along, densely
-from limber.robot.ros import guarded
+from limber.robot.ros import guarded_robot
 from limber.robot.ros.bridge import Bridge
 from limber.robot.ros.cloud_topic import CloudTopic
-from limber.robot.ros.guarded import RosRobot, Topics
+from limber.robot.ros.guarded_robot import RosRobot, Topics
 from limber.robot.ros.messages import JointStates, cloud_of, goal_of
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
@@ -166,7 +166,7 @@ def test_with_the_branch_held_the_tare_of_the_approach_is_used(monkeypatch, tmp_
 
 
 def test_a_topic_that_sends_nothing_is_named(monkeypatch):
-    monkeypatch.setattr("limber.robot.ros.guarded.SECONDS", 0.3)
+    monkeypatch.setattr("limber.robot.ros.guarded_robot.SECONDS", 0.3)
     with RosBridge(HOME) as server:
         server.silent.add("/force_torque_sensor_broadcaster/wrench")
         with pytest.raises(WorkError, match="Nothing came on /force_torque_sensor_broadcaster"):
@@ -213,7 +213,7 @@ def test_the_example_node_stops_on_a_word_and_on_silence(monkeypatch):
     assert watch.heard(True, 101.0) and not watch.is_silent(102.0)
     for path in package.rglob("*.py"):
         compile(path.read_text(encoding="utf-8"), str(path), "exec")
-    assert guarded._BEAT_SECONDS < 0.3 / 2
+    assert guarded_robot._BEAT_SECONDS < 0.3 / 2
 
 
 def cloud_message(points: np.ndarray, *, big: bool = False) -> dict:

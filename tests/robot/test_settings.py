@@ -10,7 +10,7 @@ from limber.core.numerics.rigid_kernels import pose_of
 from limber.robot.cell.cell import Cell
 from limber.robot.cell.controller_settings import differences
 from limber.robot.interface import Sample
-from limber.robot.observed import Observed
+from limber.robot.robot_state import Observed
 
 GRASP = (0.01, 0.0, 0.15, 0.0, 0.0, 0.3)
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},

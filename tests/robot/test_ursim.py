@@ -12,7 +12,7 @@ import pytest
 
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.controls import calibration_of
-from limber.robot.driver.ur_control import UrControl
+from limber.robot.ur.ur_control import UrControl
 
 pytest.importorskip("rtde_control")
 ADDRESS = os.environ.get("LIMBER_URSIM", "")

@@ -2,13 +2,13 @@
 
 import pytest
 
-from benchmarks.held_up import Voided, Witness
+from benchmarks.machine_stalls import Voided, Witness
 
 
 @pytest.fixture
 def witness(monkeypatch):
     """One that watches nothing, and has seen two processors stand still for a while."""
-    monkeypatch.setattr("benchmarks.held_up._processors", list)
+    monkeypatch.setattr("benchmarks.machine_stalls._processors", list)
     witness = Witness()
     witness._seen = [[(1.002, 0.002), (1.008, 0.003), (5.0, 0.2)], [(1.004, 0.004)]]
     yield witness
@@ -41,11 +41,11 @@ def test_a_stop_is_done_again_only_where_the_machine_was_away_for_as_long(witnes
 def test_a_pause_long_before_a_failure_explains_nothing(witness, monkeypatch):
     def fails():
         raise AssertionError("it failed")
-    monkeypatch.setattr("benchmarks.held_up.time.monotonic", iter([0.0, 20.0]).__next__)
+    monkeypatch.setattr("benchmarks.machine_stalls.time.monotonic", iter([0.0, 20.0]).__next__)
     with pytest.raises(AssertionError):
         Voided(witness).again(fails, "a loop")
     moments = iter([0.0, 8.0, 0.0, 40.0])
-    monkeypatch.setattr("benchmarks.held_up.time.monotonic", moments.__next__)
+    monkeypatch.setattr("benchmarks.machine_stalls.time.monotonic", moments.__next__)
     voided = Voided(witness)
     with pytest.raises(AssertionError):
         voided.again(fails, "a loop")

@@ -16,9 +16,9 @@ from limber.mechanics.added_masses import PointMass
 from limber.mechanics.loads.load_effects import load_effects
 from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
 from limber.session import protocol
-from limber.session.opening import load_held
 from limber.session.outdoor_effects import EffectsTeller, effects_of, gusts_of
 from limber.session.session_branch import HeldBranch
+from limber.session.session_start import load_held
 from limber.session.settings import SessionSettings
 from limber.stages.motion.load import LoadSettings, load
 from limber.store import Branch

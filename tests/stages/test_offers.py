@@ -7,7 +7,7 @@ import pytest
 
 from limber.cli.main import call
 from limber.core.errors import InputError
-from limber.stages.offers import offers, position_in
+from limber.stages.error_suggestions import offers, position_in
 from limber.stages.registry import stage_schema
 
 

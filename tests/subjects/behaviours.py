@@ -80,7 +80,7 @@ def _interrupted(_signal: int, _frame: object) -> None:
 
 def main(name: str) -> int:
     """Run one as a program; returns the exit code."""
-    from limber.core.processes.ending import end_with_parent_pipe
+    from limber.core.processes.end_with_parent import end_with_parent_pipe
 
     signal.signal(signal.SIGTERM, _interrupted)
     end_with_parent_pipe(grace_seconds=0.3)

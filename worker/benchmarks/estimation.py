@@ -15,15 +15,15 @@ from benchmarks import silicone_beam
 from benchmarks.estimation_force import FORCE_ROWS, force_rows
 from benchmarks.estimation_noise import NOISE_ROWS, noise_rows
 from benchmarks.estimation_scans import SCAN_ROWS, scan_rows
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.paper_branches import BRANCHES, FRACTIONS, Bench, PaperBranch, exact_pull, measured
 from benchmarks.table import Asked, Part, Row, Setting
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT
 from limber.estimation.estimated_branch import Subject
+from limber.estimation.fit_assessment import Estimate
 from limber.estimation.fitting.initial_modulus import scaled_start
 from limber.estimation.fitting.optimise import gauss_newton, nelder_mead
-from limber.estimation.judgement import Estimate
 from limber.estimation.online.follow import begin
 from limber.estimation.online.full_model import Beside
 from limber.estimation.online.information import OnlineFrame

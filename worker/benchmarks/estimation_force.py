@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 
 from benchmarks import paper_branches
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.paper_branches import BRANCHES, Bench, exact_pull, measured
 from benchmarks.table import Asked, Row, Setting, share_met
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.estimation.settings import EstimateSettings
 
 SETTINGS = EstimateSettings(hold_out=False)

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.budget import Budget
-from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.table import Asked, Row, Setting, share_met
+from benchmarks.trial_log import go_on, read_trials, source_digest
 from limber.core.errors import LimberError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings

@@ -15,9 +15,9 @@ from scipy.spatial import cKDTree
 
 from benchmarks import scan_scores
 from benchmarks.geometry_crowns import CROWN_ROWS, against_graph, crown_rows, explained
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.scan_scores import Dense, score
 from benchmarks.table import Asked, Part, Row, Setting
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.json_values import plain
 from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.io.clouds import read_points

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.scan_scores import Dense
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.geometry.generated import BranchSpec, scan
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton

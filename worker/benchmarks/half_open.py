@@ -11,7 +11,7 @@ import subprocess
 import sys
 from typing import Literal
 
-from limber.core.processes.ending import end_by_closing
+from limber.core.processes.end_with_parent import end_by_closing
 from limber.robot.driver.real_time import (
     VIRTUAL_ROBOT_PRIORITY,
     claim_real_time,

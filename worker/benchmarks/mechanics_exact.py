@@ -25,7 +25,7 @@ from limber.mechanics import (
     simulate_dynamics,
     solve_static,
 )
-from limber.mechanics.elements import shapes as fe
+from limber.mechanics.elements import shape_functions as fe
 from limber.mechanics.statics.rest_shape import unloaded_rest_shape
 
 ELASTICA = Path(__file__).parents[3] / "shared" / "data" / "elastica"

@@ -22,7 +22,7 @@ from limber.reduced.reduced_model import ReducedModel
 from limber.reduced.state import ReducedSettings
 from limber.reduced.training import Snapshots, Trainer, TrainingSettings, sample_poses, sample_young
 from limber.session.client import InteractiveSession
-from limber.session.opening import load_held, reduced_settings
+from limber.session.session_start import load_held, reduced_settings
 from limber.session.settings import SessionSettings
 from limber.store import Branch
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from limber.core.progress import Progress
 from limber.estimation.fit import fit_pulls
+from limber.estimation.fit_assessment import Estimate
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.judgement import Estimate
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.simulated_pull import TrueBranch, VirtualPullSettings, simulate_pull

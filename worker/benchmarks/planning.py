@@ -19,7 +19,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.planning_branches import ARC_NAMES, Subject, arcs, forked
 from benchmarks.planning_confidence import SURE_ROW, Sure, run_sure, sure_rows
 from benchmarks.planning_detours import DETOUR_ROWS, Detour, detour_rows, run_detour
@@ -35,6 +34,7 @@ from benchmarks.planning_limits import (
 )
 from benchmarks.planning_trials import Trial, no_path_seconds, run_trial
 from benchmarks.table import Asked, Part, Row, Setting
+from benchmarks.trial_log import go_on, read_trials, source_digest
 from limber.core.errors import LimberError
 from limber.core.json_values import plain
 from limber.core.progress import Progress

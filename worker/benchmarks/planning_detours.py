@@ -8,12 +8,12 @@ from scipy.integrate import trapezoid
 
 from benchmarks.table import Asked, Row
 from limber.core.errors import LimberError
+from limber.planning.baseline_and_plan import plan_pair
 from limber.planning.cost import arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.path_start import random_start
 from limber.planning.settings import PlanSettings
-from limber.planning.two_paths import plan_pair
 
 SAVED, ADDED = 35.69, 8.10
 """Percent, means over the paper's three branches."""

@@ -20,8 +20,8 @@ from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.limited_quantities import limited
 from limber.planning.field.local_error import LocalError
 from limber.planning.field.sampling import solve_branch
-from limber.planning.field.solved import samples_of
 from limber.planning.field.solver_pool import SolverPool
+from limber.planning.field.stored_states import samples_of
 from limber.planning.goals.grasp_goal import near
 from limber.planning.make_plan import plan_motion
 from limber.planning.path_on_full_model import resolve_path

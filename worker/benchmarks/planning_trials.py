@@ -7,6 +7,7 @@ import numpy as np
 
 from benchmarks.planning_optimum import best_cost
 from limber.core.errors import LimberError, NoPathError
+from limber.planning.baseline_and_plan import plan_within
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import EnergyField
@@ -18,7 +19,6 @@ from limber.planning.path_on_full_model import resolve_path
 from limber.planning.path_problem import GentleProblem
 from limber.planning.path_start import random_start
 from limber.planning.settings import PlanSettings
-from limber.planning.two_paths import plan_within
 
 _OPTIMUM_STARTS = 3
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from limber.core.progress import SILENT
 from limber.mechanics.model import BranchModel
-from limber.mechanics.statics.path import Path
+from limber.mechanics.statics.equilibrium_path import Path
 from limber.mechanics.statics.solve import DEFAULT_SETTINGS, StaticResult, StaticSettings
 from limber.mechanics.statics.static_problem import StaticProblem
 

@@ -12,8 +12,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks import robot_faults
-from benchmarks.held_up import Voided, Witness
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
+from benchmarks.machine_stalls import Voided, Witness
 from benchmarks.robot_branches import FOLLOWED_ROWS, LOST_ROW, followed_paths, lost_branches
 from benchmarks.robot_faults import (
     ENDS_ROBOT,
@@ -32,6 +31,7 @@ from benchmarks.robot_ros import LEAST_ROS_S, ROS_ROWS, ros_door
 from benchmarks.robot_stream import LEAST_STREAM_S, STREAM_ROWS, recorded_stream
 from benchmarks.robot_wrong_states import STATES_ROW, wrong_states
 from benchmarks.table import Asked, Part, Row, Setting
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.errors import LimberError
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.expected_wrench import ExpectedWrench

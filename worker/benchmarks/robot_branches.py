@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.held_up import Voided
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
+from benchmarks.machine_stalls import Voided
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.errors import LimberError, SafetyStop
 from limber.estimation.simulated_pull import VirtualPullSettings
 from limber.geometry.generated import generate_branch

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.held_up import Voided
-from benchmarks.kept_trials import go_on, read_trials, source_digest
+from benchmarks.machine_stalls import Voided
 from benchmarks.table import Asked, Row, Setting, share_met
+from benchmarks.trial_log import go_on, read_trials, source_digest
 from limber.cli.closed_loop.comparison import GOAL_TOLERANCE_M, comparison
 from limber.cli.closed_loop.loop import OPEN_FACTOR, ClosedLoop
 from limber.cli.terminal import table_lines

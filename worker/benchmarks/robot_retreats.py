@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks import robot_stepped
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.robot_stepped import Run, Spring, Wall
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.errors import LimberError
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.contact_speed import speed_within

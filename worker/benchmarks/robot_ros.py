@@ -9,7 +9,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from benchmarks.held_up import Voided
+from benchmarks.machine_stalls import Voided
 from benchmarks.robot_rosbridge import STEP, RosBridge
 from benchmarks.table import Asked, Row, Setting
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
@@ -19,7 +19,7 @@ from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.robot.ros.bridge import Bridge
-from limber.robot.ros.guarded import RosRobot, Topics
+from limber.robot.ros.guarded_robot import RosRobot, Topics
 
 LEAST_ROS_S = 30.0
 _ASKED_S, _STOP_S, _STOPS = 600.0, 0.1, 5

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks import scan_cases
-from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.scan_cases import one_sided_case, round_case
 from benchmarks.scan_scores import Dense
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.trial_log import go_on, read_trials, source_digest
 from limber.core.errors import LimberError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.io.clouds import read_points

@@ -18,10 +18,10 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
-from benchmarks.kept_trials import keep, read_trials
 from benchmarks.scan_cases import ScanCase
 from benchmarks.scan_runs import KINDS, case_source
 from benchmarks.scan_scores import Dense, doubled, fork_matches, seen_part
+from benchmarks.trial_log import keep, read_trials
 from limber.core.errors import LimberError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import prepare

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks import scan_cases, scan_plants, scan_scores
-from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.scan_cases import (
     ScanCase,
     gap_case,
@@ -24,6 +23,7 @@ from benchmarks.scan_cases import (
 from benchmarks.scan_plants import crown_case, leafy_case
 from benchmarks.scan_scores import cylinder_volume, points_on_axes, score, seen_part
 from benchmarks.table import Setting
+from benchmarks.trial_log import go_on, read_trials, source_digest
 from benchmarks.worlds.dropped_points import dropped_points
 from benchmarks.worlds.sources import WORLDS
 from limber.core.alignment import Alignment

@@ -12,8 +12,8 @@ from benchmarks import (
     truth_states,
     truth_trials,
 )
-from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.table import Asked, Part, Row, Setting, share_met
+from benchmarks.trial_log import go_on, read_trials, source_digest
 from benchmarks.truth_recordings import BAD_RECORDINGS, bad_recordings_row
 from benchmarks.truth_trials import Trial, trial
 from limber.recordings.cell_errors import CalibrationEntry

@@ -8,9 +8,9 @@ from typing import Any, Literal
 import numpy as np
 
 from benchmarks import silicone_beam
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.silicone_beam import BeamResult
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.errors import Cancelled, LimberError
 from limber.estimation.settings import EstimateSettings, PredictSettings, SwingSettings
 from limber.geometry.sections import Sections, mesh_sections, read_sections

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import truth_branch
-from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.table import Asked, Row, Setting, share_met
+from benchmarks.trial_log import go_on, read_trials, source_digest
 from benchmarks.truth_branch import recorded
 from limber.core.errors import Cancelled, LimberError
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings

@@ -8,18 +8,18 @@ from functools import partial
 import numpy as np
 
 from benchmarks import paper_branches, truth_branch, truth_trials
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.paper_branches import BRANCHES, Bench, PaperBranch, measured
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from benchmarks.truth_branch import FRACTIONS, Truth, drawn_truth, recorded
 from limber.core.errors import LimberError
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import fit_branch
+from limber.estimation.fit_assessment import Estimate, require_result
 from limber.estimation.fit_preparation import forwards_of, parameter_space
 from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import gauss_newton
-from limber.estimation.judgement import Estimate, require_result
 from limber.estimation.next_pull import PullChoice
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings

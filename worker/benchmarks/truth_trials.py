@@ -28,10 +28,10 @@ from limber.core.json_values import plain
 from limber.estimation.estimate_summary import details, summary
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import fit_branch
+from limber.estimation.fit_assessment import Estimate, judge_model, require_result
 from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.interpolation_prior import open_field
-from limber.estimation.judgement import Estimate, judge_model, require_result
 from limber.estimation.next_pull import Cell, Known, PullChoice, suggest
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings

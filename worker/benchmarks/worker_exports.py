@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import eigh
 
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.progress import SILENT
 from limber.geometry.generated import generate_branch
 from limber.geometry.reconstruction import mesh_skeleton

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.kept_trials import keep, read_trials, source_digest
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.trial_log import keep, read_trials, source_digest
 from benchmarks.worker_batches import (
     RECONSTRUCT,
     digests,

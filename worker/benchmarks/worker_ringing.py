@@ -5,8 +5,8 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.table import Asked, Row, Setting, share_met
+from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.progress import SILENT
 from limber.estimation.vibration.ringing import identify
 from limber.geometry.generated import generate_branch

@@ -8,7 +8,6 @@ import pytest
 
 from limber.cli import main
 from limber.cli.closed_loop import loop
-from limber.cli.closed_loop.bystander import Watch
 from limber.cli.closed_loop.cell_layout import (
     base_beside,
     bending_modulus,
@@ -17,6 +16,7 @@ from limber.cli.closed_loop.cell_layout import (
 )
 from limber.cli.closed_loop.comparison import comparison
 from limber.cli.closed_loop.loop import ClosedLoop
+from limber.cli.closed_loop.robot_observer import Watch
 from limber.cli.robot_commands.calibrate import _points
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices

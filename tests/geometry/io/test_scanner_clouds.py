@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
-from limber.geometry.cloud.gathering import gathered
+from limber.geometry.cloud.piecewise_reading import gathered
 from limber.geometry.io.clouds import read_points
 from limber.geometry.io.scanners import e57 as e57_module
 from limber.geometry.io.scanners import ptx as ptx_module

@@ -5,10 +5,10 @@ import pytest
 
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
-from limber.geometry.skeleton.radii import sides_seen
+from limber.geometry.skeleton.radii import visible_sides
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.noisy_rings import mean_positions, weighted_aims
-from limber.geometry.skeleton.radii.sides_seen import seen_sides
+from limber.geometry.skeleton.radii.visible_sides import seen_sides
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
@@ -81,7 +81,7 @@ def test_a_side_seen_to_the_grazing_angle_has_no_bias_at_any_noise(share: float)
     """Where noise is low, too, it is the arc's ends that tell the radius: it came out 3 % too thin
     at 0.06 of the radius, and right at 0.12."""
     rng = np.random.default_rng(0)
-    angle = rng.uniform(-sides_seen._GRAZING, sides_seen._GRAZING, 6000)
+    angle = rng.uniform(-visible_sides._GRAZING, visible_sides._GRAZING, 6000)
     points = np.stack([0.006 * np.cos(angle), 0.006 * np.sin(angle), rng.uniform(0, 0.5, 6000)],
                       axis=1) + rng.normal(0, share * 0.006, (6000, 3))
     fit = fit_axes(_axis(0.006), points, rounds=20, uncertainty=False)
@@ -102,7 +102,7 @@ def test_a_side_comes_to_one_radius_wherever_it_starts() -> None:
     """Noise of a third of the radius: steps twice as far as they should be ended at 0.83 and at
     1.00 of it by turns."""
     rng = np.random.default_rng(1)
-    angle = rng.uniform(-sides_seen._GRAZING, sides_seen._GRAZING, 3000)
+    angle = rng.uniform(-visible_sides._GRAZING, visible_sides._GRAZING, 3000)
     points = np.stack([0.006 * np.cos(angle), 0.006 * np.sin(angle), rng.uniform(0, 0.5, 3000)],
                       axis=1) + rng.normal(0, 0.002, (3000, 3))
     told = fit_axes(_axis(0.006), points, uncertainty=False).seen
@@ -123,7 +123,7 @@ def _twig_beside_a_stem(radius: float, noise: float, half: bool, per_radius: flo
     rng, length = np.random.default_rng(seed), 0.2
     places, axes = [], []
     for thick, beside, count in ((0.009, 0.0, 1400), (radius, 0.08, per_radius * length / radius)):
-        reach = sides_seen._GRAZING if half else np.pi
+        reach = visible_sides._GRAZING if half else np.pi
         angle = rng.uniform(-reach, reach, int(count))
         places.append(np.stack([thick * np.cos(angle), beside + thick * np.sin(angle),
                                 rng.uniform(0, length, len(angle))], axis=1))
@@ -232,7 +232,7 @@ def test_a_flat_stem_is_not_taken_for_half_a_ring(monkeypatch) -> None:
     points += np.random.default_rng(6).normal(0, 0.002, points.shape)
     whole = np.median(fit_axes(_axis(0.004), points, rounds=30).skeleton.radius[5:-5])
     assert whole == pytest.approx(0.005, rel=0.1)
-    monkeypatch.setattr(sides_seen, "_BENT_LEAST", 0.0)
+    monkeypatch.setattr(visible_sides, "_BENT_LEAST", 0.0)
     half = np.median(fit_axes(_axis(0.004), points, rounds=30).skeleton.radius[5:-5])
     assert half > 1.05 * whole
 

@@ -278,7 +278,7 @@ def test_a_ragged_foot_that_contraction_led_around_its_rim_may_be_the_root() -> 
 
 def test_an_end_is_not_left_beyond_the_points() -> None:
     """Where contraction overshoots a cut end, the root is brought back to where points are."""
-    from limber.geometry.skeleton.repair.ends import with_full_tips
+    from limber.geometry.skeleton.repair.run_ends import with_full_tips
 
     points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
     z = np.concatenate([[-0.03, -0.001], np.linspace(0.01, 0.29, 29)])
@@ -289,7 +289,7 @@ def test_an_end_is_not_left_beyond_the_points() -> None:
 
 def test_an_end_that_slid_beyond_the_points_is_drawn_back() -> None:
     """Both ends of an axis 12 mm past a tube: they come back to it; ends within it stay."""
-    from limber.geometry.skeleton.repair.ends import ends_within
+    from limber.geometry.skeleton.repair.run_ends import ends_within
 
     points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
     for over, moved in ((0.012, True), (-0.002, False)):

@@ -9,7 +9,7 @@ import pytest
 from limber.core.errors import InputError
 from limber.geometry.tets.element_types import EDGES, quadrature
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.elements import shapes as elements
+from limber.mechanics.elements import shape_functions as elements
 
 
 @pytest.mark.parametrize(("degree", "count"), [(1, 1), (2, 4), (4, 14), (5, 14)])

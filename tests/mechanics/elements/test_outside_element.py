@@ -11,7 +11,7 @@ from limber.geometry import TetMesh, register_element
 from limber.geometry.tets import element_types
 from limber.geometry.tets.element_types import Quadrature, quadrature
 from limber.mechanics import BranchModel, Grasp, solve_static
-from limber.mechanics.elements.shapes import has_curved_sides, node_weights
+from limber.mechanics.elements.shape_functions import has_curved_sides, node_weights
 from limber.results.exports.abaqus import inp_text
 
 

@@ -7,9 +7,9 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.scan_files import AS_IT_IS, DATA, SCANS
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.trial_log import go_on, read_trials, source_digest
 from benchmarks.worlds import degraded
 from benchmarks.worlds.degraded import DEGRADED
 from limber.core.errors import LimberError

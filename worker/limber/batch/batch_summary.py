@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from limber.batch.jobs.branch_jobs import BranchJob, JobFile
-from limber.batch.pictures import pictures
-from limber.batch.records import (
+from limber.batch.batch_progress import (
     DONE,
     FAILED,
     KEPT,
@@ -22,6 +20,8 @@ from limber.batch.records import (
     path_of_page,
     path_of_table,
 )
+from limber.batch.jobs.branch_jobs import BranchJob, JobFile
+from limber.batch.pictures import pictures
 from limber.core.files.atomic import write_atomically
 from limber.version import VERSION
 

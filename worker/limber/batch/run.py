@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
+from limber.batch.batch_log import BatchLog
+from limber.batch.batch_progress import DONE, FAILED, KEPT, RUNNING, Record, Records, numbers_of
 from limber.batch.jobs.branch_jobs import BranchJob, JobFile, StageTask
-from limber.batch.log import BatchLog
 from limber.batch.machines.cluster import Cluster, ClusterLostError
 from limber.batch.machines.staging import AT_ONCE, Staging
-from limber.batch.records import DONE, FAILED, KEPT, RUNNING, Record, Records, numbers_of
 from limber.batch.stage_task import is_shown, run_task
 from limber.core.errors import Cancelled, LimberError, WorkError
 from limber.core.processes import Pool, worker_count

@@ -235,7 +235,7 @@ def call(arguments: list[str] | None = None) -> int:
     """Run one command line and return its exit code; called by Blender's command entry."""
     _terminate_like_interrupt()
     if "LIMBER_PARENT_PIPE" in os.environ:
-        from limber.core.processes.ending import end_with_parent_pipe
+        from limber.core.processes.end_with_parent import end_with_parent_pipe
 
         end_with_parent_pipe()
     try:
@@ -313,7 +313,7 @@ def _choices(name: str, error: LimberError) -> list[dict[str, Any]]:
     """Return the remedies that the error offers, as options of the stage; see ``offers``."""
     if name not in stage_summaries():
         return []
-    from limber.stages.offers import offers
+    from limber.stages.error_suggestions import offers
 
     return offers(stage_schema(name), f"{error.why} {error.fix}")
 
@@ -322,7 +322,7 @@ def _position(name: str, error: LimberError) -> list[float] | None:
     """Return the position of the problem: as the error has it, else as its text names it."""
     if error.place or name not in stage_summaries():
         return list(error.place) if error.place else None
-    from limber.stages.offers import position_in
+    from limber.stages.error_suggestions import position_in
 
     return position_in(stage_schema(name), error.seen)
 

@@ -14,7 +14,7 @@ pydantic_core._pydantic_core.ValidationError: ...
 from limber.core.lazy import exports
 
 _PLACES = {
-    "Estimate": "judgement",
+    "Estimate": "fit_assessment",
     "EstimateSettings": "settings",
     "EvaluationLog": "fitting.evaluations",
     "OnlineEstimator": "online.filter",

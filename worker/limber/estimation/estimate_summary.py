@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from limber.estimation.estimated_branch import Subject
+from limber.estimation.fit_assessment import Estimate
 from limber.estimation.fitting.objective import Evaluation, Objective
-from limber.estimation.judgement import Estimate
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import outliers
 from limber.estimation.uncertainty.drift import drift, pull_moduli, scale_steps

@@ -1,6 +1,6 @@
 """Fit Young's modulus along a branch to its pulls: initial values and fit.
 
-:mod:`limber.estimation.judgement` holds the result and its uncertainty.
+:mod:`limber.estimation.fit_assessment` holds the result and its uncertainty.
 :mod:`limber.estimation.estimate_summary` selects the written values.
 """
 
@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import Cancelled, InputError, WorkError
+from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
-from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
+from limber.estimation.fit_assessment import MISFIT_FACTOR, Estimate, hold_out, judge_fit
 from limber.estimation.fit_preparation import (
     forwards_of,
     parameter_space,
@@ -33,7 +34,6 @@ from limber.estimation.fitting.objective import Evaluation, Objective, Stopped
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton, nelder_mead
 from limber.estimation.fitting.reduced_fit import Reduction, fit_reduced
 from limber.estimation.forward.forward_model import Forward, under_its_weight
-from limber.estimation.judgement import MISFIT_FACTOR, Estimate, hold_out, judge_fit
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import uncertainty

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError, WorkError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.forward.quasi_static import QuasiStaticForward

@@ -14,7 +14,7 @@ import numpy as np
 
 from limber.core.constants import GRAVITY
 from limber.core.errors import InputError, WorkError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.settings import VirtualPullSettings

@@ -9,8 +9,8 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import closest_rotation, rotation_matrix, rotation_vector
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.elements.shapes import node_weights
-from limber.mechanics.grip import nodes_between, parts_between
+from limber.mechanics.elements.shape_functions import node_weights
+from limber.mechanics.gripped_piece import nodes_between, parts_between
 
 RADIAN = 0.3
 """Distance that a rotation by one radian counts as between poses, as a fraction of the branch's

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 from limber.core.errors import InputError
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.elements import shapes as elements
+from limber.mechanics.elements import shape_functions as elements
 from limber.mechanics.elements.forces import ForceLayout
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Equations

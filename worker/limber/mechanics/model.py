@@ -22,9 +22,9 @@ from limber.mechanics.elements.forces import (
     strains,
     tangent_times,
 )
-from limber.mechanics.elements.principal import largest_principal_strains
+from limber.mechanics.elements.principal_strain import largest_principal_strains
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.grip import stiffening
+from limber.mechanics.gripped_piece import stiffening
 from limber.mechanics.linear.equations import Equations, Viscous
 from limber.mechanics.materials.law import MaterialLaw, hooke_strain, hooke_stress
 from limber.mechanics.materials.material_registry import material_named
@@ -91,7 +91,7 @@ class BranchModel:
         hanging: How the mesh's shape carries the weight; None if the mesh is the unloaded shape,
             which gravity bends. See :meth:`as_scanned`.
         gradients, weights: Strain operators at the quadrature points, from
-            :mod:`limber.mechanics.elements.shapes`.
+            :mod:`limber.mechanics.elements.shape_functions`.
 
     Raises:
         InputError: elements are inverted or flat, the mesh has several pieces or nodes without
@@ -168,8 +168,8 @@ class BranchModel:
     def gripped(self, *grasps: Grasp) -> "BranchModel":
         """Return the model stiffened by these clamping grippers, and no others.
 
-        See :mod:`limber.mechanics.grip`. Pinned grasps, and grasps of which only the nodes are
-        known, change nothing.
+        See :mod:`limber.mechanics.gripped_piece`. Pinned grasps, and grasps of
+        which only the nodes are known, change nothing.
         """
         held = [grasp.held for grasp in grasps
                 if grasp.mode == "clamped" and grasp.held is not None]

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.elements.shapes import shape_functions, shape_gradients
+from limber.mechanics.elements.shape_functions import shape_functions, shape_gradients
 
 _CANDIDATES = 40
 _FARTHEST = 1e9  # [m]

@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.not_none import present
 from limber.core.numerics.rigid import composed
-from limber.core.present import present
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.dynamics.load_case import (

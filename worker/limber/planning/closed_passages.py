@@ -18,12 +18,12 @@ from limber.planning.field.energy_field import EnergyField, GraspSamples
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.limited_quantities import limited
 from limber.planning.field.sampling import solve_branch
-from limber.planning.field.solved import Solved, samples_of
 from limber.planning.field.solver_pool import SolverPool
+from limber.planning.field.stored_states import Solved, samples_of
 from limber.planning.goals.goal import Goal
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.path_problem import UNPROVEN, NoWayError
-from limber.planning.planners.easiest import EasiestWay
+from limber.planning.planners.least_violation import EasiestWay
 
 _STATES = 12  # solved states of the branch
 _APART = 0.01  # [m] between them and from known samples

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import Cancelled, NoPathError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
+from limber.planning.baseline_and_plan import PathPair, plan_within
 from limber.planning.closed_passages import checked_wall, confirmed, not_confirmed
 from limber.planning.constraints.chance import Risk, YoungUncertainty
 from limber.planning.constraints.full_model_check import broken_on_full_model, field_error, learnt
@@ -30,12 +31,11 @@ from limber.planning.path_on_full_model import ResolvedPath, resolve_side_by_sid
 from limber.planning.path_problem import NoWayError
 from limber.planning.path_start import start_of
 from limber.planning.plan_summary import doubts_of, summary_of
-from limber.planning.planners.easiest import easiest_path
+from limber.planning.planners.least_violation import easiest_path
 from limber.planning.planners.tree_search import SearchTree
 from limber.planning.search_files import CostToGo
 from limber.planning.settings import PlanSettings
 from limber.planning.timing import DEFAULT_PACE, Pace
-from limber.planning.two_paths import PathPair, plan_within
 from limber.planning.undecided_passages import Passages, solved_if_undecided, with_added_poses
 
 _RESERVE = 1.01  # factor on the tightening of limits: the risk changes a little with the path

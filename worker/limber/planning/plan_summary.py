@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.planning.baseline_and_plan import PathPair
 from limber.planning.certificate.lower_bound import COST
 from limber.planning.constraints.full_model_check import field_error
 from limber.planning.cost import STEP, PathMeasures, measure_path, resample
@@ -14,7 +15,6 @@ from limber.planning.goals.goal_kinds import asked_kinds
 from limber.planning.path_on_full_model import ResolvedPath
 from limber.planning.planners.trees import chosen_engine
 from limber.planning.settings import PlanSettings
-from limber.planning.two_paths import PathPair
 
 _CHANGES = ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent")
 _STILL = 1e-9  # [m] a path that is not longer has no length

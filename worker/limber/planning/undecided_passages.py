@@ -15,7 +15,7 @@ from limber.planning.goals.goal import Goal
 from limber.planning.goals.grasp_goal import near
 from limber.planning.path_on_full_model import ResolvedPath, resolve_path
 from limber.planning.path_problem import NoWayError
-from limber.planning.planners.easiest import easiest_path
+from limber.planning.planners.least_violation import easiest_path
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,9 @@
 import numpy as np
 
 from limber.core.progress import SILENT, Progress
+from limber.planning.baseline_and_plan import PlanSettings, plan_pair
 from limber.planning.field.energy_field import GraspSamples, fit_field
 from limber.planning.goals.grasp_goal import GraspGoal
-from limber.planning.two_paths import PlanSettings, plan_pair
 
 
 def warm_up(progress: Progress = SILENT) -> None:

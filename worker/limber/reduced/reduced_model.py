@@ -17,8 +17,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.not_none import present
 from limber.core.numerics.rigid import pose_between
-from limber.core.present import present
 from limber.mechanics.grasp import Grasp, check_pose
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.reduced.basis import Basis, GraspCoordinates
@@ -30,7 +30,7 @@ _STATIC = ReducedStaticSettings()
 _NO_INCREMENT = np.empty(0)
 _LOST = 0.25
 """Fraction of the potential's change in a step beyond its work above which the step counts as a
-jump, as for the full model (limber.mechanics.statics.path).
+jump, as for the full model (limber.mechanics.statics.equilibrium_path).
 """
 _LEADING = 20
 """Modes that decide whether a state is like those of the training. Chosen, not measured."""

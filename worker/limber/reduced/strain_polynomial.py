@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.not_none import present
 from limber.core.numerics.compiled import compiled
-from limber.core.present import present
 from limber.mechanics.materials.materials import lame
 from limber.mechanics.model import BranchModel
 from limber.reduced.basis import (

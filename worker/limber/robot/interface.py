@@ -16,6 +16,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+_PLAYING = 2  # as RTDE reports a running program
+
 
 @dataclass(frozen=True)
 class Rods:
@@ -171,6 +173,11 @@ class Sample:
     payload: float | None = None
     payload_centre: np.ndarray | None = None
     outputs: int | None = None
+
+    @property
+    def program_runs(self) -> bool:
+        """Whether a program runs on the controller."""
+        return self.runtime_state == _PLAYING
 
 
 class ArmControl(Protocol):

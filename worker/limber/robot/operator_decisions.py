@@ -11,7 +11,7 @@ import numpy as np
 from limber.core.errors import InputError, LimberError, SafetyStop
 from limber.robot.driver.link import COLUMNS, RobotLink
 from limber.robot.grippers import drive_gripper, holds, is_driven
-from limber.robot.observed import show_before_motion
+from limber.robot.robot_state import show_before_motion
 
 if TYPE_CHECKING:
     from limber.core.progress import Progress

@@ -16,8 +16,8 @@ import numpy as np
 
 from limber.core.errors import InputError, WorkError
 from limber.core.json_lines import json_objects
-from limber.core.present import present
-from limber.core.processes.ending import end_by_closing
+from limber.core.not_none import present
+from limber.core.processes.end_with_parent import end_by_closing
 from limber.session.frame_buffer import Frame, FrameReader
 from limber.session.protocol import PROTOCOL
 from limber.session.settings import SessionSettings

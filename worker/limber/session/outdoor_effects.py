@@ -19,9 +19,9 @@ from limber.mechanics.loads.gust_loads import Gusts, Turbulence, WindRecord, blo
 from limber.mechanics.loads.load_effects import load_effects
 from limber.mechanics.loads.outdoor import Outdoors
 from limber.session.event_writer import Events
-from limber.session.opening import load_held
 from limber.session.protocol import Effects
 from limber.session.session_branch import HeldBranch
+from limber.session.session_start import load_held
 from limber.session.settings import SessionSettings
 from limber.store import Branch
 from limber.store.loading import known_damping

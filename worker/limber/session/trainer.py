@@ -39,7 +39,7 @@ from limber.reduced.model_cache import (
     model_key,
 )
 from limber.reduced.refresh import RefreshingModel
-from limber.session.opening import load_held, reduced_settings
+from limber.session.session_start import load_held, reduced_settings
 from limber.session.settings import SessionSettings
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from limber.core.errors import LimberError
 from limber.core.json_lines import json_objects
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.mechanics.grasp import Grasp
 from limber.reduced.model_file import read_model
 from limber.reduced.reduced_model import ReducedModel

@@ -85,13 +85,13 @@ from limber.mechanics.added_masses import PointMass
 from limber.mechanics.loads.outdoor import Outdoors
 from limber.reduced.strain_polynomial import compile_kernels
 from limber.session import protocol
+from limber.session.command_queue import Inbox, Received, read_commands
 from limber.session.event_writer import Events
 from limber.session.frame_buffer import FrameWriter
-from limber.session.inbox import Inbox, Received, read_commands
 from limber.session.model_choice import Answering
-from limber.session.opening import load_held
 from limber.session.outdoor_effects import EffectsTeller
 from limber.session.session_branch import Answer
+from limber.session.session_start import load_held
 from limber.session.settings import SessionSettings
 from limber.session.trainer_process import Checked, Learnt
 from limber.version import VERSION

@@ -31,7 +31,7 @@ from limber.core.files.temporary_names import owned_name, sweep
 from limber.core.json_values import plain
 from limber.core.settings import Settings
 from limber.store import journal
-from limber.store.disk import gone, in_words, require_room, require_there
+from limber.store.disk_errors import gone, in_words, require_room, require_there
 from limber.store.folder_state import (
     begin,
     drop_empty,

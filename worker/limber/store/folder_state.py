@@ -12,7 +12,7 @@ from limber.core.files import safe_names
 from limber.core.files.atomic import flush_folder, write_atomically
 from limber.core.files.temporary_names import is_owned_name, owned_name, sweep, sweep_beside
 from limber.store import journal
-from limber.store.disk import in_words
+from limber.store.disk_errors import in_words
 from limber.store.lock import (
     COMMIT_LOCK,
     HOLDER,

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.doubtful_parts import start_angle
-from limber.geometry.skeleton.repair.backwards import without_backward_starts
+from limber.geometry.skeleton.repair.backward_twigs import without_backward_starts
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.uncertain_parts import start_angle
 
 
 def _forked(at: int, hook: bool) -> Skeleton:

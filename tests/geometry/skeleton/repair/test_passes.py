@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.doubtful_parts import KINK, start_angle, turns
 from limber.geometry.skeleton.radii.axis_fit import AxisFit
-from limber.geometry.skeleton.radii.sides_seen import seen_sides
+from limber.geometry.skeleton.radii.visible_sides import seen_sides
 from limber.geometry.skeleton.repair.passes import PASSES, Pass, Repaired
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, UNRESOLVED, Skeleton
+from limber.geometry.skeleton.uncertain_parts import KINK, start_angle, turns
 
 Z, RADIUS, NOISE = 0.005 * np.arange(81), 0.008, 0.0005
 ALONG = np.stack([0 * Z, 0 * Z, Z], axis=1)

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from limber.batch.addresses import checked_address, is_address, matching, plain_name
 from limber.batch.jobs.problems import Problems
 from limber.batch.jobs.toml_positions import KeyPath
+from limber.batch.remote_files import checked_address, is_address, matching, plain_name
 from limber.core.errors import LimberError
 from limber.store.manifest import MANIFEST
 

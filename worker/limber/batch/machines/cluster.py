@@ -17,8 +17,8 @@ from limber.batch.jobs.branch_jobs import JobFile, StageTask
 from limber.batch.jobs.command_lines import line_of_task
 from limber.batch.machines.dask_worker import run_line, stop_lines, unfit
 from limber.core.errors import Cancelled, InputError, WorkError
+from limber.core.not_none import present
 from limber.core.optional import require_extra
-from limber.core.present import present
 from limber.core.processes import worker_count
 from limber.core.processes.budget import CORES, core_budget
 from limber.core.progress import Progress

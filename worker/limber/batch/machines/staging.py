@@ -12,7 +12,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Event
 
-from limber.batch.addresses import (
+from limber.batch.batch_progress import path_of_page, path_of_table
+from limber.batch.jobs.branch_jobs import BranchJob, JobFile
+from limber.batch.remote_files import (
     copy_here,
     fetch,
     put,
@@ -20,8 +22,6 @@ from limber.batch.addresses import (
     remove,
     take_away,
 )
-from limber.batch.jobs.branch_jobs import BranchJob, JobFile
-from limber.batch.records import path_of_page, path_of_table
 from limber.core.errors import BranchFolderError, Cancelled, InputError, WorkError
 from limber.core.files.atomic import file_digest, write_atomically
 from limber.core.files.reading import read_json

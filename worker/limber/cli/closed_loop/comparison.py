@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.cli.closed_loop.bystander import Watch
+from limber.cli.closed_loop.robot_observer import Watch
 from limber.cli.closed_loop.task_sizes import TaskSizes
 from limber.core.json_values import plain
 from limber.estimation.simulated_pull import TrueBranch

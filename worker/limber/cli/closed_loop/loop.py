@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from limber.cli.closed_loop.bystander import Watch
 from limber.cli.closed_loop.cell_layout import (
     GRASP_FRACTION,
     base_beside,
@@ -26,6 +25,7 @@ from limber.cli.closed_loop.cell_layout import (
     write_touched,
 )
 from limber.cli.closed_loop.comparison import Planned, compared
+from limber.cli.closed_loop.robot_observer import Watch
 from limber.cli.closed_loop.task_sizes import TaskSizes, wish_for
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.json_values import plain

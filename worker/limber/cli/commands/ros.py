@@ -41,7 +41,7 @@ def check(run: Run, cell_file: Path, url: str) -> dict[str, Any]:
     """Read joint states and wrenches, and move nothing."""
     from limber.robot.cell.cell import read_cell
     from limber.robot.ros.bridge import Bridge
-    from limber.robot.ros.guarded import RosRobot, Topics
+    from limber.robot.ros.guarded_robot import RosRobot, Topics
 
     cell = read_cell(cell_file)
     bridge = Bridge(url)
@@ -101,7 +101,7 @@ def scan(run: Run, cell_file: Path, topic: str, output: Path, views: int, url: s
     from limber.robot.cell.cell import read_cell
     from limber.robot.ros.bridge import Bridge
     from limber.robot.ros.cloud_topic import CloudTopic
-    from limber.robot.ros.guarded import Topics
+    from limber.robot.ros.guarded_robot import Topics
 
     cell = read_cell(cell_file)
     if views > 1 and not sys.stdin.isatty():
@@ -187,7 +187,7 @@ def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: st
     """
     from limber.core.errors import InputError, SafetyStop
     from limber.robot.cell.cell import read_cell
-    from limber.robot.motion.way_file import followed_path
+    from limber.robot.motion.followed_path import followed_path
 
     cell = read_cell(cell_file)
     way = followed_path(cell, "Open the gripper, and free the branch by hand.")
@@ -256,7 +256,7 @@ def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, 
     from limber.core.errors import SafetyStop
     from limber.robot.driver.real_time import claim_real_time
     from limber.robot.ros.bridge import Bridge
-    from limber.robot.ros.guarded import RosRobot, Topics
+    from limber.robot.ros.guarded_robot import RosRobot, Topics
 
     with ExitStack() as around:
         bridge = Bridge(url)

@@ -11,7 +11,7 @@ from limber.cli.main import Run, stage_command
 
 if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell
-    from limber.robot.observed import Observed
+    from limber.robot.robot_state import Observed
 
 _SECONDS = 1.0
 
@@ -26,7 +26,7 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
     showing them, and restore them.
     """
     from limber.robot.cell.cell import read_cell
-    from limber.robot.observed import observe
+    from limber.robot.robot_state import observe
 
     cell = read_cell(cell_file)
     seen = observe(cell, _SECONDS)

@@ -84,8 +84,8 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
     from limber.core.errors import SafetyStop
     from limber.robot.cell.cell import read_cell
     from limber.robot.driver.link import RobotLink
+    from limber.robot.motion.followed_path import followed_path
     from limber.robot.motion.retreat import RetreatPath
-    from limber.robot.motion.way_file import followed_path
     from limber.robot.operator_decisions import require_confirmation, retreat_if_chosen
 
     cell = read_cell(cell_file)
@@ -143,7 +143,7 @@ def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) ->
     from limber.core.errors import InputError
     from limber.robot.cell.cell import read_cell
     from limber.robot.grippers import drive_gripper, is_driven
-    from limber.robot.motion.way_file import FollowedPathFile
+    from limber.robot.motion.followed_path import FollowedPathFile
 
     cell = read_cell(cell_file)
     if not is_driven(cell):
@@ -219,7 +219,7 @@ def _followed(run: Run, cell_file: Path, word: str, link: RobotLink, motion: Tra
 def stands(cell: Cell) -> tuple[Sample, np.ndarray]:
     """Current position of the arm: a sample, and the pose of the gripper's middle [6]."""
     from limber.robot.cell.base_calibration import gripper_pose
-    from limber.robot.observed import observe
+    from limber.robot.robot_state import observe
 
     sample = observe(cell, _OBSERVED_SECONDS).samples[-1]
     return sample, gripper_pose(cell, sample)
@@ -234,7 +234,7 @@ def _with_pose(sample: Sample, pose: np.ndarray) -> Sample:
 def require_empty(cell: Cell, run: Run) -> None:
     """Refuse a motion of the arm alone if the gripper is known to hold the branch."""
     from limber.core.errors import SafetyStop
-    from limber.robot.motion.way_file import read_followed_path
+    from limber.robot.motion.followed_path import read_followed_path
 
     followed = read_followed_path(cell)
     if followed is not None and followed.gripper_closed:
@@ -257,7 +257,7 @@ def log_move(cell_file: Path, word: str, result: dict[str, Any]) -> None:
     import json
 
     from limber.core.json_values import plain
-    from limber.robot.motion.way_file import log_path
+    from limber.robot.motion.followed_path import log_path
 
     path = log_path()
     path.parent.mkdir(parents=True, exist_ok=True)

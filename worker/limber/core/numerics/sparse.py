@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import sparse
 
-from limber.core.present import present
+from limber.core.not_none import present
 
 if TYPE_CHECKING:
     from scipy.sparse.linalg import SuperLU

@@ -15,7 +15,7 @@ from typing import Any
 
 from limber.core.errors import LimberError, WorkError
 from limber.core.processes.budget import CORES
-from limber.core.processes.ending import end_by_kernel
+from limber.core.processes.end_with_parent import end_by_kernel
 from limber.core.progress import Progress, report_damage_to
 
 _REPORT_SECONDS = 0.05

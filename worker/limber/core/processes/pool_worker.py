@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from limber.core.errors import Cancelled, WorkError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.processes.pool_process import Reported, Task, serve
 from limber.core.processes.process_limits import Limits, LimitWatch
 from limber.core.processes.process_tree import kill_tree

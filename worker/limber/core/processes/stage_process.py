@@ -13,7 +13,7 @@ from typing import Any, TextIO
 from limber.core.errors import Cancelled, InputError, LimberError, SafetyStop, WorkError
 from limber.core.json_lines import json_object
 from limber.core.processes.budget import CORES
-from limber.core.processes.ending import PARENT_PIPE
+from limber.core.processes.end_with_parent import PARENT_PIPE
 from limber.core.processes.process_limits import UNLIMITED, Limits, LimitWatch
 from limber.core.processes.process_tree import kill_tree
 from limber.core.progress import SILENT, Progress

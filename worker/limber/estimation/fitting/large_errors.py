@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from limber.core.not_none import present
 from limber.core.numerics.rigid import rotated
-from limber.core.present import present
 from limber.estimation.fitting.nuisances import nuisance_records
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.parameters import Values

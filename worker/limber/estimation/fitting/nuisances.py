@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.estimation.forward.forward_model import Forward
 from limber.recordings.cell_errors import CalibrationEntry, calibration_of
 from limber.recordings.recording import PullEntry

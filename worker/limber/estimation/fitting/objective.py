@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.core.errors import Cancelled
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.nuisances import CellErrors, Eliminated, ErrorSlopes, eliminated

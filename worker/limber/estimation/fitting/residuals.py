@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.forward.input_force import Response
 from limber.recordings.synchronisation import Frames

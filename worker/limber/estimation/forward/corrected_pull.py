@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.forward.reduced_pull import ReducedForward

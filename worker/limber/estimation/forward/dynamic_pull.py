@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.estimation.forward.force_motion import motion_response
 from limber.estimation.forward.forward_model import Forward, Simulated, under_its_weight
 from limber.estimation.forward.input_force import Response, nodal_loads

@@ -15,8 +15,8 @@ from typing import TypeGuard
 
 import numpy as np
 
+from limber.core.not_none import present
 from limber.core.numerics.rigid import principal_axes
-from limber.core.present import present
 from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.forward.input_force import Response
 from limber.estimation.forward.quasi_static import QuasiStaticForward, equal_values

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError, WorkError
+from limber.core.not_none import present
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.numerics.sparse import NotPositiveDefiniteError
-from limber.core.present import present
 from limber.estimation.forward.forward_model import Forward, Simulated, under_its_weight
 from limber.estimation.forward.input_force import (
     Course,

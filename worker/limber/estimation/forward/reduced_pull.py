@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.forward.key_frames import key_frames, travel
 from limber.estimation.forward.quasi_static import uses_torque

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.estimation.online.corrections import COVERED, Corrections
 from limber.estimation.online.full_model import Beside, Here
 from limber.estimation.online.information import Information, Kept, OnlineFrame

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.core.errors import InputError, WorkError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.uncertainty.model_error import MeshStiffness, mesh_error
 from limber.estimation.vibration.modal_swing import Ends, ModalSwing

@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 
 from limber.core.errors import InputError
-from limber.core.present import present
-from limber.estimation.vibration.readings import cut_off, plucks, ringing_columns
+from limber.core.not_none import present
+from limber.estimation.vibration.ringing_detection import cut_off, plucks, ringing_columns
 from limber.recordings.importing.import_request import ImportRequest
 from limber.recordings.importing.recording_formats import RECORDINGS
 from limber.recordings.tables import read_table, split_title, time_stream

@@ -17,7 +17,7 @@ from limber.core.files.reading import read_arrays
 from limber.core.files.text_columns import ColumnsError, Table
 from limber.geometry.cloud.cloud import LEFT_OUT, POINTS, Cloud
 from limber.geometry.cloud.columns import property_names
-from limber.geometry.cloud.gathering import gathered
+from limber.geometry.cloud.piecewise_reading import gathered
 from limber.geometry.io.formats import Format, Registry, head_of, starts_with
 from limber.geometry.io.las import is_packed, las_columns
 from limber.geometry.io.las_units import METRES, in_metres

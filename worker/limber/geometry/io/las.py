@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.geometry.cloud.cloud import LEFT_OUT, POINTS, Cloud
-from limber.geometry.cloud.gathering import PIECE_POINTS, gathered
+from limber.geometry.cloud.piecewise_reading import PIECE_POINTS, gathered
 from limber.geometry.io.las_units import METRES, stated_metres
 
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from limber.geometry.skeleton.confidence import doubted
 from limber.geometry.skeleton.repair.attachment import attached
-from limber.geometry.skeleton.repair.ends import with_full_tips
 from limber.geometry.skeleton.repair.resampling import resampled
+from limber.geometry.skeleton.repair.run_ends import with_full_tips
 from limber.geometry.skeleton.repair.run_radii import limited, tapered
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
 

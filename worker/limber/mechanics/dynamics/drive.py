@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.mechanics.dynamics.pose_path import PosePath
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Equations

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.energy_momentum import EnergyMomentumStepper

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import Progress
 from limber.mechanics.dynamics.integration import MotionSettings, simulate_dynamics
 from limber.mechanics.grasp import Grasp

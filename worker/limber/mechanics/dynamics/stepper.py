@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import MotionSettings
 from limber.mechanics.linear.equations import Tangent, Viscous

@@ -7,7 +7,7 @@ two stable states of one grasp, and the history of the branch decides which one 
 import numpy as np
 
 from limber.core.progress import SILENT
-from limber.mechanics.statics.path import Path
+from limber.mechanics.statics.equilibrium_path import Path
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.static_problem import Target
 

@@ -16,7 +16,7 @@ from limber.core.progress import SILENT, Progress
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.solve_status import Status
-from limber.mechanics.statics.path import Path
+from limber.mechanics.statics.equilibrium_path import Path
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
 from limber.mechanics.statics.return_path import uncertainty_of
 from limber.mechanics.statics.static_problem import StaticProblem, Target

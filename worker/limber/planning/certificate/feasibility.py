@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, off_zero
 from limber.planning.cost import resample
 from limber.planning.field.chart import Chart
-from limber.planning.field.trust import nearest_of
+from limber.planning.field.valid_region import nearest_of
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.path_problem import GentleProblem, least_over
 

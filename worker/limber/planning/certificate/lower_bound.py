@@ -20,8 +20,8 @@ import scipy
 
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import SILENT, Progress
-from limber.planning.certificate.about_goal import about_goal
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, least_between, least_size
+from limber.planning.certificate.goal_cells import about_goal
 from limber.planning.certificate.grid import COARSEST, FINEST, Grid, descent, first_grid, refined
 from limber.planning.certificate.subsolution import (
     RIM,

@@ -14,12 +14,12 @@ import numpy as np
 from limber.core.errors import NoPathError
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
+from limber.planning.baseline_and_plan import plan_pair
 from limber.planning.cost import STEP, measure_path, resample
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals.goal import Goal
 from limber.planning.path_start import random_start
 from limber.planning.settings import PlanSettings
-from limber.planning.two_paths import plan_pair
 
 BASELINE = "RRT*, not smoothed"
 """Baseline of the comparison, as in the paper."""

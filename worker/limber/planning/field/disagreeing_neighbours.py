@@ -17,9 +17,9 @@ from scipy.spatial import Delaunay
 from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart
 from limber.planning.field.grasp_model import GraspModel, refusal
-from limber.planning.field.guess import extrapolated, midpoint_blend
-from limber.planning.field.solved import Solved, taken
+from limber.planning.field.initial_guess import extrapolated, midpoint_blend
 from limber.planning.field.solver_pool import SolverPool
+from limber.planning.field.stored_states import Solved, taken
 
 _JUMP = 0.01  # fraction of the branch's length by which predictions of two neighbours differ
 _ONE = 0.003  # fraction of it below which shapes are the same

@@ -22,7 +22,7 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart, mapped, pulled_back_size
 from limber.planning.field.local_error import LocalError, Slack, slack_at, slack_of
 from limber.planning.field.radial import RadialInterpolant, gradient_at, value_at
-from limber.planning.field.trust import TrustRegion, trusted_at
+from limber.planning.field.valid_region import TrustRegion, trusted_at
 
 
 @dataclass(frozen=True)

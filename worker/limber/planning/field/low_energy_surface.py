@@ -16,8 +16,8 @@ import scipy
 from limber.core.progress import SILENT, Progress
 from limber.mechanics import StaticResult
 from limber.planning.field.grasp_model import GraspModel, refusal
-from limber.planning.field.solved import Solved, taken
 from limber.planning.field.solver_pool import SolverPool
+from limber.planning.field.stored_states import Solved, taken
 
 _STEP = 1e-4  # [m] displacement that measures the stiffness at rest
 _RIM = 1.1  # factor on the force of linear bending at the largest deflection

@@ -20,10 +20,10 @@ from limber.planning.field.chart import Chart
 from limber.planning.field.disagreeing_neighbours import ask_between
 from limber.planning.field.energy_field import GraspSamples
 from limber.planning.field.grasp_model import GraspModel, Reach
-from limber.planning.field.guess import guess_of
+from limber.planning.field.initial_guess import guess_of
 from limber.planning.field.low_energy_surface import LowEnergySurface, walk_energy_surface
-from limber.planning.field.solved import Solved, samples_of, taken
 from limber.planning.field.solver_pool import SolverPool
+from limber.planning.field.stored_states import Solved, samples_of, taken
 from limber.planning.settings import EnergySettings
 
 _LAYER = 0.06  # fraction of the surface's radius

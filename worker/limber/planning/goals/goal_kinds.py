@@ -1,7 +1,7 @@
 """The kinds of goals, and the one requested by a plan's settings."""
 
 from limber.core.errors import InputError
-from limber.planning.goals.cell_place import IN_VIEW, SECOND_ARM
+from limber.planning.goals.cell_region import IN_VIEW, SECOND_ARM
 from limber.planning.goals.chosen_pose import DRAWN, default_goal
 from limber.planning.goals.goal import Goal, GoalKind, GoalRequest
 from limber.planning.goals.grasp_goal import AT_PLACE

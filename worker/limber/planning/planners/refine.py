@@ -20,7 +20,7 @@ import scipy
 
 from limber.planning.cost import resample
 from limber.planning.field.local_error import slacks_at
-from limber.planning.field.trust import nearest_of
+from limber.planning.field.valid_region import nearest_of
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.smoothing import smooth_cost
 

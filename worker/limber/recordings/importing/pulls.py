@@ -14,7 +14,7 @@ from limber.recordings.importing.import_request import (
     require_near,
     require_on_branch,
 )
-from limber.recordings.importing.loads import import_load, require_loadable
+from limber.recordings.importing.markers_under_load import import_load, require_loadable
 from limber.recordings.importing.readers import read_robot
 from limber.recordings.importing.recording_formats import (
     RECORDINGS,

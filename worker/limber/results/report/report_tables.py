@@ -242,7 +242,8 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
     Args:
         doubtful: Uncertain parts, each with ``kind``, ``branch``, ``at`` [3], ``length_m``,
-            ``radius_m`` and ``value`` (see :class:`limber.geometry.skeleton.doubtful_parts.Doubt`).
+            ``radius_m`` and ``value``: those of
+            :class:`limber.geometry.skeleton.uncertain_parts.Doubt`.
     """
     value_formats = {"unlikely branch": "probability {:.2f}",
                      "unresolved radius": "sigma {:.0%} of the radius",

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from limber.geometry.skeleton import qsm_tables
-from limber.geometry.skeleton.doubtful_parts import DoubtfulPart, doubtful_parts
 from limber.geometry.skeleton.qsm_tables import Caliper
+from limber.geometry.skeleton.uncertain_parts import DoubtfulPart, doubtful_parts
 from limber.results.report import figures
 from limber.results.report.report_tables import (
     caliper_rows,

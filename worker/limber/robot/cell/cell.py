@@ -17,10 +17,10 @@ from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_toml
 from limber.core.json_values import plain, validated
 from limber.core.numerics.rigid import inverted, matrices
-from limber.robot.cell.slips import FAR, slips
+from limber.robot.cell.implausible_values import FAR, slips
 from limber.robot.interface import Arm
 from limber.robot.known_arms import arm_named
-from limber.robot.ratings import MOST_SPEED, MOST_TURN_SPEED
+from limber.robot.load_ratings import MOST_SPEED, MOST_TURN_SPEED
 from limber.robot.urdf.chain_arm import ENDING
 
 Vector = tuple[float, float, float]

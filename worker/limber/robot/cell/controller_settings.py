@@ -18,7 +18,6 @@ NOMINAL_M, NOMINAL_RAD = 0.01, np.radians(2.0)
 # From one sample to the next an arm's own dimensions explain micrometres of a change.
 _STEP_M, _STEP_RAD = 1e-3, np.radians(0.5)
 _SAME_KG, _SAME_CENTRE_M = 0.005, 0.001
-_PLAYING = 2
 
 
 @dataclass(frozen=True)
@@ -138,11 +137,6 @@ class SteadySettings:
             return None
         return (f"the tool centre point in the controller was changed by {1000 * moved:.1f} mm "
                 f"and {np.degrees(turned):.1f} degrees")
-
-
-def plays(sample: Sample) -> bool:
-    """Whether a program runs on the controller."""
-    return sample.runtime_state == _PLAYING
 
 
 def in_millimetres(pose: np.ndarray) -> str:

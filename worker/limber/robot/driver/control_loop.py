@@ -20,9 +20,9 @@ from limber.robot.driver.controls import control_of
 from limber.robot.driver.current_motion import Following, UnderWay
 from limber.robot.driver.deadline import CONNECT_SECONDS, RenewedDeadline, set_deadline
 from limber.robot.driver.delays import HoldUps
+from limber.robot.driver.force_samples import Senses
 from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain, open_sensor
-from limber.robot.driver.guard import PLAYING, Guard, GuardSettings, State
-from limber.robot.driver.judged_samples import Senses
+from limber.robot.driver.guard import Guard, GuardSettings, State
 from limber.robot.driver.messages import Words
 from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
 from limber.robot.interface import ArmControl, Sample
@@ -217,7 +217,7 @@ class Driver:
         self._deadline.renew()
         deadline = time.monotonic() + _PROGRAM_SECONDS
         while not (self._control.program_runs()
-                   and self._require_sample().runtime_state == PLAYING):
+                   and self._require_sample().program_runs):
             if not started or time.monotonic() > deadline:
                 raise WorkError("The control program is not running.", "", "See the pendant.")
             self._deadline.renew()

@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 from limber.core.errors import InputError, WorkError
 from limber.robot.cell.cell import Cell
-from limber.robot.driver.ur_control import UrControl
 from limber.robot.interface import ArmControl
 from limber.robot.ur.factory_calibration import FactoryCalibration, read_calibration
 from limber.robot.ur.samples import Dashboard
+from limber.robot.ur.ur_control import UrControl
 
 _JOINTS = 6  # joints for which samples and recordings have columns
 

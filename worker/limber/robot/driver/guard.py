@@ -19,9 +19,9 @@ from limber.core.numerics.rigid_kernels import length, pose_between, turn_betwee
 from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
 from limber.robot.cell.controller_settings import SteadySettings
 from limber.robot.interface import Arm, Sample
-from limber.robot.ratings import within_ratings
+from limber.robot.load_ratings import within_ratings
 
-_RUNNING, _NORMAL, PLAYING = 7, 1, 2
+_RUNNING, _NORMAL = 7, 1
 _SAME = 1e-9  # N, N m
 _DEVIATIONS = 2.0  # standard deviations of a prediction that are allowed
 _MOSTLY = 0.8  # cosine of the angle to the predicted force that a difference opposes
@@ -321,7 +321,7 @@ class Guard:
             return self._stop(_SAFETY.get(sample.safety_mode, f"safety mode {sample.safety_mode}"))
         if sample.robot_mode != _RUNNING:
             return self._stop(f"robot mode {sample.robot_mode}: the robot is not running")
-        if self.state in (State.MOVING, State.PAUSED) and sample.runtime_state != PLAYING:
+        if self.state in (State.MOVING, State.PAUSED) and not sample.program_runs:
             return self._stop("the program on the controller was stopped")
         return _GO
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.core.json_lines import json_objects
-from limber.core.processes.ending import end_by_closing
+from limber.core.processes.end_with_parent import end_by_closing
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.controls import stop_from_outside
 from limber.robot.driver.deadline import CALL_SECONDS, ended_by_deadline

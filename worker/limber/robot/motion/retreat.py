@@ -7,9 +7,9 @@ import numpy as np
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid_kernels import length, turn_between
 from limber.robot.interface import Sample
+from limber.robot.motion.followed_path import FollowedPath, FollowedPathFile
 from limber.robot.motion.start_check import POSITION_M, ROTATION_RAD, different_joints
 from limber.robot.motion.trajectory import Trajectory, along
-from limber.robot.motion.way_file import FollowedPath, FollowedPathFile
 
 _APART_M, _APART_RAD = 1e-3, 0.005  # between the stored poses
 _SAME = 0.3  # fraction of the distance bridged at a start below which two poses are the same

@@ -17,7 +17,7 @@ import numpy as np
 
 from limber.core.errors import LimberError, WorkError
 from limber.core.json_lines import json_objects
-from limber.core.processes.ending import end_by_closing
+from limber.core.processes.end_with_parent import end_by_closing
 from limber.robot.driver.real_time import spare_what_is_loaded
 from limber.robot.virtual.arm_motions import Servo, SpeedMotion, Waypoint, line_move
 from limber.robot.virtual.controller import Controller

@@ -22,7 +22,7 @@ from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.estimation.estimated_branch import Subject
-    from limber.estimation.judgement import Estimate
+    from limber.estimation.fit_assessment import Estimate
 
 
 EVALUATIONS = ".estimate-evaluations.jsonl"
@@ -86,8 +86,8 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
               progress: Progress) -> dict[str, Any]:
     from limber.estimation.estimate_summary import details, summary
     from limber.estimation.fit import fit_branch
+    from limber.estimation.fit_assessment import judge_model, require_result
     from limber.estimation.fitting.evaluations import EvaluationLog
-    from limber.estimation.judgement import judge_model, require_result
     from limber.store.loading import load_pulls, load_subject, pull_names, pulls_digest
 
     names = pull_names(branch, settings)
@@ -216,7 +216,7 @@ def _cloud(branch: Branch) -> np.ndarray | None:
 def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,
                      settings: EstimateSettings, progress: Progress) -> None:
     """Score the branch's pulls that this estimate did not use."""
-    from limber.estimation.judgement import foretell
+    from limber.estimation.fit_assessment import foretell
     from limber.store.loading import known_pulls, load_pulls
 
     for name in [name for name in known_pulls(branch) if name not in names]:

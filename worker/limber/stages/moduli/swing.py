@@ -10,7 +10,7 @@ import numpy as np
 
 from limber.core.errors import InputError, WorkError
 from limber.core.json_values import plain
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings, SwingSettings
 from limber.stages.inputs import BranchInputs, RunOptions, by_name

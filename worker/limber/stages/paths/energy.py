@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.settings import EnergySettings
 from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
@@ -23,9 +23,9 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
         BranchFolderError: there is no mesh yet.
         WorkError: too few poses could be solved.
     """
+    from limber.planning.field.adaptive_sampling import refined
     from limber.planning.field.energy_field import fit_field
     from limber.planning.field.reduced_grasp import LearntGraspModel
-    from limber.planning.field.refining import refined
     from limber.planning.field.sampling import energy_inputs, sample_field
     from limber.store.loading import load_grasp_model
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from limber.core.errors import InputError, SafetyStop
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen

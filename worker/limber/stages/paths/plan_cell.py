@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError, NoPathError
+from limber.core.not_none import present
 from limber.core.numerics.rigid import inverted, matrices
-from limber.core.present import present
 from limber.core.progress import Progress
 from limber.geometry.io.surfaces import SURFACES, usable_surface
 from limber.geometry.tets.tet_mesh import TetMesh

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.constraints.obstacles import Obstacle

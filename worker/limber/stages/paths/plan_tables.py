@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.planning.cost import arc_lengths
 from limber.planning.plan_file import Way
 from limber.planning.planners.tree_search import SearchTree

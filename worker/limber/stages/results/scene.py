@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field
 
 from limber.core.errors import InputError, WorkError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.stages.inputs import BranchInputs, NoOptions, by_name

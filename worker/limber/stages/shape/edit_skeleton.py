@@ -40,9 +40,9 @@ from limber.stages.shape.reconstruct import EDITS, edits_digest, load_edits, wri
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.geometry.skeleton.doubtful_parts import DoubtfulPart
     from limber.geometry.skeleton.edits import Edit
     from limber.geometry.skeleton.skeleton import Skeleton
+    from limber.geometry.skeleton.uncertain_parts import DoubtfulPart
 
 _SHOWN = 30  # doubtful parts in the table; the JSON result has all
 
@@ -88,7 +88,7 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
         InputError: an edit does not fit. MeshingError: the edited skeleton cannot be meshed. The
             folder is then unchanged.
     """
-    from limber.geometry.skeleton.doubtful_parts import doubtful_parts
+    from limber.geometry.skeleton.uncertain_parts import doubtful_parts
 
     if edits_path is not None:
         branch = Branch.open(folder)

@@ -16,7 +16,7 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.core.files.reading import require_size
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.gathering import PIECE_POINTS, gathered
+from limber.geometry.cloud.piecewise_reading import PIECE_POINTS, gathered
 
 _NAMES = {"intensity": "intensity", "rowIndex": "row", "columnIndex": "column",
           "returnIndex": "return", "timeStamp": "time"}
@@ -43,8 +43,8 @@ class _Field:
 def read_e57(path: Path) -> Cloud:
     """Return the points of all scans [m] in their common frame, with colour and scalars.
 
-    Of more than :data:`~limber.geometry.cloud.gathering.MOST_POINTS`, one in each cell of a grid is
-    kept.
+    Of more than :data:`~limber.geometry.cloud.piecewise_reading.MOST_POINTS`, one in
+    each cell of a grid is kept.
 
     Raises:
         InputError: the file is damaged, is compressed in a way that the standard leaves open, or

@@ -11,7 +11,7 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.core.files.text_columns import LINES_AT_ONCE, coding_of, lines_of
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.gathering import gathered
+from limber.geometry.cloud.piecewise_reading import gathered
 
 _MOST = 10**9
 """Most rows or columns of a scanner's grid."""
@@ -32,8 +32,8 @@ class _Scan(NamedTuple):
 def read_ptx(path: Path) -> Cloud:
     """Return the points of all scans [m] in their common frame, with intensity and colour.
 
-    Of more than :data:`~limber.geometry.cloud.gathering.MOST_POINTS`, one in each cell of a grid is
-    kept.
+    Of more than :data:`~limber.geometry.cloud.piecewise_reading.MOST_POINTS`, one in
+    each cell of a grid is kept.
 
     Raises:
         InputError: a scan is cut short, or a header or a line of it is invalid.

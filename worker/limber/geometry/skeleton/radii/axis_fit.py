@@ -28,7 +28,7 @@ from limber.geometry.skeleton.radii.robust_noise import (
     settled_weights,
     tukey,
 )
-from limber.geometry.skeleton.radii.sides_seen import (
+from limber.geometry.skeleton.radii.visible_sides import (
     SCATTERED_ALONG_SIGHT,
     SeenSides,
     across_sight,

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import i0e, i1e
 
 from limber.geometry.skeleton.radii.fit_kernels import mean_on_circle
-from limber.geometry.skeleton.radii.sides_seen import SeenSides, sides_of
+from limber.geometry.skeleton.radii.visible_sides import SeenSides, sides_of
 
 # Square of radius over noise from which positions are known to within 5 degrees; and to within one
 # degree, where only one side was seen and its edges determine the radius.

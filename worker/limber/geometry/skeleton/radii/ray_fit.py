@@ -9,7 +9,7 @@ from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.radii.projected_widths import by_projected_widths
 from limber.geometry.skeleton.radii.robust_noise import robust_sigma
 from limber.geometry.skeleton.radii.sampling_evidence import rays_over_skin
-from limber.geometry.skeleton.radii.sides_seen import PLACES, SeenSides
+from limber.geometry.skeleton.radii.visible_sides import PLACES, SeenSides
 
 _LIKELIER = 3.0  # logarithm: twenty times
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from limber.geometry.skeleton.doubtful_parts import KINK, turns
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths
+from limber.geometry.skeleton.uncertain_parts import KINK, turns
 
 _END = 8.0  # radii from a kink to the tip below which the rest is a folded end
 _ROUNDED = 4.0  # radii on each side of a kink that are smoothed

@@ -13,10 +13,11 @@ from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.cylinders import point_counts
 from limber.geometry.skeleton.radii.ray_fit import fit_of_rays
 from limber.geometry.skeleton.repair.attachment import attached
-from limber.geometry.skeleton.repair.backwards import without_backward_starts
-from limber.geometry.skeleton.repair.ends import ends_within, with_full_tips, without_bare_ends
+from limber.geometry.skeleton.repair.backward_twigs import without_backward_starts
+from limber.geometry.skeleton.repair.double_strands import without_strands
 from limber.geometry.skeleton.repair.kinks import without_kinks
 from limber.geometry.skeleton.repair.resampling import resampled
+from limber.geometry.skeleton.repair.run_ends import ends_within, with_full_tips, without_bare_ends
 from limber.geometry.skeleton.repair.run_radii import (
     filled_in,
     limited,
@@ -25,7 +26,6 @@ from limber.geometry.skeleton.repair.run_radii import (
     unpinched,
 )
 from limber.geometry.skeleton.repair.spurs import prune_spurs
-from limber.geometry.skeleton.repair.strands import without_strands
 from limber.geometry.skeleton.skeleton import Skeleton
 
 LEAF_SHARE = 0.5

@@ -12,7 +12,7 @@ import numpy as np
 
 from limber.planning.field.grasp_model import GraspModel, Guess
 from limber.planning.field.radial import RadialInterpolant
-from limber.planning.field.solved import Solved
+from limber.planning.field.stored_states import Solved
 
 _STATES = 6  # states around a position that are used
 _SURE = 0.02  # fraction of the length by which they may differ from the nearest state

@@ -26,7 +26,7 @@ from limber.planning.goals.grasp_goal import near
 from limber.planning.path_problem import UNPROVEN, GentleProblem, NoWayError
 from limber.planning.path_start import check_start
 from limber.planning.planners.detour import DetourPath, plan_detour
-from limber.planning.planners.gentle import GentlePath, plan_gentle, separated
+from limber.planning.planners.eikonal import GentlePath, plan_gentle, separated
 from limber.planning.planners.refine import refine
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, chosen_engine, found_again, plan_path

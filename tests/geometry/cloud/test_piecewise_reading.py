@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from limber.core.files import text_columns
-from limber.geometry.cloud import gathering
+from limber.geometry.cloud import piecewise_reading
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.gathering import gathered
+from limber.geometry.cloud.piecewise_reading import gathered
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.io import clouds, las, pcd, ply
 from limber.geometry.io.clouds import read_points
@@ -49,14 +49,14 @@ def test_of_many_points_an_even_part_stays():
 def test_what_is_held_is_bounded():
     """No more than twice what is kept, and a piece, lies in memory together."""
     points, held, most = _tube(40_000), [], 3000
-    kept = gathering._together
+    kept = piecewise_reading._together
 
     def together(pieces):
         held.append(sum(map(len, pieces)))
         return kept(pieces)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gathering, "_together", together)
+        patch.setattr(piecewise_reading, "_together", together)
         gathered(_pieces(points, 40), most)
     assert max(held) <= 2 * most + 1000
 

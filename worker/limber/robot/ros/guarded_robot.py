@@ -20,10 +20,10 @@ from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import Reading, WrenchChain
 from limber.robot.driver.guard import Decision, Guard, GuardSettings, Verdict
 from limber.robot.interface import Sample
+from limber.robot.motion.followed_path import FollowedPathFile, read_followed_path
 from limber.robot.motion.retreat import RetreatPath
 from limber.robot.motion.start_check import require_start
 from limber.robot.motion.trajectory import Trajectory
-from limber.robot.motion.way_file import FollowedPathFile, read_followed_path
 from limber.robot.ros.bridge import SECONDS, Bridge
 from limber.robot.ros.messages import (
     FOLLOW,

@@ -16,7 +16,7 @@ from limber.planning.certificate.feasibility import Verdict, judge
 from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
 from limber.planning.cost import arc_lengths
 from limber.planning.path_problem import GentleProblem, NoWayError, no_path_error, not_found
-from limber.planning.planners.easiest import easiest_path
+from limber.planning.planners.least_violation import easiest_path
 from limber.planning.planners.refine import refine
 
 _GAIN = 1e-3  # relative gain of cost that another refinement must bring

@@ -19,7 +19,7 @@ from limber.core.errors import InputError, LimberError, MissingDependencyError, 
 from limber.core.files.atomic import write_atomically
 from limber.core.files.temporary_names import owned_name, sweep_beside
 from limber.core.optional import require_extra
-from limber.store.disk import LEAST_FREE_BYTES
+from limber.store.disk_errors import LEAST_FREE_BYTES
 
 # One letter before the colon is a drive.
 _ADDRESS = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]+)://(.*)$", re.DOTALL)

@@ -14,7 +14,7 @@ from limber.mechanics.linear.equations import Equations
 from limber.mechanics.model import BranchModel
 
 if TYPE_CHECKING:
-    from limber.mechanics.statics.path import Path
+    from limber.mechanics.statics.equilibrium_path import Path
 
 # Chosen on the columns and bows of tests/mechanics/statics; none was measured in a series.
 _FIRST_DRAG = 1e-5

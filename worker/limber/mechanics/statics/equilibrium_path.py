@@ -11,7 +11,7 @@ from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.model import InternalState
 from limber.mechanics.solve_status import Status
 from limber.mechanics.statics.result import StaticResult
-from limber.mechanics.statics.snap import settle
+from limber.mechanics.statics.snap_through import settle
 from limber.mechanics.statics.static_problem import (
     StaticProblem,
     Target,

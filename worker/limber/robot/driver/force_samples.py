@@ -13,9 +13,9 @@ from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain
 from limber.robot.driver.guard import Guard, Verdict
 from limber.robot.interface import ArmControl, Sample
+from limber.robot.motion.followed_path import FollowedPathFile, read_followed_path
 from limber.robot.motion.retreat import RetreatPath
 from limber.robot.motion.trajectory import Trajectory
-from limber.robot.motion.way_file import FollowedPathFile, read_followed_path
 
 _BATCH_SECONDS = 0.02
 _OLDEST_READING_SECONDS = 0.05

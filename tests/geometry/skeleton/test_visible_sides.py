@@ -5,10 +5,10 @@ import pytest
 
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
-from limber.geometry.skeleton.radii import sides_seen
+from limber.geometry.skeleton.radii import visible_sides
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.shared_errors import shared_error
-from limber.geometry.skeleton.radii.sides_seen import fit_seen_side, side_uncertainty
+from limber.geometry.skeleton.radii.visible_sides import fit_seen_side, side_uncertainty
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
@@ -33,15 +33,15 @@ def test_view_and_limit_are_told_to_a_degree_or_two(limit: float, noise: float) 
     """From a view that is 17 degrees off and a limit that is another sensor's."""
     out, axis, sharpness = _two_branches(np.deg2rad(limit), noise)
     mean = np.array([1.0, -0.25, 0.15]) / np.linalg.norm([1.0, -0.25, 0.15])
-    told = sides_seen._one_side(mean)
+    told = visible_sides._one_side(mean)
     for _ in range(8):
         told = fit_seen_side(out, axis, sharpness, np.ones(len(out)), mean, told)
     assert np.degrees(np.arccos(told.view[0])) < 2.5
     assert np.degrees(told.limit) == pytest.approx(limit, abs=1.0)
     # What is told is less in doubt than what is not.
-    assert told.limit_sigma < 0.5 * sides_seen._GRAZING_SIGMA
+    assert told.limit_sigma < 0.5 * visible_sides._GRAZING_SIGMA
     doubts = [side_uncertainty(seen, np.array([0.005]), 0.001)[0] for seen in (
-        told, sides_seen._one_side(mean))]
+        told, visible_sides._one_side(mean))]
     assert doubts[0] < 0.5 * doubts[1]
 
 

@@ -8,8 +8,8 @@ a twig meets its carrier nearer to the root.
 
 import numpy as np
 
-from limber.geometry.skeleton.doubtful_parts import start_angle
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.uncertain_parts import start_angle
 
 _BACKWARDS = np.deg2rad(80.0)  # angle to the carrier above which a twig is examined
 _FORWARDS = np.deg2rad(75.0)  # largest angle after the repair

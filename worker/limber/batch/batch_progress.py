@@ -10,7 +10,7 @@ from typing import Any
 
 from limber.batch.jobs.branch_jobs import BranchJob, JobFile, StageTask
 from limber.core.files.temporary_names import is_alive
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.store.growing_files import Stream, stream_lines
 
 _LEAST_LINES, _MOST_TIMES = 2000, 4

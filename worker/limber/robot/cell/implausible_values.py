@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from limber.core.numerics.rigid import matrices
-from limber.robot.ratings import greatest_force, greatest_torque
+from limber.robot.load_ratings import greatest_force, greatest_torque
 
 if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell, SensorEntry

@@ -1,16 +1,17 @@
 """A controller of Universal Robots for the driver's loop: RTDE, ur-rtde, dashboard."""
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from limber.core.errors import InputError, SafetyStop, WorkError
-from limber.robot.cell.cell import Cell
-from limber.robot.cell.controller_settings import plays
 from limber.robot.interface import Sample
 from limber.robot.ur.robotiq import RobotiqGripper
 from limber.robot.ur.samples import Dashboard, SampleStream
+
+if TYPE_CHECKING:
+    from limber.robot.cell.cell import Cell
 
 _WATCHDOG_HZ = 10.0
 _GAIN = 900.0
@@ -32,7 +33,7 @@ class UrControl(SampleStream):
     lookahead = 0.06
     silence = 1.0 / _WATCHDOG_HZ
 
-    def __init__(self, cell: Cell):
+    def __init__(self, cell: "Cell"):
         super().__init__(cell.robot.address)
         self._cell = cell
         self._dashboard = Dashboard(cell.robot.address)
@@ -88,7 +89,7 @@ class UrControl(SampleStream):
         """
         from rtde_control import RTDEControlInterface
 
-        if plays(self._first):
+        if self._first.program_runs:
             raise SafetyStop("A program is running on the controller "
                              f"({self._dashboard.ask('programState')}).",
                              "Limber's own program would end it, wherever it is.",

@@ -7,6 +7,7 @@ import pytest
 
 from limber.core.progress import Progress
 from limber.planning import make_plan as planning
+from limber.planning.baseline_and_plan import plan_within
 from limber.planning.certificate.feasibility import judge
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
@@ -15,11 +16,10 @@ from limber.planning.field.energy_field import EnergyField, GraspSamples, fit_fi
 from limber.planning.goals.chosen_pose import default_goal
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.path_problem import GentleProblem, NoWayError
-from limber.planning.planners.easiest import easiest_path
-from limber.planning.planners.gentle import plan_gentle
+from limber.planning.planners.eikonal import plan_gentle
+from limber.planning.planners.least_violation import easiest_path
 from limber.planning.planners.refine import refine
 from limber.planning.settings import PlanSettings
-from limber.planning.two_paths import plan_within
 from limber.planning.undecided_passages import solved_if_undecided
 
 RADIUS = 0.2  # [m] of the shell about the origin

@@ -10,7 +10,7 @@ from limber.planning.field.disagreeing_neighbours import neighbours
 from limber.planning.field.energy_field import EnergyField, refit
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import Sampled
-from limber.planning.field.solved import Solved, samples_of, taken
+from limber.planning.field.stored_states import Solved, samples_of, taken
 
 _ROUND = 0.15  # fraction of the samples added in a round
 _FEWEST = 8

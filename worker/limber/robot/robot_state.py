@@ -11,7 +11,7 @@ import numpy as np
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import matrices
 from limber.robot.cell.cell import Cell
-from limber.robot.cell.controller_settings import Difference, differences, plays
+from limber.robot.cell.controller_settings import Difference, differences
 from limber.robot.driver.controls import calibration_of, control_of
 from limber.robot.driver.force_sensors import ForceTorqueSensor, open_sensor
 from limber.robot.interface import ArmControl, Sample
@@ -46,7 +46,7 @@ class Observed:
     @property
     def program_runs(self) -> bool:
         """Whether a program runs on the controller."""
-        return plays(self.samples[-1])
+        return self.samples[-1].program_runs
 
     def nominal_off(self, cell: Cell) -> float | None:
         """Return the deviation of the controller's pose from the arm's nominal dimensions [m].

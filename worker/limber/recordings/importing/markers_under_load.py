@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.present import present
+from limber.core.not_none import present
 from limber.recordings.cell_errors import WITHOUT_GRIPPER
 from limber.recordings.hung_load import settled, swung
 from limber.recordings.importing.import_request import (
