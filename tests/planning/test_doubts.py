@@ -16,7 +16,7 @@ from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.goals.regions import Ball
 from limber.planning.goals.target_goal import TargetGoal
-from limber.planning.path_problem import UNPROVEN, GentleProblem, NoWayError
+from limber.planning.path_problem import UNPROVEN, BlockedError, GentleProblem
 from limber.planning.settings import PlanSettings
 
 START, GOAL = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
@@ -84,7 +84,7 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
         tried.append(tried_limits.max_loads[0])
         assert beyond.max_loads[0] == pytest.approx(2.4 + uncertainty)
         if tried[-1] <= 2.4:
-            raise NoWayError(seen, "On a grid.", "Raise the limit.")
+            raise BlockedError(seen, "On a grid.", "Raise the limit.")
         return there
 
     uncertainty = limits.doubts(rough_field)["strain"]
@@ -96,7 +96,7 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
         assert not any(found.margins.values()) and tried[-1] == pytest.approx(2.4 + uncertainty)
         assert any("extended by the field's error (strain 0." in words for words in told)
     else:
-        with pytest.raises(NoWayError, match="No path exists"):
+        with pytest.raises(BlockedError, match="No path exists"):
             baseline_and_plan.plan_within(*arguments, progress=progress)
         assert max(tried) <= 2.4 and len(tried) == 1, "without margins it is proven as well"
 

@@ -15,7 +15,7 @@ from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, GraspSamples, fit_field
 from limber.planning.goals.chosen_pose import default_goal
 from limber.planning.goals.grasp_goal import GraspGoal
-from limber.planning.path_problem import GentleProblem, NoWayError
+from limber.planning.path_problem import BlockedError, GentleProblem
 from limber.planning.planners.eikonal import plan_gentle
 from limber.planning.planners.least_violation import easiest_path
 from limber.planning.planners.refine import refine
@@ -65,7 +65,7 @@ def test_a_force_just_too_low_is_proven_and_one_just_enough_has_a_path(shell_fie
     assert found.cost == wide.cost(found.points) < np.inf
     none = problem_on(shell_field, max_force=0.8 * held)
     assert judge(none).proven
-    with pytest.raises(NoWayError, match=r"No path exists.*proven on a grid"):
+    with pytest.raises(BlockedError, match=r"No path exists.*proven on a grid"):
         plan_gentle(none)
 
 
@@ -137,7 +137,7 @@ def test_a_plan_that_a_wrong_field_excludes_is_made_with_more_poses(
     def excluded(known, *arguments, **options):
         counts.append(len(known.samples.poses))
         if len(counts) <= blind:
-            raise NoWayError("No path exists.", "Proven on a grid.", "Raise the limit.")
+            raise BlockedError("No path exists.", "Proven on a grid.", "Raise the limit.")
         return plan_within(known, *arguments, **options)
 
     monkeypatch.setattr(planning, "plan_within", excluded)
@@ -153,6 +153,7 @@ def test_a_plan_that_a_wrong_field_excludes_is_made_with_more_poses(
         assert np.linalg.norm(found.plan.solved.forces, axis=1).max() <= 1.3 * held
         assert counts[1] > counts[0] and "poses are added" in warnings[0]
     else:
-        with pytest.raises(NoWayError, match=r"No path exists.*poses were added .* of .* N, at \("):
+        with pytest.raises(BlockedError,
+                           match=r"No path exists.*poses were added .* of .* N, at \("):
             made()
         assert len(counts) <= 3

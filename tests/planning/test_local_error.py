@@ -16,9 +16,9 @@ from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.goals.regions import Ball
 from limber.planning.goals.target_goal import TargetGoal
-from limber.planning.path_problem import GentleProblem, NoWayError
+from limber.planning.path_problem import BlockedError, GentleProblem
 from limber.planning.plan_file import read_plan
-from limber.planning.planners.least_violation import EasiestWay
+from limber.planning.planners.least_violation import LeastViolation
 
 AT_REST = GraspGoal((0.0, 0.0, 0.0), 0.01)
 
@@ -96,7 +96,7 @@ def test_a_wall_is_confirmed_by_the_full_model_or_refuted(apart, small_model, mo
     above than its error, refute it and are learnt."""
     field, places, forces = apart
     monkeypatch.setattr(closed_passages, "_STATES", 2)
-    none = NoWayError("No path exists.", "Proven on a grid.", "").behind(places)
+    none = BlockedError("No path exists.", "Proven on a grid.", "").behind(places)
     low, high = Limits(force=0.3 * forces.min()), Limits(force=3.0 * forces.max())
     monkeypatch.setattr(Limits, "errors", lambda self, known: {})
     check = checked_wall(field, small_model, low, none, AT_REST, workers=1)
@@ -110,7 +110,7 @@ def test_a_wall_is_confirmed_by_the_full_model_or_refuted(apart, small_model, mo
     wrong = LocalError(np.zeros((1, 3)), np.zeros(1), 1.0, 0.0, -1.0)  # the field says too much
     monkeypatch.setattr(Limits, "errors", lambda self, known: {"force": wrong})
     assert checked_wall(field, small_model, low, none, AT_REST, workers=1).learnt is not None
-    assert checked_wall(field, small_model, low, NoWayError("No."), AT_REST, workers=1).bears_out
+    assert checked_wall(field, small_model, low, BlockedError("No."), AT_REST, workers=1).bears_out
     monkeypatch.setattr(closed_passages, "solve_branch", lambda *_, **__: ([None], []))
     unsolved = checked_wall(field, small_model, low, none, AT_REST, workers=1)
     assert not unsolved.bears_out and unsolved.learnt is None
@@ -121,7 +121,7 @@ def test_a_target_out_of_reach_is_confirmed_by_the_full_model(apart, small_model
     field's error allows, refutes that. A state over a limit refutes nothing."""
     field, places, forces = apart
     monkeypatch.setattr(closed_passages, "_STATES", 2)
-    none = NoWayError("No path exists.", "Proven on a grid.", "").behind(
+    none = BlockedError("No path exists.", "Proven on a grid.", "").behind(
         np.empty((0, 3)), places[:1])
     tip = field.tip(places[:1])[0]
     off = float(field.place_errors(None, places[:1])[0])
@@ -140,10 +140,10 @@ def test_a_target_out_of_reach_is_confirmed_by_the_full_model(apart, small_model
 
 def test_a_proof_that_is_not_borne_out_is_none():
     """What is said then proves nothing, and names the limits."""
-    said = not_confirmed(Limits(force=4.0), EasiestWay(np.zeros((2, 3)), 1.04))
+    said = not_confirmed(Limits(force=4.0), LeastViolation(np.zeros((2, 3)), 1.04))
     assert not said.is_proven and "force 4 N" in said.seen and "104 % of a limit" in said.why
     assert "easiest" not in not_confirmed(Limits(force=4.0), None).why
-    assert NoWayError("No path exists.", "Proven.", "").is_proven
+    assert BlockedError("No path exists.", "Proven.", "").is_proven
 
 
 def test_a_plan_keeps_off_a_limit_by_the_error_of_the_place(half_rough):

@@ -5,7 +5,7 @@ import pytest
 
 from limber.core.progress import Progress
 from limber.planning.constraints.obstacles import Box
-from limber.planning.plan_file import Way
+from limber.planning.plan_file import PlanPath
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.execution import robot_motion
 from limber.robot.motion.expected_wrench import Predicted
@@ -61,7 +61,7 @@ def test_each_leg_is_checked_for_collisions(motion):
 
 def test_a_plan_without_a_robot_has_the_legs_of_the_branch():
     count = np.arange(5.0)
-    motion = Way(np.column_stack([0.01 * np.array([0, 1, 2, 1, 0]), *np.zeros((5, 5))]), count,
+    motion = PlanPath(np.column_stack([0.01 * np.array([0, 1, 2, 1, 0]), *np.zeros((5, 5))]), count,
                  np.array([0.0, 1, 3, 1, 0]), count, torques=np.zeros((5, 3)),
                  times=np.array([0.0, 1, 3, 5, 6]),
                  phases=("approach", "path", "path", "return", "return"))

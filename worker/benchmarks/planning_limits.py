@@ -25,7 +25,7 @@ from limber.planning.field.stored_states import samples_of
 from limber.planning.goals.grasp_goal import near
 from limber.planning.make_plan import plan_motion
 from limber.planning.path_on_full_model import resolve_path
-from limber.planning.path_problem import NoWayError
+from limber.planning.path_problem import BlockedError
 from limber.planning.path_start import random_start
 from limber.planning.settings import PlanSettings
 
@@ -93,7 +93,7 @@ def _with_limit(found: NearLimit, model: GraspModel, known: EnergyField, asked: 
     try:
         motion = plan_motion(known, model, bound, workers=1)
         found.seconds, found.said = time.process_time() - began, "planned"
-    except NoWayError as error:
+    except BlockedError as error:
         found.seconds = time.process_time() - began
         found.said = "proven" if error.is_proven else "not found"
         return
@@ -114,7 +114,7 @@ def _hopeless(found: NearLimit, model: GraspModel, known: EnergyField, asked: Pl
     try:
         plan_motion(known, model, asked.model_copy(update={"max_force": limit}), workers=1)
         found.hopeless_said = "planned"
-    except NoWayError as error:
+    except BlockedError as error:
         found.hopeless_said = "proven" if error.is_proven else "not found"
     except LimberError as error:
         found.hopeless_said = type(error).__name__

@@ -75,7 +75,7 @@ def test_trials_without_a_bridge_end(monkeypatch):
     all_tried = sum(tried)
     assert all_tried
     tried.clear()
-    monkeypatch.setattr(joining, "_MOST_WAYS", all_tried - 1)
+    monkeypatch.setattr(joining, "_MOST_PATHS", all_tried - 1)
     _joined(8)
     assert sum(tried) < all_tried
 

@@ -432,8 +432,8 @@ class Plan(Result):
         certificate.
         gap: Largest cost of the gentle path above that of the best one [%]; None if unknown.
 
-    >>> way = limber.open("a.branch").results["plan:to-goal"]
-    >>> way.path.shape[1], way.bound <= way.cost
+    >>> plan = limber.open("a.branch").results["plan:to-goal"]
+    >>> plan.path.shape[1], plan.bound <= plan.cost
     (6, True)
     """
 

@@ -432,8 +432,8 @@ class Branch:
             BranchFolderError: there is no energy field, or one of another branch.
             NoPathError: no path reaches the goal; the message states why.
 
-        >>> way = limber.open("a.branch").plan(max_strain=0.02, name="soft")  # doctest: +SKIP
-        >>> way.strains.max() <= 0.02                                        # doctest: +SKIP
+        >>> soft = limber.open("a.branch").plan(max_strain=0.02, name="soft")  # doctest: +SKIP
+        >>> soft.strains.max() <= 0.02                                        # doctest: +SKIP
         """
         return cast(Plan, self._run("plan", quiet, settings))
 

@@ -117,9 +117,9 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
             progress.warn(f"{error.seen} {error.why} The gripper's recorded path is prescribed "
                           "instead.")
             # Force-driven evaluations do not apply here.
-            led = settings.model_copy(update={"drive": "pose"})
+            path_driven = settings.model_copy(update={"drive": "pose"})
             try:
-                return once(branch, led, EvaluationLog(None, ""))
+                return once(branch, path_driven, EvaluationLog(None, ""))
             except WorkError as second:
                 raise error from second
 

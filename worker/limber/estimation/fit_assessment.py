@@ -288,18 +288,18 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
 
 def _path_error(found: Estimate, progress: Progress) -> np.ndarray | None:
     """Error from the gripper's frame if its path is prescribed, with a warning."""
-    led = path_prescribed(found.objective.forwards)
-    if not led:
+    prescribed = path_prescribed(found.objective.forwards)
+    if not prescribed:
         return None
     error = path_error(found.fit.evaluation, found.objective)
     grown = ("Its effect could not be computed and is NOT in the intervals"
              if error is None else
              f"It adds up to {100 * error.max():.0f} % to the standard deviations")
     progress.warn(
-        f"{', '.join(forward.name for forward in led)}: the fit prescribes the gripper's recorded "
-        "path and takes its frame as exact. According to [calibration], the frame may have an "
-        f"error. {grown}. Record the force and use it to drive the fit (of a clamped grasp also "
-        "the torque, with torque_sigma_nm), or state a better [calibration] in pull.toml.")
+        f"{', '.join(forward.name for forward in prescribed)}: the fit prescribes the gripper's "
+        "recorded path and takes its frame as exact. According to [calibration], the frame may "
+        f"have an error. {grown}. Record the force and use it to drive the fit (of a clamped grasp "
+        "also the torque, with torque_sigma_nm), or state a better [calibration] in pull.toml.")
     return error
 
 

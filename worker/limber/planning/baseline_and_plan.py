@@ -23,7 +23,7 @@ from limber.planning.goals.allowed_poses import (
 )
 from limber.planning.goals.goal import Goal
 from limber.planning.goals.grasp_goal import near
-from limber.planning.path_problem import UNPROVEN, GentleProblem, NoWayError
+from limber.planning.path_problem import UNPROVEN, BlockedError, GentleProblem
 from limber.planning.path_start import check_start
 from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.eikonal import GentlePath, plan_gentle, separated
@@ -103,7 +103,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
                               before=before, progress=progress.part(0.0, 0.5))
             return replace(found, margins=part)
         except NoPathError as error:
-            if isinstance(error, NoWayError) and error.is_proven:
+            if isinstance(error, BlockedError) and error.is_proven:
                 raise  # by the limits and the field's error alone: without margins as well
             progress.warn("No path keeps the limits with margins for the energy field's error "
                           f"({_margin_text(part)}). The path is planned without margins. The full "
@@ -112,7 +112,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
         found = plan_pair(field, start, goal, settings, limits.on(field), beyond=surely,
                           errors=errors, asked_goal=asked_goal, before=before,
                           progress=progress.part(0.5, 1.0))
-    except NoWayError as error:
+    except BlockedError as error:
         found = _in_doubt(error, field, start, goal, settings, limits, surely, errors=errors,
                           asked_goal=asked_goal, before=before, progress=progress.part(0.5, 1.0))
     return replace(found, margins=none)
@@ -120,9 +120,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
 
 def _check_any_path(field: EnergyField, start: np.ndarray, goal: Goal, limits: Limits,
                     asked: Limits) -> None:
-    """Raise NoWayError if cells prove at once that no path keeps the limits, before any search for
-    one.
-    """
+    """Raise BlockedError if cells prove, before any search, that no path keeps the limits."""
     if not limits.asked():
         return
     problem = GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
@@ -134,18 +132,18 @@ def _check_any_path(field: EnergyField, start: np.ndarray, goal: Goal, limits: L
     try:
         goal_points(goal, field, problem.limits)
     except GoalOverLimitsError as nobody:
-        raise NoWayError(nobody.seen, f"{nobody.why} {none.why}", nobody.fix).behind(
+        raise BlockedError(nobody.seen, f"{nobody.why} {none.why}", nobody.fix).behind(
             none.wall, none.nearest) from nobody
     raise none
 
 
-def _in_doubt(none: NoWayError, field: EnergyField, start: np.ndarray, goal: Goal,
+def _in_doubt(none: BlockedError, field: EnergyField, start: np.ndarray, goal: Goal,
               settings: PlanSettings, limits: Limits, surely: FieldArrays,
               **options: Any) -> PathPair:
     """Return the plan with limits relaxed by the field's possible error.
 
     Raises:
-        NoWayError: ``none``, if it is proven, the field has no error, or relaxing does not help.
+        BlockedError: ``none``, if it is proven, the field has no error, or relaxing does not help.
     """
     doubts = limits.doubts(field)
     if UNPROVEN not in none.seen or not any(doubts.values()):
@@ -202,10 +200,10 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     known = [path.points for path in trees.values()]
     try:
         gentle, detour = _gentle(problem, known, settings, progress.part(0.5, 1.0))
-    except NoWayError as error:
+    except BlockedError as error:
         if nobody is None or UNPROVEN in error.seen:
             raise
-        raise NoWayError(nobody.seen, f"{nobody.why} {error.why}", nobody.fix).behind(
+        raise BlockedError(nobody.seen, f"{nobody.why} {error.why}", nobody.fix).behind(
             error.wall, error.nearest) from error
     if detour is not None:
         weighed = replace(weighed, distance=detour.weight * weighed.distance)

@@ -22,8 +22,8 @@ from limber.planning.field.solver_pool import SolverPool
 from limber.planning.field.stored_states import Solved, samples_of
 from limber.planning.goals.goal import Goal
 from limber.planning.path_on_full_model import SolvedPoses
-from limber.planning.path_problem import UNPROVEN, NoWayError
-from limber.planning.planners.least_violation import EasiestWay
+from limber.planning.path_problem import UNPROVEN, BlockedError
+from limber.planning.planners.least_violation import LeastViolation
 
 _STATES = 12  # solved states of the branch
 _APART = 0.01  # [m] between them and from known samples
@@ -46,7 +46,7 @@ class WallCheck:
     learnt: GraspSamples | None = None
 
 
-def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, none: NoWayError,
+def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, none: BlockedError,
                  goal: Goal, *, workers: int | None = None, progress: Progress = SILENT,
                  ) -> WallCheck:
     """Solve the branch where ``none`` states that the path is blocked.
@@ -125,22 +125,22 @@ def _over_and_off(field: EnergyField, limits: Limits, samples: GraspSamples,
     return over, off
 
 
-def confirmed(none: NoWayError, check: WallCheck) -> NoWayError:
+def confirmed(none: BlockedError, check: WallCheck) -> BlockedError:
     """Return the error, stating that the full model confirms it."""
     if not check.solved:
         return none
-    return NoWayError(none.seen, f"{none.why} {check.solved} states of the full model, where the "
+    return BlockedError(none.seen, f"{none.why} {check.solved} states of the full model, where the "
                       "way is closed, confirm it.", none.fix)
 
 
-def not_confirmed(limits: Limits, easiest: EasiestWay | None) -> NoWayError:
+def not_confirmed(limits: Limits, easiest: LeastViolation | None) -> BlockedError:
     """Return the error of a proof that the full model does not confirm; ``easiest`` is the path
     that exceeds the limits least.
     """
     least = "" if easiest is None or easiest.worst <= 1.0 else (
         f" By the field the easiest way takes {100.0 * easiest.worst:.0f} % of a limit, within its "
         "error.")
-    return NoWayError(
+    return BlockedError(
         f"No path to the goal with{limits.in_words() or ' known poses'} was found, {UNPROVEN}.",
         "The energy field, its error counted, leaves no path, but the full model does not confirm "
         f"that where the way is closed.{least}",

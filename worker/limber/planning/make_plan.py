@@ -28,7 +28,7 @@ from limber.planning.field.sampling import displacements_at
 from limber.planning.goals.goal import CellPlace, Goal, GoalRequest
 from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.path_on_full_model import ResolvedPath, resolve_side_by_side
-from limber.planning.path_problem import NoWayError
+from limber.planning.path_problem import BlockedError
 from limber.planning.path_start import start_of
 from limber.planning.plan_summary import doubts_of, summary_of
 from limber.planning.planners.least_violation import easiest_path
@@ -174,13 +174,13 @@ class _Rounds:
         """Return paths on the field; None if poses were added instead.
 
         Raises:
-            NoWayError: none was found, or none exists and the full model confirms it.
+            BlockedError: none was found, or none exists and the full model confirms it.
         """
         try:
             return plan_within(self.field, self.start, self.aim, self.settings,
                                self.planned_limits, asked=self.limits, asked_goal=self.goal,
                                before=self.pair, progress=ahead.part(0.0, 0.3))
-        except NoWayError as none:
+        except BlockedError as none:
             found = None if is_last else solved_if_undecided(
                 self.field, self.grasp_model, self.start, self.aim, self.planned_limits,
                 ahead.part(0.3, 1.0))
@@ -193,11 +193,11 @@ class _Rounds:
             self.field = refit(self.field, found.learnt)
             return None
 
-    def _closed(self, none: NoWayError, is_last: bool, ahead: Progress) -> None:
+    def _closed(self, none: BlockedError, is_last: bool, ahead: Progress) -> None:
         """Pass on that there is no path, or learn evidence against it.
 
         Raises:
-            NoWayError: no evidence against it was found, or no round is left.
+            BlockedError: no evidence against it was found, or no round is left.
         """
         if none.is_proven:
             ahead(0.0, "checking on the full model where the way is closed")

@@ -19,7 +19,7 @@ UNPROVEN = "but it is not proven that none exists"
 """Part of messages without a path: more samples may show one. Checked across processes."""
 
 
-class NoWayError(NoPathError):
+class BlockedError(NoPathError):
     """No path from the start to the goal keeps the limits on the field: proven, or none found.
 
     ``wall`` are grasp positions where limits block the path, those least over them first [m], shape
@@ -35,7 +35,7 @@ class NoWayError(NoPathError):
         """Whether the field, including its error, allows no path."""
         return UNPROVEN not in self.seen
 
-    def behind(self, wall: np.ndarray, nearest: np.ndarray | None = None) -> "NoWayError":
+    def behind(self, wall: np.ndarray, nearest: np.ndarray | None = None) -> "BlockedError":
         """Return the error with the positions where the path is blocked."""
         self.wall = wall
         self.nearest = self.nearest if nearest is None else nearest
@@ -127,22 +127,22 @@ def _in_words(problem: GentleProblem, limits: FieldArrays) -> str:
     return (" at most " + " and ".join(kept)) if kept else ""
 
 
-def no_path_error(problem: GentleProblem, proof: str) -> NoWayError:
+def no_path_error(problem: GentleProblem, proof: str) -> BlockedError:
     """Return the error for a goal that no path reaches, with the ``proof``."""
     counted = _in_words(problem, problem.sure_limits)
     if counted:
         proof += (" The proof includes the largest cross-validation error of the energy field: no "
                   f"path exists with{counted} on the field either.")
-    return NoWayError(
+    return BlockedError(
         "No path exists in the sampled region: no path "
         f"with{problem.limits_in_words() or ' accepted poses'} leads from the start to the "
         "goal.", proof,
         "Raise the limit, choose another goal, or sample farther (`limber energy --deflection`).")
 
 
-def not_found(problem: GentleProblem, why: str) -> NoWayError:
+def not_found(problem: GentleProblem, why: str) -> BlockedError:
     """Return the error for a path that was not found, with ``why``, which proves nothing."""
-    return NoWayError(
+    return BlockedError(
         f"No path to the goal with{problem.limits_in_words() or ' known poses'} was found, "
         f"{UNPROVEN}.", why,
         "Relax the limits slightly, or sample more poses with `limber energy --samples`.")

@@ -53,7 +53,7 @@ _COLUMNS = {"poses": "poses", "energies": "energies_j", "strains": "strains", "t
 
 
 @dataclass(frozen=True)
-class Way:
+class PlanPath:
     """States along a path; None if a file does not contain them.
 
     Attributes:
@@ -241,21 +241,21 @@ class PlanFile:
 
     version: int
     summary: dict[str, Any]
-    baseline: Way
-    plan: Way
-    motion: Way | None
+    baseline: PlanPath
+    plan: PlanPath
+    motion: PlanPath | None
 
 
 def path_record(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
                 pace: Pace = DEFAULT_PACE, stops: tuple[int, ...] = (),
                 field_energies: np.ndarray | None = None,
-                phases: tuple[str, ...] | None = None) -> Way:
+                phases: tuple[str, ...] | None = None) -> PlanPath:
     """Return the path of solved poses, as fast as ``pace`` allows, at standstill at ``stops``.
 
     Args:
         targets: Names, in the order of the solution's targets.
     """
-    return Way(
+    return PlanPath(
         poses=solved.poses, energies=solved.energies, force_sizes=solved.force_sizes,
         strains=solved.strains, forces=solved.forces, torques=solved.torques,
         times=times_along(solved.poses[:, :3], pace, stops), tips=solved.tips,
@@ -265,7 +265,7 @@ def path_record(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
 
 
 def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = (),
-                 pace: Pace = DEFAULT_PACE) -> Way:
+                 pace: Pace = DEFAULT_PACE) -> PlanPath:
     """Return approach from rest, path, and the return path, which is the same reversed.
 
     Equilibria have no memory: on the return path the branch takes the same states.
@@ -278,7 +278,7 @@ def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = (),
                        stops=(len(ahead.poses) - 1,), phases=phases)
 
 
-def limits_of_motion(motion: Way, limits: Limits) -> dict[str, dict[str, float]]:
+def limits_of_motion(motion: PlanPath, limits: Limits) -> dict[str, dict[str, float]]:
     """Return value, peak along the motion and margin of each requested limit."""
     peaks = {"energy": motion.energies, "force": motion.force_sizes, "strain": motion.strains,
              "stress": motion.stresses, "axial_force": motion.axial_forces,
@@ -292,7 +292,7 @@ def limits_of_motion(motion: Way, limits: Limits) -> dict[str, dict[str, float]]
     return found
 
 
-def plan_text(summary: dict[str, Any], baseline: Way, plan: Way, motion: Way,
+def plan_text(summary: dict[str, Any], baseline: PlanPath, plan: PlanPath, motion: PlanPath,
               limits: dict[str, dict[str, float]], pace: Pace = DEFAULT_PACE) -> str:
     """Return the content of a file of format 2.
 
@@ -344,14 +344,14 @@ def read_plan_summary(path: Path) -> dict[str, Any]:
     return content
 
 
-def _columns(path: Way) -> dict[str, Any]:
+def _columns(path: PlanPath) -> dict[str, Any]:
     found = {column: getattr(path, name) for name, column in _COLUMNS.items()
              if getattr(path, name) is not None}
     found |= {"forces_n": path.forces, "targets_m": path.targets}
     return found if path.phases is None else found | {"phases": path.phases}
 
 
-def _path_from(content: dict[str, Any]) -> Way:
+def _path_from(content: dict[str, Any]) -> PlanPath:
     values = {name: number_array(content[column]) for name, column in _COLUMNS.items()
               if content.get(column) is not None}
     count = len(values["poses"])
@@ -365,7 +365,7 @@ def _path_from(content: dict[str, Any]) -> Way:
         raise ValueError("columns of unequal length")
     if any(not np.isfinite(column).all() for column in [*values.values(), forces]):
         raise ValueError("values that are not finite")
-    return Way(force_sizes=np.linalg.norm(forces, axis=1) if known else forces,
+    return PlanPath(force_sizes=np.linalg.norm(forces, axis=1) if known else forces,
                forces=forces if known else None, targets=targets, phases=phases, **values)
 
 

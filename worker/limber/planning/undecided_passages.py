@@ -14,7 +14,7 @@ from limber.planning.field.limited_quantities import UNITS
 from limber.planning.goals.goal import Goal
 from limber.planning.goals.grasp_goal import near
 from limber.planning.path_on_full_model import ResolvedPath, resolve_path
-from limber.planning.path_problem import NoWayError
+from limber.planning.path_problem import BlockedError
 from limber.planning.planners.least_violation import easiest_path
 
 
@@ -65,8 +65,8 @@ def _demand_text(solved: ResolvedPath, limits: Limits) -> str:
             f"{values[name][peak]:.3g} {UNITS[name]}".rstrip() + f", at ({position}) m")
 
 
-def with_added_poses(none: NoWayError, count: int, summary: str) -> NoWayError:
+def with_added_poses(none: BlockedError, count: int, summary: str) -> BlockedError:
     """Return the error, stating which poses were solved on the full model before."""
     times = "once" if count == 1 else f"{count} times"
-    return NoWayError(none.seen, f"{none.why} The field's error made this uncertain, so poses "
+    return BlockedError(none.seen, f"{none.why} The field's error made this uncertain, so poses "
                       f"were added {times}: {summary}.", none.fix)

@@ -110,8 +110,8 @@ def _rods(axes: Axes, seen: list[int], rods: Sequence[Rod], colour: str, label: 
 
 def _outline(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarray:
     """Outline of a capsule between two places [2] of a view, shape [n, 2]."""
-    way = end - start
-    turn = np.arctan2(way[1], way[0]) if np.linalg.norm(way) > 0 else 0.0
+    axis = end - start
+    turn = np.arctan2(axis[1], axis[0]) if np.linalg.norm(axis) > 0 else 0.0
     ends = []
     for place, first in ((end, turn - 0.5 * np.pi), (start, turn + 0.5 * np.pi)):
         angles = first + _ROUND

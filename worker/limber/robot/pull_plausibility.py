@@ -25,7 +25,7 @@ _SMOOTHED = 3  # fewest readings in a smoothed force
 _RAW, _COLUMNS = slice(7, 10), slice(13, 16)
 _BIN_M, _MOVED_M = 2.5e-4, 1e-6
 _RECENT_M = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012, 0.02)  # over which the force's growth is
-_RECENT_SHARE = 0.2  # measured, and of the whole way at least: a stop relaxes the wood
+_RECENT_SHARE = 0.2  # measured, and of the whole travel at least: a stop relaxes the wood
 _SLIPS = 0.5  # of the growth before: less is a slip
 _CERTAIN = 5.0  # standard deviations
 _LARGER = ("the force is larger than the known moduli allow: the sensor's unit is wrong, or "
@@ -33,7 +33,7 @@ _LARGER = ("the force is larger than the known moduli allow: the sensor's unit i
 _SMALLER = ("the force is smaller than the known moduli allow: the sensor's unit is wrong, or the "
             "branch is not held")
 _BASE_DEVIATIONS, _AXIS_M = 2.0, 0.002  # of a calibration; error of a scanned axis
-_TURNED_M = 1e-3  # back from the farthest place: the way out is over
+_TURNED_M = 1e-3  # back from the farthest point: the outward motion is over
 
 
 def off_axis(cell: Cell, gripper: np.ndarray, distance: float) -> str | None:
@@ -57,7 +57,7 @@ def off_axis(cell: Cell, gripper: np.ndarray, distance: float) -> str | None:
 
 @dataclass(frozen=True)
 class PredictedPull:
-    """Forces along the first way out of a pull, by the branch's model.
+    """Forces along the first outward motion of a pull, by the branch's model.
 
     Attributes:
         travels: Travel of the gripper [m], ascending from 0, shape [n].
@@ -79,39 +79,40 @@ class PredictedPull:
 class _Growth:
     """The growth of a force along the predicted one, now and before.
 
-    Readings are summed over bins of the way, so that a long pull takes no longer to judge.
+    Readings are summed over bins of travel, so that a long pull takes no longer to judge.
 
     Args:
         noise: Standard deviation of a single reading [N].
-        end: Way up to which there is a prediction [m].
+        end: Travel up to which there is a prediction [m].
     """
 
     def __init__(self, noise: float, end: float):
         self._noise = noise
-        # Of each bin: count, and sums of the predicted force, the felt one, and their products.
+        # Of each bin: count, and sums of the predicted force, the measured one, and their products.
         self._sums = np.zeros((int(end / _BIN_M) + 1, 5))
         self._farthest = 0.0
         self._is_over = False
 
-    def take(self, ways: np.ndarray, wanted: np.ndarray, felt: np.ndarray) -> None:
-        """Take readings along the prediction [N] at ways [m], where ``wanted`` [N] are predicted,
+    def take(self, travels: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> None:
+        """Take ``predicted`` forces [N] at travels [m], and the forces [N] measured along them,
         shape [n] each.
         """
-        farthest = np.maximum.accumulate(np.r_[self._farthest, ways])[1:]
-        back = np.flatnonzero(ways < farthest - _TURNED_M)
-        out = len(ways) if not len(back) else int(back[0])
-        if self._is_over or not len(ways):
+        farthest = np.maximum.accumulate(np.r_[self._farthest, travels])[1:]
+        back = np.flatnonzero(travels < farthest - _TURNED_M)
+        out = len(travels) if not len(back) else int(back[0])
+        if self._is_over or not len(travels):
             return
-        self._is_over = out < len(ways)
+        self._is_over = out < len(travels)
         self._farthest = float(farthest[-1])
-        places = (ways[:out] / _BIN_M).astype(int)
-        rows = np.column_stack([np.ones(len(ways)), wanted, felt, wanted * wanted, wanted * felt])
-        known = places < len(self._sums)
-        np.add.at(self._sums, places[known], rows[:out][known])
+        bins = (travels[:out] / _BIN_M).astype(int)
+        rows = np.column_stack([np.ones(len(travels)), predicted, measured,
+                                predicted * predicted, predicted * measured])
+        known = bins < len(self._sums)
+        np.add.at(self._sums, bins[known], rows[:out][known])
 
     def slip(self) -> tuple[float, float] | None:
         """Return how much of the predicted growth the force has now, over that before, and the
-        way [m] over which; None if it grows on, or if noise explains it.
+        travel [m] over which; None if it grows on, or if noise explains it.
         """
         end = min(int(self._farthest / _BIN_M), len(self._sums))
         if self._is_over or not self._sums[0, 0]:
@@ -122,38 +123,39 @@ class _Growth:
                 return None
             if recent < _RECENT_SHARE * self._farthest:
                 continue
-            before, unsure = self._whole(self._sums[1:first].sum(axis=0))
-            now, unsure_now = self._slope(self._sums[first:end].sum(axis=0))
+            before, sigma = self._whole(self._sums[1:first].sum(axis=0))
+            now, sigma_now = self._slope(self._sums[first:end].sum(axis=0))
             missing = _SLIPS * before - now
-            if missing > _CERTAIN * float(np.hypot(_SLIPS * unsure, unsure_now)):
+            if missing > _CERTAIN * float(np.hypot(_SLIPS * sigma, sigma_now)):
                 return now / before, recent
         return None
 
     def whole(self) -> tuple[float, float] | None:
         """Return the growth per predicted newton since the start, and its standard deviation; None
-        over too short a way.
+        over too short a travel.
         """
-        # Slack of a millimetre counts little over such a way.
+        # Slack of a millimetre counts little over such a travel.
         if self._farthest < 3 * _FROM_M or not self._sums[0, 0]:
             return None
         return self._whole(self._sums[1:].sum(axis=0))
 
     def _slope(self, sums: np.ndarray) -> tuple[float, float]:
         """Growth of the force per predicted newton, and its standard deviation."""
-        count, wanted, felt, square, product = sums
-        spread = square - wanted * wanted / max(count, 1.0)
+        count, predicted, measured, square, product = sums
+        spread = square - predicted * predicted / max(count, 1.0)
         if not spread > 0.0:
             return 0.0, np.inf
-        return (product - wanted * felt / count) / spread, self._noise / float(np.sqrt(spread))
+        slope = (product - predicted * measured / count) / spread
+        return slope, self._noise / float(np.sqrt(spread))
 
     def _whole(self, sums: np.ndarray) -> tuple[float, float]:
         """The same since the start, where the first bin's force is that of the resting branch."""
-        _, wanted, _, square, product = sums
+        _, predicted, _, square, product = sums
         first, rest = self._sums[0, 0], self._sums[0, 2] / self._sums[0, 0]
         if not square > 0.0:
             return 0.0, np.inf
-        unsure = self._noise * float(np.sqrt(1.0 / square + (wanted / square) ** 2 / first))
-        return (product - rest * wanted) / square, unsure
+        sigma = self._noise * float(np.sqrt(1.0 / square + (predicted / square) ** 2 / first))
+        return (product - rest * predicted) / square, sigma
 
 
 class PullPlausibility:
@@ -174,7 +176,7 @@ class PullPlausibility:
         self._growth = _Growth(cell.sensor.force_sigma_n, float(predicted.travels[-1]))
         self._start: np.ndarray | None = None
         self._began = self._peak = 0.0
-        self._doubt_streak = ("", 0)
+        self._suspicion_streak = ("", 0)
         self.reason: str | None = None
 
     def take(self, samples: np.ndarray) -> str | None:
@@ -182,14 +184,14 @@ class PullPlausibility:
         sensor cannot be right, or None."""
         if self._start is None:
             self._start, self._began = samples[0, 1:4].copy(), float(samples[0, 0])
-        ways = np.linalg.norm(samples[:, 1:4] - self._start, axis=1)
-        for travel, force in zip(ways, samples[:, _COLUMNS], strict=True):
+        travels = np.linalg.norm(samples[:, 1:4] - self._start, axis=1)
+        for travel, force in zip(travels, samples[:, _COLUMNS], strict=True):
             if not np.isfinite(force).all():
                 continue
             self._peak = max(self._peak, float(np.linalg.norm(force)))
             if self.reason is None and _FROM_M <= travel <= LOOKED_M:
-                self._agree(self._doubt(float(travel), force))
-        self._grow(samples, ways)
+                self._agree(self._suspicion(float(travel), force))
+        self._grow(samples, travels)
         if self.reason is None:
             self.reason = self._slip() or self._scale()
         return self.reason
@@ -207,55 +209,55 @@ class PullPlausibility:
                 f"{allowed:.2g} N are explained by noise, drift and the branch. The sensor "
                 "drifted, or the branch slipped in the gripper")
 
-    def _agree(self, doubt: str) -> None:
+    def _agree(self, suspected: str) -> None:
         """Take a suspected error as certain when it is repeated."""
-        kind = doubt.split(":", maxsplit=1)[0]
-        self._doubt_streak = (kind, self._doubt_streak[1] + 1 if doubt
-                              and kind == self._doubt_streak[0] else 1)
-        if doubt and self._doubt_streak[1] >= _AGREE:
-            self.reason = doubt
+        kind = suspected.split(":", maxsplit=1)[0]
+        self._suspicion_streak = (kind, self._suspicion_streak[1] + 1 if suspected
+                                  and kind == self._suspicion_streak[0] else 1)
+        if suspected and self._suspicion_streak[1] >= _AGREE:
+            self.reason = suspected
 
-    def _grow(self, samples: np.ndarray, ways: np.ndarray) -> None:
+    def _grow(self, samples: np.ndarray, travels: np.ndarray) -> None:
         # Before it moves nothing is predicted, but the direction is known.
-        wanted = self._predicted.at(np.maximum(ways, _MOVED_M))
-        sizes = np.linalg.norm(wanted, axis=1)
+        predicted = self._predicted.at(np.maximum(travels, _MOVED_M))
+        sizes = np.linalg.norm(predicted, axis=1)
         good = np.isfinite(samples[:, _RAW]).all(axis=1) & (sizes > 0.0)
-        along = (samples[good, _RAW] * wanted[good]).sum(axis=1) / sizes[good]
-        self._growth.take(ways[good], sizes[good], along)
+        along = (samples[good, _RAW] * predicted[good]).sum(axis=1) / sizes[good]
+        self._growth.take(travels[good], sizes[good], along)
 
     def _scale(self) -> str | None:
-        """The same as :meth:`_doubt` for a soft branch, whose single readings are mostly noise."""
+        """As :meth:`_suspicion`, for a soft branch, whose single readings are mostly noise."""
         factor, whole = self._predicted.factor, self._growth.whole()
         if factor is None or whole is None:
             return None
-        share, unsure = whole[0], _CERTAIN * whole[1]
-        told = f"it grows by {100 * share:.0f} % of the predicted force"
-        if share > factor + unsure:
-            return f"{_LARGER} ({told})"
-        return f"{_SMALLER} ({told})" if share < 1.0 / factor - unsure else None
+        share, margin = whole[0], _CERTAIN * whole[1]
+        detail = f"it grows by {100 * share:.0f} % of the predicted force"
+        if share > factor + margin:
+            return f"{_LARGER} ({detail})"
+        return f"{_SMALLER} ({detail})" if share < 1.0 / factor - margin else None
 
     def _slip(self) -> str | None:
         slip = self._growth.slip()
         if slip is None:
             return None
-        share, way = slip
+        share, travel = slip
         return ("the force no longer grows as it did before: the branch slips slowly in the "
-                f"gripper, or gives way (over the last {1000 * way:.0f} mm it grew by "
+                f"gripper, or gives way (over the last {1000 * travel:.0f} mm it grew by "
                 f"{100 * max(share, 0.0):.0f} % of what came before)")
 
-    def _doubt(self, travel: float, force: np.ndarray) -> str:
+    def _suspicion(self, travel: float, force: np.ndarray) -> str:
         predicted = self._predicted.at(travel)
-        size, felt = float(np.linalg.norm(predicted)), float(np.linalg.norm(force))
+        size, measured = float(np.linalg.norm(predicted)), float(np.linalg.norm(force))
         if size < 1e-9:
             return ""
         along = float(force @ predicted) / size
         when = f"after {1000 * travel:.1f} mm"
-        if felt > self._noise and along < -_MOSTLY * felt:
+        if measured > self._noise and along < -_MOSTLY * measured:
             return ("the force points against the predicted one: the sensor's sign or pose "
-                    f"(sensor.pose) is wrong ({felt:.2g} N {when})")
-        if felt > self._noise and along < _MOSTLY * felt:
+                    f"(sensor.pose) is wrong ({measured:.2g} N {when})")
+        if measured > self._noise and along < _MOSTLY * measured:
             return ("the force lies across the predicted one: the sensor's axes or pose "
-                    f"(sensor.pose) are wrong, or another part is pulled ({felt:.2g} N {when})")
+                    f"(sensor.pose) are wrong, or another part is pulled ({measured:.2g} N {when})")
         factor = self._predicted.factor
         if factor is None:
             return ""

@@ -10,8 +10,8 @@ import numpy as np
 from limber.robot.virtual.launch import VirtualRobot
 
 STILL_M_S = 1e-4
-_LED_M = 0.015  # the tip moves this far from the grasp's rest while the branch is led
-_LED_M_S = 0.01
+_GUIDED_M = 0.015  # the tip moves this far from the grasp's rest while it is guided
+_MOVED_M_S = 0.01
 _AT_END_M = 5e-4
 _EVERY_SECONDS, _CLOSELY_SECONDS = 0.05, 0.004
 
@@ -90,7 +90,7 @@ class Watch:
                 start = None
                 continue
             start = position if start is None else start
-            is_moving = np.linalg.norm(position - start) > _LED_M and _speed(state) > _LED_M_S
+            is_moving = np.linalg.norm(position - start) > _GUIDED_M and _speed(state) > _MOVED_M_S
             if self.overload is not None and self.overloaded is None and is_moving:
                 self._overload()
 

@@ -190,9 +190,9 @@ def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: st
     from limber.robot.motion.followed_path import followed_path
 
     cell = read_cell(cell_file)
-    way = followed_path(cell, "Open the gripper, and free the branch by hand.")
-    result: dict[str, Any] = {"armed": armed, "tare_known": way.bias is not None,
-                              "places": len(way.poses)}
+    followed = followed_path(cell, "Open the gripper, and free the branch by hand.")
+    result: dict[str, Any] = {"armed": armed, "tare_known": followed.bias is not None,
+                              "places": len(followed.poses)}
     if not armed:
         return result
     if confirm != "retreat":

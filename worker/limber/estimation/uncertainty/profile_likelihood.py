@@ -164,7 +164,7 @@ def bend_of(at: float, root: float) -> float:
     if abs(ratio - 1) < 1e-6:
         return 0.0
     ends = (1e-9, 200.0) if ratio < 1 else (-20.0, -1e-9)
-    return scipy.optimize.brentq(lambda way: -np.expm1(-way) / way - ratio, *ends) / at
+    return scipy.optimize.brentq(lambda step: -np.expm1(-step) / step - ratio, *ends) / at
 
 
 def limit_of(bend: float, root: float) -> float:

@@ -182,5 +182,5 @@ def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndar
         after.append(forward.out_of_balance(key, state))
         rights.append((before - after[-1]) / STEP - here.model.tangent_times(state, moved[-1]))
     found = tangent.solve_all(rights, np.column_stack(pins))
-    return [(led + free, out + STEP * here.model.tangent_times(state, led + free))
-            for led, free, out in zip(moved, found, after, strict=True)]
+    return [(imposed + free, out + STEP * here.model.tangent_times(state, imposed + free))
+            for imposed, free, out in zip(moved, found, after, strict=True)]

@@ -35,8 +35,8 @@ from limber.planning.certificate.subsolution import (
     widened,
 )
 from limber.planning.path_problem import (
+    BlockedError,
     GentleProblem,
-    NoWayError,
     least_over,
     no_path_error,
     not_found,
@@ -326,7 +326,7 @@ def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, corners:
 
 
 def _separated(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, wall: np.ndarray,
-               ) -> NoWayError:
+               ) -> BlockedError:
     share = 100.0 * open_cells.mean()
     return no_path_error(problem,
                          f"This is proven on a grid of {1e3 * grid.spacing:.1f} mm: forbidden "

@@ -178,10 +178,10 @@ class _Search:
         if found.certificate.stopped or self.integral <= (1.0 + _ENOUGH) * value:
             return None
         spare = metre * (self.longest - length)
-        unsure = found.cost / energy - lower
-        if spare < unsure and self.length >= _BINDS * self.longest:
+        uncertainty = found.cost / energy - lower
+        if spare < uncertainty and self.length >= _BINDS * self.longest:
             self.low = weight
-        elif spare > unsure:
+        elif spare > uncertainty:
             self.high = weight
         else:
             return None

@@ -15,7 +15,7 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import Verdict, judge
 from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
 from limber.planning.cost import arc_lengths
-from limber.planning.path_problem import GentleProblem, NoWayError, no_path_error, not_found
+from limber.planning.path_problem import BlockedError, GentleProblem, no_path_error, not_found
 from limber.planning.planners.least_violation import easiest_path
 from limber.planning.planners.refine import refine
 
@@ -40,7 +40,7 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
     below which the bound is refined no further.
 
     Raises:
-        NoWayError: it is proven that there is none, or none was found; states which.
+        BlockedError: it is proven that there is none, or none was found; states which.
     """
     best: list = [None, np.inf]
     verdicts: list[Verdict] = []
@@ -80,7 +80,7 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
     return GentlePath(best[0], best[1], certificate)
 
 
-def separated(problem: GentleProblem, verdict: Verdict) -> NoWayError:
+def separated(problem: GentleProblem, verdict: Verdict) -> BlockedError:
     """Return the error for a goal that cells separate from the start."""
     return no_path_error(problem,
                          f"This is proven on {_grid(verdict)}: forbidden cells separate the "

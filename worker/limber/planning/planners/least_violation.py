@@ -27,7 +27,7 @@ _DEARER = 30.0  # weight of the length at a pose twice over its limit
 
 
 @dataclass(frozen=True)
-class EasiestWay:
+class LeastViolation:
     """A path ``points`` [n, 3] from the start into the goal; ``worst`` is the largest ratio of a
     quantity to its limit along it, 1 or less if all limits are kept.
     """
@@ -37,7 +37,7 @@ class EasiestWay:
 
 
 def easiest_path(field: EnergyField, limits: FieldArrays, start: np.ndarray, goal: Goal,
-                 ) -> EasiestWay | None:
+                 ) -> LeastViolation | None:
     """Return the path from ``start`` [3]; None if none stays among the samples, limits or not."""
     chart, points_of_grid = _grid(field)
     shape = points_of_grid.shape[:3]
@@ -58,7 +58,7 @@ def easiest_path(field: EnergyField, limits: FieldArrays, start: np.ndarray, goa
     # Along the shell: chords are well off it.
     flat = np.concatenate([chart.map(start), chart.map(points[numbers])])
     path = chart.curved(resample(flat, _FINE))
-    return EasiestWay(path, float(max(_shares(field, limits, path).max(), 0.0)))
+    return LeastViolation(path, float(max(_shares(field, limits, path).max(), 0.0)))
 
 
 def _grid(field: EnergyField) -> tuple:

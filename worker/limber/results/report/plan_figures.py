@@ -11,7 +11,7 @@ from limber.core.numerics.rigid import principal_axes
 from limber.planning.constraints.damage_along import DamageAlong
 from limber.planning.cost import arc_lengths
 from limber.planning.field.energy_field import EnergyField
-from limber.planning.plan_file import PlanFile, Way, read_plan
+from limber.planning.plan_file import PlanFile, PlanPath, read_plan
 from limber.planning.search_files import CostToGo, read_trees
 from limber.results.report.charts import chart
 from limber.results.report.damage_figure import damage_along_branch
@@ -283,7 +283,7 @@ def trade_off(plan: PlanFile) -> "Figure":
     return figure
 
 
-def _paths_of(plan: PlanFile) -> dict[str, Way]:
+def _paths_of(plan: PlanFile) -> dict[str, PlanPath]:
     return {"baseline": plan.baseline, "plan": plan.plan}
 
 

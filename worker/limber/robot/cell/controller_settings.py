@@ -26,17 +26,17 @@ class Difference:
 
     Attributes:
         what: Its name.
-        seen, wanted: Value in the controller, and in the cell file.
+        seen, required: Value in the controller, and in the cell file.
         is_set: Whether a motion sets it automatically, and restores it.
     """
 
     what: str
     seen: str
-    wanted: str
+    required: str
     is_set: bool
 
     def __str__(self) -> str:
-        message = f"{self.what}: {self.seen} in the controller, {self.wanted} in the cell file"
+        message = f"{self.what}: {self.seen} in the controller, {self.required} in the cell file"
         return f"{message} (set for a motion, and put back)" if self.is_set else message
 
 

@@ -468,9 +468,9 @@ class Guard:
         expected_size = length(expected[:3])
         if expected_size > settings.least_force:
             along = float(filtered[:3] @ expected[:3]) / expected_size
-            unsure = _DEVIATIONS * float(np.sqrt(max(
+            margin = _DEVIATIONS * float(np.sqrt(max(
                 expected[:3] @ uncertainty[:3, :3] @ expected[:3], 0.0))) / expected_size
-            if along < (1 - settings.lost_share) * expected_size - settings.least_force - unsure:
+            if along < (1 - settings.lost_share) * expected_size - settings.least_force - margin:
                 return self._stop("the branch slipped, broke or was never held: force in the "
                                   "predicted direction [N]", along, expected_size)
         limits = settings.limits

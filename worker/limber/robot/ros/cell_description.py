@@ -117,8 +117,8 @@ def _rods_of_links(arm: Arm) -> list[list[tuple[np.ndarray, np.ndarray, float]]]
         turned = zero.copy()
         turned[0, number] = _STEP
         rods = arm.rods(turned)
-        way = np.maximum(np.abs(rods.starts - still.starts), np.abs(rods.ends - still.ends))
-        last[way[0].max(axis=1) > _MOVES] = number
+        shift = np.maximum(np.abs(rods.starts - still.starts), np.abs(rods.ends - still.ends))
+        last[shift[0].max(axis=1) > _MOVES] = number
     for joint, start, end, radius in zip(last, still.starts[0], still.ends[0], still.radii,
                                          strict=True):
         found[joint].append((start, end, float(radius)))
@@ -129,11 +129,11 @@ def _capsule(link: Element, start: np.ndarray, end: np.ndarray, radius: float) -
     """Add a cylinder and its two round ends, in the link's frame."""
     for place in (start, end):
         _shape(link, _shifted(place), "sphere", radius=f"{radius:.9g}")
-    way = end - start
-    length = float(np.linalg.norm(way))
+    axis = end - start
+    length = float(np.linalg.norm(axis))
     if length > 0.0:
         frame = _shifted(0.5 * (start + end))
-        frame[:3, :3] = _along(way / length)
+        frame[:3, :3] = _along(axis / length)
         _shape(link, frame, "cylinder", radius=f"{radius:.9g}", length=f"{length:.9g}")
 
 

@@ -89,7 +89,7 @@ class RosRobot:
         self._kept = FollowedPathFile(cell)
         self._way = RetreatPath(cell.arm.joint_names, read_followed_path(cell), self._kept)
         self._hold_ups = HoldUps(_LISTEN_SECONDS,
-                                 lambda **told: self.warnings.append(told["text"]))
+                                 lambda **event: self.warnings.append(event["text"]))
         for topic, kind in ((topics.joint_states, JOINT_STATE), (topics.wrench, WRENCH),
                             (topics.stop, STOP)):
             bridge.subscribe(topic, kind)

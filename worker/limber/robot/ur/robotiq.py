@@ -77,8 +77,8 @@ class RobotiqGripper:
         Raises:
             WorkError: no acknowledgement.
         """
-        wanted = f"SET POS {CLOSED if close else 0} SPE 255 FOR {round(255 * force)} GTO 1"
-        if self._asked(wanted).strip() != b"ack":
+        command = f"SET POS {CLOSED if close else 0} SPE 255 FOR {round(255 * force)} GTO 1"
+        if self._asked(command).strip() != b"ack":
             raise WorkError("The Robotiq gripper did not acknowledge its command.", "",
                             "See its status on the pendant.")
 

@@ -23,7 +23,7 @@ _SOLVER_PRIORITY = 10
 _REST = 0.25  # fraction of a solution's time: a process that never rests is throttled by the system
 SAME_PLACE = 1e-6  # m, rad; the tangent extrapolates exactly over it
 _TOLERANCE = 1e-5  # of the residual relative to the forces: far below a sensor's resolution
-_MOST_WAYS = 2.0  # distance between two solutions, over which a change is extrapolated
+_MOST_STEPS = 2.0  # distance between two solutions, over which a change is extrapolated
 _TRIED_WAY = 3e-3  # m across the branch when the gripper has closed
 
 
@@ -211,7 +211,7 @@ class BranchSolver:
         change, follows = self._last.change_to(patch), self._follows
         if self._turning is not None:
             axis, turning = self._turning
-            part = float(np.clip(change[:3] @ axis / (axis @ axis), -_MOST_WAYS, _MOST_WAYS))
+            part = float(np.clip(change[:3] @ axis / (axis @ axis), -_MOST_STEPS, _MOST_STEPS))
             follows = follows + 0.5 * part * turning
         return self._state + follows @ change
 

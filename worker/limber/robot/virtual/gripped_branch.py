@@ -150,10 +150,10 @@ class HeldBranch:
         step = np.linalg.solve(self._solution.stiffness[:3, :3], self._solution.wrench[:3])
         self._move_in_jaws(-part * step)
 
-    def _move_in_jaws(self, way: np.ndarray) -> None:
-        """Move the branch by ``way`` [m], shape [3], while the gripper stays."""
+    def _move_in_jaws(self, shift: np.ndarray) -> None:
+        """Move the branch by ``shift`` [m], shape [3], while the gripper stays."""
         moved = np.eye(4)
-        moved[:3, 3] = way
+        moved[:3, 3] = shift
         self._offset = inverse_of(self._gripper) @ moved @ self._gripper @ self._offset
 
     def close(self) -> None:

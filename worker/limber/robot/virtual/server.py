@@ -201,8 +201,8 @@ class Server:
             if self.ft300_fault == "cut":
                 return
             if self.ft300_fault != "silent":
-                told = "( - , - , - )" if self.ft300_fault else f"( {fields} )"
-                self.send(writer, told.encode())
+                line = "( - , - , - )" if self.ft300_fault else f"( {fields} )"
+                self.send(writer, line.encode())
             # After a delay it omits readings and keeps its cycle.
             behind = time.perf_counter() - due
             due += _FT300_SECONDS * (1 + behind // _FT300_SECONDS)

@@ -183,10 +183,10 @@ def _stated_by_plan(branch: Branch, name: str) -> dict[str, Any]:
     return {key: found[key] for key in kept if found.get(key) is not None}
 
 
-def _as_planned(told: dict[str, Any], settings: ExecuteSettings, cell: Cell) -> ExecuteSettings:
+def _as_planned(plan: dict[str, Any], settings: ExecuteSettings, cell: Cell) -> ExecuteSettings:
     """Return the settings with the plan's own speed and time at its end where none is given."""
-    speed = (told.get("timing") or {}).get("speed_m_s", _SPEED)
-    hold = next((leg["duration_s"] for leg in told.get("legs", ()) if leg["name"] == "hold"),
+    speed = (plan.get("timing") or {}).get("speed_m_s", _SPEED)
+    hold = next((leg["duration_s"] for leg in plan.get("legs", ()) if leg["name"] == "hold"),
                 _HOLD_SECONDS)
     own = {"speed": min(speed, cell.limits.speed_m_s), "hold": hold}
     return settings.model_copy(update={

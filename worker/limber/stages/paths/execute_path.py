@@ -45,10 +45,10 @@ def planned_poses(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
         raise InputError(f"{path} has {len(planned)} points.", "This is not a path.", "Plan again.")
     # At rest the grasped piece is at its own position and not rotated.
     start = np.r_[rest, np.zeros(3)]
-    way = float(np.linalg.norm(planned[0, :3] - rest))
-    leading = start + np.linspace(0, 1, max(int(np.ceil(way / 0.01)), 1) + 1)[:-1, None] * (
+    distance = float(np.linalg.norm(planned[0, :3] - rest))
+    leading = start + np.linspace(0, 1, max(int(np.ceil(distance / 0.01)), 1) + 1)[:-1, None] * (
         planned[0] - start)
-    return np.vstack([leading, planned]) if way > 1e-4 else planned
+    return np.vstack([leading, planned]) if distance > 1e-4 else planned
 
 
 def offsets_along(turning: dict[str, Any] | None, positions: np.ndarray) -> np.ndarray:
@@ -125,7 +125,7 @@ def _closely(positions: np.ndarray) -> np.ndarray:
     positions = positions[kept]
     places = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
     spacing = max(_SPACING, places[-1] / _MOST_POSES)
-    wanted = np.concatenate([
+    stations = np.concatenate([
         np.linspace(a, b, max(int(np.ceil((b - a) / spacing)), 1) + 1)[:-1]
         for a, b in pairwise(places)] + [places[-1:]])
-    return Akima1DInterpolator(places, positions, method="makima")(wanted)
+    return Akima1DInterpolator(places, positions, method="makima")(stations)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from limber.planning.field.grasp_model import GraspModel
     from limber.planning.goals.goal import CellPlace
     from limber.planning.make_plan import PlannedMotion
-    from limber.planning.plan_file import Way
+    from limber.planning.plan_file import PlanPath
     from limber.planning.timing import Pace
     from limber.robot.cell.cell import Cell
 
@@ -214,7 +214,7 @@ class _InCell:
         return cls(cell, obstacles, limits_in(cell, limits, obstacles, clearance),
                    cell_positions(cell, obstacles), clearance)
 
-    def taken(self, motion: Way, grasp_model: GraspModel, found: PlannedMotion,
+    def taken(self, motion: PlanPath, grasp_model: GraspModel, found: PlannedMotion,
               settings: PlanSettings, progress: Progress) -> dict[str, Any]:
         """Return a plan's entries about its robot, the clearance, the legs of its motion, and how
         the gripper turns if not with the branch.
@@ -290,7 +290,7 @@ def _stiffer(branch: Branch) -> float:
     return float(np.max(share, initial=1.0))
 
 
-def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: Way,
+def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: PlanPath,
            grasp_model: GraspModel, found: PlannedMotion) -> None:
     from limber.mechanics.strain import strain_state
     from limber.planning.plan_file import limits_of_motion, path_record, plan_text

@@ -20,7 +20,7 @@ from limber.planning.field.grasp_model import GraspModel
 from limber.planning.goals.camera_view import View
 from limber.planning.goals.goal import CellPlace
 from limber.planning.goals.regions import Ball
-from limber.planning.plan_file import Way
+from limber.planning.plan_file import PlanPath
 from limber.robot.cell.cell import BoxEntry, Cell, SecondArmEntry, read_cell
 from limber.robot.cell.compatibility import check_branch
 from limber.robot.interface import Arm
@@ -234,7 +234,7 @@ def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...], clear
                             cell.limits.soft_force_n, obstacles, clearance)
 
 
-def predicted_ahead(motion: Way) -> Predicted:
+def predicted_ahead(motion: PlanPath) -> Predicted:
     """Return poses and wrenches of a motion along approach and path."""
     there = np.array(motion.phases) != "return"
     forces = present(motion.forces, "force of the motion")

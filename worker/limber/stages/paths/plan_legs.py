@@ -9,7 +9,7 @@ from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.constraints.obstacles import Obstacle
 from limber.planning.cost import arc_lengths
-from limber.planning.plan_file import Way
+from limber.planning.plan_file import PlanPath
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.execution import RobotMotion
 from limber.robot.motion.legs import HELD, Leg, described, legs_of
@@ -26,7 +26,7 @@ def surface_points(mesh: TetMesh, displacements: np.ndarray) -> np.ndarray:
     return mesh.nodes[some] + displacements[:, some]
 
 
-def legs_without_cell(motion: Way, hold: float) -> list[dict[str, Any]]:
+def legs_without_cell(motion: PlanPath, hold: float) -> list[dict[str, Any]]:
     """Return the legs of a plan without a robot: path, hold and return, as plain data."""
     times = present(motion.times, "time of the motion")
     phases = present(motion.phases, "phase of the motion")

@@ -8,7 +8,7 @@ import numpy as np
 
 from limber.core.not_none import present
 from limber.planning.cost import arc_lengths
-from limber.planning.plan_file import Way
+from limber.planning.plan_file import PlanPath
 from limber.planning.planners.tree_search import SearchTree
 from limber.planning.timing import Pace, poses_at, time_law
 
@@ -20,14 +20,14 @@ _MOTION_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "fx
                    "tx_nm", "ty_nm", "tz_nm", "energy_j", "strain")
 
 
-def path_table(way: Way) -> str:
+def path_table(path: PlanPath) -> str:
     """Return a path, one row per pose."""
-    along = arc_lengths(way.poses[:, :3])
+    along = arc_lengths(path.poses[:, :3])
     return _csv(_COLUMNS, np.column_stack(
-        [along, way.poses, way.energies, way.force_sizes, way.strains]))
+        [along, path.poses, path.energies, path.force_sizes, path.strains]))
 
 
-def motion_table(motion: Way) -> str:
+def motion_table(motion: PlanPath) -> str:
     """Return the whole motion with its times, wrenches, targets and phases."""
     targets = [f"{name}_{axis}_m" for name in motion.targets for axis in "xyz"]
     times = present(motion.times, "time of the motion")
@@ -38,7 +38,7 @@ def motion_table(motion: Way) -> str:
     return _csv((*_MOTION_COLUMNS, *targets), rows, motion.phases)
 
 
-def setpoints(motion: Way, pace: Pace, rate: float) -> str:
+def setpoints(motion: PlanPath, pace: Pace, rate: float) -> str:
     """Return the grasp's poses every 1 / ``rate`` [s], and at the motion's end."""
     phases = present(motion.phases, "phase of the motion")
     end = phases.count("approach") + phases.count("path") - 1

@@ -171,8 +171,8 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
         with live, RobotLink(cell, take) as link:
             sample = link.wait_for_samples()
             point, off = _grasp_point(branch, sample[1:4])
-            if told := off_axis(cell, sample[1:4], off):
-                progress.warn(told)
+            if warning := off_axis(cell, sample[1:4], off):
+                progress.warn(warning)
             recorder = PullRecorder(stream, point, cell.tool.compliance_m_per_n)
             recorders.append(recorder)
             # Before the tare: during long work the sensor would drift.

@@ -250,7 +250,7 @@ def _values(path: Path, field: _Field, stream: bytes, count: int) -> np.ndarray:
 
 
 def _cloud(path: Path, columns: dict[str, np.ndarray], scan: ElementTree.Element,
-           wanted: set[str]) -> Cloud:
+           fields: set[str]) -> Cloud:
     from scipy.spatial.transform import Rotation
 
     if set(_CARTESIAN) <= columns.keys():
@@ -269,8 +269,8 @@ def _cloud(path: Path, columns: dict[str, np.ndarray], scan: ElementTree.Element
     turn = [float(scan.findtext(f"./pose/rotation/{axis}") or axis == "w") for axis in "xyzw"]
     shift = [float(scan.findtext(f"./pose/translation/{axis}") or 0) for axis in "xyz"]
     attributes = {_NAMES[name]: values[seen] for name, values in columns.items()
-                  if _NAMES.get(name) in wanted}
-    if "color" in wanted:
+                  if _NAMES.get(name) in fields}
+    if "color" in fields:
         attributes["color"] = np.stack([columns[name] for name in _COLOURS], axis=1)[seen]
     return Cloud(Rotation.from_quat(turn).apply(points[seen]) + shift, attributes,
                  not_finite=int((~seen).sum()))

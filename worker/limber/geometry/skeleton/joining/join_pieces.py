@@ -12,7 +12,7 @@ from limber.geometry.skeleton.joining.plants import plants_apart
 _ODD = 1.9  # price of a bridge over its length above which its neighbours are tried without it
 _AROUND = 2.0  # neighbourhood, in lengths of that bridge
 _CLEARLY = 0.98  # fraction of the price of all bridges below which others are better
-_MOST_WAYS = 150_000_000  # paths between ends and nodes in all trials: some seconds
+_MOST_PATHS = 150_000_000  # paths between ends and nodes in all trials: some seconds
 
 
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
@@ -108,10 +108,10 @@ def _reconsidered(state: Joined, rules: Rules) -> Joined:
         best, without = state, refused
         for pair in _doubted(state, rules.gap):
             # As many as there were with that bridge.
-            ways = sum(past.path_count for past in state.rounds[_start(state, pair):])
-            if pair in vain or gone_through + ways > _MOST_WAYS:
+            path_count = sum(past.path_count for past in state.rounds[_start(state, pair):])
+            if pair in vain or gone_through + path_count > _MOST_PATHS:
                 continue
-            gone_through += ways
+            gone_through += path_count
             dearest = _CLEARLY * best.cost()
             other = _without(state, pair, rules, refused, dearest)
             parts = other.label.max() > state.label.max()

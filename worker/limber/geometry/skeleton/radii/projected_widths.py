@@ -46,8 +46,8 @@ class SightField:
 
     def at(self, places: np.ndarray) -> np.ndarray:
         """Unit vectors towards the sensor at places [m], shape [n, 3]."""
-        way = self.towards - self.nearer * (places - self.middle)
-        return way / np.maximum(np.linalg.norm(way, axis=1), 1e-300)[:, None]
+        direction = self.towards - self.nearer * (places - self.middle)
+        return direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-300)[:, None]
 
 
 def sight_field(skeleton: Skeleton, points: np.ndarray) -> SightField:
@@ -122,24 +122,24 @@ def _moved(skeleton: Skeleton, points: np.ndarray, field: SightField) -> Skeleto
         at = place[low[inside]] + share[inside] * (place[high[inside]] - place[low[inside]])
         inside = inside[np.argsort(at, kind="stable")]
         at = np.sort(at, kind="stable")
-        told = np.array([_width(at, beside[inside], depth[inside], here, thick)
-                         for here, thick in zip(along[-len(own):], skeleton.radius[own],
-                                                strict=True)])
-        known = np.isfinite(told[:, 0])
+        widths = np.array([_width(at, beside[inside], depth[inside], here, thick)
+                           for here, thick in zip(along[-len(own):], skeleton.radius[own],
+                                                  strict=True)])
+        known = np.isfinite(widths[:, 0])
         if not known.any():
             continue
         # Gaps are filled; beyond the first and the last place nothing is known.
         within = slice(int(np.argmax(known)), len(known) - int(np.argmax(known[::-1])))
         own, here, known = own[within], along[-len(own):][within], known[within]
-        told = np.stack([np.interp(here, here[known], column[within][known]) for column in told.T],
-                        axis=1)
+        widths = np.stack([np.interp(here, here[known], column[within][known])
+                           for column in widths.T], axis=1)
         # Where a twig hides part of its carrier, a few widths are of strips.
-        told = scipy.ndimage.median_filter(told, size=(_STRIPS, 1), mode="nearest")
+        widths = scipy.ndimage.median_filter(widths, size=(_STRIPS, 1), mode="nearest")
         sight = field.at(skeleton.nodes[own])
         side = np.cross(axis[own], sight)
         side /= np.maximum(np.linalg.norm(side, axis=1), 1e-300)[:, None]
-        nodes[own] += told[:, 1:2] * side + told[:, 2:3] * np.cross(side, axis[own])
-        radius[own], sigma[own] = told[:, 0], told[:, 3]
+        nodes[own] += widths[:, 1:2] * side + widths[:, 2:3] * np.cross(side, axis[own])
+        radius[own], sigma[own] = widths[:, 0], widths[:, 3]
         state[own] = np.where(known, MEASURED, INTERPOLATED)
     return replace(skeleton, nodes=nodes, radius=radius, radius_sigma=sigma, radius_state=state)
 
@@ -180,15 +180,16 @@ def _width(at: np.ndarray, beside: np.ndarray, depth: np.ndarray, here: float, t
         thick: The radius so far [m].
     """
     middle, (least, most) = int(np.searchsorted(at, here)), (
-        np.searchsorted(at, [here - way * thick, here + way * thick]) for way in (_LONG, _REACH))
+        np.searchsorted(at, [here - reach * thick, here + reach * thick])
+        for reach in (_LONG, _REACH))
     near = slice(max(min(middle - _NEAR, least[0]), most[0]),
                  min(max(middle + _NEAR, least[1]), most[1]))
     if near.stop - near.start < _LEAST:
         return np.nan, 0.0, 0.0, 0.0
-    way, side = at[near] - here, beside[near]
-    centred = way - way.mean()
+    along, side = at[near] - here, beside[near]
+    centred = along - along.mean()
     slope = float(centred @ side) / max(float(centred @ centred), 1e-300)
-    side = side - slope * way
+    side = side - slope * along
     count = len(side)
     rank = int(_TAIL * count)
     ordered = np.sort(side)

@@ -13,7 +13,7 @@ from limber.geometry.skeleton.uncertain_parts import start_angle
 
 _BACKWARDS = np.deg2rad(80.0)  # angle to the carrier above which a twig is examined
 _FORWARDS = np.deg2rad(75.0)  # largest angle after the repair
-_SKIPPED, _LED = 6.0, 10.0  # carrier radii skipped at its start, and led straight
+_SKIPPED, _STRAIGHT = 6.0, 10.0  # carrier radii skipped at its start, and led straight
 _AHEAD, _LEAST = 8, 4  # nodes that show its own direction; fewest
 _NEAR = 1.2  # carrier radii by which that line may miss the carrier's axis
 
@@ -58,7 +58,7 @@ def _straight_back(skeleton: Skeleton, members: np.ndarray, carrier: np.ndarray,
         missed = np.linalg.norm(to_twig - back[:, None] * vector, axis=1) / radius[inner]
         size = np.linalg.norm(outwards, axis=1) * np.linalg.norm(to_twig, axis=1)
         cosine = np.einsum("kj,kj->k", outwards, to_twig) / np.maximum(size, 1e-300)
-        able = (back > 0) & (back < _LED * start) & (cosine > np.cos(_FORWARDS))
+        able = (back > 0) & (back < _STRAIGHT * start) & (cosine > np.cos(_FORWARDS))
         near = int(np.argmin(np.where(able, missed, np.inf)))
         if able[near] and missed[near] < least:
             best, least = (k, int(inner[near])), float(missed[near])
