@@ -41,6 +41,7 @@ MODULES = (
     "panels.pie",
     "overlays.skeleton",
     "overlays.legend",
+    "overlays.energy_slice",
     "overlays.graph",
     "frame_colours",
     "goal_ball",

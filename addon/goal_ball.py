@@ -1,22 +1,28 @@
 """The goal's ball in the view: moving it by hand moves the plan's goal."""
 
+from dataclasses import dataclass
+from typing import Any
+
 import bpy
 from bpy.app.handlers import persistent
 from mathutils import Vector
 
 from . import branches
-from .branches import SHOWS_KEY, ShownBranch, add_object
+from .branches import GRASP_KEY, SHOWS_KEY, ShownBranch, add_object
 from .bridge import materials, meshes
 from .properties import OPEN
 
 _PLACE_KEY = "limber_goal_m"
 """Position of the ball when the plan's goal was last set [m]."""
 _FIELD_KEY = "limber_goal_field"
+TARGET_KEY = "limber_target"
+"""Name of the target that a target's mark shows, or that a goal is for."""
 COLOUR = (0.02, 0.42, 0.08)
 _FIELDS = {"grasp": "goal", "tip": "tip_goal", "target": "tip_goal"}
 """Field of the plan for each kind of goal."""
 _OTHERS = ("goal", "tip_goal", "target_box", "goal_seed")
 """A plan takes one of these."""
+_KEYS = (_PLACE_KEY, _FIELD_KEY, TARGET_KEY)
 
 
 def add(shown: ShownBranch, kind: str, place: list[float], radius: float) -> bpy.types.Object:
@@ -32,6 +38,15 @@ def add(shown: ShownBranch, kind: str, place: list[float], radius: float) -> bpy
     return thing
 
 
+def add_by_hand(surface: bpy.types.Object, place: list[float]) -> bpy.types.Object:
+    """Show the ball of a new goal of the grasp, at ``place`` in the branch's frame [m]."""
+    marked = surface.get(GRASP_KEY)
+    radius = max(surface.dimensions) / 50 if marked is None else 1.6 * marked[3]
+    ball = add(ShownBranch(branches.branch_of(surface), surface), "grasp", place, radius)
+    ball.delta_location = surface.delta_location
+    return ball
+
+
 def of(branch: bpy.types.Collection | None) -> bpy.types.Object | None:
     """Return the ball of a branch; None without."""
     return None if branch is None else next(
@@ -41,6 +56,15 @@ def of(branch: bpy.types.Collection | None) -> bpy.types.Object | None:
 def place_of(thing: bpy.types.Object) -> Vector | None:
     """Return where a goal's ball is, in the frame of its branch [m]; None if it is no such ball."""
     return Vector(thing.location) if _PLACE_KEY in thing else None
+
+
+def aim(ball: bpy.types.Object, target: str | None) -> None:
+    """Make a ball the goal of the grasp (None) or of a named target."""
+    ball[_FIELD_KEY] = _FIELDS["grasp" if target is None else "target"]
+    if target is not None:
+        ball[TARGET_KEY] = target
+    elif TARGET_KEY in ball:
+        del ball[TARGET_KEY]
 
 
 def follow(scene: bpy.types.Scene) -> None:
@@ -54,6 +78,44 @@ def follow(scene: bpy.types.Scene) -> None:
     for name in _OTHERS:
         setattr(plan, OPEN + name, name == ball[_FIELD_KEY])
     setattr(plan, ball[_FIELD_KEY], ball.location)
+    if TARGET_KEY in ball:
+        plan.target = ball[TARGET_KEY]
+
+
+@dataclass(frozen=True)
+class Before:
+    """The ball and the plan's goal before a drag, to be put back. ``place`` is None: no ball."""
+
+    place: Vector | None
+    keys: dict[str, Any]
+    plan: dict[str, Any]
+
+    @classmethod
+    def of(cls, scene: bpy.types.Scene, branch: bpy.types.Collection) -> "Before":
+        ball, plan = of(branch), scene.limber.plan
+        names = [*_OTHERS, *(OPEN + name for name in _OTHERS), "target"]
+        return cls(None if ball is None else Vector(ball.location),
+                   {} if ball is None else {key: _plain(ball[key]) for key in _KEYS if key in ball},
+                   {name: _plain(getattr(plan, name)) for name in names})
+
+    def put_back(self, scene: bpy.types.Scene, branch: bpy.types.Collection) -> None:
+        ball = of(branch)
+        if self.place is None and ball is not None:
+            bpy.data.objects.remove(ball)
+        elif ball is not None:
+            ball.location = self.place
+            for key in _KEYS:
+                if key in self.keys:
+                    ball[key] = self.keys[key]
+                elif key in ball:
+                    del ball[key]
+        for name, value in self.plan.items():
+            setattr(scene.limber.plan, name, value)
+
+
+def _plain(value: Any) -> Any:
+    """Return a property's value as a copy."""
+    return value if isinstance(value, str | int | float | bool) else list(value)
 
 
 @persistent

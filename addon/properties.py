@@ -106,6 +106,10 @@ class LimberSettings(bpy.types.PropertyGroup):
         description="Show imported scans over the branches made from them")
     show_legend: bpy.props.BoolProperty(
         name="Legend", default=True, description="Explain the colours in the 3D view")
+    show_energy_slice: bpy.props.BoolProperty(
+        name="Energy Slice", default=False,
+        description="Show the energy with the grasp there, in the plane through the 3D cursor that "
+                    "faces the view. While a goal is dragged, it is shown through the goal")
     each_frame: bpy.props.BoolProperty(
         name="Colours Follow the Motion", default=True, update=_color_again,
         description="Colour by the value in the current frame; otherwise by the worst value over "

@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from . import annotations, goal_ball
+from . import annotations, energy_field, goal_ball
 from .branches import (
     ENERGY_KEY,
     FOLDER_KEY,
@@ -70,6 +70,7 @@ def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = No
     _add_base(shown, data)
     annotations.add_rods(shown, data)
     annotations.add_hemisphere(shown, data)
+    energy_field.add(shown, data)
     _add_motion(scene, shown, data)
     for kind, things in shown.objects.items():
         for thing in things:
@@ -252,6 +253,8 @@ def _add_points(shown: ShownBranch, data: SceneData) -> None:
             thing = add_object(shown.collection, f"{title} {named}", ball, material)
             thing.location = point
             thing.scale = [data.arrays[f"{name}_radius"][number]] * 3
+            if name == "targets":
+                thing[goal_ball.TARGET_KEY] = named
             shown.objects[name].append(thing)
 
 

@@ -21,8 +21,8 @@ _MOST_ARRAYS = 500
 # Dimensions by letter: v vertices, f faces, c points of the cloud, n skeleton nodes, k control
 # points, t targets, s frames, o observations, m observed points, g gripper poses, w points to be
 # seen, p points of a path (each path has its own), q nodes of a search tree, u vertices and x faces
-# of rods (likewise), y colours of a palette, l positions along an arm. i: integers, b: booleans, r:
-# real numbers.
+# of rods (likewise), y colours of a palette, l positions along an arm, h, j, z points along the
+# edges of a grid. i: integers, b: booleans, r: real numbers.
 _SHAPES = {
     "vertices": "v3 r", "faces": "f3 i", "scalar": "v r", "color": "v4 r", "frame_scalar": "sv r",
     "frame_level": "sv i", "palette": "y4 r",
@@ -41,6 +41,7 @@ _SHAPES = {
     "observation_grasp": "g3 r", "observation_grasp_times": "g r",
     "observation_motion": "sm3 r", "observation_seen": "sm b",
     "rods": "u3 r", "rod_faces": "x3 i", "rod_color": "u4 r",
+    "energy_grid": "hjz r", "energy_grid_color": "hjz4 r",
     "robot_starts": "sl3 r", "robot_ends": "sl3 r", "robot_radii": "l r",
     "view_points": "w3 r", "view_direction": "3 r"}
 _NEEDED = ("vertices", "faces", "view_points", "view_direction")
@@ -191,6 +192,7 @@ def _pairs_trouble(arrays: dict[str, np.ndarray], info: dict[str, Any]) -> str:
                for kind in ("tree", "tree_parent")]
     wanted += [f"frame_scalar:{name}" for name in info.get("frame_scalars") or {}]
     wanted += ["observation_seen"] * ("observation_motion" in arrays)
+    wanted += ["energy_grid", "energy_grid_color"] * bool(info.get("energy_grid"))
     wanted += [f"{kind}:{name}" for name in info.get("rods") or {}
                for kind in ("rods", "rod_faces", "rod_color")]
     if len(arrays.get("targets", ())) != len(info.get("targets") or ()):

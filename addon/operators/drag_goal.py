@@ -1,4 +1,4 @@
-"""Drag the plan's goal in the view by its handle."""
+"""Drag the plan's goal in the view: by its own handle, or away from the grasp or a target."""
 
 from typing import ClassVar
 
@@ -6,62 +6,108 @@ import bpy
 from bpy_extras.view3d_utils import region_2d_to_location_3d
 from mathutils import Vector
 
-from .. import branches, goal_ball
+from .. import branches, energy_field, goal_ball, scene
 from .needs_result import NeedsBranchInObjectMode
+from .seeing import things_of
+
+_GRASP, _TARGETS = "grasp", "targets"
 
 
 class LIMBER_OT_drag_goal(NeedsBranchInObjectMode, bpy.types.Operator):
-    """Drag the goal of the plan in the plane of the view. Esc puts it back"""
+    """Drag to where the plan is to bring this, in the plane of the view. Esc puts it back"""
 
     bl_idname = "limber.drag_goal"
     bl_label = "Drag the Goal"
     bl_options: ClassVar = {"REGISTER", "UNDO", "INTERNAL"}
 
+    mark: bpy.props.StringProperty(
+        name="Mark", description="Name of the grasp or target that is dragged to its goal. Empty: "
+                                 "the goal itself is dragged")
     move: bpy.props.FloatVectorProperty(
         name="Move [m]", size=3, subtype="TRANSLATION", description="In the world")
 
+    _is_dragging = False
+
     def invoke(self, context, event):
-        ball = current_ball(context)
-        if ball is None:
+        if not self._begin(context):
             return {"CANCELLED"}
-        self._begin = self._at_mouse(context, event, ball.matrix_world.translation)
-        self._before = Vector(ball.location)
+        self._mouse = self._at_mouse(context, event)
+        self._is_dragging = True
+        self._reach = [(thing, thing.hide_viewport)
+                       for thing in things_of(self._branch, "hemisphere")]
+        for thing, _ in self._reach:
+            thing.hide_viewport = False
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
-        ball = current_ball(context)
-        if ball is None:
-            return {"CANCELLED"}
         if event.type == "MOUSEMOVE":
-            self.move = self._at_mouse(context, event, self._begin) - self._begin
-            ball.location = self._before
-            _move(context, ball, self.move)
+            self.move = self._at_mouse(context, event) - self._mouse
+            energy_field.held[:] = [self._from + Vector(self.move)]
+            self._apply()
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
+            self.cancel(context)
+            if not Vector(self.move).length:
+                return {"CANCELLED"}
             goal_ball.follow(context.scene)
             return {"FINISHED"}
         elif event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
-            ball.location = self._before
+            self._before.put_back(context.scene, self._branch)
+            self.cancel(context)
             return {"CANCELLED"}
         return {"RUNNING_MODAL"}
 
+    def cancel(self, context):
+        """Hide again what is drawn while something is dragged."""
+        energy_field.held.clear()
+        for thing, was_hidden in self._reach:
+            thing.hide_viewport = was_hidden
+        context.area.tag_redraw()
+
     def execute(self, context):
-        ball = current_ball(context)
-        if ball is None:
-            self.report({"ERROR"}, "There is no goal. Press Move the Goal by Hand first.")
+        if not self._is_dragging and not self._begin(context):
             return {"CANCELLED"}
-        _move(context, ball, self.move)
+        self._apply()
         goal_ball.follow(context.scene)
         return {"FINISHED"}
 
-    def _at_mouse(self, context, event, place: Vector) -> Vector:
-        """Return the place under the mouse in the view's plane through ``place``, in the world."""
+    def _begin(self, context) -> bool:
+        """Note where everything is; reports why nothing can be dragged."""
+        self._surface = branches.find_surface(context.scene)
+        self._branch = branches.branch_of(self._surface)
+        thing = self._branch.objects.get(self.mark) if self.mark else goal_ball.of(self._branch)
+        if thing is None:
+            self.report({"ERROR"}, f"The branch has no {self.mark}." if self.mark else
+                                   "There is no goal. Press Move the Goal by Hand first.")
+            return False
+        self._from = Vector(thing.matrix_world.translation)
+        self._target = thing.get(goal_ball.TARGET_KEY)
+        self._before = goal_ball.Before.of(context.scene, self._branch)
+        return True
+
+    def _apply(self) -> None:
+        """Put the ball at its place; made where there is none."""
+        ball = goal_ball.of(self._branch)
+        into = self._surface.matrix_world.inverted()
+        place = self._before.place
+        if self.mark:
+            place = into @ self._from
+            ball = ball or goal_ball.add_by_hand(self._surface, list(place))
+            goal_ball.aim(ball, self._target)
+        ball.location = place + into.to_3x3() @ Vector(self.move)
+
+    def _at_mouse(self, context, event) -> Vector:
+        """Return the place under the mouse in the view's plane through what is dragged, in the
+        world.
+        """
         return region_2d_to_location_3d(context.region, context.region_data,
-                                        (event.mouse_region_x, event.mouse_region_y), place)
+                                        (event.mouse_region_x, event.mouse_region_y), self._from)
 
 
 class LIMBER_GGT_goal(bpy.types.GizmoGroup):
-    """The handle of the plan's goal: a ring about it, in the plane of the view."""
+    """Handles of the plan's goal, the grasp and the targets: a ring about each, in the plane of the
+    view.
+    """
 
     bl_idname = "LIMBER_GGT_goal"
     bl_label = "Goal"
@@ -71,35 +117,48 @@ class LIMBER_GGT_goal(bpy.types.GizmoGroup):
 
     @classmethod
     def poll(cls, context):
-        ball = current_ball(context)
-        return context.mode == "OBJECT" and ball is not None and ball.visible_get()
+        return context.mode == "OBJECT" and bool(handles(context))
 
     def setup(self, context):
-        self._handle = self.gizmos.new("GIZMO_GT_move_3d")
-        self._handle.draw_options = {"ALIGN_VIEW", "FILL_SELECT"}
-        self._handle.draw_style = "RING_2D"
-        self._handle.scale_basis = 0.25
-        self._handle.color, self._handle.alpha = goal_ball.COLOUR, 0.9
-        self._handle.color_highlight, self._handle.alpha_highlight = (1.0, 1.0, 1.0), 1.0
-        self._handle.target_set_operator("limber.drag_goal")
+        self._rings = {}
+        self.refresh(context)
+
+    def refresh(self, context):
+        marks = handles(context)
+        if marks.keys() != self._rings.keys():
+            self.gizmos.clear()
+            self._rings = {name: self._ring(name, colour) for name, (_, colour) in marks.items()}
 
     def draw_prepare(self, context):
-        ball = current_ball(context)
-        if ball is not None:
-            self._handle.matrix_basis.translation = ball.matrix_world.translation
+        marks = handles(context)
+        for name, ring in self._rings.items():
+            ring.hide = name not in marks
+            if not ring.hide:
+                ring.matrix_basis.translation = marks[name][0].matrix_world.translation
+
+    def _ring(self, name: str, colour: tuple[float, float, float]) -> bpy.types.Gizmo:
+        ring = self.gizmos.new("GIZMO_GT_move_3d")
+        ring.draw_options = {"ALIGN_VIEW", "FILL_SELECT"}
+        ring.draw_style = "RING_2D"
+        ring.scale_basis = 0.25
+        ring.color, ring.alpha = colour, 0.9
+        ring.color_highlight, ring.alpha_highlight = (1.0, 1.0, 1.0), 1.0
+        ring.target_set_operator("limber.drag_goal").mark = name
+        return ring
 
 
-def current_ball(context: bpy.types.Context) -> bpy.types.Object | None:
-    """Return the ball of the current branch's goal; None without."""
+def handles(context: bpy.types.Context) -> dict[str, tuple]:
+    """Return what can be dragged, in sight: objects and colours by name; empty for the goal."""
     surface = branches.find_surface(context.scene)
-    return None if surface is None else goal_ball.of(branches.branch_of(surface))
-
-
-def _move(context: bpy.types.Context, ball: bpy.types.Object, move: Vector) -> None:
-    """Move the ball by a displacement in the world [m]; its location is in the branch's frame."""
-    surface = branches.find_surface(context.scene)
-    into = surface.matrix_world.inverted().to_3x3()
-    ball.location = Vector(ball.location) + into @ Vector(move)
+    if surface is None:
+        return {}
+    branch = branches.branch_of(surface)
+    found = {} if (ball := goal_ball.of(branch)) is None else {"": (ball, goal_ball.COLOUR)}
+    for thing in branch.objects:
+        kind = thing.get(branches.SHOWS_KEY)
+        if kind in (_GRASP, _TARGETS):
+            found[thing.name] = (thing, scene.COLORS[kind])
+    return {name: mark for name, mark in found.items() if mark[0].visible_get()}
 
 
 def register() -> None:

@@ -5,7 +5,7 @@ from typing import ClassVar
 import bpy
 
 from .. import branches, goal_ball
-from ..branches import GRASP_KEY, ShownBranch
+from ..branches import GRASP_KEY
 from .needs_result import NeedsBranchInObjectMode
 
 
@@ -19,8 +19,7 @@ class LIMBER_OT_place_goal(NeedsBranchInObjectMode, bpy.types.Operator):
 
     def execute(self, context):
         surface, plan = branches.find_surface(context.scene), context.scene.limber.plan
-        branch = branches.branch_of(surface)
-        ball = goal_ball.of(branch)
+        ball = goal_ball.of(branches.branch_of(surface))
         if ball is None:
             marked = surface.get(GRASP_KEY)
             if marked is None and not plan.use_goal:
@@ -28,9 +27,7 @@ class LIMBER_OT_place_goal(NeedsBranchInObjectMode, bpy.types.Operator):
                                        "set Goal in the panel Plan.")
                 return {"CANCELLED"}
             place = list(plan.goal) if plan.use_goal else list(marked[:3])
-            radius = max(surface.dimensions) / 50 if marked is None else 1.6 * marked[3]
-            ball = goal_ball.add(ShownBranch(branch, surface), "grasp", place, radius)
-            ball.delta_location = surface.delta_location
+            ball = goal_ball.add_by_hand(surface, place)
         ball.hide_viewport = False
         context.view_layer.update()
         branches.activate(context.scene, ball)

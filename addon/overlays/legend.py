@@ -6,9 +6,10 @@ import textwrap
 import blf
 import bpy
 import gpu
+import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from .. import branches, frame_colours
+from .. import branches, energy_field, frame_colours
 from . import covered_width
 
 _MARGIN, _WIDTH, _HEIGHT, _TEXT = 24, 16, 160, 12
@@ -21,8 +22,11 @@ def shown_scales(surface: bpy.types.Object) -> list[dict]:
     """Return the scales of everything coloured now: the branch's, then those of its surroundings.
     """
     scales = [frame_colours.shown_scale(surface) or _scale_at_rest(surface)]
-    for thing in branches.branch_of(surface).objects:
-        if branches.SCALE_KEY in thing and thing.visible_get():
+    branch = branches.branch_of(surface)
+    for thing in branch.objects:
+        is_seen = thing.visible_get() or (energy_field.is_sliced(bpy.context.scene)
+                                          and thing == energy_field.of(branch))
+        if branches.SCALE_KEY in thing and is_seen:
             scales.append(json.loads(thing[branches.SCALE_KEY]))
     told = {scale["title"]: scale for scale in scales if scale is not None}
     return list(told.values())
@@ -40,15 +44,16 @@ def bar(stops: list[list[float]], x: float, y: float, width: float, height: floa
     places, colours, triangles = [], [], []
     for position, *colour in stops:
         places += [(x, y + position * height), (x + width, y + position * height)]
-        colours += [(*(_display(value) for value in colour), 1.0)] * 2
+        colours += [(*display(np.array(colour)), 1.0)] * 2
     for k in range(0, len(places) - 2, 2):
         triangles += [(k, k + 1, k + 2), (k + 1, k + 3, k + 2)]
     return places, colours, triangles
 
 
-def _display(value: float) -> float:
-    """Return a linear component of a colour as sRGB."""
-    return 12.92 * value if value < 0.0031308 else 1.055 * value ** (1 / 2.4) - 0.055
+def display(linear: np.ndarray) -> np.ndarray:
+    """Return linear components of colours as sRGB."""
+    return np.where(linear < 0.0031308, 12.92 * linear,
+                    1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
 def _draw() -> None:

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import branches, compat, preferences, properties, warming
+from .. import branches, compat, energy_field, preferences, properties, warming
 from ..lines import draw_text
 from ..operators import live_loads, seeing
 from ..overlays import graph as viewport_graph
@@ -153,6 +153,8 @@ def _draw_in_sight(layout: bpy.types.UILayout, context: bpy.types.Context,
     row.prop(settings, "show_legend")
     row.prop(settings, "show_scan")
     branch = branches.branch_of(surface)
+    if energy_field.of(branch) is not None:
+        body.prop(settings, "show_energy_slice")
     for group, (title, _) in seeing.GROUPS.items():
         things = seeing.things_of(branch, group)
         if things:

@@ -113,12 +113,17 @@ def step_state(scene: bpy.types.Scene, step: Step) -> StepState:
 
 
 def next_stage(scene: bpy.types.Scene) -> Stage | None:
-    """Return the first stage not yet run for the branch as it is, whose inputs exist or are set.
-    None if there is none.
+    """Return the first stage not yet run for the branch as it is, whose inputs exist or are set;
+    for a scan without a branch, the one that makes it. None if there is none.
     """
     folder = branches.current_folder(scene)
     record = None if folder is None else branch_folder.read_record(folder)
-    for step in STEPS if record is not None else ():
+    if record is None:
+        first = stages()[STEPS[0].view.stage]
+        is_due = properties.group_of(scene, first).cloud and (
+            state_of(scene, first.name)[0] is StepState.NOT_RUN)
+        return first if is_due else None
+    for step in STEPS:
         stage = stages()[step.view.stage]
         if step.scene_operator or stage.moves_robot or stage.makes_branch:
             continue

@@ -1,7 +1,11 @@
 """How many clicks a new user needs, in a real Blender's window, from its factory start-up."""
 
+from pathlib import Path
+
 import pytest
 from tests.addon.window import colour_count, driven, require_screen
+
+from limber.geometry.generated import generate_branch
 
 pytestmark = [pytest.mark.real_blender, pytest.mark.slow]
 
@@ -16,4 +20,25 @@ def test_four_clicks_to_a_bent_branch(run, blender, environment, tmp_path):
     assert seen["clicks_to_bent"] == 4
     assert seen["goal_moved_m"] > 0.01 and seen["goal"] == pytest.approx(seen["ball"])
     for name in ("tab", "example", "bent", "goal"):
+        assert colour_count(tmp_path / f"{name}.png") > 50
+
+
+def test_an_own_scan_to_a_planned_path(run, blender, environment, tmp_path):
+    """The tab, import, the file, the branch, its grasp dragged to a goal, the plan: seven places to
+    press and one to confirm. The goal is where it was dragged to."""
+    require_screen()
+    home = tmp_path / "home"
+    home.mkdir()
+    generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud.write_ply(
+        home / "scan.ply")
+    caches = environment.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))
+    seen = driven("drive_own_scan.py", blender,
+                  environment | {"HOME": str(home), "XDG_CACHE_HOME": caches}, tmp_path,
+                  (1280, 720), seconds=500)
+    assert seen["clicks"] <= 15
+    assert seen["file"] == "scan.ply"
+    assert seen["goal_from_grasp_m"] > 0.03
+    assert seen["goal"] == pytest.approx(seen["ball"], abs=1e-6)
+    assert seen["state"] == "DONE" and seen["paths"]
+    for name in ("browser", "chosen", "scan", "branch", "goal", "path"):
         assert colour_count(tmp_path / f"{name}.png") > 50

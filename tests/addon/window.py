@@ -21,7 +21,7 @@ def require_screen() -> None:
 
 
 def driven(script: str, blender: str, environment: dict[str, str], folder: Path,
-           size: tuple[int, int] = (1280, 800)) -> dict:
+           size: tuple[int, int] = (1280, 800), seconds: float = 240.0) -> dict:
     """Run a script that drives Blender in a window as large as the screen; return what it has seen.
     """
     with virtual_screen(size) as display:
@@ -31,7 +31,7 @@ def driven(script: str, blender: str, environment: dict[str, str], folder: Path,
             env=environment | {"DISPLAY": display}, stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE, text=True)
         try:
-            _take_pictures(folder, display, process)
+            _take_pictures(folder, display, process, seconds)
         finally:
             process.kill()
     assert (folder / "log.json").is_file(), process.stderr.read()[-2000:]
@@ -57,9 +57,11 @@ def virtual_screen(size: tuple[int, int]) -> Iterator[str]:
         server.wait(10)
 
 
-def _take_pictures(folder: Path, display: str, process: subprocess.Popen) -> None:
-    """Take a picture of the screen whenever Blender asks for one; return when it has ended."""
-    end = time.monotonic() + 240
+def _take_pictures(folder: Path, display: str, process: subprocess.Popen,
+                   seconds: float) -> None:
+    """Take a picture of the screen whenever Blender asks for one; return when it has ended, or
+    after some seconds."""
+    end = time.monotonic() + seconds
     while process.poll() is None and time.monotonic() < end:
         for request in folder.glob("*.request"):
             picture = request.with_suffix(".png")

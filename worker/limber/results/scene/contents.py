@@ -35,6 +35,9 @@ Arrays (m, s, J, Pa; missing parts of a folder are omitted):
 [x, 3], ``rod_color:NAME`` [u, 4]               ``plan``, ``baseline`` by energy, ``skeleton`` as
                                                 thick as it is, ``fit`` along simulated points
                                                 with balls at measured ones
+``energy_grid`` [h, j, z],                      the field's energy on the grid of
+``energy_grid_color`` [h, j, z, 4]              ``info["energy_grid"]`` (``low_m``, ``high_m``,
+                                                ``scale``); transparent where it is not trusted
 ``observation`` [t, m, 3], ``observation_       what was measured in the pull that
 visible`` [t, m], ``observation_times`` [t],    ``info["observation"]`` names, and the gripper
 ``observation_grasp`` [g, 3], ``observation_
@@ -66,7 +69,8 @@ from limber.results.scene.arrays import FORMAT, SceneData
 from limber.results.scene.colours import colour_scale
 from limber.results.scene.fit_errors import add_fit
 from limber.results.scene.observation import add_observation
-from limber.results.scene.paths import add_hemisphere, add_plan
+from limber.results.scene.paths import add_plan
+from limber.results.scene.reach import add_reach
 from limber.results.scene.robot_links import add_robot
 from limber.results.scene.still_objects import (
     add_cloud,
@@ -118,7 +122,7 @@ def scene_data(branch: Branch, plan: str | None = None, motion: str | None = Non
     add_marks(data, mesh, used)
     add_targets(data, targets)
     plan = add_plan(data, branch, plan)
-    add_hemisphere(data, branch)
+    add_reach(data, branch)
     add_motion(data, branch, plan, motion, strength)
     add_robot(data, branch, plan)
     add_observation(data, branch)

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.files.reading import read_arrays, read_columns, require_shapes
+from limber.core.files.reading import read_columns
 from limber.planning.plan_file import read_plan_summary
 from limber.planning.search_files import read_trees
 from limber.results.findings import PATH_NAMES, SAME, remarks_on
@@ -58,20 +58,6 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
     if beyond := remarks_on(summary).get("peak_strain"):
         data.info["notes"].append(f"strain, {beyond}")
     return plan
-
-
-def add_hemisphere(data: SceneData, branch: Branch) -> None:
-    """Add the hemisphere about the base that bounds the sampled grasp positions, if any."""
-    if not branch.has("energy.npz"):
-        return
-    path = branch.path("energy.npz")
-    content = read_arrays(path, "an energy field")
-    if {"chart_base_m", "arc_length_m"} <= set(content):
-        require_shapes(path, content, {"chart_base_m": (3,), "arc_length_m": ()},
-                       "an energy field")
-        data.info["hemisphere"] = {
-            "centre_m": content["chart_base_m"].tolist(),
-            "radius_m": float(content["arc_length_m"]), "axis": [0.0, 0.0, 1.0]}
 
 
 def _add_path(data: SceneData, key: str, table: dict[str, np.ndarray]) -> None:

@@ -1,0 +1,119 @@
+"""From Blender's factory start-up to a planned path of an own scan, by mouse and keys alone;
+test_clicks.py starts it.
+
+The home folder has scan.ply and nothing else.
+"""
+
+import sys
+from pathlib import Path
+
+import bpy
+from bpy_extras import view3d_utils
+
+sys.path.insert(0, str(Path(__file__).parent))
+from driving import KEY, drive, picture, seen, view, waited
+from mouse import (
+    at,
+    click,
+    event,
+    find,
+    is_ours,
+    is_sidebar_open,
+    let_go,
+    open_sidebar,
+    point_at_tab,
+    press,
+)
+
+
+def part(name):
+    return sys.modules[f"{KEY}.{name}"]
+
+
+def browser(kind):
+    """Return the window of the file browser, its area and its region of a kind; None without."""
+    return next(((window, area, next(region for region in area.regions if region.type == kind))
+                 for window in bpy.context.window_manager.windows for area in window.screen.areas
+                 if area.type == "FILE_BROWSER"), None)
+
+
+def is_browser_open():
+    return browser("WINDOW") is not None and waited(1.0)
+
+
+def point_at_file():
+    """At the first row of the list."""
+    window, _, region = browser("WINDOW")
+    at.update(x=region.x + 120, y=region.y + region.height - 35, window=window)
+    event("MOUSEMOVE")
+    return waited(0.3)
+
+
+def is_chosen():
+    seen["file"] = browser("WINDOW")[1].spaces.active.params.filename
+    return seen["file"] == "scan.ply"
+
+
+def point_at_import():
+    """At the button in the lower right corner."""
+    window, _, region = browser("EXECUTE")
+    at.update(x=region.x + region.width - 70, y=region.y + region.height // 2, window=window)
+    event("MOUSEMOVE")
+    return waited(0.3)
+
+
+def is_imported():
+    at.pop("window", None)
+    return "scan scan" in bpy.data.objects and waited(0.5)
+
+
+def is_made():
+    return "scan" in bpy.data.collections and not part("jobs").is_running() and waited(1.0)
+
+
+def point_at_grasp():
+    branch = bpy.data.collections["scan"]
+    grasp = next(thing for thing in branch.objects if thing.name.startswith("Grasp"))
+    _, area, region = view()
+    place = view3d_utils.location_3d_to_region_2d(
+        region, area.spaces.active.region_3d, grasp.matrix_world.translation)
+    at.update(x=region.x + place.x, y=region.y + place.y)
+    event("MOUSEMOVE")
+    return waited(0.3)
+
+
+def goal():
+    return part("goal_ball").of(bpy.data.collections["scan"])
+
+
+def drag():
+    at["x"] += 4
+    event("MOUSEMOVE")
+    if goal() is None:
+        return False
+    grasp = part("branches").find_surface(bpy.context.scene)["limber_grasp_m"][:3]
+    seen["goal_from_grasp_m"] = sum(
+        (a - b) ** 2 for a, b in zip(goal().location, grasp, strict=True)) ** 0.5
+    return seen["goal_from_grasp_m"] > 0.03
+
+
+def is_planned():
+    jobs = part("jobs")
+    if jobs.is_running() or not waited(1.0):
+        return False
+    if error := jobs.current().error:
+        raise RuntimeError(error)
+    scene = bpy.context.scene
+    seen["state"] = part("panels.steps").state_of(scene, "plan")[0].name
+    seen["goal"], seen["ball"] = [*scene.limber.plan.goal], [*goal().location]
+    seen["paths"] = sorted(thing.name for thing in bpy.data.collections["scan"].objects
+                           if thing.name.endswith("path"))
+    return seen["state"] == "DONE" and bool(seen["paths"])
+
+
+drive([open_sidebar, is_sidebar_open, point_at_tab, click, is_ours,
+       find("import_cloud"), click, is_browser_open, picture("browser"), point_at_file, click,
+       is_chosen, point_at_import, picture("chosen"), click, is_imported, picture("scan"),
+       find("reconstruct"), click, is_made, picture("branch"),
+       point_at_grasp, press, drag, picture("goal"), let_go,
+       find("plan"), click, is_planned, picture("path")], longest=400)
