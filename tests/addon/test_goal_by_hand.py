@@ -4,8 +4,13 @@ import importlib
 import io
 import json
 import math
+import shutil
 
+import numpy as np
 import pytest
+from tests.addon.conftest import ROOT
+
+from limber.planning.field.energy_field import EnergyField
 
 pytestmark = pytest.mark.usefixtures("worker_here")
 
@@ -118,3 +123,86 @@ def test_a_plan_samples_the_energy_that_it_lacks(bpy, registered, bare_beam, mon
     with pytest.raises(RuntimeError, match="exit code 3"):
         bpy.ops.limber.plan(name="first")
     assert ran == ["energy", "plan", "plan", "energy"]
+
+
+@pytest.mark.slow
+def test_the_grasp_is_dragged_to_a_goal(bpy, registered, bare_beam):
+    """Without a plan: a ball is made there, and is the plan's goal. Put back, there is neither."""
+    bpy.ops.limber.open_result(directory=str(bare_beam.folder))
+    scene, goal_ball = bpy.context.scene, part("goal_ball")
+    surface = part("branches").find_surface(scene)
+    branch = part("branches").branch_of(surface)
+    bpy.context.view_layer.update()
+    before = goal_ball.Before.of(scene, branch)
+    assert bpy.ops.limber.drag_goal(mark="Grasp 1", move=(0.05, 0.0, -0.01)) == {"FINISHED"}
+    grasp = branch.objects["Grasp 1"].location
+    wanted = [grasp.x + 0.05, grasp.y, grasp.z - 0.01]
+    assert list(goal_ball.of(branch).location) == pytest.approx(wanted, abs=1e-6)
+    assert scene.limber.plan.use_goal
+    assert list(scene.limber.plan.goal) == pytest.approx(wanted, abs=1e-6)
+    before.put_back(scene, branch)
+    assert goal_ball.of(branch) is None and not scene.limber.plan.use_goal
+    with pytest.raises(RuntimeError, match="has no Grasp 7"):
+        bpy.ops.limber.drag_goal(mark="Grasp 7", move=(0.05, 0.0, 0.0))
+
+
+@pytest.mark.slow
+def test_a_target_is_dragged_to_a_goal(bpy, ball, beam):
+    """The plan's goal becomes that of the named target, and no longer that of the grasp."""
+    assert bpy.ops.limber.target(name="bud", at=(0.0, 0.0, 0.3)) == {"FINISHED"}
+    bpy.ops.limber.open_result(directory=str(beam.folder))
+    bpy.context.view_layer.update()
+    scene, plan = bpy.context.scene, bpy.context.scene.limber.plan
+    branch = part("branches").branch_of(part("branches").find_surface(scene))
+    mark = branch.objects["Target bud"]
+    plan.use_goal = True
+    before = part("goal_ball").Before.of(scene, branch)
+    place = part("goal_ball").of(branch).location.copy()
+    assert bpy.ops.limber.drag_goal(mark=mark.name, move=(0.0, 0.1, 0.0)) == {"FINISHED"}
+    assert (plan.use_tip_goal, plan.use_goal, plan.target) == (True, False, "bud")
+    wanted = [mark.location.x, mark.location.y + 0.1, mark.location.z]
+    assert list(plan.tip_goal) == pytest.approx(wanted, abs=1e-6)
+    before.put_back(scene, branch)
+    bpy.context.view_layer.update()
+    assert (plan.use_tip_goal, plan.use_goal, plan.target) == (False, True, "")
+    assert list(part("goal_ball").of(branch).location) == list(place)
+
+
+@pytest.mark.slow
+def test_the_slice_shows_the_energy_field(bpy, registered, tmp_path):
+    """In the plane through a place: the colours of the core's field, transparent where it is not
+    trusted; in the world, also where the branch was put aside."""
+    from mathutils import Vector
+
+    folder = tmp_path / "twig.branch"
+    shutil.copytree(ROOT / "blend_files" / "bending_branch", folder)
+    bpy.ops.limber.open_result(directory=str(folder))
+    scene = bpy.context.scene
+    surface = part("branches").find_surface(scene)
+    branch = part("branches").branch_of(surface)
+    for thing in branch.objects:
+        thing.delta_location = (2.0, 0.0, 0.0)
+    bpy.context.view_layer.update()
+    thing, field = part("energy_field").of(branch), EnergyField.read(folder / "energy.npz")
+    assert thing.hide_render and not thing.visible_get()
+    # The field's own numbers, at the points of the grid.
+    meshes = part("bridge.meshes")
+    points = meshes.positions(thing.data).astype(float)
+    trusted = field.region.contains(points)
+    colours = part("energy_field").colours_at(thing, points)
+    assert 100 < trusted.sum() < len(points) and (colours[:, 3] > 0.99)[trusted].mean() > 0.99
+    np.testing.assert_allclose(meshes.scalars(thing.data, "energy_j")[trusted],
+                               field.energy(points[trusted]), rtol=2e-2, atol=1e-5)
+    place = Vector(field.rest) + Vector((2.0, 0.0, 0.0))
+    across, up = Vector((1.0, 0.0, 0.0)), Vector((0.0, 0.0, 1.0))
+    at, seen, triangles = part("overlays.energy_slice").net(thing, surface, place, across, up)
+    np.testing.assert_allclose(at[:, 1], place.y)
+    assert len(triangles) > 50 and (seen[triangles, 3] > 0).any(axis=1).all()
+    nearest = np.argmin(np.linalg.norm(at - np.array(place), axis=1))
+    rest = part("energy_field").colours_at(thing, np.array([field.rest]))[0, :3].sum()
+    assert seen[nearest, 3] > 0
+    assert rest < np.quantile(colours[trusted, :3].sum(axis=1), 0.25), "the least energy is dark"
+    assert not scene.limber.show_energy_slice and not part("energy_field").is_sliced(scene)
+    scene.limber.show_energy_slice = True
+    scales = part("overlays.legend").shown_scales(surface)
+    assert any("with the grasp there" in scale["title"] for scale in scales)
