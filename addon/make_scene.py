@@ -38,8 +38,8 @@ def _load_addon():
 def _end_with_parent() -> None:
     """End when the parent does: `limber` then closes this process's standard input.
 
-    The core requests it by LIMBER_PARENT_PIPE; see limber.core.processes.end_with_parent, which Blender's
-    Python lacks.
+    The core requests it by LIMBER_PARENT_PIPE; see limber.core.processes.end_with_parent, which
+    Blender's Python lacks.
     """
     if os.environ.pop("LIMBER_PARENT_PIPE", None) != "stdin":
         return

@@ -11,7 +11,7 @@ from limber.core.alignment import Alignment
 from limber.core.errors import BranchFolderError, InputError
 from limber.core.files.atomic import write_atomically
 from limber.core.json_values import plain
-from limber.store import FORMAT_VERSION, Branch
+from limber.store import FORMAT_VERSION, Branch, disk
 
 
 @pytest.fixture
@@ -254,3 +254,27 @@ def test_plain_makes_json():
     value = {"a": np.float32(1.5), "b": np.arange(2), "c": (Path("x"), np.nan), "d": np.True_}
     assert json.loads(json.dumps(plain(value))) == {
         "a": 1.5, "b": [0, 1], "c": ["x", None], "d": True}
+
+
+def test_paths_too_long_for_windows(tmp_path: Path, monkeypatch):
+    """Refused with a sentence, before any work: to make, to write to and to read a folder. Read are
+    paths that just fit."""
+    folder = tmp_path / ("n" * 100) / "apple.branch"
+    folder.parent.mkdir()
+    with Branch.create(folder).stage("first") as stage:
+        stage.path("plans/path.csv").write_text("one")
+    monkeypatch.setattr(disk, "limits_paths", lambda: True)
+    just = len(str(folder / "plans/path.csv"))
+    monkeypatch.setattr(disk, "_LONGEST_PATH", just)
+    assert Branch.read(folder).has("plans/path.csv")
+    for act in (Branch.open, Branch.create):
+        with pytest.raises(BranchFolderError, match=f"at most {just} characters.*LongPathsEnabled"):
+            act(folder)
+    monkeypatch.setattr(disk, "_LONGEST_PATH", just - 1)
+    with pytest.raises(BranchFolderError, match=f"would have {just} characters"):
+        Branch.read(folder)
+    with pytest.raises(BranchFolderError, match="shorter path"):
+        Branch.create(folder.with_name("pear.branch"))
+    assert not folder.with_name("pear.branch").exists()
+    monkeypatch.setattr(disk, "_LONGEST_PATH", just + disk.NAME_ROOM)
+    assert Branch.open(folder).name == "apple"

@@ -183,7 +183,7 @@ class Branch:
                 is not set.
         """
         folder = Path(folder)
-        with opening(folder):
+        with opening(folder, only_reads=True):
             settle(folder, unfinished=unfinished)
             return cls(folder, journal.current_manifest(folder), only_reads=True)
 

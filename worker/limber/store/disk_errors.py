@@ -1,17 +1,23 @@
 """Messages for stages that meet a full disk or a lost folder."""
 
 import gc
+import os
 import shutil
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from limber.core.errors import WorkError
+from limber.core.errors import BranchFolderError, WorkError
 from limber.core.machine_errors import machine_error
 from limber.store import journal
 from limber.store.manifest import MANIFEST
 
+NAME_ROOM = 100
+"""Longest name of a file that a stage writes: in a work folder (50), such as
+executions/NAME/report.json (50)."""
+_LONGEST_PATH = 259
+"""Of Windows' MAX_PATH, the last character is a zero."""
 LEAST_FREE_BYTES = 200e6
 """A stage does not start with less free space on the disk: it would lose its results at the end."""
 
@@ -52,6 +58,36 @@ def gone(folder: Path) -> WorkError:
     return WorkError(f"{folder} no longer exists.",
                      "It was moved or removed, or its disk or network folder was "
                      "lost.", "Restore it, and run this again. Earlier results are kept.")
+
+
+def require_short(folder: Path, room: int) -> None:
+    """Refuse a folder in which Windows cannot open files: their paths would be too long. ``room``
+    is the length of the longest name of a file to be written; those that are there are counted.
+    """
+    if not limits_paths():
+        return
+    place = str(folder.absolute())
+    length = len(place) + 1 + max([room, *(
+        len(str(path.relative_to(folder))) for path in folder.rglob("*"))])
+    if length > _LONGEST_PATH and not place.startswith("\\\\?\\"):
+        raise BranchFolderError(
+            f"Paths of files in {folder} would have {length} characters.",
+            f"Windows opens paths of at most {_LONGEST_PATH} characters.",
+            "Move the folder to one with a shorter path, such as C:\\branches, or switch on long "
+            "paths in Windows (LongPathsEnabled) and start the program again.")
+
+
+def limits_paths() -> bool:
+    """Whether this is a Windows on which long paths are not switched on."""
+    if os.name != "nt":
+        return False
+    import ctypes
+
+    try:
+        return not ctypes.WinDLL("ntdll").RtlAreLongPathsEnabled()
+    except (AttributeError, OSError):
+        # Before Windows 10 of 2016.
+        return True
 
 
 def require_room(folder: Path, purpose: str) -> None:

@@ -12,7 +12,7 @@ from limber.core.files import safe_names
 from limber.core.files.atomic import flush_folder, write_atomically
 from limber.core.files.temporary_names import is_owned_name, owned_name, sweep, sweep_beside
 from limber.store import journal
-from limber.store.disk_errors import in_words
+from limber.store.disk_errors import NAME_ROOM, in_words, require_short
 from limber.store.lock import (
     COMMIT_LOCK,
     HOLDER,
@@ -26,6 +26,7 @@ from limber.store.manifest import MANIFEST, Manifest, read_manifest
 
 def begin(folder: Path, manifest: Manifest) -> None:
     """Make the folder with its manifest: a new one appears complete, an empty one is filled."""
+    require_short(folder, NAME_ROOM)
     unfinished = folder.with_name(owned_name(folder.name))
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -68,8 +69,11 @@ def settled_manifest(folder: Path) -> Manifest:
 
 
 @contextmanager
-def opening(folder: Path) -> Iterator[None]:
-    """Refuse a folder that does not exist or has links; report a lost disk."""
+def opening(folder: Path, *, only_reads: bool = False) -> Iterator[None]:
+    """Refuse a folder that does not exist, has links, or is too deep for Windows; report a lost
+    disk.
+    """
+    require_short(folder, 0 if only_reads else NAME_ROOM)
     with in_words(folder):
         if not folder.is_dir():
             raise BranchFolderError(
