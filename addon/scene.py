@@ -25,7 +25,7 @@ from .branches import (
     ShownBranch,
     add_object,
 )
-from .bridge import animation, curves, materials, meshes, skeletons
+from .bridge import animation, colour_nodes, curves, materials, meshes, skeletons
 from .scene_data import SceneData
 from .skeleton_edits import Skeleton
 
@@ -133,7 +133,8 @@ def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> 
     if "grasp" in data.arrays:
         surface[GRASP_KEY] = [*data.arrays["grasp"][0].tolist(),
                               float(data.arrays["grasp_radius"][0])]
-    for key in data.info["scalars"]:
+    for key, scale in data.info["scalars"].items():
+        colour_nodes.colour_group(scale["colours"], scale["stops"])
         meshes.set_scalars(mesh, key, data.arrays[f"scalar:{key}"])
         meshes.set_colors(mesh, f"{key}_color", data.arrays[f"color:{key}"])
     names = list(data.info["scalars"])

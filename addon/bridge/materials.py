@@ -67,7 +67,7 @@ def scalar_material(name: str, attribute: str, *, low: float, high: float, log: 
     place.inputs["From Max"].default_value = high
     links.new(output, place.inputs["Value"])
     ramp = nodes.new("ShaderNodeValToRGB")
-    _set_stops(ramp.color_ramp, stops)
+    set_stops(ramp.color_ramp, stops)
     links.new(place.outputs["Result"], ramp.inputs["Fac"])
     if flat:
         _make_flat(material, shader)
@@ -98,7 +98,8 @@ def _make_flat(material: bpy.types.Material, shader: bpy.types.Node) -> None:
     links.new(emission.outputs["Emission"], output.inputs["Surface"])
 
 
-def _set_stops(ramp: bpy.types.ColorRamp, stops: list[list[float]]) -> None:
+def set_stops(ramp: bpy.types.ColorRamp, stops: list[list[float]]) -> None:
+    """Set a ramp to rows ``[position 0..1, red, green, blue]``, linear."""
     while len(ramp.elements) > 1:
         ramp.elements.remove(ramp.elements[-1])
     for number, (position, *color) in enumerate(stops):
