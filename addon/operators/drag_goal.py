@@ -121,16 +121,14 @@ class LIMBER_GGT_goal(bpy.types.GizmoGroup):
 
     def setup(self, context):
         self._rings = {}
-        self.refresh(context)
-
-    def refresh(self, context):
-        marks = handles(context)
-        if marks.keys() != self._rings.keys():
-            self.gizmos.clear()
-            self._rings = {name: self._ring(name, colour) for name, (_, colour) in marks.items()}
+        self.draw_prepare(context)
 
     def draw_prepare(self, context):
         marks = handles(context)
+        # Rings are only added: one may be under the mouse.
+        for name, (_, colour) in marks.items():
+            if name not in self._rings:
+                self._rings[name] = self._ring(name, colour)
         for name, ring in self._rings.items():
             ring.hide = name not in marks
             if not ring.hide:

@@ -11,7 +11,7 @@ import bpy
 from bpy_extras import view3d_utils
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import KEY, drive, picture, seen, view, waited
+from driving import FOLDER, KEY, drive, picture, seen, view, waited
 from mouse import (
     at,
     click,
@@ -97,6 +97,12 @@ def drag():
     return seen["goal_from_grasp_m"] > 0.03
 
 
+def is_goal_set():
+    plan = bpy.context.scene.limber.plan
+    seen["goal"], seen["ball"] = [*plan.goal], [*goal().location]
+    return plan.use_goal
+
+
 def is_planned():
     jobs = part("jobs")
     if jobs.is_running() or not waited(1.0):
@@ -111,9 +117,13 @@ def is_planned():
     return seen["state"] == "DONE" and bool(seen["paths"])
 
 
-drive([open_sidebar, is_sidebar_open, point_at_tab, click, is_ours,
-       find("import_cloud"), click, is_browser_open, picture("browser"), point_at_file, click,
-       is_chosen, point_at_import, picture("chosen"), click, is_imported, picture("scan"),
-       find("reconstruct"), click, is_made, picture("branch"),
-       point_at_grasp, press, drag, picture("goal"), let_go,
-       find("plan"), click, is_planned, picture("path")], longest=400)
+steps = [
+    open_sidebar, is_sidebar_open, point_at_tab, click, is_ours,
+    find("import_cloud"), click, is_browser_open, picture("browser"), point_at_file, click,
+    is_chosen, point_at_import, picture("chosen"), click, is_imported, picture("scan"),
+    find("reconstruct"), click, is_made, picture("branch"),
+    point_at_grasp, press, drag, picture("goal"), let_go, is_goal_set, find("plan")]
+if (FOLDER / "plan").exists():
+    # It takes minutes.
+    steps += [click, is_planned, picture("path")]
+drive(steps, longest=400)

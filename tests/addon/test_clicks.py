@@ -1,5 +1,6 @@
 """How many clicks a new user needs, in a real Blender's window, from its factory start-up."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -24,21 +25,26 @@ def test_four_clicks_to_a_bent_branch(run, blender, environment, tmp_path):
 
 
 def test_an_own_scan_to_a_planned_path(run, blender, environment, tmp_path):
-    """The tab, import, the file, the branch, its grasp dragged to a goal, the plan: seven places to
-    press and one to confirm. The goal is where it was dragged to."""
+    """The tab, import, the file and its confirmation, the branch, its grasp dragged to a goal, the
+    plan. The goal is where it was dragged to.
+
+    Planning takes minutes, so the last click is made only where LIMBER_TEST_FIRST_PATH is set."""
     require_screen()
-    home = tmp_path / "home"
+    home, is_planned = tmp_path / "home", bool(os.environ.get("LIMBER_TEST_FIRST_PATH"))
     home.mkdir()
+    if is_planned:
+        (tmp_path / "plan").touch()
     generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud.write_ply(
         home / "scan.ply")
     caches = environment.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))
     seen = driven("drive_own_scan.py", blender,
                   environment | {"HOME": str(home), "XDG_CACHE_HOME": caches}, tmp_path,
                   (1280, 720), seconds=500)
-    assert seen["clicks"] <= 15
-    assert seen["file"] == "scan.ply"
-    assert seen["goal_from_grasp_m"] > 0.03
+    assert seen["clicks"] == 6 + is_planned
+    assert seen["file"] == "scan.ply" and seen["goal_from_grasp_m"] > 0.03
     assert seen["goal"] == pytest.approx(seen["ball"], abs=1e-6)
-    assert seen["state"] == "DONE" and seen["paths"]
-    for name in ("browser", "chosen", "scan", "branch", "goal", "path"):
+    for name in ("browser", "chosen", "scan", "branch", "goal"):
         assert colour_count(tmp_path / f"{name}.png") > 50
+    if is_planned:
+        assert seen["state"] == "DONE" and seen["paths"]
+        assert colour_count(tmp_path / "path.png") > 50

@@ -217,24 +217,6 @@ def test_grab(run, blender, environment, beam, tmp_path):
         assert colour_count(tmp_path / f"{name}.png") > 50
 
 
-def test_first_path(run, blender, environment, tmp_path):
-    """From an empty scene to a planned path by the panels' buttons alone; pictures of each step.
-
-    One to four minutes, so only where LIMBER_TEST_FIRST_PATH is set."""
-    if not os.environ.get("LIMBER_TEST_FIRST_PATH"):
-        pytest.skip("a long way: set LIMBER_TEST_FIRST_PATH=1")
-    require_screen()
-    scan = generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud
-    scan.write_ply(tmp_path / "scan.ply")
-    seen = driven("drive_first_path.py", blender, environment, tmp_path)
-    assert seen["points"] == len(scan.points)
-    assert seen["states"] == {"reconstruct": "DONE", "energy": "DONE", "plan": "DONE"}
-    assert seen["motion"] and seen["scan_hidden"]
-    assert any("path" in name for name in seen["objects"]) and "Goal" in seen["objects"]
-    for picture in ("1_empty", "2_scan", "3_branch", "4_path", "5_bent"):
-        assert colour_count(tmp_path / f"{picture}.png") > 50
-
-
 def test_manual_pictures(run, blender, environment, tmp_path):
     """The manual's pictures can be taken: a window each, with what it shows. Kept where
     LIMBER_MANUAL_PICTURES says, which alone has them taken."""
