@@ -203,6 +203,12 @@ def species() -> dict[str, Any]:
     return _content()["species"]
 
 
+def sensors(stage: str) -> dict[str, Any]:
+    """Return the sensor presets of a stage by name: ``title``, ``source`` and ``settings``."""
+    return {name: known for name, known in _content()["sensors"].items()
+            if known["stage"] == stage}
+
+
 @cache
 def _content() -> dict[str, Any]:
     content = json.loads(_FILE.read_text(encoding="utf-8"))

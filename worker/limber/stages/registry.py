@@ -189,12 +189,16 @@ def stage_schema(name: str) -> dict[str, Any]:
 
 
 def all_schemas() -> dict[str, Any]:
-    """Return the schemas of all stages by name, the format's version, and species presets."""
+    """Return the schemas of all stages by name, the format's version, and the presets of species
+    and sensors.
+    """
     from limber.mechanics.materials.species import SOURCE, SPECIES
+    from limber.recordings.sensor_presets import SENSORS
 
     return {"format": FORMAT,
             "species": {"source": SOURCE,
                         "presets": {name: asdict(known) for name, known in SPECIES.items()}},
+            "sensors": {name: asdict(known) for name, known in SENSORS.items()},
             "stages": {name: stage_schema(name) for name in stage_summaries()}}
 
 

@@ -1,0 +1,56 @@
+"""Presets of sensors: they set what the stage that reads the sensor's data takes, with a source."""
+
+import importlib
+
+import pytest
+
+from limber.recordings.sensor_presets import SENSORS
+from limber.stages.registry import stage_description
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_each_is_valid_for_its_stage(name):
+    """Of settings that the stage has, other than its defaults, and with a source."""
+    preset = SENSORS[name]
+    settings = stage_description(preset.stage).settings(**preset.settings)
+    assert {key: getattr(settings, key) for key in preset.settings}.keys() == preset.settings.keys()
+    assert len(preset.source) > 20
+
+
+def test_a_camera_of_millimetres(bpy, registered):
+    """Its unit, its up and its place are set; undone by the preset of another sensor."""
+    settings = bpy.context.scene.limber.reconstruct
+    assert bpy.ops.limber.sensor(sensor="azure_kinect") == {"FINISHED"}
+    assert (settings.unit, list(settings.up)) == ("mm", [0.0, -1.0, 0.0])
+    assert settings.use_camera_at and list(settings.camera_at) == [0.0] * 3
+    bpy.ops.limber.sensor(sensor="laser_scanner")
+    assert (settings.unit, list(settings.up)) == ("m", [0.0, 0.0, 1.0])
+    assert not settings.use_camera_at
+
+
+def test_a_force_sensor(bpy, registered):
+    """Half of the precision of its data sheet; the torque only where it is known."""
+    settings = bpy.context.scene.limber.import_pull
+    bpy.ops.limber.sensor(sensor="ur5e")
+    assert settings.force_sigma == pytest.approx(1.75)
+    assert settings.use_torque_sigma and settings.torque_sigma == pytest.approx(0.1)
+    bpy.ops.limber.sensor(sensor="ft300")
+    assert settings.force_sigma == pytest.approx(0.6) and not settings.use_torque_sigma
+
+
+def test_menus_offer_the_sensors_of_their_stage(bpy, registered):
+    """Every sensor in one menu, its title as text, its values and source as tooltip."""
+    presets = importlib.import_module("limber_addon.operators.presets")
+    offered = {}
+    for stage in presets.SENSED:
+        class Layout:
+            def operator(self, name, text, stage=stage):
+                offered.setdefault(stage, []).append(text)
+                return type("Given", (), {})()
+        menu = getattr(bpy.types, presets.sensor_menu(stage))
+        menu.draw(type("Menu", (), {"layout": Layout(), "stage": stage})(), bpy.context)
+    assert offered == {stage: [known.title for known in SENSORS.values() if known.stage == stage]
+                       for stage in presets.SENSED}
+    given = type("Given", (), {"sensor": "ur5e"})()
+    text = presets.LIMBER_OT_sensor.description(bpy.context, given)
+    assert "1.75 N" in text and "data sheet" in text
