@@ -53,6 +53,7 @@ class StageView:
 class Step:
     """One panel: its first stage. ``fields`` of it are above its button, the rest is folded in.
 
+    ``page`` is that of the guide about it.
     ``scene_operator`` replaces the stage's button if the step itself runs none.
     """
 
@@ -62,6 +63,7 @@ class Step:
     fields: tuple[str, ...] = ()
     scene_operator: tuple[str, str] = ()
     hint: str = ""
+    page: str = ""
 
     @property
     def others(self) -> tuple[StageView, ...]:
@@ -72,19 +74,22 @@ class Step:
 
 STEPS = (
     Step("scan", "Scan", StageView("reconstruct", ("input",)), fields=("cloud", "unit"),
-         scene_operator=("limber.import_cloud", "Import Scan")),
-    Step("skeleton", "Skeleton", StageView("reconstruct", ("shape", "running"))),
+         scene_operator=("limber.import_cloud", "Import Scan"), page="howto/scan"),
+    Step("skeleton", "Skeleton", StageView("reconstruct", ("shape", "running")),
+         page="howto/skeleton"),
     Step("mesh", "Mesh", StageView("reconstruct", ("mesh",)),
-         hint="Made together with the skeleton"),
+         hint="Made together with the skeleton", page="tutorials/scan_to_bend"),
     Step("material", "Material", StageView("reconstruct", ("material",)),
-         scene_operator=("limber.color_by", "Show Young's Modulus")),
-    Step("pulls", "Pulls", StageView("import-pull")),
-    Step("estimate", "Estimate", StageView("estimate")),
+         scene_operator=("limber.color_by", "Show Young's Modulus"),
+         page="explanation/loaded_branch"),
+    Step("pulls", "Pulls", StageView("import-pull"), page="howto/pulls"),
+    Step("estimate", "Estimate", StageView("estimate"), page="howto/intervals"),
     Step("plan", "Plan", StageView("plan"),
          fields=("goal", "max_detour", "max_force", "max_strain"),
-         hint="Samples the energy first where needed"),
-    Step("robot", "Robot", StageView("execute"), hint="A dry run comes first and moves nothing"),
-    Step("report", "Report", StageView("report")),
+         hint="Samples the energy first where needed", page="howto/limits"),
+    Step("robot", "Robot", StageView("execute"), hint="A dry run comes first and moves nothing",
+         page="howto/cell"),
+    Step("report", "Report", StageView("report"), page="reference/branch_folder"),
 )
 
 

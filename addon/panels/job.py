@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import jobs
+from .. import guide, jobs
 from ..lines import draw_text
 from ..plain_words import plain
 from .sidebar import SidebarPanel
@@ -23,6 +23,9 @@ class LIMBER_PT_job(SidebarPanel, bpy.types.Panel):
     def poll(cls, context):
         job = jobs.current()
         return jobs.is_running() or bool(jobs.waiting()) or (job is not None and bool(job.error))
+
+    def draw_header_preset(self, context):
+        guide.draw(self.layout, "job")
 
     def draw(self, context):
         job = jobs.current()

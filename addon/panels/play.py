@@ -3,7 +3,7 @@
 import bpy
 from bpy.app.handlers import persistent
 
-from .. import branches
+from .. import branches, guide
 from ..bridge import animation
 from .sidebar import SidebarPanel
 
@@ -17,6 +17,9 @@ class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
     def poll(cls, context):
         surface = branches.find_surface(context.scene)
         return surface is not None and animation.MODIFIER in surface.modifiers
+
+    def draw_header_preset(self, context):
+        guide.draw(self.layout, "play")
 
     def draw(self, context):
         playing = bool(context.screen) and context.screen.is_animation_playing

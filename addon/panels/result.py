@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import branches, compat, energy_field, preferences, properties, warming
+from .. import branches, compat, energy_field, guide, preferences, properties, warming
 from ..lines import draw_text
 from ..operators import live_loads, seeing
 from ..overlays import graph as viewport_graph
@@ -21,6 +21,7 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
 
     def draw_header_preset(self, context):
         warming.draw(self.layout)
+        guide.draw(self.layout, "result")
 
     def draw(self, context):
         settings = context.scene.limber

@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import branches, warming
+from .. import branches, guide, warming
 from ..lines import draw_text
 from .sidebar import SidebarPanel
 
@@ -20,6 +20,7 @@ class LIMBER_PT_start(SidebarPanel, bpy.types.Panel):
 
     def draw_header_preset(self, context):
         warming.draw(self.layout)
+        guide.draw(self.layout, "start")
 
     def draw(self, context):
         column = self.layout.column()

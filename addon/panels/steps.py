@@ -5,9 +5,10 @@ from typing import Any
 
 import bpy
 
-from .. import branch_folder, branches, jobs, properties, trouble_mark
+from .. import branch_folder, branches, guide, jobs, properties, trouble_mark
 from ..branch_folder import BranchRecord, StageRecord
 from ..lines import draw_text, has_room_beside
+from ..operators.presets import sensor_menu
 from ..plain_words import choice_title, first_sentence, plain, settings_in, stages_in
 from ..stages import Field, Stage, stages
 from ..steps import FIRST, PLACES, REGIONS, STEPS, WAYS, StageView, Step, StepState
@@ -31,8 +32,9 @@ class StepPanel(SidebarPanel):
     step: Step
 
     def draw_header_preset(self, context):
-        """Show its state, at the right end of the header."""
+        """Show its state and the way to its help, at the right end of the header."""
         self.layout.label(text="", icon=step_state(context.scene, self.step).icon)
+        guide.draw(self.layout, self.step.page)
 
     def draw(self, context):
         layout, step = self.layout, self.step
@@ -54,11 +56,13 @@ class StepPanel(SidebarPanel):
             _draw_scene_button(layout, context, step)
             if step.name == "scan":
                 layout.operator("limber.crop_scan", icon="CUBE")
+                layout.menu(sensor_menu("reconstruct"), text="Known Sensors")
         else:
             _draw_stage(layout, context, view, is_primary=True)
         if step.name == "skeleton":
             draw_skeleton(layout, context)
         if step.name == "pulls":
+            layout.menu(sensor_menu("import-pull"), text="Known Sensors")
             draw_pulls(layout, context)
         if step.name == "robot":
             draw_robot(layout, context)
