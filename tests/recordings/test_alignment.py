@@ -44,6 +44,25 @@ def test_clock_offset_is_found(plain_pull, offset):
     assert abs(found - offset) < 4 * sigma
 
 
+@pytest.mark.parametrize("quantum", [2e-4, 1e-3, 5e-3])
+def test_the_offsets_error_includes_the_rounding_of_the_poses(plain_pull, quantum):
+    """A pull one way with rounded poses: the offset is off by far more than noise explains."""
+    seen = np.linspace(0.2, 3.8, 120)
+    way = np.interp(seen, plain_pull.times, plain_pull.poses[:, 0])
+    off = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        positions = np.zeros((120, 2, 3))
+        positions[:, 0, 0], positions[:, 1, 0], positions[:, 1, 2] = 0.3 * way, 0.7 * way, -way**2
+        positions += 5e-5 * rng.standard_normal(positions.shape)
+        poses = plain_pull.poses.copy()
+        poses[:, 0] = quantum * np.round(poses[:, 0] / quantum + rng.uniform(-0.5, 0.5))
+        pull = replace(plain_pull, poses=poses, observations=Observations(seen, positions))
+        found, sigma = estimate_offset(pull)
+        off.append(found / sigma)
+    assert np.abs(off).max() < 3.0 and np.sqrt(np.mean(np.square(off))) < 1.5
+
+
 def test_an_offset_that_nothing_shows_is_not_invented(plain_pull):
     """Of a branch that does not move, no offset is claimed."""
     seen = plain_pull.observations

@@ -13,6 +13,10 @@ from limber.recordings.force_slope import force_slope, read_force_displacement
 DATA = Path(__file__).parents[1] / "data" / "blueberry_cane_push"
 
 
+def columns(table):
+    return table.displacement, table.force
+
+
 def test_slope_contact_and_offset_of_a_known_push():
     """A hinge with offset and noise: slope, contact and reading without load come back."""
     rng = np.random.default_rng(0)
@@ -52,7 +56,7 @@ def test_units_come_from_the_header(tmp_path):
     rows = "".join(f"{100 * k},{k}\n" for k in range(6))
     path = tmp_path / "a.csv"
     path.write_text("Load Cell Reading (gf),Displacement (mm)\n" + rows)
-    way, force, _ = read_force_displacement(path)
+    way, force = columns(read_force_displacement(path))
     assert force[1] == pytest.approx(0.980665) and way[1] == pytest.approx(1e-3)
     path.write_text("force,displacement_mm\n" + rows)
     with pytest.raises(InputError, match="unit"):
@@ -64,8 +68,8 @@ def test_incomplete_rows_are_dropped_with_a_word(tmp_path):
     rows = "".join(f"{0.1 * k},{k}\n" for k in range(8))
     path = tmp_path / "a.csv"
     path.write_text("force (N),displacement (mm)\n" + rows + "0.9")
-    way, _, warnings = read_force_displacement(path)
-    assert len(way) == 8 and "incomplete" in warnings[0]
+    table = read_force_displacement(path)
+    assert len(table.force) == 8 and "incomplete" in table.warnings[0]
 
 
 def test_recorded_canes():
@@ -76,8 +80,9 @@ def test_recorded_canes():
     assert len(files) == 27
     off = []
     for path in files:
-        way, force, warnings = read_force_displacement(path)
-        found = force_slope(way, force, warnings=warnings)
+        table = read_force_displacement(path)
+        way, force = columns(table)
+        found = force_slope(way, force, warnings=table.warnings)
         over = force > 20 * 9.80665e-3
         plain = np.polyfit(way[over], force[over], 1)[0]
         assert 10 < found.interval[0] < found.slope < found.interval[1] < 2000
@@ -151,7 +156,7 @@ def test_headers_of_other_load_cells(tmp_path, header, row, newtons, metres):
     rows = "".join(row.format(k=k, f=10 + k, d=0.5 * k) + "\n" for k in range(8))
     path = tmp_path / "a.csv"
     path.write_text(f"{header}\n{rows}")
-    way, force, _ = read_force_displacement(path)
+    way, force = columns(read_force_displacement(path))
     assert force[2] == pytest.approx(12 * newtons) and way[2] == pytest.approx(metres)
 
 

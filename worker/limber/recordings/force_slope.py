@@ -22,6 +22,8 @@ from limber.recordings.time_series import saturated
 NOISE_FLOOR_N = 20 * FORCE_UNITS_N["gf"]
 """Force above the unloaded reading that counts as contact [N]; a drop of twice as much is a slip.
 """
+_DISTANCE = r"distance|along|from.?(the.?)?base"
+"""Title of the column that states where the branch was loaded."""
 OBSTACLE = 2.0
 """Growth factor of the slope at a bend above which there is an obstacle behind the branch."""
 STIFFENING = 0.3
@@ -68,12 +70,30 @@ class ForceSlope:
     warnings: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class ForceTable:
+    """Readings in the file's order.
+
+    Attributes:
+        displacement: [m], shape [n].
+        force: [N], shape [n].
+        distance: Distance of the load from the base along the branch [m]; None: not in the table.
+        warnings: Problems found in the file.
+    """
+
+    displacement: np.ndarray
+    force: np.ndarray
+    distance: float | None = None
+    warnings: tuple[str, ...] = ()
+
+
 def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: str | None = None,
-                            ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+                            ) -> ForceTable:
     """Read displacement [m] and force [N] in the file's order; units are those of the header.
 
     Columns are found by name: ``Load Cell Reading (gf)`` or ``force [N]``, ``Displacement (mm)``,
-    with any separator and preamble. Incomplete rows are dropped with a warning.
+    with any separator and preamble; a third column such as ``distance from base (cm)`` states
+    where the branch was loaded. Incomplete rows are dropped with a warning.
 
     Args:
         path: The file.
@@ -81,7 +101,8 @@ def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: 
         force_unit: Unit of the force, instead of the header's.
 
     Raises:
-        InputError: a column or its unit is missing, or fewer than 5 rows remain.
+        InputError: a column or its unit is missing, fewer than 3 rows remain, or the branch was
+            loaded at several distances.
     """
     table = read_table(path)
     force_at, force_scale = _column(table, r"force|load", FORCE_NAMES_N, force_unit)
@@ -92,10 +113,27 @@ def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: 
     warnings = list(table.warnings)
     if len(kept) < len(pairs):
         warnings.append(f"{path.name}: {len(pairs) - len(kept)} incomplete row(s) were discarded.")
-    if len(kept) < 5:
-        raise InputError(f"{path} has {len(kept)} complete rows.", "A slope needs at least five.",
+    if len(kept) < 3:
+        raise InputError(f"{path} has {len(kept)} complete rows.", "A slope needs at least three.",
                          "Record more of the push.")
-    return kept[:, 0] * moved_scale, kept[:, 1] * force_scale, tuple(warnings)
+    return ForceTable(kept[:, 0] * moved_scale, kept[:, 1] * force_scale,
+                      _distance(table, path), tuple(warnings))
+
+
+def _distance(table: Table, path: Path) -> float | None:
+    """Distance of the load from the base [m], if the table has such a column."""
+    if not any(re.search(_DISTANCE, split_title(title).name.lower()) for title in table.titles):
+        return None
+    at, scale = _column(table, _DISTANCE, LENGTH_UNITS_M, None)
+    column = table.values[:, at]
+    found = np.unique(column[np.isfinite(column)]) * scale
+    if len(found) > 1:
+        raise InputError(
+            f"{path}: the branch was loaded at {', '.join(f'{value:.4g}' for value in found)} m "
+            "from its base.", "A pull has one grasp point.",
+            "Make a table for each distance, and import each as a pull of its own. An estimate "
+            "uses all of them together.")
+    return float(found[0]) if len(found) else None
 
 
 def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[str, ...] = (),

@@ -45,6 +45,8 @@ class SensorEntry(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     position_sigma_m: float = Field(1e-3, gt=0)
+    measured_direction: Vector | None = Field(
+        None, description="Positions were measured along this direction alone, as with a ruler.")
     force_sigma_n: float = Field(0.1, gt=0)
     torque_sigma_nm: float | None = Field(None, gt=0)
     force_range_n: float | None = Field(None, gt=0)

@@ -5,6 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, field_validator
 
 from limber.core.settings import (
+    Direction,
     GraspMode,
     Groups,
     OneOf,
@@ -23,8 +24,8 @@ class ImportSettings(Settings):
             "coordinates", "time_offset", "recorded", "yolo_weights", "yolo_prompt", "yolo_class"),
         "bags and robot logs": ("cell", "frame_pose", "wrench_topic", "pose_topic",
             "points_topic", "bag_clock"),
-        "grasp and loads": ("grasp_point", "grasp_radius", "grasp_mode", "weight", "load",
-            "own_weight"),
+        "grasp and loads": ("grasp_point", "grasp_distance", "grasp_radius", "grasp_mode",
+            "direction", "weight", "load", "own_weight"),
         "simulation": ("drive", "motion", "swing_start"),
         "noise": ("position_sigma", "force_sigma", "torque_sigma", "pull_toml"),
     }
@@ -56,6 +57,12 @@ class ImportSettings(Settings):
     grasp_point: tuple[float, float, float] | None = Field(
         None, description="Position of the grasp or the load at rest [m]. Default: the robot's "
         "first pose.")
+    grasp_distance: float | None = Field(
+        None, gt=0, description="Instead of --grasp-point: its distance from the base along the "
+        "main path [m]. Default for a force table: its column of that distance.")
+    direction: Direction = Field(
+        (0.0, 0.0, -1.0), description="Direction of force and displacement in a force table, in "
+        "the frame of --coordinates.")
     grasp_radius: float = Field(
         0.01, gt=0, description="Radius of the grasp patch, or half the length of the piece that "
         "a clamping gripper holds [m].")

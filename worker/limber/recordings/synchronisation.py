@@ -14,6 +14,9 @@ from limber.core.numerics.rigid import poses_at
 from limber.recordings.recording import Pull
 from limber.recordings.time_series import gaps, inside_gap
 
+UNMEASURED_M = 1.0
+"""Standard deviation of a position across the direction in which a ruler measures it."""
+
 
 @dataclass(frozen=True)
 class Frames:
@@ -52,15 +55,14 @@ def frames_of(pull: Pull) -> Frames:
     Raises:
         InputError: the clocks do not overlap, or there is nothing to compare.
     """
-    sigma = pull.entry.sensor.position_sigma_m
     seen = pull.observations
     if seen is None:
         times, positions = pull.times, np.full((len(pull.times), 0, 3), np.nan)
         covariance = np.zeros((len(times), 0, 3, 3))
     else:
         times, positions = seen.times + pull.entry.time_offset_s, seen.positions
-        isotropic = np.broadcast_to(sigma**2 * np.eye(3), (*positions.shape, 3))
-        covariance = isotropic if seen.covariance is None else seen.covariance
+        alike = np.broadcast_to(_reading_covariance(pull), (*positions.shape, 3))
+        covariance = alike if seen.covariance is None else seen.covariance
     slack = 0.5 * np.median(np.diff(pull.times))
     usable = (times >= pull.times[0] - slack) & (times <= pull.times[-1] + slack)
     usable &= ~inside_gap(times, gaps(pull.times))
@@ -79,13 +81,24 @@ def frames_of(pull: Pull) -> Frames:
                   positions[usable], np.array(covariance[usable]), warnings)
 
 
+def _reading_covariance(pull: Pull) -> np.ndarray:
+    """Covariance of one reading of a position [m^2], shape [3, 3]."""
+    sensor = pull.entry.sensor
+    if sensor.measured_direction is None:
+        return sensor.position_sigma_m**2 * np.eye(3)
+    along = np.array(sensor.measured_direction) / np.linalg.norm(sensor.measured_direction)
+    across = np.eye(3) - np.outer(along, along)
+    return sensor.position_sigma_m**2 * np.outer(along, along) + UNMEASURED_M**2 * across
+
+
 def estimate_offset(pull: Pull, *, limit_s: float = 1.0) -> tuple[float, float]:
     """Find the offset [s] to add to the observations' stamps, and its standard deviation.
 
     Without inertia the observed motion is a smooth function of the gripper's pose. The offset
     returned is the one for which a quadratic function of the pose best fits the observed points.
     A pull at constant speed, started and ended out of view, does not determine it: the standard
-    deviation is then infinite.
+    deviation is then infinite. It includes the rounding of poses and positions: as long as a
+    rounded value stays the same, its error does not average out.
     """
     seen = pull.observations
     if seen is None or len(seen.times) < 12:
@@ -93,12 +106,20 @@ def estimate_offset(pull: Pull, *, limit_s: float = 1.0) -> tuple[float, float]:
     whole = seen.visible.all(axis=0) if seen.visible.all(axis=0).any() else seen.visible.any(axis=0)
     positions = seen.positions[:, whole]
     rows = np.isfinite(positions).all(axis=(1, 2))
-    target = positions[rows].reshape(rows.sum(), -1)
-    target = target - target.mean(axis=0)
+    observed = positions[rows].reshape(rows.sum(), -1)
+    target = observed - observed.mean(axis=0)
+
+    quanta = _quanta(pull.poses)
+    smooth = np.column_stack([
+        _unrounded(pull.times, each) if quantum > 0 else each
+        for each, quantum in zip(pull.poses.T, quanta, strict=True)])
+
+    def at(offset: float, poses: np.ndarray = smooth) -> np.ndarray:
+        moments = np.clip(seen.times[rows] + offset, pull.times[0], pull.times[-1])
+        return poses_at(pull.times, poses, moments)
 
     def unexplained(offset: float) -> float:
-        moments = np.clip(seen.times[rows] + offset, pull.times[0], pull.times[-1])
-        features = _quadratic_features(poses_at(pull.times, pull.poses, moments))
+        features = _Quadratic.of(at(offset)).features(at(offset))
         solved = np.linalg.lstsq(features, target, rcond=1e-9)[0]
         return float(np.mean((target - features @ solved)**2))
 
@@ -113,19 +134,100 @@ def estimate_offset(pull: Pull, *, limit_s: float = 1.0) -> tuple[float, float]:
     beside = unexplained(found.x + step) + unexplained(found.x - step)
     curvature = (beside - 2 * found.fun) / step**2
     noise = max(found.fun, 1e-16)
-    informative = curvature > 0 and np.ptp(cost) > 0.2 * noise + 1e-16
-    sigma = float(np.sqrt(2 * noise / (curvature * target.size))) if informative else np.inf
-    return (float(found.x), sigma) if np.isfinite(sigma) else (start, sigma)
+    if not (curvature > 0 and np.ptp(cost) > 0.2 * noise + 1e-16):
+        return start, np.inf
+    kept = np.searchsorted(pull.times, seen.times[rows] + found.x).clip(0, len(pull.times) - 1)
+    rounded = _rounding(pull.poses[kept], quanta, observed,
+                        [at(found.x + k * step) for k in (-1, 0, 1)], step)
+    return float(found.x), float(np.hypot(np.sqrt(2 * noise / (curvature * target.size)), rounded))
 
 
-def _quadratic_features(poses: np.ndarray) -> np.ndarray:
-    centred = poses - poses.mean(axis=0)
-    _, size, axes = np.linalg.svd(centred, full_matrices=False)
-    along = centred @ axes[size > 1e-3 * size[0] + 1e-12].T
-    if along.shape[1]:
-        along = along / np.abs(along).max(axis=0)
-    pairs = [along[:, i] * along[:, j] for i in range(along.shape[1]) for j in range(i + 1)]
-    return np.column_stack([np.ones(len(poses)), along, *pairs])
+@dataclass(frozen=True)
+class _Quadratic:
+    """Quadratic functions of a pose along the directions in which it moves."""
+
+    middle: np.ndarray
+    axes: np.ndarray
+    size: np.ndarray
+
+    @classmethod
+    def of(cls, poses: np.ndarray) -> "_Quadratic":
+        centred = poses - poses.mean(axis=0)
+        _, size, axes = np.linalg.svd(centred, full_matrices=False)
+        axes = axes[size > 1e-3 * size[0] + 1e-12].T
+        return cls(poses.mean(axis=0), axes, np.abs(centred @ axes).max(axis=0, initial=0.0))
+
+    def features(self, poses: np.ndarray) -> np.ndarray:
+        along = (poses - self.middle) @ self.axes / self.size
+        pairs = [along[:, i] * along[:, j] for i in range(along.shape[1]) for j in range(i + 1)]
+        return np.column_stack([np.ones(len(poses)), along, *pairs])
+
+
+def _rounding(rounded: np.ndarray, quanta: np.ndarray, observed: np.ndarray,
+              poses: list[np.ndarray], step: float) -> float:
+    """Standard deviation of the offset from rounded poses and positions [s].
+
+    Args:
+        rounded: Recorded poses at the observed frames [m, rad], shape [f, 6].
+        quanta: Steps to which they were rounded, shape [6].
+        observed: Positions at the observed frames [m], shape [f, c].
+        poses: At the found offset less ``step`` [s], at it, and at it plus ``step``, [f, 6] each.
+    """
+    before, middle, after = poses
+    target = observed - observed.mean(axis=0)
+    basis = _Quadratic.of(middle)
+    features = basis.features(middle)
+    solved = np.linalg.lstsq(features, target, rcond=1e-9)[0]
+    speed = (basis.features(after) - basis.features(before)) @ solved / (2 * step)
+    spanned = np.linalg.qr(features)[0]
+    weight = speed - spanned @ (spanned.T @ speed)
+    variance = 0.0
+    for column, quantum in enumerate(quanta):
+        if quantum > 0:
+            moved = middle + quantum / 12**0.5 * np.eye(6)[column]
+            error = (basis.features(moved) - features) @ solved
+            variance += _coherent((weight * error).sum(axis=1), rounded[:, column])
+    for column, quantum in enumerate(_quanta(observed)):
+        if quantum > 0:
+            variance += _coherent(weight[:, column] * quantum / 12**0.5, observed[:, column])
+    return float(np.sqrt(variance) / max(np.sum(weight**2), 1e-300))
+
+
+def _coherent(effect: np.ndarray, values: np.ndarray) -> float:
+    """Variance of a sum of errors that are the same as long as a value stays the same, [f] each.
+
+    Those of neighbouring values are related as well, so the deviations add up.
+    """
+    runs = np.r_[0, np.cumsum(np.diff(values) != 0)]
+    return float(np.sum(np.abs(np.bincount(runs, effect))))**2
+
+
+def _unrounded(times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """A rounded course without its steps: halfway between two levels where it changes, [n]."""
+    last = np.flatnonzero(np.diff(values) != 0)
+    moments, levels = (0.5 * (each[last] + each[last + 1]) for each in (times, values))
+    # Runs at both ends, and where the motion reverses, stay at their level in between.
+    widths = np.diff(moments, prepend=moments[0], append=moments[-1])
+    still = [(times[0], values[0]), (times[-1], values[-1])]
+    if len(moments) > 1:
+        still += [(max(times[0], moments[0] - widths[1] / 2), values[0]),
+                  (min(times[-1], moments[-1] + widths[-2] / 2), values[-1])]
+    turns = np.flatnonzero(np.diff(levels) == 0)
+    still += [(0.5 * (moments[k] + moments[k + 1]), values[last[k] + 1]) for k in turns]
+    knots = np.array(sorted([*zip(moments, levels, strict=True), *still]))
+    return np.interp(times, *knots.T)
+
+
+def _quanta(values: np.ndarray) -> np.ndarray:
+    """Step to which each column was rounded; 0: not rounded, or constant. Shape [c]."""
+    found = np.zeros(values.shape[1])
+    for column, each in enumerate(values.T):
+        steps = np.diff(np.unique(each))
+        steps = steps[steps > 1e-9 * max(np.abs(each).max(), 1e-9)]
+        counts = (each - each.min()) / steps.min(initial=np.inf)
+        if len(steps) and np.abs(counts - np.round(counts)).max() < 0.02:
+            found[column] = steps.min()
+    return found
 
 
 def _mean_wrenches(pull: Pull, at_times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

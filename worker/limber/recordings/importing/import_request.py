@@ -30,11 +30,31 @@ class BranchFrame:
         gravity: [m/s^2] in the branch's frame.
         nodes: Nodes of its mesh [m], shape [n, 3]; needed for a steady load. None: there is no mesh
             yet to compare with.
+        path: Nodes of its main path from base to tip [m], shape [m, 3].
     """
 
     alignment: Alignment = field(default_factory=Alignment)
     gravity: tuple[float, float, float] = GRAVITY
     nodes: np.ndarray | None = None
+    path: np.ndarray | None = None
+
+    def at(self, distance: float) -> np.ndarray:
+        """Return the point at a distance from the base along the main path [m], shape [3].
+
+        Raises:
+            InputError: there is no skeleton, or its main path is shorter.
+        """
+        if self.path is None:
+            raise InputError("The branch has no skeleton.",
+                             "A distance is measured along the main path.",
+                             "Give --grasp-point, or reconstruct the branch first.")
+        along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(self.path, axis=0), axis=1))]
+        if distance > along[-1]:
+            raise InputError(f"The position of the grasp is {distance:g} m from the base, but the "
+                             f"main path is {along[-1]:.3g} m long.",
+                             "There is no branch to hold at that distance.",
+                             "Check the distance and its unit, or give --grasp-point.")
+        return np.array([np.interp(distance, along, axis) for axis in self.path.T])
 
 
 @dataclass(frozen=True)
@@ -105,8 +125,11 @@ class ImportRequest:
 
     def grasp_or(self, otherwise: Callable[[], np.ndarray]) -> tuple[float, float, float]:
         """Return the grasp point in the branch's frame [m]; if none was given, the alternative."""
-        point = self.settings.grasp_point
-        x, y, z = otherwise()[:3] if point is None else self.in_branch(np.array([point]))[0]
+        point, distance = self.settings.grasp_point, self.settings.grasp_distance
+        if point is not None:
+            x, y, z = self.in_branch(np.array([point]))[0]
+        else:
+            x, y, z = otherwise()[:3] if distance is None else self.branch.at(distance)
         return float(x), float(y), float(z)
 
     def registered(self, rest: np.ndarray, labels: list[str]) -> Registration | None:

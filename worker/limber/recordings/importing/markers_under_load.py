@@ -8,7 +8,8 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.not_none import present
-from limber.recordings.cell_errors import WITHOUT_GRIPPER
+from limber.recordings.cell_errors import WITHOUT_GRIPPER, CalibrationEntry
+from limber.recordings.force_slope import ForceTable
 from limber.recordings.hung_load import settled, swung
 from limber.recordings.importing.import_request import (
     ImportRequest,
@@ -18,6 +19,9 @@ from limber.recordings.importing.import_request import (
 from limber.recordings.importing.recording_formats import RecordingFormat
 from limber.recordings.recording import Observations, Pull, SwingEntry, write_pull
 from limber.recordings.time_series import Stream
+
+UNLOADED = 0.01
+"""Fraction of the largest force of a table below which the branch is unloaded."""
 
 
 def require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
@@ -36,10 +40,10 @@ def require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
         raise InputError("Both --weight and --load were given.", "The branch carries one load.",
                          "Give only one of them.")
     sags = settings.weight == 0 and settings.own_weight
-    if settings.grasp_point is None and not sags:
+    if settings.grasp_point is None and settings.grasp_distance is None and not sags:
         raise InputError("A load was given without its position.",
                          "The deflection of the branch depends on that position.",
-                         "Give --grasp-point.")
+                         "Give --grasp-point or --grasp-distance.")
     if settings.motion == "dynamic":
         raise InputError("A steady load was given for a dynamic pull.",
                          "A branch under a steady load either swings after release or is at rest.",
@@ -143,6 +147,50 @@ def _write(request: ImportRequest, found: _Placed, times: np.ndarray, moved: np.
     wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))
     write_pull(request.folder, Pull(request.name, entry, times[[0, -1]], poses, wrenches,
                                     Observations(times, found.positions)))
+
+
+def import_gauge(table: ForceTable, request: ImportRequest) -> dict[str, Any]:
+    """Make a pull of a test with force gauge and ruler, and return its numbers.
+
+    The branch was pulled in one direction, and its displacement was read in that direction at the
+    point where the gauge held it. A row without force, if there is one, is the ruler's zero.
+
+    Raises:
+        InputError: there is no mesh, the grasp is not on the branch, or the force is always zero.
+    """
+    settings, nodes = request.settings, request.branch.nodes
+    if nodes is None:
+        raise InputError("The branch has no mesh yet.", "The position of the load is on it.",
+                         "Reconstruct the branch first.")
+    peak = float(np.abs(table.force).max())
+    if peak == 0.0:
+        raise InputError(f"{request.source.name} has no force.", "Nothing pulled the branch.",
+                         "Check the columns of the table.")
+    for message in table.warnings:
+        request.progress.warn(message)
+    unloaded = np.abs(table.force) <= UNLOADED * peak
+    zero = float(table.displacement[unloaded].mean()) if unloaded.any() else 0.0
+    direction = np.array(settings.direction) / np.linalg.norm(settings.direction)
+    if settings.coordinates == "scan":
+        direction = np.array(request.branch.alignment.rotation) @ direction
+    point = np.array(request.grasp_or(lambda: nodes[0]))
+    entry = request.entry("markers", point[None], drive="force", mode="pinned",
+                          sigma=settings.position_sigma or 1e-3, grasp=tuple(point.tolist()))
+    entry = request.as_stated(entry.model_copy(update={
+        "calibration": WITHOUT_GRIPPER.model_copy(update={
+            "point_sigma_m": CalibrationEntry().point_sigma_m, "camera_sigma_rad": 0.0}),
+        "sensor": entry.sensor.model_copy(
+            update={"measured_direction": tuple(direction.tolist())})}))
+    require_on_branch(entry.grasp, request.name, nodes)
+    times = np.arange(len(table.force), dtype=float)
+    seen = point + (table.displacement - zero)[:, None, None] * direction
+    poses, wrenches = np.zeros((2, len(times), 6))
+    poses[:, :3], wrenches[:, :3] = seen[:, 0], table.force[:, None] * direction
+    write_pull(request.folder, Pull(request.name, entry, times, poses, wrenches,
+                                    Observations(times, seen)))
+    return {"frame_count": len(times), "point_count": 1, "time_offset_s": 0.0,
+            "load_n": (peak * direction).tolist(),
+            "displacement_m": (seen[np.argmax(np.abs(table.force))] - point).tolist()}
 
 
 def _nearest(nodes: np.ndarray, point: np.ndarray) -> np.ndarray:

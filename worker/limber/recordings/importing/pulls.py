@@ -7,14 +7,19 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope
+from limber.recordings.cell_errors import calibration_of
+from limber.recordings.force_slope import WHY_NO_MODULUS, ForceTable, force_slope
 from limber.recordings.importing.import_request import (
     ImportRequest,
     of_known_robot,
     require_near,
     require_on_branch,
 )
-from limber.recordings.importing.markers_under_load import import_load, require_loadable
+from limber.recordings.importing.markers_under_load import (
+    import_gauge,
+    import_load,
+    require_loadable,
+)
 from limber.recordings.importing.readers import read_robot
 from limber.recordings.importing.recording_formats import (
     RECORDINGS,
@@ -43,8 +48,8 @@ def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
 
     Returns:
         ``frame_count``, ``point_count``, ``time_offset_s``; for a steady load ``displacement_m``,
-        ``settled_s`` and ``registration_rms_m``; for a force table ``slope_n_per_m``,
-        ``slope_interval_n_per_m`` and ``why_no_modulus``.
+        ``settled_s`` and ``registration_rms_m``; for a force table without the position of
+        the load ``slope_n_per_m``, ``slope_interval_n_per_m`` and ``why_no_modulus``.
 
     Raises:
         InputError: the recording cannot be read as its stated kind.
@@ -52,7 +57,12 @@ def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
     request.progress(0.1, f"reading {kind}")
     chosen, settings = recording_format(kind), request.settings
     if chosen.holds == "force":
-        return _import_force(_read(chosen, request), request)
+        table = _read(chosen, request)
+        if table.distance is not None and not request.stated & {"grasp_point", "grasp_distance"}:
+            request = replace(request, settings=settings.model_copy(
+                update={"grasp_distance": table.distance}))
+        is_placed = request.stated & {"grasp_point", "grasp_distance"}
+        return (import_gauge if is_placed else _import_force)(table, request)
     if settings.weight is not None or settings.load is not None:
         require_loadable(chosen, request)
         return import_load(_read(chosen, request), request)
@@ -69,10 +79,9 @@ def _read(chosen: RecordingFormat, request: ImportRequest) -> Any:
     return read
 
 
-def _import_force(read: tuple[np.ndarray, np.ndarray, tuple[str, ...]], request: ImportRequest,
-                  ) -> dict[str, Any]:
-    displacement, force, warnings = read
-    found = force_slope(displacement, force, warnings=warnings)
+def _import_force(read: ForceTable, request: ImportRequest) -> dict[str, Any]:
+    displacement, force = read.displacement, read.force
+    found = force_slope(displacement, force, warnings=read.warnings)
     for message in found.warnings:
         request.progress.warn(message)
     request.progress.warn(f"{request.source.name} does not give a modulus. {WHY_NO_MODULUS}")
@@ -128,7 +137,10 @@ def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEn
     entry = pull.entry.model_copy(update={"time_offset_s": offset})
     found, sigma = estimate_offset(replace(pull, entry=entry))
     if sigma < 0.02:
-        return entry.model_copy(update={"time_offset_s": found})
+        known = calibration_of(entry)
+        is_wider = sigma > known.clock_sigma_s > 0
+        return entry.model_copy(update={"time_offset_s": found} | ({
+            "calibration": known.model_copy(update={"clock_sigma_s": sigma})} if is_wider else {}))
     request.progress.warn(
         f"{pull.name}: the offset between the clocks cannot be determined from this pull. "
         f"{offset:g} s is assumed.")

@@ -9,7 +9,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.files.safe_names import refuse_links
-from limber.recordings.force_slope import read_force_displacement
+from limber.recordings.force_slope import ForceTable, read_force_displacement
 from limber.recordings.image_folders import copy_clouds, copy_rgbd, moved_into
 from limber.recordings.importing.import_request import ImportRequest
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, Pull, read_pull
@@ -42,9 +42,8 @@ def is_force_table(path: Path) -> bool:
     return moved and any(re.search(r"force|load", name) for name in names)
 
 
-def read_force_table(path: Path, request: ImportRequest,
-                     ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return displacements [m], forces [N] and warnings."""
+def read_force_table(path: Path, request: ImportRequest) -> ForceTable:
+    """Return displacements [m] and forces [N]."""
     return read_force_displacement(path, unit=request.settings.unit,
                                    force_unit=request.settings.force_unit)
 

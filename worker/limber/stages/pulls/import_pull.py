@@ -74,7 +74,8 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
         for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
             stage.remove(old)
         folder = stage.path(prefix + "pull.toml").parent
-        frame = BranchFrame() if is_force else _frame(branch, settings)
+        is_bare = is_force and not branch.has("mesh.vtu")
+        frame = BranchFrame() if is_bare else _frame(branch, settings)
         in_branch = settings.model_copy(update=_poses_in_branch(given, branch))
         stage.result.update(import_recording(kind, ImportRequest(
             source, folder, name, in_branch, frame, robot, progress)))
@@ -126,11 +127,15 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
 
 def _frame(branch: Branch, settings: ImportSettings) -> BranchFrame:
     from limber.recordings.importing.import_request import BranchFrame
-    from limber.store.loading import load_mesh
+    from limber.store.loading import load_mesh, load_skeleton
 
     loaded = settings.weight is not None or settings.load is not None
+    path = None
+    if branch.has("skeleton.swc"):
+        skeleton = load_skeleton(branch)
+        path = skeleton.nodes[skeleton.main_path()]
     return BranchFrame(branch.manifest.alignment, branch.gravity,
-                       load_mesh(branch).nodes if loaded or branch.has("mesh.vtu") else None)
+                       load_mesh(branch).nodes if loaded or branch.has("mesh.vtu") else None, path)
 
 
 def _digest(path: Path) -> str:
