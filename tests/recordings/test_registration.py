@@ -33,6 +33,7 @@ def test_a_marker_without_a_place_is_named():
 
 @pytest.mark.parametrize(("points", "labels", "nominal", "word"), [
     (captured(NOMINAL), [*LABELS[:4], "x"], NOMINAL, "e has a nominal position"),
+    (captured(NOMINAL), ["u", "v", "w", "x", "y"], NOMINAL, "markers u, v, w, x, y"),
     (captured(NOMINAL * [1, 1, -1]), LABELS, NOMINAL, "mirrored"),
     (captured(NOMINAL[[1, 0, 2, 3, 4]]), LABELS, NOMINAL, "a and b"),
     (captured(NOMINAL * [1, 0, 0]), LABELS, NOMINAL * [1, 0, 0], "on a line"),

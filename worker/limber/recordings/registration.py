@@ -2,7 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,6 @@ POOR_FIT_M = 5e-3
 """Residual of a rigid fit at a marker above which it is reported."""
 COLLINEAR = 0.03
 """Ratio of extents across and along a line from which markers span a triangle."""
-_MOST_FOR_PERMUTATION = 7
 
 
 @dataclass(frozen=True)
@@ -82,9 +81,7 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
              nominal: np.ndarray, name: str) -> Registration:
     """Fit markers at rest rigidly to their nominal positions.
 
-    Markers are paired by name. If no name matches and both have the same number, they are paired by
-    order, or by the order that fits best. An outlier is excluded from the fit if three others
-    agree.
+    Markers are paired by name. An outlier is excluded from the fit if three others agree.
 
     Args:
         points: At rest in the capture frame [m], shape [n, 3].
@@ -99,10 +96,6 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
     """
     pairs = [(k, j) for k, label in enumerate(labels) for j, known in enumerate(nominal_labels)
              if same_label(label, known) and np.isfinite(points[k]).all()]
-    messages = []
-    if len(pairs) < 3 and len(labels) == len(nominal_labels) and np.isfinite(points).all():
-        pairs, pairing = _paired_by_fit(points, nominal)
-        messages.append(f"{name}: the markers' names do not match the nominal names; {pairing}.")
     if len(pairs) < 3:
         raise InputError(
             f"{name}: the recording has the markers {', '.join(labels)}. Nominal positions are "
@@ -111,7 +104,7 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
             "Use the recording's labels in the table of nominal positions.")
     used = np.array([k for k, _ in pairs])
     target = nominal[[j for _, j in pairs]]
-    messages += _unpaired(labels, nominal_labels, pairs, name)
+    messages = _unpaired(labels, nominal_labels, pairs, name)
     _require_body(target, name)
     _require_same_body(points[used], target, [labels[k] for k in used], name)
     inlier = _consistent(points[used], target)
@@ -200,17 +193,3 @@ def _consistent(points: np.ndarray, target: np.ndarray) -> np.ndarray:
             break
         keep[worst] = False
     return keep
-
-
-def _paired_by_fit(points: np.ndarray, nominal: np.ndarray) -> tuple[list[tuple[int, int]], str]:
-    order = tuple(range(len(points)))
-    rms = float(np.sqrt(np.mean(_residuals(points, nominal)**2)))
-    pairing = "they were paired in order"
-    if rms > POOR_FIT_M and len(points) <= _MOST_FOR_PERMUTATION:
-        found = min(permutations(order), key=lambda p: float(
-            np.sum(_residuals(points, nominal[list(p)])**2)))
-        better = float(np.sqrt(np.mean(_residuals(points, nominal[list(found)])**2)))
-        if better < rms / 3:
-            order, rms = found, better
-            pairing = "they were paired by the best fit"
-    return [(k, order[k]) for k in range(len(points))], f"{pairing} ({rms * 1e3:.1f} mm RMS)"
