@@ -8,11 +8,19 @@ from tests.estimation.test_nuisances import TRUTH, objective_of
 
 from benchmarks.paper_branches import measured
 from limber.estimation.fitting.objective import Objective
-from limber.estimation.parameters import Values
+from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.simulated_pull import VirtualPullSettings, simulate_pull
 from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.model_error import ModelError
-from limber.estimation.uncertainty.next_actions import ANOTHER_PULL, Prospects
+from limber.estimation.uncertainty.next_actions import (
+    ANOTHER_PULL,
+    TORQUE_SIGMA_NM,
+    Prospects,
+)
+from limber.estimation.uncertainty.path_error import path_error
 from limber.recordings.cell_errors import CalibrationEntry
+from limber.recordings.synchronisation import frames_of
 
 CELL = CalibrationEntry(force_bias_sigma_n=0.5, force_drift_sigma_n=0.5, repeat_sigma=0.03)
 UNIT = {"variance_factor": 1.0, "repetition": 1.0}
@@ -64,6 +72,42 @@ def test_a_calibration_gives_what_was_promised(today, small_bench, noisy, action
     got = prospects(small_bench, [replace(noisy, entry=entry)])
     share = next(each for each in today.best(9) if each["action"] == action)["width_share"]
     assert share == pytest.approx(float((got._now / today._now).mean()), rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pose_sigma", [0.0, 1e-3])
+def test_a_recorded_torque_gives_what_was_promised(small, small_bench, pose_sigma):
+    """A clamping gripper whose torque was not recorded leaves the outer moduli undetermined."""
+    settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=10, mode="clamped",
+                                   grasp_fraction=0.85, phase=0.5, torque_noise=0.0)
+    pull = simulate_pull(small.truth(), "pull-1", settings)[0]
+    calibration = CELL.model_copy(update={
+        "held_length_sigma_m": 0.0, "pose_sigma_m": pose_sigma, "pose_sigma_rad": 0.0})
+
+    def prospects_with(torque_sigma, error):
+        sensor = pull.entry.sensor.model_copy(update={"torque_sigma_nm": torque_sigma})
+        entry = pull.entry.model_copy(update={"calibration": calibration, "sensor": sensor})
+        seen = replace(pull, entry=entry)
+        forward = QuasiStaticForward(pull.name, small_bench.model, small_bench.weights, entry,
+                                     frames_of(seen), np.array(entry.rest_points_m), key_count=6)
+        objective = Objective([forward], ParameterSpace.separate(Values(TRUTH, 0.36, 900.0)),
+                              force_sigma=[entry.sensor.force_sigma_n])
+        evaluation = objective.evaluate(np.log(TRUTH), jacobian=True)
+        sure = replace(uncertainty(evaluation, objective), recording_spread=0.03, **UNIT)
+        path = path_error(evaluation, objective) if error else None
+        return Prospects(evaluation, objective, sure, ModelError(path=path), TRUTH)
+
+    poor = prospects_with(None, pose_sigma > 0)
+    chosen = next(each for each in poor.best(9) if each["action"] == "record the torque")
+    promised = poor._with_torque().mean()
+    exact = prospects_with(TORQUE_SIGMA_NM, False)._now.mean()
+    assert chosen["width_share"] == pytest.approx((poor._with_torque() / poor._now).mean())
+    assert chosen["width_share"] < 0.9
+    if pose_sigma == 0:
+        assert promised == pytest.approx(exact, rel=0.1)
+    else:
+        # The fit finds part of the frame's error; a prescribed path puts all of it into the moduli.
+        assert exact < promised < prospects_with(TORQUE_SIGMA_NM, True)._now.mean()
 
 
 def test_the_best_come_first_and_the_idle_do_not_come(today, small_bench, noisy):

@@ -14,15 +14,19 @@ from typing import TypedDict
 import numpy as np
 
 from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import YOUNG_BOUNDS_PA
-from limber.estimation.uncertainty.covariance import Uncertainty, inverse_information
+from limber.estimation.uncertainty.covariance import Uncertainty, inverse_information, scaled_rows
 from limber.estimation.uncertainty.model_error import ModelError, total_interval
+from limber.estimation.uncertainty.path_error import path_slopes
 from limber.estimation.uncertainty.variance_parts import InformationRows, information_rows
 
 WORTHWHILE = 0.98
 """Mean half width after an action over that before, above which it is not proposed."""
 SHAPE_SHARE = 0.5
 """Error of the shape after a scan from more sides over that before: assumed."""
+TORQUE_SIGMA_NM = 0.02
+"""Standard deviation of one reading of a wrist sensor's torque: assumed."""
 ANOTHER_PULL = "another pull"
 REGISTER = "register the camera"
 
@@ -87,8 +91,9 @@ class Prospects:
     def __init__(self, evaluation: Evaluation, objective: Objective, sure: Uncertainty,
                  error: ModelError, young: np.ndarray):
         self._objective, self._error, self._spread = objective, error, sure.recording_spread
-        self._rows = information_rows(evaluation, objective,
-                                      sure.variance_factor * sure.repetition)
+        self._evaluation = evaluation
+        self._scale = sure.variance_factor * sure.repetition
+        self._rows = information_rows(evaluation, objective, self._scale)
         self._pull_count = len(objective.forwards)
         self._middle = np.log(young * error.mesh_factor)
         self._interval = np.log(total_interval(young, sure.young_interval, error))
@@ -101,6 +106,10 @@ class Prospects:
         for each in _MEASUREMENTS:
             found.append(self._result(each.action, each.how,
                                       self._deviation(self._measured(each.sigmas))))
+        if (then := self._with_torque()) is not None:
+            found.append(self._result("record the torque", f"of the clamping gripper to "
+                                      f"{TORQUE_SIGMA_NM:g} N m, stated as torque_sigma_nm under "
+                                      "[sensor]", then))
         found.append(self._result("add a second camera", "that sees the points from another side",
                                   self._deviation(self._seen_twice())))
         last = self._objective.forwards[-1].name
@@ -161,6 +170,33 @@ class Prospects:
         causes = ("noise of the points", "camera frame", "places of the points")
         return [replace(each, rows=2**0.5 * each.rows) if each.cause in causes else each
                 for each in self._rows]
+
+    def _with_torque(self) -> np.ndarray | None:
+        """Standard deviation of log E if the torque of each clamped grasp had been recorded too,
+        shape [K]; None if there is no such grasp without torque, or no equilibrium.
+        """
+        values = self._objective.space.unpack(self._evaluation.free)
+        forwards, is_new = [], False
+        for forward in self._objective.forwards:
+            full = forward.full
+            if (isinstance(full, QuasiStaticForward) and full.drive == "pose"
+                    and full.entry.grasp.mode == "clamped" and not full.uses_torque):
+                full, is_new = full.with_torque(values, TORQUE_SIGMA_NM), True
+            forwards.append(full)
+        if not is_new:
+            return None
+        then = Objective(forwards, self._objective.space, force_sigma=self._objective.force_sigma)
+        found, slopes = (then.evaluate(self._evaluation.free, jacobian=True),
+                         path_slopes(self._evaluation, then))
+        if found is None or slopes is None:
+            return None
+        # With the torque, the gripper's frame is an unknown of the fit.
+        by_free, by_frame = (scaled_rows(each, self._objective.space.own_row_count, self._scale)
+                             for each in (found.slopes, slopes[1]))
+        size = by_frame.shape[1]
+        rows = np.block([[by_free, by_frame], [np.zeros((size, by_free.shape[1])), np.eye(size)]])
+        return self._deviation([InformationRows("", rows)],
+                               error=replace(self._error, path=None))
 
     def _with_repetition(self, number: int) -> list[InformationRows]:
         """Measurements of a pull once more, with its own errors and its own course of the force."""

@@ -44,6 +44,20 @@ def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
     Returns:
         None if a simulation finds no equilibrium.
     """
+    slopes = path_slopes(evaluation, objective)
+    if slopes is None:
+        return None
+    steps = np.linalg.lstsq(*slopes, rcond=1e-9)[0]
+    groups = list(objective.space.groups)
+    return np.minimum(np.linalg.norm(steps[groups], axis=1), WIDEST)
+
+
+def path_slopes(evaluation: Evaluation, objective: Objective,
+                ) -> tuple[np.ndarray, np.ndarray] | None:
+    """Slopes of the residuals to the free vector, [r, p], and to the errors of the gripper's frame
+    in their deviations, [r, S]; None if a simulation finds no equilibrium. Arguments as for
+    :func:`path_error`.
+    """
     known = {calibration_of(forward.entry): np.array(forward.entry.grasp.point_m)
              for forward in reversed(path_prescribed(objective.forwards))}
     base = _evaluated(evaluation, objective, [forward.with_prescribed_poses(forward.frames.poses)
@@ -63,9 +77,7 @@ def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
             if found is None:
                 return None
             changes.append((found.residual - base.residual) / STEP)
-    steps = np.linalg.lstsq(base.slopes, np.array(changes).T, rcond=1e-9)[0]
-    groups = list(objective.space.groups)
-    return np.minimum(np.linalg.norm(steps[groups], axis=1), WIDEST)
+    return base.slopes, np.reshape(changes, (-1, len(base.residual))).T
 
 
 def _aside(poses: np.ndarray, calibration: CalibrationEntry, pivot: np.ndarray,
