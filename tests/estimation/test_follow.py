@@ -66,6 +66,7 @@ def test_it_says_enough_only_where_noise_alone_limits(plain_pull, calibration, t
     state = OnlineState(1.0, np.array([1e7]), np.array([[0.99e7, 1.01e7]]), 1.0, True, True, False)
     follow._report("p", state, 0.5, told, Progress(on_warning=said.append))
     assert any("known to 2 %" in each for each in said) is tells
+    assert any("Stop pulling" in each for each in said) is not tells
 
 
 def test_a_pull_that_is_being_recorded_is_found_where_it_grows(bare_branch):

@@ -34,6 +34,9 @@ from limber.reduced.training import TrainingSettings
 
 SAID = {
     "enough": "every modulus is known to 2 %. Another pull would hardly improve the estimate.",
+    "quiet": "noise adds less than 2 % to every modulus. Stop pulling: more frames do not reduce "
+    "the constant errors of the cell. `limber estimate` states the intervals with these errors, "
+    "and what reduces them most.",
     "idle": "continuing this pull adds nothing: the last tenth of the frames narrowed no interval "
     "by 1 %. Pull farther, at another point or in another direction."}
 QUIET_SECONDS = 3.0
@@ -77,7 +80,7 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Est
         pace = np.inf
     states: list[OnlineState] = []
     reported = begun_sentences(first, progress)
-    is_exact = not reported
+    is_exact = "enough" not in reported
     slowest, stopped = 0.0, False
     with Beside(begun.branch) as beside:
         estimator = begun.estimator(beside)
@@ -118,7 +121,7 @@ def begun_sentences(pull: Pull, progress: Progress) -> set[str]:
     if not any((known.pose_sigma_m, known.pose_sigma_rad, known.force_gain_sigma,
                 known.force_bias_sigma_n, known.force_drift_sigma_n, known.camera_sigma_m,
                 known.camera_sigma_rad, known.point_sigma_m)):
-        return set()
+        return {"quiet"}
     progress.warn(
         f"{pull.name}: live intervals include the noise of the sensors alone. Constant errors of "
         "the cell ([calibration]: gripper frame, zero and gain of the force, camera) may be "
@@ -133,7 +136,7 @@ def _report(name: str, state: OnlineState, share: float, reported: set[str],
              young_mpa=" ".join(f"{young / 1e6:.4g}" for young in state.young),
              young_factor=" ".join(f"{np.sqrt(high / low):.3g}" for low, high in state.interval),
              enough=state.enough)
-    for kind, is_so in (("enough", state.enough), ("idle", state.idle)):
+    for kind, is_so in (("enough", state.enough), ("quiet", state.enough), ("idle", state.idle)):
         if is_so and kind not in reported:
             progress.warn(f"{name}: {state.time:.2f} s: {SAID[kind]}")
             reported.add(kind)
