@@ -75,6 +75,8 @@ def test_edits_outlive_a_new_reconstruct(made, tmp_path) -> None:
     edits.write_text(json.dumps([{"do": "delete", "at": tip}]))
     told = review_skeleton(target, edits_path=edits, output=tmp_path / "out.swc")
     assert told["length_m"] < result["length_m"] and told["mesh"] == "current"
+    assert told["edit_effects"][0]["length_change_m"] == pytest.approx(
+        told["length_m"] - result["length_m"])
     assert Branch.open(target, verify=True).manifest.stages["reconstruct"].result[
         "mesh_volume_m3"] < result["mesh_volume_m3"]
     written = read_swc(tmp_path / "out.swc")
@@ -93,6 +95,7 @@ def test_edits_outlive_a_new_reconstruct(made, tmp_path) -> None:
                          progress=Progress(on_warning=warned.append))
     assert undone["length_m"] == pytest.approx(result["length_m"])
     assert any("Edit 1 (delete)" in text and "skipped" in text for text in warned)
+    assert review_skeleton(target)["edit_effects"] == []
     edits.write_text("[]")
     assert review_skeleton(target, edits_path=edits)["edits"] == []
     assert not (target / "edits.json").exists()

@@ -9,7 +9,7 @@ import pytest
 from limber.core.alignment import Alignment
 from limber.core.errors import InputError
 from limber.core.json_values import validated
-from limber.geometry.skeleton.edits import Edit, edited, edits_text, read_edits
+from limber.geometry.skeleton.edits import Edit, edited, edits_text, effects_of, read_edits
 from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
 
 
@@ -41,6 +41,16 @@ def test_edits_do_what_they_say() -> None:
         np.abs(moved.nodes - [0.01, 0, 0.3]).sum(axis=1).min() < 1e-9)
     thick = edited(tree, _edits({"do": "radius", "at": (0, 0, 0.3), "radius": 0.01}))
     assert thick.radius.max() == 0.01 and thick.radius_sigma.max() == pytest.approx(2e-4)
+
+
+def test_an_edit_says_which_node_it_took_and_what_it_removed() -> None:
+    tree = _tree()
+    cut, moved = effects_of(tree, _edits({"do": "delete", "at": (0.084, 0, 0.2)},
+                                         {"do": "move", "at": (0, 0, 0.4), "to": (0, 0, 0.42)}),
+                            [])
+    np.testing.assert_allclose(cut.node, [0.08, 0, 0.2], atol=1e-9)
+    assert cut.distance == pytest.approx(4e-3) and cut.length_change == pytest.approx(-0.08)
+    assert moved.distance == pytest.approx(0.0) and moved.length_change == pytest.approx(0.02)
 
 
 def test_branches_are_merged_split_and_confirmed() -> None:

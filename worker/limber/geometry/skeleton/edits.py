@@ -9,7 +9,7 @@ file, as `limber skeleton` lists them::
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -160,6 +160,39 @@ def edited(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str] | None 
                 raise refusal from error
             misfits.append(str(refusal))
     return skeleton
+
+
+@dataclass(frozen=True)
+class EditEffect:
+    """What one edit did.
+
+    Attributes:
+        do: Kind of the edit.
+        node: Position of the node that it took [m], shape [3].
+        distance: From that node to the requested position [m].
+        length_change: Change of the length of all branches [m]; negative: it removed something.
+    """
+
+    do: str
+    node: np.ndarray
+    distance: float
+    length_change: float
+
+
+def effects_of(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str],
+               ) -> list[EditEffect]:
+    """Return what each edit that fits does; applied in order, arguments as for :func:`edited`."""
+    found = []
+    for edit in edits:
+        skipped = len(misfits)
+        after = edited(skeleton, [edit], misfits)
+        if len(misfits) > skipped:
+            continue
+        node = skeleton.nodes[_nearest(skeleton, edit.at)]
+        found.append(EditEffect(edit.do, node, float(np.linalg.norm(node - np.array(edit.at))),
+                                after.length - skeleton.length))
+        skeleton = after
+    return found
 
 
 def _nearest(skeleton: Skeleton, at: Place) -> int:

@@ -237,6 +237,15 @@ def caliper_rows(compared: Sequence[Mapping[str, Any]]) -> list[list[str]]:
                _known(row["sigmas"], "{:+.1f}")] for row in compared)]
 
 
+def edit_rows(effects: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return what edits of a skeleton did: ``do``, ``at`` [3], ``off_m``, ``length_change_m``."""
+    rows = [["edit", "took the node at", "off [mm]", "length added [mm]"]]
+    for each in effects:
+        rows.append([each["do"], " ".join(f"{value:.8g}" for value in each["at"]),
+                     f"{1e3 * each['off_m']:.1f}", f"{1e3 * each['length_change_m']:+.0f}"])
+    return rows
+
+
 def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return the uncertain parts of a skeleton.
 

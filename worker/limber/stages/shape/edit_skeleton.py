@@ -82,7 +82,10 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
     Returns:
         ``doubtful``: a list of ``kind``, ``branch``, ``at`` (in the scan's coordinates), ``at_m``
         (in the branch's frame), ``length_m``, ``radius_m`` and ``value``; ``edits``, those that
-        are applied; ``mesh``: ``current``, ``out of date`` or ``missing``; ``unit`` of ``at``.
+        are applied; ``edit_effects``, of each the node that it took (``at``, ``at_m``), how far
+        that is from the requested position (``off_m``) and the change of the branches' length
+        (``length_change_m``); ``mesh``: ``current``, ``out of date`` or ``missing``; ``unit`` of
+        ``at``.
 
     Raises:
         InputError: an edit does not fit. MeshingError: the edited skeleton cannot be meshed. The
@@ -111,6 +114,7 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
         "mesh": mesh,
         "unit": _unit(branch),
         "edits": [edit.model_dump(mode="json", exclude_none=True) for edit in applied],
+        "edit_effects": _effects(branch, applied, alignment, progress),
         "output": output,
     }
 
@@ -127,6 +131,22 @@ def _requested_edits(branch: Branch, path: Path, frame: str, append: bool) -> li
 
 def _applied(branch: Branch) -> list[Edit]:
     return load_edits(branch) if "edits" in _entry(branch).reads else []
+
+
+def _effects(branch: Branch, edits: list[Edit], alignment: Alignment, progress: Progress,
+             ) -> list[dict[str, Any]]:
+    from limber.geometry.skeleton.edits import effects_of
+    from limber.store.loading import load_found_skeleton
+
+    if not edits:
+        return []
+    found, misfits = load_found_skeleton(branch, alignment, _unit(branch)), list[str]()
+    effects = effects_of(found, [edit.aligned(alignment) for edit in edits], misfits)
+    for message in misfits:
+        progress.warn(message)
+    return [{"do": each.do, "at": np.round(alignment.undo(each.node[None])[0], 6),
+             "at_m": each.node, "off_m": each.distance, "length_change_m": each.length_change}
+            for each in effects]
 
 
 def _entry(branch: Branch) -> Any:
@@ -241,14 +261,16 @@ def _part_entry(uncertain_part: DoubtfulPart, alignment: Alignment) -> dict[str,
 
 
 def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
-    """Return the doubtful parts as a table."""
-    from limber.results.report.report_tables import doubtful_rows
+    """Return what the edits did, and the doubtful parts, as tables."""
+    from limber.results.report.report_tables import doubtful_rows, edit_rows
 
     doubtful = result["doubtful"]
+    edits = [(f"Edits, places in the scan's coordinates [{result['unit']}]",
+              edit_rows(result["edit_effects"]))] if result["edit_effects"] else []
     if not doubtful:
-        return []
+        return edits
     more = f" ({len(doubtful) - _SHOWN} more with --json)" if len(doubtful) > _SHOWN else ""
-    return [(f"Doubtful parts, places in the scan's coordinates [{result['unit']}]{more}",
+    return [*edits, (f"Doubtful parts, places in the scan's coordinates [{result['unit']}]{more}",
              doubtful_rows(doubtful[:_SHOWN]))]
 
 
