@@ -13,6 +13,8 @@ from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.simulated_pull import TrueBranch, VirtualPullSettings, simulate_pull
+from limber.geometry.reconstruction import mesh_skeleton
+from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.cylinder_mesh import curved_beam
@@ -32,19 +34,28 @@ class PaperBranch:
 
     Attributes:
         name: Name in the paper.
-        young: Young's moduli [Pa], shape [4].
+        young: Young's moduli at K control points at equal distances [Pa], shape [K].
         poisson: Poisson's ratio.
         length: Length [m].
         radius: Radii at base and tip [m].
         bend: Rotation of the axis from base to tip [rad].
+        fork: Position of a side branch on the axis as a fraction, and its length [m]; None: there
+            is none.
     """
 
     name: str
-    young: tuple[float, float, float, float]
+    young: tuple[float, ...]
     poisson: float
     length: float
     radius: tuple[float, float]
     bend: float
+    fork: tuple[float, float] | None = None
+
+    @property
+    def fractions(self) -> tuple[float, ...]:
+        """Positions of the control points as fractions of the axis."""
+        count = len(self.young)
+        return tuple((k + 1) / (count + 1) for k in range(count))
 
     @property
     def skeleton(self) -> Skeleton:
@@ -55,11 +66,21 @@ class PaperBranch:
         tangent /= np.linalg.norm(tangent, axis=1)[:, None]
         steps = (tangent[1:] + tangent[:-1]) / 2 * self.length / 80
         nodes = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-        return Skeleton.from_edges(nodes, np.arange(-1, 80), np.interp(s, [0, 1], self.radius))
+        radii, parents = np.interp(s, [0, 1], self.radius), np.arange(-1, 80)
+        if self.fork is not None:
+            start, count = round(80 * self.fork[0]), 20
+            outward = tangent[start] + np.cross(tangent[start], [0.0, 1.0, 0.0])
+            outward *= self.fork[1] / count / np.linalg.norm(outward)
+            nodes = np.vstack([nodes, nodes[start] + np.arange(1, count + 1)[:, None] * outward])
+            radii = np.r_[radii, np.linspace(0.7, 0.5, count) * radii[start]]
+            parents = np.r_[parents, start, 81 + np.arange(count - 1)]
+        return Skeleton.from_edges(nodes, parents, radii)
 
     def mesh(self, *, slice_length: float, sides: int) -> TetMesh:
-        """Swept tetrahedra with the base marked."""
+        """Swept tetrahedra with the base marked; with a fork as reconstruct meshes it."""
         skeleton = self.skeleton
+        if self.fork is not None:
+            return mesh_skeleton(skeleton, ReconstructSettings()).mesh
         mesh = curved_beam(skeleton.nodes, skeleton.radius, slice_length=slice_length,
                            sides=sides)
         return mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
@@ -68,7 +89,8 @@ class PaperBranch:
         """The branch on its fine mesh, weightless: such moduli could not carry its weight."""
         skeleton = self.skeleton
         return TrueBranch(self.mesh(slice_length=1.3, sides=10), skeleton,
-                          control_points(skeleton, FRACTIONS), FRACTIONS, np.array(self.young),
+                          control_points(skeleton, self.fractions), self.fractions,
+                          np.array(self.young),
                           is_weightless=True)
 
 
@@ -112,7 +134,7 @@ class Bench:
     def __init__(self, branch: PaperBranch, *, slice_length: float = 1.7, sides: int = 8):
         self.branch = branch
         self.mesh = branch.mesh(slice_length=slice_length, sides=sides)
-        self.points = control_points(branch.skeleton, FRACTIONS)
+        self.points = control_points(branch.skeleton, branch.fractions)
         self.weights = young_weights(self.mesh, self.points)
         self.model = BranchModel(self.mesh, young=1e7, poisson=0.35, density=900.0, gravity=None)
 
@@ -124,7 +146,7 @@ class Bench:
                                        key_count=settings.key_frames) for pull in pulls]
         poisson = 0.35 if settings.poisson is None else settings.poisson
         extra = ("poisson",) if settings.fit_poisson else ()
-        start = Values(np.full(4, 1e7), poisson, 900.0)
+        start = Values(np.full(len(self.points), 1e7), poisson, 900.0)
         return Objective(forwards, ParameterSpace.separate(start, extra),
                          force_sigma=[pull.entry.sensor.force_sigma_n for pull in pulls])
 

@@ -28,8 +28,9 @@ from limber.estimation.virtual_cell import CellErrors
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import Pull
 
-START_ROW = Asked("truths of 0.3 MPa to 10 GPa that fall 1 to 30 fold: fits that end at them (loss "
-                  "within 1 %)", "198 of 200")
+START_ROW = Asked("truths of 0.3 MPa to 10 GPa that fall 1 to 30 fold, at 1 to 4 control points, "
+                  "half of them with a fork: fits that end at them (loss within 1 %)",
+                  "198 of 200")
 ADVICE_ROW = Asked("interval expected after an action over that got by following it",
                    "within 20 %")
 PAPER_ROW = Asked("the paper's branches, noisy: worst error; simulations and seconds, its method / "
@@ -65,7 +66,7 @@ def _start(seed: int, source: str) -> Numbers:
     branch, pull = _pulled(np.random.default_rng([seed, 77]))
     bench = Bench(branch, slice_length=2.4, sides=6)
     subject = Subject(bench.mesh, branch.skeleton, bench.points, bench.weights, bench.model,
-                      Values(np.full(4, 1e7), 0.35, 900.0))
+                      Values(np.full(len(branch.young), 1e7), 0.35, 900.0))
     try:
         found = fit_branch([pull], subject, _PLAIN, log=EvaluationLog(None, ""))
         refused = found.is_bad is not None
@@ -79,11 +80,14 @@ def _start(seed: int, source: str) -> Numbers:
 def _pulled(rng: np.random.Generator) -> tuple[PaperBranch, Pull]:
     """Draw a branch that can be pulled, and its recording."""
     while True:
-        steps = np.log(rng.uniform(1.0, 30.0)) * np.r_[0.0, np.cumsum(rng.dirichlet(np.ones(3)))]
+        count = int(rng.integers(1, 5))
+        shares = rng.dirichlet(np.ones(count - 1)) if count > 1 else []
+        steps = np.log(rng.uniform(1.0, 30.0)) * np.r_[0.0, np.cumsum(shares)]
         young = np.exp(rng.uniform(np.log(3e5), np.log(1e10)) - steps)
         branch = PaperBranch(
             "drawn", tuple(young.tolist()), 0.35, rng.uniform(0.3, 0.8),
-            (rng.uniform(4e-3, 1e-2), rng.uniform(3e-3, 4e-3)), rng.uniform(0, 0.6))
+            (rng.uniform(4e-3, 1e-2), rng.uniform(3e-3, 4e-3)), rng.uniform(0, 0.6),
+            (rng.uniform(0.3, 0.7), rng.uniform(0.05, 0.2)) if rng.uniform() < 0.5 else None)
         try:
             pull = measured(paper_branches.exact_pull(branch, 0, frames=40), 0)
         except LimberError:
