@@ -11,7 +11,7 @@ from limber.core.alignment import Alignment
 from limber.core.errors import BranchFolderError, InputError
 from limber.core.files.atomic import write_atomically
 from limber.core.json_values import plain
-from limber.store import FORMAT_VERSION, Branch, disk
+from limber.store import FORMAT_VERSION, Branch, disk_errors
 
 
 @pytest.fixture
@@ -263,18 +263,18 @@ def test_paths_too_long_for_windows(tmp_path: Path, monkeypatch):
     folder.parent.mkdir()
     with Branch.create(folder).stage("first") as stage:
         stage.path("plans/path.csv").write_text("one")
-    monkeypatch.setattr(disk, "limits_paths", lambda: True)
+    monkeypatch.setattr(disk_errors, "limits_paths", lambda: True)
     just = len(str(folder / "plans/path.csv"))
-    monkeypatch.setattr(disk, "_LONGEST_PATH", just)
+    monkeypatch.setattr(disk_errors, "_LONGEST_PATH", just)
     assert Branch.read(folder).has("plans/path.csv")
     for act in (Branch.open, Branch.create):
         with pytest.raises(BranchFolderError, match=f"at most {just} characters.*LongPathsEnabled"):
             act(folder)
-    monkeypatch.setattr(disk, "_LONGEST_PATH", just - 1)
+    monkeypatch.setattr(disk_errors, "_LONGEST_PATH", just - 1)
     with pytest.raises(BranchFolderError, match=f"would have {just} characters"):
         Branch.read(folder)
     with pytest.raises(BranchFolderError, match="shorter path"):
         Branch.create(folder.with_name("pear.branch"))
     assert not folder.with_name("pear.branch").exists()
-    monkeypatch.setattr(disk, "_LONGEST_PATH", just + disk.NAME_ROOM)
+    monkeypatch.setattr(disk_errors, "_LONGEST_PATH", just + disk_errors.NAME_ROOM)
     assert Branch.open(folder).name == "apple"

@@ -33,9 +33,9 @@ Direction = Annotated[tuple[float, float, float], AfterValidator(_with_length)]
 """A direction: three numbers, not all 0; of any length."""
 
 
-POSITION = {"frame": "branch"}
+POSITION: dict[str, Any] = {"frame": "branch"}
 """Extra of a field whose position a stage also takes in the scan's coordinates."""
-BOX = {"frame": "branch axes"}
+BOX: dict[str, Any] = {"frame": "branch axes"}
 """Extra of a field whose box has the axes of the branch's frame."""
 
 

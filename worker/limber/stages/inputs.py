@@ -49,7 +49,7 @@ def by_name(function: Callable[..., dict[str, Any]], **fields: str) -> Run:
     return run
 
 
-NOT_KEPT = {"panel": False}
+NOT_KEPT: dict[str, Any] = {"panel": False}
 """For a field that the add-on's panels do not store: it is typed each time, or given elsewhere."""
 
 
@@ -85,7 +85,8 @@ class PlacedInputs(BranchInputs):
         alignment = Branch.read(self.branch_folder).manifest.alignment
         moved = {}
         for name, field in type(settings).model_fields.items():
-            kind, value = (field.json_schema_extra or {}).get("frame"), getattr(settings, name)
+            extra: Any = field.json_schema_extra or {}
+            kind, value = extra.get("frame"), getattr(settings, name)
             if kind == "branch axes" and value is not None:
                 raise InputError(f"--{name.replace('_', '-')} is given in the scan's coordinates.",
                                  "Its box has the axes of the branch's frame, which are others.",

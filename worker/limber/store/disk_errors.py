@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from limber.core.errors import BranchFolderError, WorkError
 from limber.core.machine_errors import machine_error
@@ -83,8 +84,9 @@ def limits_paths() -> bool:
         return False
     import ctypes
 
+    libraries: Any = ctypes  # WinDLL is on Windows alone
     try:
-        return not ctypes.WinDLL("ntdll").RtlAreLongPathsEnabled()
+        return not libraries.WinDLL("ntdll").RtlAreLongPathsEnabled()
     except (AttributeError, OSError):
         # Before Windows 10 of 2016.
         return True

@@ -14,7 +14,7 @@ from limber.core.files.column_titles import stated_unit
 from limber.core.files.declared_sizes import header_bytes
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.columns import property_names
-from limber.geometry.cloud.gathering import PIECE_POINTS, gathered
+from limber.geometry.cloud.piecewise_reading import PIECE_POINTS, gathered
 
 _PADDING = "#$%&~~"  # prefix by which pypcd4 names fields that are called _
 

@@ -265,13 +265,14 @@ def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
     from limber.results.report.report_tables import doubtful_rows, edit_rows
 
     doubtful = result["doubtful"]
-    edits = [(f"Edits, places in the scan's coordinates [{result['unit']}]",
-              edit_rows(result["edit_effects"]))] if result["edit_effects"] else []
-    if not doubtful:
-        return edits
-    more = f" ({len(doubtful) - _SHOWN} more with --json)" if len(doubtful) > _SHOWN else ""
-    return [*edits, (f"Doubtful parts, places in the scan's coordinates [{result['unit']}]{more}",
-             doubtful_rows(doubtful[:_SHOWN]))]
+    places = f"places in the scan's coordinates [{result['unit']}]"
+    shown: list[tuple[str, Sequence[Sequence[str]]]] = []
+    if result["edit_effects"]:
+        shown.append((f"Edits, {places}", edit_rows(result["edit_effects"])))
+    if doubtful:
+        more = f" ({len(doubtful) - _SHOWN} more with --json)" if len(doubtful) > _SHOWN else ""
+        shown.append((f"Doubtful parts, {places}{more}", doubtful_rows(doubtful[:_SHOWN])))
+    return shown
 
 
 def _doubtful_line(result: Mapping[str, Any]) -> str:
