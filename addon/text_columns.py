@@ -244,9 +244,9 @@ class Table:
         return words
 
     def _place(self, line: str) -> int:
-        wanted = " ".join(line.split())
+        beginning = " ".join(line.split())
         return next((k for k, other in enumerate(self._lines(), start=1)
-                     if " ".join(other.split()).startswith(wanted)), 1)
+                     if " ".join(other.split()).startswith(beginning)), 1)
 
 
 def _has_tracks(text: str) -> bool:

@@ -77,11 +77,11 @@ def test_a_sweep_is_every_combination(write):
     jobs = read_jobs(write(SCANS + """
 [job.sweep]
 "reconstruct.mesh_spacing" = [2, 3.5]
-"reconstruct.radii" = ["fit", "paper"]
+"reconstruct.leaves" = ["cut", "keep"]
 """))
     assert [branch.name for branch in jobs.branches[:4]] == [
-        "apple-mesh_spacing-2-radii-fit", "apple-mesh_spacing-2-radii-paper",
-        "apple-mesh_spacing-3.5-radii-fit", "apple-mesh_spacing-3.5-radii-paper"]
+        "apple-mesh_spacing-2-leaves-cut", "apple-mesh_spacing-2-leaves-keep",
+        "apple-mesh_spacing-3.5-leaves-cut", "apple-mesh_spacing-3.5-leaves-keep"]
     assert len(jobs.branches) == 8
     assert jobs.branches[3].tasks[0].settings.mesh_spacing == 3.5
     assert len({branch.tasks[0].fingerprint for branch in jobs.branches}) == 8
@@ -97,11 +97,11 @@ def test_a_sweep_is_every_combination(write):
     ("[[job]]\n[[job.stage]]\nrun = 'reconstruct'", 1, "either scans or folders"),
     ("[[job]]\nscans = ['none*.ply']\n[[job.stage]]\nrun = 'reconstruct'", 2, "No file matches"),
     ("[[job]]\nscans = ['scans/*.ply']", 1, "no [[job.stage]]"),
-    (SCANS + "\n# a comment\nprun = 2", 8, "Did you mean prune?"),
-    (SCANS + "prune = -1", 6, "greater than or equal to 0"),
-    (SCANS + "prune = [1, 2]", 6, "should be a valid number"),
+    (SCANS + "\n# a comment\nbridge_limt = 2", 8, "Did you mean bridge_limit?"),
+    (SCANS + "bridge_limit = -1", 6, "greater than or equal to 0"),
+    (SCANS + "bridge_limit = [1, 2]", 6, "should be a valid number"),
     (SCANS + 'density = "8 mm"', 6, "It must be in kg/m^3"),
-    (SCANS + 'prune = "8 mm"', 6, "This value has no unit"),
+    (SCANS + 'bridge_limit = "8 mm"', 6, "This value has no unit"),
     (SCANS + 'unit = "yd"', 6, "should be 'm', 'cm', 'mm', 'in' or 'um'"),
     (SCANS + 'output = "x"', 6, "The batch sets"),
     (SCANS + '[[job.stage]]\nrun = "reconstuct"', 7, "Did you mean reconstruct?"),
@@ -128,7 +128,7 @@ def test_what_is_wrong_is_told_with_its_line(write, text, line, said):
 
 
 def test_every_problem_is_told_at_once(write):
-    told = refusal(write('outt = 1\n' + SCANS + "prune = -1\nmesh_side = 3\n"))
+    told = refusal(write('outt = 1\n' + SCANS + "bridge_limit = -1\nmesh_side = 3\n"))
     assert [word for word in ("line 1:", "line 7:", "line 8:") if word in told] == [
         "line 1:", "line 7:", "line 8:"]
 
@@ -198,5 +198,5 @@ def test_an_endless_sweep_is_refused_before_it_is_made(write):
     values = list(range(1, 101))
     told = refusal(write(SCANS + "[job.sweep]\n" + "".join(
         f'"reconstruct.{name}" = {values}\n' for name in (
-            "seed", "young", "density", "poisson", "up", "twig_radius", "twig_order", "leaves"))))
+            "seed", "young", "density", "poisson", "up", "twig_radius", "leaf_density", "leaves"))))
     assert "The sweep has 1e+16 combinations" in told and "line 6" in told

@@ -155,16 +155,10 @@ def test_response_of_a_small_motion(small_bench):
 
 @pytest.mark.slow
 def test_nelder_mead_says_why_it_ended(small_bench, noisy):
-    """Too few simulations, and a threshold under the noise: neither converged, each in words."""
+    """Too few simulations: not converged, and the reason says so."""
     settings = SETTINGS.model_copy(update={"key_frames": 4})
     pull = driven(noisy)
     pull = replace(pull, entry=pull.entry.model_copy(update={"drive": "pose"}))
     short = nelder_mead(small_bench.objective([pull], settings), np.log(TRUTH) + 0.3,
                         evaluation_limit=12)
     assert not short.converged and "12 simulations were not enough" in short.reason
-    loose = nelder_mead(small_bench.objective([pull], settings), np.log(TRUTH) + 0.1,
-                        delta_m2=1e-3)
-    assert loose.converged and "fell below 0.001 m2" in loose.reason
-    strict = nelder_mead(small_bench.objective([pull], settings), np.log(TRUTH) + 0.05,
-                         delta_m2=1e-9)
-    assert not strict.converged and "settled above" in strict.reason

@@ -115,7 +115,7 @@ def test_a_mesh_follows_its_skeleton():
 def test_a_mesh_that_would_turn_inside_out_goes_less_far():
     """Neighbouring sections pushed through each other: every tetrahedron keeps its side."""
     tube = _tube()
-    mesh = mesh_branch(tube, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3)).mesh
+    mesh = mesh_branch(tube, MeshSettings(mesher="sweep", mesh_spacing=1.3)).mesh
     nodes = tube.nodes.copy()
     nodes[24:26, 2] += np.array([0.03, -0.03])
     moved = reshaped(mesh, tube, replace(tube, nodes=nodes))

@@ -110,12 +110,12 @@ def test_own_skeleton_skips_ours(generated, tmp_path):
 
 @pytest.mark.slow
 def test_left_out_twigs_become_masses(generated, tmp_path):
-    """Twigs over the order leave the mesh, and their mass is written; a later run that keeps all
+    """Thin twigs leave the mesh, and their mass is written; a later run that keeps all
     twigs takes their masses away.
     """
     folder, _, full = generated
     place = tmp_path / "t.branch"
-    result = reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_order=0))
+    result = reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_radius=0.0035))
     masses = json.loads((place / "point_masses.json").read_text())
     assert len(masses) == result["left_out_twigs"] == 2
     whole = 900 * full["mesh_volume_m3"]

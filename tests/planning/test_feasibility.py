@@ -143,7 +143,8 @@ def test_a_plan_that_a_wrong_field_excludes_is_made_with_more_poses(
     monkeypatch.setattr(planning, "plan_within", excluded)
     warnings = []
     settings = PlanSettings(goal=goal.position, goal_tolerance=goal.tolerance, iterations=300,
-                            max_force=1.3 * held, inertia=False, replans=2)
+                            max_force=1.3 * held, inertia=False)
+    monkeypatch.setattr(planning, "_REPLANS", 2)
 
     def made():
         return planning.plan_motion(field, small_model, settings, workers=1,

@@ -95,12 +95,12 @@ def test_the_gripper_lags_behind_where_it_may_not_turn_with_the_branch(copied, m
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
-def test_a_cell_that_allows_too_little_force_is_named(copied):
+def test_a_cell_that_allows_too_little_force_is_named(copied, monkeypatch):
     """The cell's force limit, not a vague word: the goal alone needs more."""
+    monkeypatch.setattr("limber.planning.make_plan._REPLANS", 0)
     weak = cell_file(copied, limits={"soft_force_n": 0.1, "hard_force_n": 20.0})
     with pytest.raises(NoPathError, match="force"):
-        plan_paths(copied, SETTINGS.model_copy(update={"replans": 0}), name="weak",
-                   cell_file=weak, workers=1)
+        plan_paths(copied, SETTINGS, name="weak", cell_file=weak, workers=1)
 
 
 @pytest.mark.slow

@@ -163,14 +163,14 @@ def test_other_modulus_makes_the_field_stale(copied):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
-def test_refusals_leave_the_folder_as_it_was(copied):
+def test_refusals_leave_the_folder_as_it_was(copied, monkeypatch):
     """Goals out of reach, over a limit, doubled, or a cancel: an error each, no file changed."""
+    monkeypatch.setattr("limber.planning.make_plan._REPLANS", 0)
     before = sorted(p.name for p in copied.rglob("*") if p.name != ".lock")
     with pytest.raises(NoPathError, match="misses it by"):
         plan_paths(copied, PlanSettings(goal=(2.0, 0.0, 0.0)), name="bad")
     with pytest.raises(NoPathError, match=r"force .* exceeds the limit 0.01 "):
-        plan_paths(copied, PlanSettings(max_force=0.01, replans=0, iterations=300), name="bad",
-                   workers=1)
+        plan_paths(copied, PlanSettings(max_force=0.01, iterations=300), name="bad", workers=1)
     with pytest.raises(NoPathError, match=r"in millimetres\?"):
         plan_paths(copied, PlanSettings(goal=(20.0, 0.0, 400.0)), name="bad")
     with pytest.raises(InputError, match=r"in millimetres\?"):
@@ -275,8 +275,9 @@ def test_plan_that_breaks_a_limit_on_the_full_model_is_refused(copied, monkeypat
         return fit_field(samples, field.chart.pivot, field.chart.radius)
 
     monkeypatch.setattr(EnergyField, "read", promising)
+    monkeypatch.setattr("limber.planning.make_plan._REPLANS", 0)
     with pytest.raises(NoPathError, match=r"force \[N\] .* exceeds .* at \(.*\) m") as refused:
-        plan_paths(copied, PlanSettings(max_force=cap, replans=0, start=tuple(
+        plan_paths(copied, PlanSettings(max_force=cap, start=tuple(
             plan["plan"]["poses"][0][:3]), goal=tuple(plan["plan"]["poses"][-1][:3])),
             name="refused", workers=1)
     assert refused.value.exit_code == 3

@@ -26,7 +26,7 @@ NAMES = list(stage_summaries())
 OTHERS = {
     "reconstruct": ({"cloud": "scan.ply", "output": "a.branch", "mask": "m.png"},
                     {"up": (0.0, -1.0, 0.0), "upright": False, "unit": "mm", "young": 2.5e8,
-                     "plants": "largest", "contraction_points": 500}),
+                     "plants": "largest", "bridge_limit": 0.2}),
     "simulate": ({"branch_folder": "a.branch"},
                  {"move": (-0.1, 0.0, 1e-3), "gravity": False, "kind": "static",
                   "load_at": ((0.0, 0.0, 0.1, 1.0, -2.0, 0.5), (0.0, 0.0, 0.2, 0.0, 0.0, -1.0))}),
@@ -125,7 +125,7 @@ def test_units_and_experts_are_in_the_schema():
     """A panel finds units, titles, groups and what only experts are shown."""
     properties = stage_schema("simulate")["settings"]["properties"]
     assert properties["young"]["unit"] == "Pa"
-    assert properties["lumped_mass"]["expert"] and not properties["young"]["expert"]
+    assert properties["damping_mass"]["expert"] and not properties["young"]["expert"]
     assert properties["damping_mass"] | {"title": "Damping mass", "group": "material"} == (
         properties["damping_mass"])
 
@@ -134,9 +134,9 @@ def test_help_shows_what_most_users_choose(capsys):
     """--help leaves other options out and says so; --help-all has them."""
     assert main.call(["simulate", "--help"]) == 0
     short = capsys.readouterr().out
-    assert "--lumped-mass" not in short and "--help-all" in short and "Material:" in short
+    assert "--damping-mass" not in short and "--help-all" in short and "Material:" in short
     assert main.call(["simulate", "--help-all"]) == 0
-    assert "--lumped-mass" in capsys.readouterr().out
+    assert "--damping-mass" in capsys.readouterr().out
 
 
 def test_help_shows_about_a_fifth():

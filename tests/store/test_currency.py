@@ -19,8 +19,7 @@ class First(Settings):
 class Shorter(First):
     """The same of a program in which ``steps`` cannot be set any more."""
 
-    retired = ("steps",)
-    steps: ClassVar[int] = 8
+    retired: ClassVar[dict[str, int]] = {"steps": 8}
 
 
 class Mended(First):

@@ -78,7 +78,7 @@ def skeletonised(case: ScanCase) -> tuple[Skeleton, float]:
         prepared, _ = without_leaves(prepared)
     found = skeletonise(prepared.cloud.points, settings, up=up, camera=prepared.view is not None)
     if prepared.view is not None:
-        found, _ = seen_skeleton(found, prepared, settings.silhouette_reach)
+        found, _ = seen_skeleton(found, prepared)
     return found.skeleton.moved(found.skeleton.nodes + prepared.origin), found.noise
 
 

@@ -6,6 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scan_scores import score
+from limber.geometry.cloud import preparation
 from limber.geometry.cloud.camera import D455, Camera, depth_to_cloud
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
@@ -85,15 +86,13 @@ def test_real_depth_images_are_recognised(recorded_data, name) -> None:
         assert find_sight(file["points_mm"].astype(float)) is not None
 
 
-def test_the_user_decides_about_flying_pixels() -> None:
-    """They are counted and told; angle 0 keeps all; the camera's place can be given."""
+def test_flying_pixels_are_counted() -> None:
+    """They are counted and reported; the camera's position can be given."""
     _, camera, depth, _ = seen(63, 0.05)
     points = in_camera_axes(camera, depth)
     prepared = prepare(Cloud(points), 1.0)
     assert prepared.counts["flying"] > 0.03 * len(points)
     assert any("flying" in text for text in prepared.warnings)
-    kept = prepare(Cloud(points), 1.0, PreparationSettings(flying_angle=0.0))
-    assert "flying" not in kept.counts
     moved = PreparationSettings(camera_at=(500.0, 100.0, 20.0))
     away = prepare(Cloud(1000 * points + np.array(moved.camera_at)), 1e-3, moved)
     assert away.counts["flying"] == prepared.counts["flying"]
@@ -101,19 +100,20 @@ def test_the_user_decides_about_flying_pixels() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [64, 65])
-def test_flying_pixels_grow_no_twigs(seed: int) -> None:
+def test_flying_pixels_grow_no_twigs(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the rule they made false forks; with it the true ones alone are found."""
     branch, camera, depth, _ = seen(seed, 0.05)
     points = in_camera_axes(camera, depth)
     false = []
-    for angle in (78.0, 0.0):
-        prepared = prepare(Cloud(points), 1.0, PreparationSettings(flying_angle=angle))
+    for angle in (78.0, 90.0):
+        monkeypatch.setattr(preparation, "_FLYING_ANGLE", angle)
+        prepared = prepare(Cloud(points), 1.0)
         root = camera.to_camera(branch.skeleton.nodes[:1])[0]
         found = skeletonise(prepared.cloud.points, root=root - prepared.origin,
                             up=np.array([0.0, 0.0, 1.0]) @ camera.rotation).skeleton
         scored = score(branch.skeleton, found.moved(
             camera.to_branch(found.nodes + prepared.origin)))
         false.append(scored["forks_false"])
-        if angle > 0:
+        if angle < 90.0:
             assert scored["forks_found"] == scored["forks"]
     assert false[0] == 0 < false[1]

@@ -137,8 +137,8 @@ class Settings(BaseModel):
             its bases.
         common: Fields that ``--help`` shows besides required ones: those that most users choose.
             ``--help-all`` shows the others too.
-        retired: Former fields that are constants of the class now. A folder, a preset or a job file
-            that states the constant's value is as before; another value is refused.
+        retired: Former fields that are constants now, each with its value. A folder, a preset or a
+            job file that states this value is as before; another value is refused.
         results_version: Increased when the same settings on the same input give other results than
             before. Branches then count as out of date, and a batch runs the stage again.
     """
@@ -147,7 +147,7 @@ class Settings(BaseModel):
 
     groups: ClassVar[Groups] = {}
     common: ClassVar[tuple[str, ...]] = ()
-    retired: ClassVar[tuple[str, ...]] = ()
+    retired: ClassVar[Mapping[str, Any]] = {}
     results_version: ClassVar[int] = 1
 
     @classmethod
@@ -155,16 +155,23 @@ class Settings(BaseModel):
         """Return values by name, without former fields that have the constant's value."""
         former = cls._former()
         return {name: value for name, value in values.items()
-                if name not in former or value != getattr(cls, name)}
+                if name not in former or value != former[name]}
 
     @classmethod
-    def _former(cls) -> list[str]:
-        return sorted({name for base in cls.__mro__ for name in vars(base).get("retired", ())})
+    def _former(cls) -> dict[str, Any]:
+        return {name: value for base in cls.__mro__
+                for name, value in vars(base).get("retired", {}).items()}
 
     @model_validator(mode="before")
     @classmethod
     def _drop_retired(cls, values: Any) -> Any:
-        return cls.without_retired(values) if isinstance(values, Mapping) else values
+        if not isinstance(values, Mapping):
+            return values
+        remaining, former = cls.without_retired(values), cls._former()
+        for name in remaining.keys() & former:
+            raise ValueError(f"{_flag(name)} {remaining[name]!r} cannot be set any more: it is "
+                             f"always {former[name]!r}")
+        return remaining
 
     @classmethod
     def group_of(cls, name: str) -> str:
@@ -190,7 +197,7 @@ class Settings(BaseModel):
             content["expert"] = cls.is_expert(name)
             if unit := _UNIT.search(content.get("description", "")):
                 content["unit"] = unit.group(1)
-        return schema | ({"retired": former} if (former := cls._former()) else {})
+        return schema | ({"retired": sorted(former)} if (former := cls._former()) else {})
 
 
 def nearest(name: str, known: Sequence[str]) -> str:

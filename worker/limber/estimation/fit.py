@@ -31,7 +31,13 @@ from limber.estimation.fitting.large_errors import (
     put_right,
 )
 from limber.estimation.fitting.objective import Evaluation, Objective, Stopped
-from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton, nelder_mead
+from limber.estimation.fitting.optimise import (
+    EVALUATION_LIMIT,
+    Fit,
+    FitStatus,
+    gauss_newton,
+    nelder_mead,
+)
 from limber.estimation.fitting.reduced_fit import Reduction, fit_reduced
 from limber.estimation.forward.forward_model import Forward, under_its_weight
 from limber.estimation.parameters import Values
@@ -302,10 +308,8 @@ def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
             ) -> tuple[Fit, Objective]:
     def optimise(chosen: Objective, free: np.ndarray, is_near: bool = False) -> Fit:
         if settings.method == "nelder-mead":
-            return nelder_mead(chosen, free, evaluation_limit=settings.evaluations,
-                               delta_m2=settings.delta_m2)
-        return gauss_newton(chosen, free, robust=settings.robust, is_near=is_near,
-                            evaluation_limit=settings.evaluations)
+            return nelder_mead(chosen, free, evaluation_limit=EVALUATION_LIMIT)
+        return gauss_newton(chosen, free, is_near=is_near, evaluation_limit=EVALUATION_LIMIT)
 
     if settings.method == "gauss-newton":
         start = _resumed(objective, start)
@@ -346,8 +350,7 @@ def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
         for forward in coarse:
             forward.refine()
         fresh = objective.with_space(objective.space)
-        fit = gauss_newton(fresh, fit.evaluation.free, robust=settings.robust,
-                           evaluation_limit=settings.evaluations)
+        fit = gauss_newton(fresh, fit.evaluation.free, evaluation_limit=EVALUATION_LIMIT)
         objective.forward_count = fresh.forward_count
     return fit
 
@@ -387,8 +390,7 @@ def _linked_at_the_end(fit: Fit, objective: Objective, settings: EstimateSetting
             break
         start = fit.evaluation.free
         objective = objective.with_space(space)
-        fit = gauss_newton(objective, start, robust=settings.robust,
-                           evaluation_limit=settings.evaluations)
+        fit = gauss_newton(objective, start, evaluation_limit=EVALUATION_LIMIT)
     for message in messages:
         progress.warn(message)
     return fit, objective

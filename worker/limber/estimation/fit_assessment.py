@@ -202,8 +202,7 @@ def hold_out(found: Estimate, settings: EstimateSettings) -> None:
     """Score the prediction of each pull by a fit without it, into ``found.held_out``."""
     for index, forward in enumerate(found.objective.forwards):
         rest = without(found.objective, index)
-        fit = gauss_newton(rest, found.fit.evaluation.free, robust=settings.robust,
-                           evaluation_limit=15)
+        fit = gauss_newton(rest, found.fit.evaluation.free, evaluation_limit=15)
         distance, force = held_out(found.objective, fit.evaluation.free, index)
         found.held_out[forward.name] = _score(forward, distance, force, in_fit=True)
 

@@ -1,6 +1,6 @@
 """Settings of estimates, virtual pulls and predictions, without heavy imports."""
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
@@ -26,15 +26,13 @@ class EstimateSettings(Settings):
         "input": ("pull", "drive", "motion", "fractions", "free_frame"),
         "material": ("young", "poisson", "density", "gravity", "fit_poisson", "fit_density",
                      "fit_damping"),
-        "solver": ("method", "forward", "key_frames", "delta_m2", "robust"),
+        "solver": ("method", "forward", "key_frames"),
         "uncertainty": ("field", "poisson_sigma", "density_sigma", "hung_sigma", "hold_out",
                         "mesh_check", "shapes"),
     }
     common = ("pull", "fractions")
-    retired = ("evaluations",)
-
-    evaluations: ClassVar[int] = 400
-    """Largest number of forward simulations of all pulls."""
+    retired: ClassVar[dict[str, Any]] = {
+        "evaluations": 400, "delta_m2": None, "robust": True}
 
     pull: tuple[str, ...] = Field((), description="Names of the pulls to use. Default: all.")
     method: Literal["gauss-newton", "nelder-mead"] = Field(
@@ -76,19 +74,16 @@ class EstimateSettings(Settings):
     key_frames: int = Field(
         12, ge=3, description="Number of simulated frames. A spline interpolates the others. The "
         "number is doubled if that changes the result.")
-    delta_m2: float | None = Field(
-        None, gt=0, description="Nelder-Mead stops at this mean squared distance [m^2].")
-    robust: bool = Field(True, description="Reduce the weight of outliers (Gauss-Newton).")
+    hung_sigma: float = Field(
+        0.4, ge=0, description="Relative standard deviation of the mass of twigs and leaves "
+        "outside the mesh. The default is the difference between two programs' volumes of one "
+        "crown.")
     hold_out: bool = Field(
         True, description="With several pulls, fit without each one in turn, and compare it with "
             "its prediction.")
     mesh_check: bool = Field(
         True, description="Measure the excess stiffness of this mesh on a finer mesh, and include "
         "it in the intervals.")
-    hung_sigma: float = Field(
-        0.4, ge=0, description="Relative standard deviation of the mass of twigs and leaves "
-        "outside the mesh. The default is the difference between two programs' volumes of one "
-        "crown.")
     shapes: int = Field(
         16, ge=0, description="Number of posterior samples of the branch's shape given the scan. "
         "The pulls are simulated on each one to include the uncertainty of the shape in the "
@@ -102,19 +97,16 @@ class SwingSettings(Settings):
     """Options for estimating Young's modulus and damping from a free swing."""
 
     groups: ClassVar[Groups] = {
-        "input": ("pull", "periods"),
-        "material": ("poisson", "density", "gravity"),
+        "input": ("pull",),
+        "material": ("poisson", "density"),
         "uncertainty": ("density_sigma",),
     }
     common = ("pull",)
+    retired: ClassVar[dict[str, Any]] = {"periods": 6.0, "gravity": True}
 
     pull: str | None = Field(None, description="Name of the swing. Default: the only one.")
-    periods: float = Field(6.0, ge=2, le=30, description="Number of periods after the release "
-        "that are used.")
     poisson: float | None = Field(None, ge=0, lt=0.495, description="Poisson's ratio.")
     density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
-    gravity: bool = Field(
-        True, description="The branch carries its own weight, as when it was scanned.")
     density_sigma: float = Field(
         0.1, ge=0, description="Relative standard deviation of the density. A swing determines "
         "the modulus through inertia, so this uncertainty enters the modulus in full.")
@@ -128,13 +120,14 @@ class VirtualPullSettings(Settings):
     groups: ClassVar[Groups] = {
         "material": ("young", "poisson", "density", "damping", "gravity", "own_weight", "shape"),
         "motion": ("motion", "drive", "weight", "frames", "duration", "grasp_fraction", "mode",
-            "reach", "turn", "phase"),
+            "reach", "phase"),
         "noise": ("position_noise", "force_noise", "torque_noise", "camera", "outliers", "seed"),
-        "errors of the cell": ("cell_errors", "pose_sigma", "pose_turn_sigma", "force_gain_sigma",
-            "force_bias_sigma", "force_drift_sigma", "torque_bias_sigma", "camera_sigma",
-            "camera_turn_sigma", "point_sigma", "clock_sigma"),
+        "errors of the cell": ("cell_errors", "force_bias_sigma", "force_drift_sigma"),
     }
     common = ("cell_errors", "seed")
+    retired: ClassVar[dict[str, Any]] = {"turn": 2.0} | dict.fromkeys((
+        "pose_sigma", "pose_turn_sigma", "force_gain_sigma", "torque_bias_sigma", "camera_sigma",
+        "camera_turn_sigma", "point_sigma", "clock_sigma"))
 
     young: tuple[float, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]. Default: that of a "
@@ -169,7 +162,6 @@ class VirtualPullSettings(Settings):
     reach: float = Field(
         0.35, gt=0, le=0.8, description="Sideways travel of the grasp as a fraction of its arc "
             "length.")
-    turn: float = Field(2.0, description="Angle by which the direction of the pull turns [rad].")
     phase: float | None = Field(
         None, description="Initial direction of the pull [rad]. Default: drawn from the seed.")
     position_noise: float = Field(1e-3, ge=0, description="Noise of the observed points [m].")
@@ -193,28 +185,11 @@ class VirtualPullSettings(Settings):
         "none", description="Errors of the cell that stay during the recording, drawn from the "
         "seed. realistic: those of a cell that was set up with care and not measured since "
         "(gripper 1 mm and 1 degree, force gain 2 %, zero and drift 1 N, camera 1 mm, points 5 mm "
-        "along the branch). The pull "
-        "states their standard deviations as its calibration. Each can be set by its own option.")
-    pose_sigma: float | None = Field(
-        None, ge=0, description="Error of the position of the gripper's frame, each axis [m].")
-    pose_turn_sigma: float | None = Field(
-        None, ge=0, description="Error of the rotation of the gripper's frame, each axis [rad].")
-    force_gain_sigma: float | None = Field(None, ge=0, description="Relative error of the force.")
+        "along the branch). The pull states their standard deviations as its calibration.")
     force_bias_sigma: float | None = Field(
         None, ge=0, description="Zero offset of the force, each axis [N].")
     force_drift_sigma: float | None = Field(
         None, ge=0, description="Drift of the force's zero over the recording, each axis [N].")
-    torque_bias_sigma: float | None = Field(
-        None, ge=0, description="Zero offset of the torque, each axis [N m].")
-    camera_sigma: float | None = Field(
-        None, ge=0, description="Error of the position of the observer's frame, each axis [m].")
-    camera_turn_sigma: float | None = Field(
-        None, ge=0, description="Error of the rotation of the observer's frame, each axis [rad].")
-    point_sigma: float | None = Field(
-        None, ge=0, description="Distance of each observed point along the branch from its control "
-        "point [m].")
-    clock_sigma: float | None = Field(
-        None, ge=0, description="Offset of the observer's clock from the robot's [s].")
     seed: int = Field(0, ge=0, description="Seed of all random numbers.")
 
     @property
@@ -223,14 +198,8 @@ class VirtualPullSettings(Settings):
         from limber.recordings.cell_errors import EXACT, CalibrationEntry
 
         begun = CalibrationEntry() if self.cell_errors == "realistic" else EXACT
-        sigmas = {"pose_sigma_m": self.pose_sigma, "pose_sigma_rad": self.pose_turn_sigma,
-                  "force_gain_sigma": self.force_gain_sigma,
-                  "force_bias_sigma_n": self.force_bias_sigma,
-                  "force_drift_sigma_n": self.force_drift_sigma,
-                  "torque_bias_sigma_nm": self.torque_bias_sigma,
-                  "camera_sigma_m": self.camera_sigma, "camera_sigma_rad": self.camera_turn_sigma,
-                  "point_sigma_m": self.point_sigma,
-                  "clock_sigma_s": self.clock_sigma}
+        sigmas = {"force_bias_sigma_n": self.force_bias_sigma,
+                  "force_drift_sigma_n": self.force_drift_sigma}
         return begun.model_copy(update={
             name: value for name, value in sigmas.items() if value is not None})
 
@@ -256,9 +225,10 @@ class PredictSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("pull",),
-        "grasp and loads": ("weight", "load", "gravity"),
+        "grasp and loads": ("weight", "load"),
     }
     common = ("weight", "load")
+    retired: ClassVar[dict[str, Any]] = {"gravity": True}
 
     pull: str | None = Field(
         None, description="Name of the pull whose points, grasp and gravity are used. Default: "
@@ -266,7 +236,5 @@ class PredictSettings(Settings):
     weight: float | None = Field(None, ge=0, description="Weight that hangs on the grasp [N].")
     load: tuple[float, float, float] | None = Field(
         None, description="Steady force in any direction, in the branch's frame [N].")
-    gravity: bool = Field(
-        True, description="The branch carries its own weight, as when it was scanned.")
 
     _force = field_validator("weight", "load")(possible_force)

@@ -50,6 +50,8 @@ SHAPE_TRIES = 8
 DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
 """A gradient like that of the paper's branches, at the stiffness of young wood."""
 
+_PULL_TURN = 2.0  # angle by which the direction of a pull turns [rad]: both bending axes are seen
+
 
 @dataclass(frozen=True)
 class TrueBranch:
@@ -101,7 +103,7 @@ def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
         mesh = refined(body) if 8 * body.tet_count <= BODY_LIMIT and body.is_quadratic else body
     else:
         # Reconstructed branches have six-sided sections four radii apart.
-        mesh = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3)
+        mesh = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_spacing=1.3)
                            ).mesh
     if scan is not None and body is None:
         skeleton, mesh = _another(skeleton, mesh, scan, np.random.default_rng([settings.seed, 2]))
@@ -140,7 +142,7 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     made = moved(model, grasp, MotionWanted(
         kind=_kind(settings), point=np.array(entry.grasp.point_m),
         axis=np.array(entry.grasp.point_m) - truth.skeleton.nodes[0], travel=settings.reach * arc,
-        turn=settings.turn, phase=phase, times=settings.times,
+        turn=_PULL_TURN, phase=phase, times=settings.times,
         weight=(settings.weight or 0.0) * np.array(truth.gravity)
         / np.linalg.norm(truth.gravity)), progress=progress)
     shifts, points = _marked(truth, settings)

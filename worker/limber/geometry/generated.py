@@ -18,6 +18,7 @@ from limber.geometry.skeleton.sweep import arc_lengths, frames, tangents
 from limber.geometry.surface.surface import Surface
 
 _Positive = Annotated[float, Field(gt=0)]
+_GAP_M = 0.02  # length of a stretch without points
 _STEP = 0.004  # [m] between nodes of the true axes
 
 
@@ -77,11 +78,6 @@ def scan(skeleton: Skeleton, spec: BranchSpec, rng: np.random.Generator) -> Clou
         keep &= _seen_from_one_side(points, normals, spec, rng)
     points, normals = points[keep], normals[keep]
     points = points + rng.normal(0, spec.noise, points.shape)
-    stray = int(spec.outlier_share * len(points))
-    if stray:
-        low, high = points.min(axis=0) - 0.05, points.max(axis=0) + 0.05
-        points = np.vstack([points, rng.uniform(low, high, (stray, 3))])
-        normals = np.vstack([normals, np.zeros((stray, 3))])
     return Cloud(points, {"normal": normals.astype(np.float32)})
 
 
@@ -201,7 +197,7 @@ def _outside_gaps(skeleton: Skeleton, run: np.ndarray, along: np.ndarray, spec: 
     keep = np.ones(len(run), bool)
     for middle in (np.arange(spec.gap_count) + 0.5) / max(spec.gap_count, 1):
         start = (0.15 + 0.75 * middle + rng.uniform(-0.03, 0.03)) * spec.length
-        keep &= (run != 0) | (np.abs(along - start) > spec.gap_length / 2)
+        keep &= (run != 0) | (np.abs(along - start) > _GAP_M / 2)
     return keep
 
 

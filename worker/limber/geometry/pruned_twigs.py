@@ -28,7 +28,7 @@ def leave_out_twigs(skeleton: Skeleton, settings: ReconstructSettings,
         own = members[1:]
         carried = not keep[members[0]]
         thin = float(np.median(skeleton.radius[own])) < settings.twig_radius
-        if not (carried or thin or skeleton.order[own[0]] > settings.twig_order):
+        if not (carried or thin):
             continue
         keep[own] = False
         masses.append(twig_mass(skeleton, run, settings.density, keep))
@@ -84,7 +84,7 @@ def tell_left_out(masses: list[dict[str, Any]], meshed: float, settings: Reconst
     more = f" and {len(masses) - _NAMED} more" if len(masses) > _NAMED else ""
     text = (f"{len(masses)} branches with a length of {sum(m['length_m'] for m in masses):.3g} m "
             f"and {100 * share:.1f} % of the mass are not in the mesh: {named}{more}.")
-    asked = settings.leave_out or settings.twig_radius > 0 or settings.twig_order < 9
+    asked = settings.leave_out or settings.twig_radius > 0
     if share > _LEFT_OUT_MOST and not asked:
         raise MeshingError(text,
                            "Their weight would act on the branch, but they could neither bend nor "

@@ -60,6 +60,8 @@ Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
 """Receives a skeleton as found, and the full result of the search for it."""
 
 _OWN_COLUMNS = ("skeleton_node", "residual", "leaf")  # columns of cloud.ply that Limber writes
+# A twig is kept if, as seen by a depth camera, it reaches this many radii beyond its parent's axis.
+_SILHOUETTE_REACH = 1.5
 _LEAVES_ASKED = 0.2  # fraction of points on no round axis above which leaves are searched for
 # Fraction of flat points from which shape alone shows leaves. Bare branches seen from one side have
 # up to 0.11, leafy seedlings 0.6 and more.
@@ -141,7 +143,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         else _found_before(prepared, known, progress))
     whole = found
     if wood.view is not None and own is None:
-        found, text = seen_skeleton(found, wood, settings.silhouette_reach)
+        found, text = seen_skeleton(found, wood)
         if text:
             progress.warn(text)
     alignment, cloud, found = _aligned(wood, found, settings)
@@ -310,16 +312,14 @@ def peak_memory_mb() -> float:
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
-def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
-                  ) -> tuple[SkeletonResult, str]:
+def seen_skeleton(found: SkeletonResult, prepared: Prepared) -> tuple[SkeletonResult, str]:
     """Compare twigs and radii of a skeleton with the depth camera's image; return warnings.
 
     Args:
         found: The skeleton of the cloud.
         prepared: The cloud, and the view from which it was seen.
-        reach: ``silhouette_reach`` of the settings.
     """
-    skeleton, dropped = without_hidden_twigs(found.skeleton, prepared.view, reach)
+    skeleton, dropped = without_hidden_twigs(found.skeleton, prepared.view, _SILHOUETTE_REACH)
     skeleton = without_edges(skeleton, prepared.view)
     skeleton, _ = within_silhouette(skeleton, prepared.cloud.points, prepared.view)
     node, residual = nearest_cylinders(skeleton, prepared.cloud.points)

@@ -1,6 +1,6 @@
 """Settings of reconstruction from scans and surfaces; this module imports nothing heavy."""
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
@@ -15,18 +15,11 @@ class PreparationSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("crop_low", "crop_high", "camera_at"),
-        "shape": ("flying_angle", "keep_sheets", "outlier_ratio", "outlier_radius", "voxel"),
+        "shape": ("keep_sheets",),
     }
-    retired = ("flying_speck", "silhouette_reach", "outlier_neighbours")
-
-    flying_speck: ClassVar[int] = 20
-    """Depth camera: groups of fewer pixels are removed as flying pixels."""
-    silhouette_reach: ClassVar[float] = 1.5
-    """Depth camera: a twig is kept if, as seen by the camera, it reaches this many radii of its
-    parent beyond the parent's axis.
-    """
-    outlier_neighbours: ClassVar[int] = 8
-    """Neighbours whose distance or number decides whether a point is an outlier."""
+    retired: ClassVar[dict[str, Any]] = {
+        "flying_speck": 20, "silhouette_reach": 1.5, "flying_angle": 78.0, "outlier_neighbours": 8,
+        "outlier_ratio": 5.0, "outlier_radius": 0.0, "voxel": 0.0}
 
     crop_low: tuple[float, float, float] | None = Field(
         None, description="Lower corner of the box to keep, in the file's coordinates.")
@@ -35,76 +28,40 @@ class PreparationSettings(Settings):
     camera_at: tuple[float, float, float] | None = Field(
         None, description="Position of the depth camera, in the file's coordinates. Default: the "
         "origin, if the cloud is an image seen from there.")
-    flying_angle: float = Field(
-        78.0, ge=0, lt=90, description="Depth camera: a step between neighbouring pixels is not "
-        "a surface if that surface would be seen at a larger angle than this [degrees]. 0 keeps "
-        "flying pixels.")
     keep_sheets: bool = Field(
         False, description="Keep walls and ground. Default: wide flat sheets are removed.")
-    outlier_ratio: float = Field(
-        5.0, ge=0, description="Remove points whose neighbours are this many times farther than "
-        "is usual around them. 0 keeps all.")
-    outlier_radius: float = Field(
-        0.0, ge=0, description="Remove points with 8 or fewer neighbours within this radius "
-        "[m]. 0: off.")
-    voxel: float = Field(
-        0.0, ge=0, description="Keep one point in each cell of this size [m]. 0 keeps all.")
 
 
 class SkeletonSettings(Settings):
     """Settings of the skeleton."""
 
     groups: ClassVar[Groups] = {
-        "shape": ("contraction_points", "attraction", "bridge_limit", "prune",
-            "twig_probability", "plants", "radii", "radius_low", "radius_high"),
+        "shape": ("bridge_limit", "twig_probability", "plants"),
     }
-    retired = ("gap_factor",)
+    retired: ClassVar[dict[str, Any]] = {
+        "gap_factor": 3.0, "contraction_points": 12_000, "attraction": "constant", "prune": 2.5,
+        "radii": "fit", "radius_low": 5e-4, "radius_high": 0.1}
 
-    gap_factor: ClassVar[float] = 3.0
-    """The paper's gamma: a distance of more than this many median steps is a gap."""
-
-    contraction_points: int = Field(
-        12_000, ge=50, description="Largest number of points that are contracted; more are "
-            "thinned evenly.")
-    attraction: Literal["constant", "growing"] = Field(
-        "constant", description="Attraction of the contraction: constant, or growing with each "
-        "iteration as neighbourhoods shrink, as in the paper's source.")
     bridge_limit: float = Field(
         0.15, ge=0, le=1, description="Bridge gaps up to this fraction of the cloud's diagonal.")
-    prune: float = Field(
-        2.5, ge=0, description="Keep a twig if it reaches this many radii of its parent beyond "
-        "the parent's axis.")
     twig_probability: float = Field(
         0.5, ge=0, le=1, description="Remove twigs whose probability is lower. 0 keeps all.")
     plants: Literal["refuse", "largest", "joined"] = Field(
         "refuse", description="Two plants in one cloud: refuse the cloud, keep the largest, or "
             "join them.")
-    radii: Literal["fit", "paper"] = Field(
-        "fit", description="fit: fit radii together with the axes. paper: the median distance of "
-        "the nearest points.")
-    radius_low: float = Field(
-        5e-4, ge=0, description="Smallest radius, as a fraction of the cloud's diagonal.")
-    radius_high: float = Field(
-        0.1, gt=0, le=1, description="Largest radius, as a fraction of the cloud's diagonal.")
-
-    def radius_limits(self, diagonal: float) -> tuple[float, float]:
-        """Least and largest radius [m] in a cloud of this size [m]: the paper's rule."""
-        return self.radius_low * diagonal, self.radius_high * diagonal
 
 
 class MeshSettings(Settings):
     """Settings of the tetrahedra."""
 
     groups: ClassVar[Groups] = {
-        "mesh": ("mesher", "mesh_sides", "mesh_spacing", "mesh_time_limit", "mesh_memory_limit_mb"),
+        "mesh": ("mesher", "mesh_spacing", "mesh_time_limit", "mesh_memory_limit_mb"),
     }
+    retired: ClassVar[dict[str, Any]] = {"mesh_sides": 8}
 
     mesher: Literal["auto", "ftetwild", "sweep"] = Field(
         "auto", description="auto: a sweep along the axes, or fTetWild if the sweep cannot join "
         "a twig. ftetwild: fTetWild, with the sweep as its fallback.")
-    mesh_sides: int = Field(
-        8, ge=4, le=24, description="Number of sides of the sections that fTetWild fills; the "
-            "sweep uses 6.")
     mesh_spacing: float = Field(
         2.5, gt=0.3, le=8, description="Distance between cross-sections in local radii.")
     mesh_time_limit: float = Field(60.0, gt=0, description="fTetWild's limit of processor time "
@@ -117,11 +74,12 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
 
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
-        "shape": ("twig_radius", "twig_order", "leaves", "unexplained", "leave_out"),
+        "shape": ("twig_radius", "leaves", "unexplained", "leave_out"),
         "material": ("young", "poisson", "density", "leaf_density"),
         "mesh": ("grasp_fraction",),
     }
     common = ("unit", "up", "root", "leaves")
+    retired: ClassVar[dict[str, Any]] = {"twig_order": 9}
 
     unit: Literal["m", "cm", "mm", "in", "um"] = Field(
         "m", description="Unit of the file, if it does not state one.")
@@ -146,9 +104,6 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     twig_radius: float = Field(
         0.0, ge=0, description="Leave twigs thinner than this [m] out of the mesh, and keep "
             "their mass.")
-    twig_order: int = Field(
-        9, ge=0, le=9, description="Leave twigs of a higher branching order out of the mesh, and "
-            "keep their mass.")
     young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
     density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
@@ -199,10 +154,10 @@ class BranchSpec(Settings):
 
     groups: ClassVar[Groups] = {
         "shape": ("length", "radius_root", "radius_tip", "bend", "fork_count"),
-        "scan": ("noise", "point_spacing", "unevenness", "occlusion", "view", "gap_count",
-            "gap_length", "outlier_share"),
+        "scan": ("noise", "point_spacing", "unevenness", "occlusion", "view", "gap_count"),
         "material": ("young_mean",),
     }
+    retired: ClassVar[dict[str, Any]] = {"gap_length": 0.02, "outlier_share": 0.0}
 
     length: float = Field(0.9, gt=0.05, description="Length of the main axis [m].")
     radius_root: float = Field(0.009, gt=0, description="Radius at the root [m].")
@@ -217,7 +172,5 @@ class BranchSpec(Settings):
         "missing.")
     view: Literal["round", "one-sided"] = Field(
         "round", description="Scanned from all around, or from one side as a depth camera does.")
-    gap_count: int = Field(0, ge=0, le=5, description="Number of stretches without points.")
-    gap_length: float = Field(0.02, gt=0, description="Length of each stretch without points [m].")
-    outlier_share: float = Field(0.0, ge=0, lt=0.3, description="Fraction of stray points.")
+    gap_count: int = Field(0, ge=0, le=5, description="Number of stretches of 2 cm without points.")
     young_mean: float = Field(1e8, gt=0, description="Typical Young's modulus [Pa].")

@@ -46,13 +46,10 @@ class MeshData:
                            for key, equations in self.equations.items()}
         return other
 
-    def mass_matrix(self, density: np.ndarray, *, lumped: bool) -> sp.csr_matrix:
+    def mass_matrix(self, density: np.ndarray) -> sp.csr_matrix:
         """Return the mass matrix [kg] of each axis for densities [kg/m^3], shape [tet_count]."""
-        consistent, diagonal = elements.node_weights(self.mesh)
+        consistent, _ = elements.node_weights(self.mesh)
         tets, n = self.mesh.tets, self.mesh.node_count
-        if lumped:
-            weights = np.bincount(tets.ravel(), (diagonal * density[:, None]).ravel(), n)
-            return sp.diags(weights).tocsr()
         per_tet = tets.shape[1]
         rows = np.repeat(tets, per_tet, axis=1).ravel()
         columns = np.tile(tets, (1, per_tet)).ravel()

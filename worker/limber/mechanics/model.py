@@ -81,7 +81,6 @@ class BranchModel:
         material: A law (:mod:`limber.mechanics.materials`), or the name of one.
         damping: Rayleigh damping, used in dynamics.
         point_masses: Added masses, and twigs (:class:`limber.mechanics.added_masses.HungTwig`).
-        lumped_mass: Diagonal mass matrix instead of the consistent one, except for twigs.
 
     Attributes:
         young: Young's modulus of the material [Pa], shape [tet_count].
@@ -103,13 +102,12 @@ class BranchModel:
                  gravity: Sequence[float] | None = GRAVITY,
                  material: str | MaterialLaw = "st_venant_kirchhoff",
                  damping: RayleighDamping = DEFAULT_DAMPING,
-                 point_masses: Iterable[PointMass] = (), lumped_mass: bool = False):
+                 point_masses: Iterable[PointMass] = ()):
         check_mesh(mesh)
         self._data = MeshData(mesh, fixed_mask(mesh, fixed))
         self.gravity = np.zeros(3) if gravity is None else np.asarray(gravity, float)
         self.material = material_named(material)
         self.damping = damping
-        self.lumped_mass = lumped_mass
         self.point_masses = tuple(point_masses)
         self.prestress: Prestress | None = None
         # Not known yet: any value counts as a change.
@@ -418,7 +416,7 @@ class BranchModel:
     def mass_matrix(self) -> sp.csr_matrix:
         """Mass matrix [kg] for each axis, shape [node_count, node_count]."""
         if "matrix" not in self._mass:
-            matrix = self._data.mass_matrix(self.density, lumped=self.lumped_mass)
+            matrix = self._data.mass_matrix(self.density)
             self._mass["matrix"] = (matrix + mass_entries(self._ties, self.mesh.node_count)
                                     ).tocsr() if self.point_masses else matrix
         return self._mass["matrix"]

@@ -1,6 +1,6 @@
 """Settings of a simulated pull, without heavy imports."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
@@ -23,14 +23,11 @@ class SimulateSettings(Settings):
             "mass_at"),
         "material": ("young", "material", "gravity", "rest_shape", "damping_mass",
             "damping_stiffness"),
-        "solver": ("step", "scheme", "lumped_mass"),
+        "solver": ("step", "scheme"),
     }
     common = ("name", "move", "grasp_force", "young")
-    retired = ("newmark_beta", "newmark_gamma")
-
-    newmark_beta: ClassVar[float] = 0.25
-    newmark_gamma: ClassVar[float] = 0.5
-    """Newmark's constants for ``scheme``: second order, and no numerical damping."""
+    retired: ClassVar[dict[str, Any]] = {
+        "newmark_beta": 0.25, "newmark_gamma": 0.5, "lumped_mass": False}
 
     name: str = Field("simulate", pattern=r"^[\w-]+$",
                       description="Name of the result files: frames/NAME.pc2 and frames/NAME.json.")
@@ -68,9 +65,6 @@ class SimulateSettings(Settings):
     scheme: Literal["energy_momentum", "newmark"] = Field(
         "energy_momentum", description="Time integration (dynamic). energy_momentum: conserves "
         "the energy at any amplitude. newmark: the paper's.")
-    lumped_mass: bool = Field(
-        False, description="Lump the mass at the nodes instead of using the consistent mass "
-            "matrix.")
     young: float | None = Field(
         None, gt=0, description="Young's modulus of the whole branch [Pa]. Default: the mesh's.")
     gravity: bool = Field(

@@ -191,7 +191,6 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         goals, nobody = np.empty((0, 3)), error
     # Scales by the goal's centre, not by a random point in it: costs of two seeds compare.
     weighed = CostWeights.between(field, start, goal.centre(field),
-                                  deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
     problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond,
                             errors=errors or {}, asked_goal=asked_goal)
@@ -243,7 +242,6 @@ def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSe
              limits: FieldArrays, beyond: FieldArrays | None) -> PathPair:
     """Return the plan if the start is in the goal: both paths stay there."""
     weighed = CostWeights.between(field, start, goal.centre(field),
-                                  deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
     problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond)
     path = FoundPath(np.stack([start, start]), 0.0, 0.0, engine=NOTHING_ASKED)
@@ -267,10 +265,6 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSetti
         raise InputError("--max-detour is given with --planner d-rrt-star.",
                          "D-RRT* cannot limit the length of its path.",
                          "Omit --planner.")
-    if settings.deformation_weight == 0.0:
-        raise InputError("--max-detour is given with a --deformation-weight of 0.",
-                         "Without a weight on energy the planner seeks the shortest path.",
-                         "Omit one of them.")
     rough = known or [plan_gentle(problem, progress=progress.part(0.0, 0.3)).points]
     paths = [_shortest(problem, path) for path in rough]
     shortest = min((path for path in paths if np.isfinite(path.cost)),
@@ -319,8 +313,7 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
     field, start = problem.energy_field, problem.start
     if np.linalg.norm(start - field.rest) < STEP:
         return field.rest[None]
-    cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight,
-                               deformation=max(settings.deformation_weight, 1.0))
+    cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight)
     goal = near(start, _AT_START)
     path = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), goal,
                          beyond=problem.beyond, errors=problem.errors)

@@ -38,6 +38,8 @@ from limber.planning.settings import PlanSettings
 from limber.planning.timing import DEFAULT_PACE, Pace
 from limber.planning.undecided_passages import Passages, solved_if_undecided, with_added_poses
 
+_REPLANS = 3  # of the same plan at most: each takes as long as the first
+_SLOWINGS = 4  # of the motion at most, until it keeps the limits
 _RESERVE = 1.01  # factor on the tightening of limits: the risk changes a little with the path
 
 
@@ -75,7 +77,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
 
     A plan that breaks a limit on the full model, or that the branch cannot follow, is not passed
     on: the states found there join the field's samples and the plan is repeated, at most
-    ``settings.replans`` times. The same holds for a plan along which the field's error is too large
+    :data:`_REPLANS` times. The same holds for a plan along which the field's error is too large
     for it to be the gentlest; the last of those is passed on with a warning. If no path keeps the
     limits on the field, and its error leaves that undecided, the states along the path that comes
     nearest join the samples likewise (:mod:`limber.planning.undecided_passages`). The same holds
@@ -98,10 +100,10 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         field = _knowing(field, grasp_model, limits, workers, progress)
     rounds = _Rounds(grasp_model, settings, limits, goal, start, uncertainty, workers, field, goal,
                      limits, pace or Pace(settings.speed, settings.acceleration), progress)
-    count = settings.replans + 1
+    count = _REPLANS + 1
     for number in range(count):
         ahead = rounds.progress.part(number / count, (number + 1) / count)
-        if rounds.plan_once(ahead, is_last=number == settings.replans):
+        if rounds.plan_once(ahead, is_last=number == _REPLANS):
             break
     return rounds.found()
 
@@ -166,7 +168,7 @@ class _Rounds:
                             "The best path found so far is not allowed: "
                             f"{'; '.join(broken)}.", "Run it again and let it finish.")
         if is_last:
-            raise _refused(broken, self.settings)
+            raise _refused(broken)
         self.field = refit(self.field, learnt(self.field, self.grasp_model, plan, self.limits))
         return False
 
@@ -247,7 +249,7 @@ class _Rounds:
         if self.settings.inertia and not broken and is_near and self.limits.asked():
             limits = self.risks[-1].left(self.limits, plan) if self.risks else self.limits
             self.moving = check_motion(
-                self.grasp_model, plan, limits, self.pace, slowings=self.settings.slowings,
+                self.grasp_model, plan, limits, self.pace, slowings=_SLOWINGS,
                 workers=self.workers, progress=ahead.part(0.95, 1.0))
             broken = self.moving.broken
             self._tighten(self.moving.excess)
@@ -311,10 +313,10 @@ def _knowing(field: EnergyField, grasp_model: GraspModel, limits: Limits, worker
     return knowing(field, limits.values(grasps, nodes + displacements))
 
 
-def _refused(broken: list[str], settings: PlanSettings) -> NoPathError:
+def _refused(broken: list[str]) -> NoPathError:
     return NoPathError(
         f"No plan keeps the limits on the full model: {'; '.join(broken)}.",
-        f"The path was planned {settings.replans + 1} times. After each plan, the states found on "
+        f"The path was planned {_REPLANS + 1} times. After each plan, the states found on "
         "the full model were added to the energy field.",
-        "Raise the limit, choose a gentler goal, sample more poses with `limber energy --samples`, "
-        "or allow more --replans.")
+        "Raise the limit, choose a gentler goal, or sample more poses with `limber energy "
+        "--samples`.")

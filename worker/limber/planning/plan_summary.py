@@ -38,7 +38,7 @@ def summary_of(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair
             for name, points in pair.compared.items()},
         "margins": pair.margins,
         "detour": pair.detour and pair.detour.describe(),
-        "weights": {"deformation": settings.deformation_weight,
+        "weights": {"deformation": pair.cost.deformation,
                     "distance": pair.cost.distance,
                     "energy_scale_j": pair.cost.energy_scale,
                     "length_scale_m": pair.cost.length_scale},

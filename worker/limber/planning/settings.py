@@ -1,6 +1,6 @@
 """Settings of the energy field and of paths; they import nothing heavy."""
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -39,18 +39,15 @@ class PlanSettings(Settings):
     groups: ClassVar[Groups] = {
         "start and goal": ("goal", "tip_goal", "target", "target_box", "in_view", "second_arm",
                            "goal_seed", "goal_tolerance", "start", "start_seed"),
-        "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
+        "weights and limits": ("distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "wood", "max_damage", "max_stress", "workspace_low",
                                "workspace_high", "clearance", "turn_slack", "confidence"),
         "timing": ("speed", "acceleration", "hold", "inertia"),
-        "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
+        "solver": ("planner", "iterations", "engine", "field_error", "seed"),
     }
     common = ("goal", "tip_goal", "target", "max_force", "max_strain")
-    retired = ("slowings",)
-
-    slowings: ClassVar[int] = 4
-    """Largest number of times that the motion is slowed down until it keeps the limits."""
+    retired: ClassVar[dict[str, Any]] = {"slowings": 4, "replans": 3, "deformation_weight": 1.0}
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the grasp, in the branch's frame [m]. Without any goal, a distant pose "
@@ -79,10 +76,8 @@ class PlanSettings(Settings):
         json_schema_extra=POSITION)
     start_seed: int | None = Field(None, ge=0, description=(
         "Seed of a random deformed start configuration, as in the paper's trials."))
-    deformation_weight: float = Field(1.0, ge=0, description=(
-        "Weight of deformation, the paper's alpha_def."))
     distance_weight: float = Field(1.5, gt=0, description=(
-        "Weight of distance, the paper's alpha_dis."))
+        "Weight of distance relative to that of deformation: the paper's alpha_dis / alpha_def."))
     max_detour: float | None = Field(None, ge=0, le=1000, description=(
         "Largest extra length over the shortest path [%]. The weight of distance is set so that "
         "the gentlest such path is found."))
@@ -143,8 +138,4 @@ class PlanSettings(Settings):
         "Largest error of the field's energy along the plan, compared with the full model [%] "
         "(root mean square). If it is larger, the states found are added to the field and "
         "planning is repeated."))
-    replans: int = Field(3, ge=0, le=10, description=(
-        "Largest number of repeated plans. Planning is repeated if the full model breaks a limit, "
-        "if the field's error is too large, or if that error makes it uncertain whether a path "
-        "exists."))
     seed: int = Field(0, ge=0, description="Seed of both planners.")

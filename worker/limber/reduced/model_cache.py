@@ -54,7 +54,7 @@ def model_key(model: BranchModel, grasp: Grasp, weights: np.ndarray, control_you
     """Return a digest of all that a reduced model depends on."""
     digest = hashlib.sha256(
         f"{FORMAT} {settings!r} {grasp.mode} {model.damping!r} {model.material.kernel}"
-        f" {model.lumped_mass} {sorted(map(repr, model.point_masses))}".encode())
+        f" False {sorted(map(repr, model.point_masses))}".encode())
     digest.update(model.mesh.geometry_digest().encode())
     for array in (weights, control_young, model.poisson, model.density, model.gravity,
                   grasp.nodes, grasp.weights, model.fixed):

@@ -146,7 +146,6 @@ class ModelOptions(TypedDict, total=False):
 
     material: str | MaterialLaw
     damping: RayleighDamping
-    lumped_mass: bool
 
 
 class Overrides(ModelOptions, total=False):

@@ -37,7 +37,7 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     scans = ["scans/*.ply"]             # a branch each; or folders = ["old/*.branch"]
     [[job.stage]]
     run = "reconstruct"                 # settings as in `limber reconstruct --help-all`, with _
-    contraction_points = 6000
+    leaves = "keep"
     [[job.stage]]
     run = "import-pull"
     source = "pulls/{scan}/*.csv"       # one run for each file that is found

@@ -10,6 +10,8 @@ import scipy
 from limber.core.errors import WorkError
 from limber.estimation.fitting.objective import FAILED_OBJECTIVE, Evaluation, Objective
 
+EVALUATION_LIMIT = 400
+"""Forward simulations of all pulls, after which a fit that still moves is given up."""
 FIRST_STEP = 1.5
 """Longest first step of Gauss-Newton in log E: a factor of 4.5. Chosen, not measured."""
 OUTLYING = 3.0
@@ -43,14 +45,12 @@ class FitStatus(StrEnum):
 
     converged: by the optimiser's own criterion.
     out_of_evaluations: no more simulations were allowed.
-    misfit: it settled, but farther from the measurements than requested.
     unconfirmed: a reduced model's fit that the full model could not confirm.
     stopped: by the user.
     """
 
     converged = "converged"
     out_of_evaluations = "out of evaluations"
-    misfit = "misfit"
     unconfirmed = "unconfirmed"
     stopped = "stopped"
 
@@ -185,24 +185,23 @@ def _wanted_step(found: Evaluation, loss: str) -> tuple[np.ndarray, float]:
     return step, float(np.linalg.norm(slopes @ step))
 
 
-def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: int = 400,
-                delta_m2: float | None = None, tolerance: float = 1e-3) -> Fit:
+def nelder_mead(objective: Objective, start: np.ndarray, *,
+                evaluation_limit: int = EVALUATION_LIMIT, tolerance: float = 1e-3) -> Fit:
     """The paper's estimator (Algorithm 1): scipy's Nelder-Mead on the free vector.
 
     Values that are free only within their priors, such as the form of the field, stay at the start:
     no simplex finds them beside the moduli. A settled search begins again from its best values with
     a simplex of full size, until that gains nothing: a simplex may collapse far from the minimum.
 
-    A search stops when the mean squared error of the points falls below ``delta_m2`` [m^2]; when
-    the error settles, that is, no longer decreases by an amount that is relevant compared to the
-    noise; or when the simplex spans less than ``tolerance`` in every log E and in the objective.
-    Settled above ``delta_m2`` is not converged.
+    A search stops when the error settles, that is, no longer decreases by an amount that is
+    relevant compared to the noise; or when the simplex spans less than ``tolerance`` in every log E
+    and in the objective.
 
     Raises:
         WorkError: no candidate had an equilibrium.
     """
     lower, upper = objective.space.bounds()
-    rule = _Settling(objective, delta_m2)
+    rule = _Settling(objective)
     if any(forward.drive == "force" for forward in objective.forwards):
         # The effect of its errors on the points is computed with the derivatives.
         _required(objective, start)
@@ -221,7 +220,7 @@ def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: in
 
     steps = _first_steps(objective)
     best, value, is_settled = np.clip(start, lower, upper), np.inf, False
-    while rule.count < evaluation_limit and not rule.is_small_enough:
+    while rule.count < evaluation_limit:
         found = _simplex_search(cost, best, steps, (lower, upper), rule, tolerance,
                                 evaluation_limit - rule.count)
         gain, value = value - found.fun, float(found.fun)
@@ -263,10 +262,9 @@ def _first_steps(objective: Objective) -> np.ndarray:
 
 
 class _Settling:
-    """The paper's termination: the mean squared error of the points settles below a threshold."""
+    """The paper's termination: the mean squared error of the points settles."""
 
-    def __init__(self, objective: Objective, delta_m2: float | None):
-        self._delta = delta_m2
+    def __init__(self, objective: Objective):
         self._points = max(sum(int(np.isfinite(f.frames.positions).all(axis=2).sum())
                                for f in objective.forwards), 1)
         self._window = SETTLED_ITERATIONS * (np.count_nonzero(_first_steps(objective)) + 1)
@@ -282,22 +280,15 @@ class _Settling:
 
     def begin_again(self) -> bool:
         """Return whether the last search ended by this rule; the next one is judged anew."""
-        ended = self._has_settled or self.is_small_enough
+        ended = self._has_settled
         self._course, self._has_settled = [], False
         return ended
-
-    @property
-    def is_small_enough(self) -> bool:
-        """Whether the error is below the requested one."""
-        return self._delta is not None and self._error < self._delta
 
     def seen(self, objective: float, loss: float) -> None:
         self._best = min(self._best, (objective, loss))
 
     def after_iteration(self, _free: np.ndarray) -> None:
         self._course.append(self._best[0])
-        if self.is_small_enough:
-            raise StopIteration
         if len(self._course) > self._window:
             fell = self._course[-1 - self._window] - self._course[-1]
             self._has_settled = fell <= min(SETTLED_FALL, 1e-3 * self._course[-1])
@@ -307,17 +298,11 @@ class _Settling:
     def verdict(self, is_settled: bool, limit: int) -> tuple[FitStatus, str]:
         """Status and reason."""
         error = f"the mean squared distance of the points, {self._error:.3g} m2,"
-        if self.is_small_enough:
-            return FitStatus.converged, f"{error} fell below {self._delta:.3g} m2"
         if not is_settled:
             return FitStatus.out_of_evaluations, (
                 f"{limit} simulations were not enough: {error} is still falling. Use "
                 "--method gauss-newton")
-        if self._delta is None:
-            return FitStatus.converged, f"{error} settled"
-        return FitStatus.misfit, (
-            f"{error} settled above the requested {self._delta:.3g} m2 (--delta-m2). The noise or "
-            "the error of the model is larger")
+        return FitStatus.converged, f"{error} settled"
 
 
 def _required(objective: Objective, free: np.ndarray) -> Evaluation:

@@ -1,4 +1,4 @@
-"""From a file's points to a prepared cloud: unit, origin, crop, outliers, thinning."""
+"""From a file's points to a prepared cloud: unit, origin, crop, outliers."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -20,6 +20,11 @@ _SMALLEST_EXTENT = 0.02
 _SHEET_LEAST = 0.08  # smallest fraction of the points that makes a wall or the ground
 _SHEETS_MOST = 6  # a box has six
 _AT_ONCE = 200_000  # points whose neighbours are held in memory at a time
+# A step between neighbouring pixels of a depth camera is no surface if that surface would be seen
+# at a larger angle [degrees]; smaller groups of pixels between such steps are flying pixels.
+_FLYING_ANGLE, _FLYING_SPECK = 78.0, 20
+# A point is an outlier if its neighbours are this many times farther than is usual around them.
+_OUTLIER_NEIGHBOURS, _OUTLIER_RATIO = 8, 5.0
 _COARSEST_STEP = 5e-3  # fraction of the cloud's size: the thickness of its twigs
 
 
@@ -83,16 +88,12 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     single = _first_of_each(points)
     counts["duplicates"] = int((~single).sum())
     cloud = cloud.subset(single)
-    keep = _without_outliers(cloud.points, settings)
+    keep = _without_outliers(cloud.points)
     counts["outliers"] = int((~keep).sum())
     cloud = cloud.subset(keep)
     if not settings.keep_sheets:
         cloud = _without_sheets(cloud, counts)
         cloud = cloud if up is None else _without_ground(cloud, up, counts)
-    if settings.voxel > 0:
-        chosen = voxel_thinned(cloud.points, settings.voxel)
-        counts["thinned"] = len(cloud) - len(chosen)
-        cloud = cloud.subset(chosen)
     _enough(cloud, "After cropping and cleaning, the cloud")
     if view is not None:
         view = replace(view, eye=view.eye - origin)
@@ -105,7 +106,8 @@ def voxel_thinned(points: np.ndarray, size: float) -> np.ndarray:
     extent = cell.max(axis=0) + 1
     if float(extent[0]) * float(extent[1]) * float(extent[2]) > 2.0**62:
         raise InputError(f"Cells of {size:g} m are too small for this cloud.",
-                         "There would be too many of them to count.", "Choose a larger --voxel.")
+                         "There would be too many of them to count.",
+                         "Check the unit (--unit), or crop stray points (--crop-low, --crop-high).")
     key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
     return np.sort(np.unique(key, return_index=True)[1])
 
@@ -170,12 +172,10 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
     if sight is None:
         return cloud, None
     view = View(scanner, sight.pitch, sight.fill)
-    if settings.flying_angle == 0:
-        return cloud, view
-    flying = flying_pixels(sight, settings.flying_angle, settings.flying_speck)
+    flying = flying_pixels(sight, _FLYING_ANGLE, _FLYING_SPECK)
     counts["flying"] = int(flying.sum())
     rest = cloud.subset(~flying)
-    _enough(rest, "Without flying pixels (--flying-angle 0 keeps them), the depth camera's cloud")
+    _enough(rest, "Without flying pixels, the depth camera's cloud")
     return rest, view
 
 
@@ -211,22 +211,16 @@ def _first_of_each(points: np.ndarray) -> np.ndarray:
     return single
 
 
-def _without_outliers(points: np.ndarray, settings: PreparationSettings) -> np.ndarray:
+def _without_outliers(points: np.ndarray) -> np.ndarray:
     """Mask of the points to keep; typical values are local, since scans are uneven."""
     keep = np.ones(len(points), bool)
-    if settings.outlier_ratio > 0:
-        count = min(settings.outlier_neighbours + 1, len(points))
-        own, near = _neighbourhoods(points, count)
-        # The median over the neighbours is itself large for a lone point among lone points, so the
-        # statistics of the whole cloud count too.
-        overall = np.median(own)
-        for part in _parts(len(points)):
-            usual = np.maximum(np.median(own[near[part]], axis=1), overall)
-            keep[part] = own[part] <= settings.outlier_ratio * np.minimum(usual, 3 * overall)
-    if settings.outlier_radius > 0:
-        number = cKDTree(points).query_ball_point(
-            points, settings.outlier_radius, return_length=True)
-        keep &= number > settings.outlier_neighbours
+    own, near = _neighbourhoods(points, min(_OUTLIER_NEIGHBOURS + 1, len(points)))
+    # The median over the neighbours is itself large for a lone point among lone points, so the
+    # statistics of the whole cloud count too.
+    overall = np.median(own)
+    for part in _parts(len(points)):
+        usual = np.maximum(np.median(own[near[part]], axis=1), overall)
+        keep[part] = own[part] <= _OUTLIER_RATIO * np.minimum(usual, 3 * overall)
     return keep
 
 
@@ -288,8 +282,8 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
     flying = counts.get("flying", 0)
     if flying > 0.02 * counts["read"]:
         texts.append(f"{flying} of {counts['read']} points were discarded as flying pixels of a "
-                     "depth camera (--flying-angle).")
+                     "depth camera.")
     lost = counts.get("outliers", 0)
     if lost > 0.1 * len(points):
-        texts.append(f"{lost} points were discarded as outliers (--outlier-ratio).")
+        texts.append(f"{lost} points were discarded as outliers.")
     return texts

@@ -23,16 +23,16 @@ from limber.geometry.skeleton.plausibility import (
     check_one_plant,
     check_round,
 )
-from limber.geometry.skeleton.radii.axis_fit import median_radii
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.repair.passes import LEAF_SHARE, repaired
-from limber.geometry.skeleton.repair.run_radii import limited
-from limber.geometry.skeleton.repair.spurs import prune_spurs
+from limber.geometry.skeleton.repair.spurs import SPUR_REACH, prune_spurs
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
 
 FIT_POINT_LIMIT = 60_000
 """More points do not improve the fit; they only slow it down."""
+_CONTRACTED_POINTS = 12_000  # more are thinned evenly: the fit, not contraction, is precise
+_GAP_FACTOR = 3.0  # the paper's gamma: a step of more than this many median steps is a gap
 
 
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
@@ -94,7 +94,7 @@ class _Search:
     def root(self, graph: CurveGraph, points: np.ndarray, near: np.ndarray | None,
              ) -> tuple[int, np.ndarray | None]:
         """The root's node, and another end that is about as likely to be the root."""
-        return root_node(graph, points, near, self.up, self.settings.prune)
+        return root_node(graph, points, near, self.up)
 
     def in_levels(self, points: np.ndarray, base: np.ndarray, width: float | None = None,
                   ) -> tuple[CurveGraph, int]:
@@ -105,7 +105,7 @@ class _Search:
     def pruned(self, graph: CurveGraph, start: int) -> tuple[Skeleton, int]:
         """A skeleton with first radii and without spurs, and the number of dropped spurs."""
         parent = rooted(graph.nodes, graph.edges, start)
-        keep, count = prune_spurs(graph.nodes, parent, graph.thickness, self.settings.prune)
+        keep, count = prune_spurs(graph.nodes, parent, graph.thickness, SPUR_REACH)
         new_index = np.cumsum(keep) - 1
         moved = np.where(parent[keep] < 0, -1, new_index[parent[keep]])
         least = 1e-3 * float(np.median(graph.thickness)) + 1e-12
@@ -121,7 +121,7 @@ class _Search:
 
     def _joining(self) -> dict[str, Any]:
         settings = self.settings
-        return {"gap_factor": settings.gap_factor, "up": self.up,
+        return {"gap_factor": _GAP_FACTOR, "up": self.up,
                 "bridge_limit": settings.bridge_limit * self.diagonal,
                 "join_plants": settings.plants == "joined"}
 
@@ -131,9 +131,9 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     """The skeleton of points in the cloud's own frame, as are ``root`` and ``up``."""
     points = own.coordinates
     search = _Search(points, settings, up, float(np.linalg.norm(np.ptp(points, axis=0))))
-    thin = points[thinned(points, settings.contraction_points)]
+    thin = points[thinned(points, _CONTRACTED_POINTS)]
     check_no_sheet(thin)
-    contraction = contract(thin, attraction=settings.attraction, progress=progress.part(0.0, 0.6))
+    contraction = contract(thin, progress=progress.part(0.0, 0.6))
     progress(0.6, "connecting")
     graph = search.connected(thin, contraction.drawn)
     check_one_plant(graph, len(thin), search.diagonal, settings.plants,
@@ -145,7 +145,7 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
         graph.loops = loops
     first, pruned = search.pruned(graph, start)
     some = search.to_fit(graph, thin)
-    fitted = repaired(first, some, settings, search.diagonal, camera, progress.part(0.65, 0.95))
+    fitted = repaired(first, some, search.diagonal, camera, progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     check_round(fitted.skeleton, points, segment, residual)
     skeleton, more = fitted.skeleton, fitted.pruned
@@ -156,9 +156,6 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
         (first, pruned), more = search.pruned(graph, start), 0
         skeleton = through_leaves(first, some, fitted.noise, fitted.radius_limits)
     skeleton, unlikely = likely(skeleton, settings.twig_probability)
-    if settings.radii == "paper":
-        skeleton = limited(replace(skeleton, radius=median_radii(skeleton, points)),
-                           *fitted.radius_limits)
     if skeleton is not fitted.skeleton:
         segment, residual = nearest_cylinders(skeleton, points)
     progress(1.0, "skeleton", nodes=skeleton.node_count)

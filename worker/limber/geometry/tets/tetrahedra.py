@@ -19,6 +19,7 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetwild_process import run_tetwild
 
 _CACHE_VERSION = 1
+_SIDES = 8  # of the sections that fTetWild fills; more only cost time, as its tetrahedra are larger
 _LEFT_OUT_LIMIT = 0.02  # fraction of the volume; thinner twigs are not worth fTetWild's time
 
 
@@ -100,7 +101,7 @@ def _wild(skeleton: Skeleton, settings: MeshSettings, progress: Progress,
     from limber.geometry.surface.forks import smooth_forks
     from limber.geometry.surface.tubes import branch_surface
 
-    shape = {"sides": settings.mesh_sides, "spacing": settings.mesh_spacing}
+    shape = {"sides": _SIDES, "spacing": settings.mesh_spacing}
     surface, _, warnings = smooth_forks(branch_surface(skeleton, **shape), skeleton, **shape)
     radii = np.sort(skeleton.radius)
     mesh, cached = tetrahedralise(

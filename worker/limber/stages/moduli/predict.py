@@ -38,7 +38,7 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
     branch = Branch.read(branch_folder)
     known = read_estimate(branch.require("estimate.json", "estimate"))
     entry = _entry(branch, settings.pull)
-    subject = load_estimated_subject(branch, known, gravity=settings.gravity)
+    subject = load_estimated_subject(branch, known, gravity=True)
     down = np.array(branch.gravity) / np.linalg.norm(branch.gravity)
     return plain(predict_rest(known, subject, entry, down, settings, progress))
 

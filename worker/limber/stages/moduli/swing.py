@@ -42,7 +42,7 @@ def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
     with branch.writing("limber swing"):
         pull = _pull(branch, settings.pull)
         subject = load_subject(branch, EstimateSettings(
-            poisson=settings.poisson, density=settings.density, gravity=settings.gravity))
+            poisson=settings.poisson, density=settings.density))
         digests = {"mesh geometry": subject.mesh.geometry_digest(),
                    "pulls": pulls_digest(branch, [pull.name])}
         if not force and branch.is_current("swing", settings, digests=digests):
@@ -58,13 +58,13 @@ def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
             SwingSeen(seen.times, seen.positions - rest, rest,
                       about.start, pull.wrenches[0, :3], about.load_mass_kg, about.noise_m,
                       about.registration_m),
-            periods=settings.periods, density_sigma=settings.density_sigma,
+            density_sigma=settings.density_sigma,
             progress=progress.keeping(warnings).part(0.0, 0.95))
         if not found.converged:
             raise WorkError("The fit of the swing did not converge.",
                             f"The residual is {100 * found.relative_residual:.0f} % of the "
                             "largest displacement.",
-                            "Check load, mass and density, or fit fewer --periods.")
+                            "Check load, mass and density.")
         young = found.factor * model.young
         result = _summary(found, young, pull, warnings)
         with branch.stage("swing", settings, digests=digests) as stage:

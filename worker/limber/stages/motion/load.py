@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from limber.mechanics.model import BranchModel
 
 _FASTEST_WIND = 150.0  # m/s; more than tornadoes have
+_MOST_MULTIPLE = 50.0  # of the loads, up to which a limit load is sought
+_GUST_SECONDS = 600.0  # within which the peak is expected: EN 1991-1-4 averages over it
 _Place = tuple[float, float, float]
 _Fruit = tuple[float, float, float, float]
 
@@ -36,10 +38,11 @@ class LoadSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "loads": ("wind", "drag", "snow", "fruit", "cut"),
-        "gusts": ("gust", "gust_length", "gust_time", "gust_record"),
-        "limits": ("strain_limit", "limit_load", "most"),
+        "gusts": ("gust", "gust_length", "gust_record"),
+        "limits": ("strain_limit", "limit_load"),
         "output": ("name",)}
     common = ("wind", "snow", "fruit", "cut", "name")
+    retired: ClassVar[dict[str, Any]] = {"gust_time": 600.0, "most": 50.0}
 
     wind: tuple[float, float, float] | None = Field(
         None, description="Wind velocity in the branch's frame [m/s].",
@@ -53,8 +56,6 @@ class LoadSettings(Settings):
     gust_length: float = Field(
         27.0, gt=0, le=1000, description="Length scale of the gusts [m]. The default is that of "
         "EN 1991-1-4 at 2 m above open land. Among trees it is about their height.")
-    gust_time: float = Field(600.0, ge=10, le=1e5, description="Time within which the peak is "
-                             "expected [s].")
     gust_record: Path | None = Field(
         None, description="Recorded gusts: a CSV file with time_s and speed_m_s along the "
         "direction of --wind.")
@@ -71,7 +72,6 @@ class LoadSettings(Settings):
         0.01, gt=0, lt=1, description="Strain at which the wood is taken to fail.")
     limit_load: bool = Field(
         False, description="Also find the limit load, as a multiple of these loads.")
-    most: float = Field(50.0, gt=1, le=1e4, description="Largest multiple that is tried.")
     name: str | None = Field(
         None, pattern=r"^[\w-]+$", max_length=60, description="Keep the result in the branch "
         "folder under this name, for report and scene.")
@@ -143,7 +143,7 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
         outdoors, peak = with_peak(outdoors, gusts, known_damping(branch, progress))
     bent, result = load_effects(
         outdoors, strain_limit=settings.strain_limit, deviation=young_deviation(branch),
-        most=settings.most if settings.limit_load else None, progress=progress.part(0.2, 1.0))
+        most=_MOST_MULTIPLE if settings.limit_load else None, progress=progress.part(0.2, 1.0))
     result |= {"frequencies_before_hz": lowest_modes(prestress, len(bent.frequencies)).frequencies,
                "gusts": peak}
     if settings.name is not None:
@@ -200,7 +200,7 @@ def _gusts(settings: LoadSettings) -> Gusts | None:
     if settings.gust_record is not None:
         return WindRecord.read(settings.gust_record)
     return None if settings.gust is None else Turbulence(
-        settings.gust, settings.gust_length, settings.gust_time)
+        settings.gust, settings.gust_length, _GUST_SECONDS)
 
 
 def _require_near(nodes: np.ndarray, points: list[_Place]) -> None:

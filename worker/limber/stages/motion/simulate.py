@@ -112,7 +112,6 @@ def _model(branch: Branch, settings: SimulateSettings, progress: Progress) -> Br
 
     values: Overrides = {
         "young": settings.young, "material": settings.material,
-        "lumped_mass": settings.lumped_mass,
         "damping": RayleighDamping(settings.damping_mass, settings.damping_stiffness)}
     if settings.rest_shape:
         return load_branch(branch, gravity=settings.gravity, progress=progress, **values).model

@@ -39,15 +39,15 @@ class CompareInputs(PlacedInputs):
 class CompareSettings(Settings):
     """Trials, their common goal, and the planning."""
 
-    groups: ClassVar[Groups] = {"trials": ("trials", "goal", "goal_tolerance", "seed"),
+    groups: ClassVar[Groups] = {"trials": ("trials", "goal", "seed"),
                                 "solver": ("max_detour", "iterations", "engine")}
+    retired: ClassVar[dict[str, Any]] = {"goal_tolerance": 0.01}
 
     trials: int = Field(10, ge=1, le=1000, description=(
         "Number of random deformed start configurations."))
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the grasp, in the branch's frame [m]. Default: a distant pose."),
         json_schema_extra=POSITION)
-    goal_tolerance: float = Field(0.01, gt=0, le=1, description="Radius of the goal region [m].")
     seed: int = Field(0, ge=0, description="Seed of the starts and the planners.")
     max_detour: float | None = Field(None, ge=0, le=1000, description=(
         "Largest extra length of the gentle path over the shortest path [%]."))
@@ -83,10 +83,10 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
     key, reads = f"compare:{name}", ["energy.npz"]
     if not force and branch.is_current(key, settings, reads=reads):
         return branch.manifest.stages[key].result
-    goal = (default_goal(field, settings.goal_tolerance) if settings.goal is None
-            else near(np.array(settings.goal), settings.goal_tolerance))
     asked = PlanSettings(**{each: getattr(settings, each) for each in (
-        "goal_tolerance", "seed", "max_detour", "iterations", "engine")})
+        "seed", "max_detour", "iterations", "engine")})
+    goal = (default_goal(field, asked.goal_tolerance) if settings.goal is None
+            else near(np.array(settings.goal), asked.goal_tolerance))
     with branch.stage(key, settings, reads=reads) as stage:
         trials = run_trials(field, goal, asked, settings.trials, workers=workers,
                             progress=progress)

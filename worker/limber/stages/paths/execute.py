@@ -47,7 +47,8 @@ class ExecuteInputs(BranchInputs):
 class ExecuteSettings(Settings):
     """Settings for following the path."""
 
-    groups: ClassVar[Groups] = {"motion": ("speed", "hold", "gripper_rotation", "gravity")}
+    groups: ClassVar[Groups] = {"motion": ("speed", "hold", "gripper_rotation")}
+    retired: ClassVar[dict[str, Any]] = {"gravity": True}
 
     speed: float | None = Field(None, gt=0, le=0.25, description=(
         "Speed of the gripper [m/s]. Default: the plan's, no faster than the cell allows."))
@@ -56,7 +57,6 @@ class ExecuteSettings(Settings):
     gripper_rotation: tuple[float, float, float] | None = Field(
         None, description="Rotation vector of the gripper at the grasp, in the branch's frame "
         "[rad]. Default: the direction across the branch that stays farthest from singularities.")
-    gravity: bool = Field(True, description="Include the branch's weight in the predicted forces.")
 
 
 class ExecuteOptions(Settings):
@@ -127,7 +127,7 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
     from limber.store.loading import load_grasp_model
 
     progress(0.02, "inverse kinematics")
-    model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
+    model = load_grasp_model(branch, gravity=True, progress=progress)
     clear = KeptClear.of(cell, Path(cell_file).parent, model, stated.get("clearance_m"))
     # The plan's own rotation of the gripper is the one checked against obstacles.
     rotation = settings.gripper_rotation or (stated.get("robot") or {}).get("gripper_rotation")

@@ -48,15 +48,14 @@ class SuggestPullInputs(BranchInputs):
 class SuggestPullSettings(Settings):
     """Limits of a pull."""
 
-    groups: ClassVar[Groups] = {"limits": ("fractions", "max_strain", "max_force", "gravity")}
+    groups: ClassVar[Groups] = {"limits": ("fractions", "max_strain", "max_force")}
+    retired: ClassVar[dict[str, Any]] = {"gravity": True}
 
     fractions: tuple[float, ...] = Field((0.5, 0.67, 0.8, 0.92), min_length=1, description=(
         "Candidate grasps as fractions of the main path."))
     max_strain: float = Field(0.01, gt=0, lt=1, description=(
         "Largest principal strain during a pull (0.01 is 1 %)."))
     max_force: float | None = Field(None, gt=0, description="Largest force of the gripper [N].")
-    gravity: bool = Field(True, description=(
-        "The branch carries its own weight, as when it was scanned."))
 
 
 def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: str | None = None,
@@ -116,11 +115,11 @@ def _state(branch: Branch, settings: SuggestPullSettings) -> tuple[Subject, Valu
     from limber.store.loading import load_estimated_subject, load_subject
 
     if not branch.has("estimate.json"):
-        subject = load_subject(branch, EstimateSettings(gravity=settings.gravity))
+        subject = load_subject(branch, EstimateSettings())
         form = () if subject.field is None else subject.field.names
         return subject, subject.start, Known.nothing(len(subject.control_points), len(form))
     found = read_estimate(branch.path("estimate.json"))
-    subject = load_estimated_subject(branch, found, gravity=settings.gravity)
+    subject = load_estimated_subject(branch, found, gravity=True)
     values = replace(
         subject.start, young=np.array(found.get("young_mesh_pa") or found["young_pa"], float),
         poisson=found["poisson"], density=found.get("density") or subject.start.density,

@@ -13,7 +13,6 @@ follows every hole of the scan and takes several times as long (`scripts/bench g
 import time
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Literal
 
 import numpy as np
 import scipy.sparse as sparse
@@ -33,7 +32,6 @@ NEIGHBOURS = 12
 """Neighbours that the point-cloud Laplacian triangulates; 12 is as good as 30 and faster."""
 
 _LINE_NEIGHBOURS = 20
-_MOST_ATTRACTION = 1e3  # chosen: the linear system loses digits above it
 _SOLVES = 12  # at most
 _LINEAR, _FEW_LEFT = 0.95, 0.03  # when a point is contracted; fraction of others at the end
 _GROWTH = 3.0
@@ -80,18 +78,17 @@ class Contraction:
     drawn: np.ndarray = field(default=None)
 
 
-def contract(points: np.ndarray, *, attraction: Literal["constant", "growing"] = "constant",
-             progress: Progress = SILENT) -> Contraction:
+def contract(points: np.ndarray, *, progress: Progress = SILENT) -> Contraction:
     """Contract points to the axes of their branches.
 
     The contraction weight of a point grows while the points around it do not lie on a line yet,
     and shrinks once they do, so that thin twigs are not shortened while thick ones still close.
+    The attraction W_H is constant. On 4 generated branches the growing one of Cao et al. (section
+    4) was as good where all sides were seen; from one side radii were 2.6 instead of 2.0 % off, and
+    one fork of 12 was lost.
 
     Args:
         points: Positions [m], shape [n, 3].
-        attraction: constant, or growing as neighbourhoods shrink (Cao et al., section 4). On 4
-            generated branches growing was as good where all sides were seen. From one side radii
-            were 2.6 instead of 2.0 % off, and one fork of 12 was lost.
         progress: Called each iteration.
 
     Raises:
@@ -103,13 +100,12 @@ def contract(points: np.ndarray, *, attraction: Literal["constant", "growing"] =
     progress(0.0, "laplacian")
     laplacian = cloud_laplacian(positions)
     solver = _NormalEquations(laplacian)
-    weight, attractions = np.ones(len(points)), np.ones(len(points))
-    growing = _Attraction(positions) if attraction == "growing" else None
+    weight = np.ones(len(points))
     history: list[dict[str, float]] = []
     status, linearity = ContractionStatus.iteration_limit, local_linearity(positions)
     for iteration in range(_SOLVES):
         started = time.perf_counter()
-        drawn = solver.solve(weight, attractions, positions)
+        drawn = solver.solve(weight, positions)
         moved = float(np.linalg.norm(drawn - positions, axis=1).mean())
         positions = drawn
         linearity = local_linearity(positions)
@@ -118,8 +114,6 @@ def contract(points: np.ndarray, *, attraction: Literal["constant", "growing"] =
         # only pulls the rest off its axis.
         growth = _GROWTH if active.mean() > _STILL_THICK else 1.0
         weight *= np.where(active, growth, 0.1)
-        if growing is not None:
-            attractions = growing.at(positions)
         history.append({"moved": moved * scale, "active": float(active.mean()),
                         "seconds": time.perf_counter() - started})
         progress((iteration + 1) / _SOLVES, "contracting", iteration=iteration + 1,
@@ -160,36 +154,17 @@ def local_linearity(points: np.ndarray) -> np.ndarray:
     return values[:, 2] / np.maximum(values.sum(axis=1), 1e-300)
 
 
-class _Attraction:
-    """W_H = W_H0 S_0 / S of Cao et al.: it grows as a point's neighbourhood of extent S shrinks."""
-
-    def __init__(self, points: np.ndarray):
-        _, self._near = cKDTree(points).query(points, k=min(NEIGHBOURS, len(points)))
-        self._extent = self._extents(points)
-
-    def at(self, points: np.ndarray) -> np.ndarray:
-        """Return the weights at the contracted ``points`` [n, 3], shape [n]."""
-        extents = np.maximum(self._extents(points), 1e-300)
-        return np.clip(self._extent / extents, 1.0, _MOST_ATTRACTION)
-
-    def _extents(self, points: np.ndarray) -> np.ndarray:
-        """Mean distance of each point from its first neighbours, shape [n]."""
-        return np.linalg.norm(points[self._near] - points[:, None], axis=2).mean(axis=1)
-
-
 class _NormalEquations:
-    """(L' W_L^2 L + W_H^2) P' = W_H^2 P by sparse Cholesky; the pattern stays the same."""
+    """(L' W_L^2 L + 1) P' = P by sparse Cholesky; the pattern stays the same."""
 
     def __init__(self, laplacian: sparse.csc_matrix):
         self._laplacian = laplacian
         self._factor: CholmodFactor | SuperLuFactor | None = None
 
-    def solve(self, contraction: np.ndarray, attraction: np.ndarray,
-              points: np.ndarray) -> np.ndarray:
-        """Solve for the diagonals of W_L and W_H, shapes [n] and [n]."""
+    def solve(self, contraction: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Solve for the diagonal of W_L, shape [n]."""
         weighted = sparse.diags(contraction) @ self._laplacian
-        hold = attraction**2
-        matrix = (weighted.T @ weighted + sparse.diags(hold)).tocsc()
+        matrix = (weighted.T @ weighted + sparse.identity(len(points))).tocsc()
         lower = sparse.tril(matrix, format="csc")
         lower.sort_indices()
         if self._factor is None:
@@ -199,13 +174,13 @@ class _NormalEquations:
             self._factor.factorise(lower.data)
         except NotPositiveDefiniteError as error:
             raise WorkError(f"The linear system of the contraction is singular ({error}).",
-                            "Many points may coincide.", "Thin the cloud (--voxel).") from error
-        return _finite(self._factor.solve(hold[:, None] * points))
+                            "Many points may coincide.", "Thin the cloud.") from error
+        return _finite(self._factor.solve(points))
 
 
 def _finite(points: np.ndarray) -> np.ndarray:
     if not np.isfinite(points).all():
         raise WorkError("The contraction produced numbers that are not finite.",
                         "The Laplacian of the cloud may be degenerate.",
-                        "Thin the cloud (--voxel).")
+                        "Thin the cloud.")
     return points

@@ -3,7 +3,7 @@
 import numpy as np
 
 from limber.geometry.skeleton.contraction.curve_graph import CurveGraph, rooted
-from limber.geometry.skeleton.repair.spurs import prune_spurs
+from limber.geometry.skeleton.repair.spurs import SPUR_REACH, prune_spurs
 
 _ROOT_SHARE = 0.45  # fraction of the thickest end above which an end may be the root
 _ROOT_THICK, _ROOT_HEIGHT = 0.25, 0.1  # logarithm of thickness, and fraction of height
@@ -14,7 +14,7 @@ _ROOT_EVEN = 1.0  # difference in these at which two ends are equally likely
 
 
 def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up: np.ndarray,
-              prune: float) -> tuple[int, np.ndarray | None]:
+              ) -> tuple[int, np.ndarray | None]:
     """The end nearest to ``root``, or the lowest of the thick ends; and another about as likely.
 
     The thickness of an end follows from its smallest extent and the distance that its points moved:
@@ -26,14 +26,14 @@ def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up
     # tip.
     first = int(tips[np.argmin(graph.nodes[tips] @ up)])
     parent = rooted(graph.nodes, graph.edges, first)
-    neighbours = _pruned_neighbours(graph, parent, prune)
+    neighbours = _pruned_neighbours(graph, parent, SPUR_REACH)
     tips = np.array([node for node, near in enumerate(neighbours) if len(near) == 1])
     if root is not None:
         return int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))]), None
     thick = _end_thickness(graph, points, neighbours, tips)
     # Where few points show a thick foot, contraction leaves strands around its rim. Each strand
     # gives as little evidence of the foot as a twig.
-    neighbours = _pruned_neighbours(graph, parent, max(prune, _STRAND))
+    neighbours = _pruned_neighbours(graph, parent, _STRAND)
     whole = np.array([len(neighbours[tip]) == 1 for tip in tips])
     thick[whole] = np.maximum(thick[whole], _end_thickness(graph, points, neighbours, tips[whole]))
     able = thick >= _ROOT_SHARE * thick.max()
@@ -48,9 +48,9 @@ def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up
     return int(tips[chosen]), other
 
 
-def _pruned_neighbours(graph: CurveGraph, parent: np.ndarray, prune: float) -> list[list[int]]:
+def _pruned_neighbours(graph: CurveGraph, parent: np.ndarray, factor: float) -> list[list[int]]:
     """Neighbours of each node in the graph without spurs."""
-    keep, _ = prune_spurs(graph.nodes, parent, graph.thickness, prune)
+    keep, _ = prune_spurs(graph.nodes, parent, graph.thickness, factor)
     neighbours: list[list[int]] = [[] for _ in graph.nodes]
     for node in np.flatnonzero(keep & (parent >= 0)):
         neighbours[node].append(int(parent[node]))

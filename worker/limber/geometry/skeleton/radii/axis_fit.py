@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.radii.cylinders import Match, cylinders_around, match_cylinders
@@ -44,7 +43,6 @@ from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 _GRID = 1e-5
 _MOVED = 0.2  # fraction of the radius; nodes that moved less keep their points' cylinders
 _REACH = 2.0  # largest distance of an axis from its contracted position, in radii
-_MEDIAN_OF = 24  # points for one of the paper's radii
 _HELD = 2  # trusted rounds in which the limit keeps that of most sensors
 
 
@@ -239,9 +237,3 @@ def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
     moved *= np.minimum(1.0, reach / np.maximum(size, 1e-300))[:, None]
     return skeleton.nodes + moved, np.clip(
         radius, skeleton.radius / (2 * _REACH), 2 * _REACH * skeleton.radius)
-
-
-def median_radii(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
-    """The paper's radii: median distance of the k nearest points to each node [m], shape [n]."""
-    distance, _ = cKDTree(points).query(skeleton.nodes, k=min(_MEDIAN_OF, len(points)))
-    return np.median(distance, axis=1)

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from limber.core.progress import SILENT, Progress
-from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.confidence import assessed
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.cylinders import point_counts
@@ -25,7 +24,7 @@ from limber.geometry.skeleton.repair.run_radii import (
     tapered,
     unpinched,
 )
-from limber.geometry.skeleton.repair.spurs import prune_spurs
+from limber.geometry.skeleton.repair.spurs import SPUR_REACH, prune_spurs
 from limber.geometry.skeleton.skeleton import Skeleton
 
 LEAF_SHARE = 0.5
@@ -33,6 +32,7 @@ LEAF_SHARE = 0.5
 
 _COARSE = 1.5  # local radii between the nodes of the first fit
 _NOISY = 0.2  # fraction of the median radius
+_LEAST_RADIUS, _MOST_RADIUS = 5e-4, 0.1  # fractions of the cloud's diagonal: the paper's rule
 _ROUNDS_NOISY, _ROUNDS_LATE = 18, 6  # rounds of the last fit
 
 
@@ -44,7 +44,6 @@ class Repaired:
         skeleton: Its current state.
         points: The scan, thinned [m], shape [m, 3].
         radius_limits: Least and largest radius [m].
-        prune: A twig is kept if it extends this many radii of its parent beyond the parent.
         camera: The points are a depth camera's.
         rays: The points are one sensor's, evenly spaced across its sight and scattered along it.
         fit: The last fit.
@@ -58,7 +57,6 @@ class Repaired:
     skeleton: Skeleton
     points: np.ndarray
     radius_limits: tuple[float, float]
-    prune: float
     camera: bool = False
     rays: bool = False
     fit: AxisFit | None = None
@@ -132,7 +130,7 @@ def _fit_unpinched(now: Repaired) -> Repaired:
 def _prune_spurs(now: Repaired) -> Repaired:
     # Noise makes a carrier look thicker, and its outliers look like twigs.
     reach = now.skeleton.radius + 2 * now.noise
-    keep, count = prune_spurs(now.skeleton.nodes, now.skeleton.parent, reach, now.prune)
+    keep, count = prune_spurs(now.skeleton.nodes, now.skeleton.parent, reach, SPUR_REACH)
     return replace(now, skeleton=now.skeleton.subset(keep), pruned=now.pruned + count)
 
 
@@ -209,19 +207,18 @@ PASSES = (
 """In the order in which they run; some run again after a fit."""
 
 
-def repaired(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, diagonal: float,
-             camera: bool, progress: Progress = SILENT) -> Repaired:
+def repaired(skeleton: Skeleton, points: np.ndarray, diagonal: float, camera: bool,
+             progress: Progress = SILENT) -> Repaired:
     """Run all passes on the skeleton of the contracted points.
 
     Args:
         skeleton: With first radii.
         points: The scan, thinned [m], shape [m, 3].
-        settings: Settings to use.
         diagonal: Size of the cloud [m].
         camera: The points are a depth camera's.
         progress: Called during fits.
     """
-    now = Repaired(skeleton, points, settings.radius_limits(diagonal), settings.prune, camera)
+    now = Repaired(skeleton, points, (_LEAST_RADIUS * diagonal, _MOST_RADIUS * diagonal), camera)
     done = 0.0
     for each in PASSES:
         until = done if each.until is None else each.until

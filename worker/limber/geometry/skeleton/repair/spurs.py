@@ -2,6 +2,9 @@
 
 import numpy as np
 
+SPUR_REACH = 2.5
+"""A twig is kept if it reaches this many radii of its carrier beyond the carrier's axis."""
+
 
 def prune_spurs(nodes: np.ndarray, parent: np.ndarray, thickness: np.ndarray, factor: float,
                 ) -> tuple[np.ndarray, int]:
