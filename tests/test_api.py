@@ -19,7 +19,15 @@ import pytest
 
 import limber
 from benchmarks.robot_cells import cell_file, standing_at
-from limber.api import typed_results, verbs
+from limber.api import (
+    branch,
+    motion_results,
+    path_results,
+    pull_results,
+    result,
+    settings_table,
+    verbs,
+)
 from limber.cli.main import call
 from limber.core.errors import BranchFolderError, InputError, MissingDependencyError, WorkError
 from limber.core.progress import LineSink
@@ -118,11 +126,13 @@ def test_the_docstrings_examples(own, tmp_path, monkeypatch):
     """They run as they stand, in a folder with a scan and a branch."""
     monkeypatch.chdir(tmp_path)
     limber.generate("scan", length=0.3, fork_count=0, seed=1)
-    for module in (verbs, typed_results):
-        failed, tried = doctest.testmod(
-            module, extraglobs={"limber": limber},
-            optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
-        assert tried >= 10 and not failed
+    counts = [doctest.testmod(
+        module, extraglobs={"limber": limber},
+        optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
+        for module in (verbs, settings_table, branch, result, pull_results, motion_results,
+                       path_results)]
+    assert sum(count.attempted for count in counts) >= 20
+    assert not sum(count.failed for count in counts)
 
 
 @pytest.mark.parametrize("key", ["estimate", "energy", "plan:to-goal", "pull:pull-1",
@@ -447,4 +457,4 @@ def test_results_are_all_of_one_make():
     assert len(RESULTS) == 10
     for kind in RESULTS:
         assert dataclasses.is_dataclass(kind) and kind.__dataclass_params__.frozen
-        assert typed_results.Result in kind.__mro__
+        assert result.Result in kind.__mro__

@@ -5,8 +5,9 @@ import pytest
 from tests.subjects.meshes import box_mesh
 
 from limber.core.errors import InputError
-from limber.estimation.vibration.free_swing import SwingSeen, first_guess, fit_swing
+from limber.estimation.vibration.free_swing import fit_swing
 from limber.estimation.vibration.modal_swing import Ends, ModalSwing
+from limber.estimation.vibration.swing_record import SwingSeen, first_guess
 from limber.mechanics import (
     BranchModel,
     EnergyMomentumSettings,

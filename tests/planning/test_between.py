@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from limber.planning.field import disagreeing_neighbours
-from limber.planning.field.chart import Chart
 from limber.planning.field.disagreeing_neighbours import ask_between, disagreeing, jump
+from limber.planning.field.interpolation.chart import Chart
 from limber.planning.field.solver_pool import SolverPool
 from limber.planning.field.stored_states import Solved
 

@@ -14,7 +14,7 @@ from limber.planning.certificate.lower_bound import certify
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import knowing
-from limber.planning.field.valid_region import TrustRegion
+from limber.planning.field.interpolation.valid_region import TrustRegion
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.goals.regions import Ball
 from limber.planning.goals.target_goal import TargetGoal

@@ -9,8 +9,9 @@ from limber.planning.certificate import lower_bound
 from limber.planning.certificate.cell_bounds import off_zero
 from limber.planning.certificate.feasibility import judge
 from limber.planning.cost import CostWeights
-from limber.planning.field.chart import Chart
-from limber.planning.field.energy_field import GraspSamples, fit_field
+from limber.planning.field.energy_field import fit_field
+from limber.planning.field.grasp_samples import GraspSamples
+from limber.planning.field.interpolation.chart import Chart
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.path_problem import GentleProblem

@@ -11,8 +11,9 @@ from limber.planning.baseline_and_plan import plan_within
 from limber.planning.certificate.feasibility import judge
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
-from limber.planning.field.chart import Chart
-from limber.planning.field.energy_field import EnergyField, GraspSamples, fit_field
+from limber.planning.field.energy_field import EnergyField, fit_field
+from limber.planning.field.grasp_samples import GraspSamples
+from limber.planning.field.interpolation.chart import Chart
 from limber.planning.goals.chosen_pose import default_goal
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.path_problem import BlockedError, GentleProblem

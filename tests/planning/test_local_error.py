@@ -11,7 +11,7 @@ from limber.planning.closed_passages import checked_wall, confirmed, not_confirm
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.field.local_error import LocalError
+from limber.planning.field.interpolation.local_error import LocalError
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.goals.regions import Ball

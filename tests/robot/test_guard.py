@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
-from limber.robot.driver.guard import Guard, GuardSettings, State, Verdict
+from limber.robot.driver.guard import Guard
+from limber.robot.driver.guard_states import GuardSettings, State, Verdict
 from limber.robot.interface import Sample
 from limber.robot.ur.arms import ARMS
 

@@ -6,7 +6,8 @@ from tests.robot.conftest import Registers
 
 from limber.core.numerics.rigid import matrices
 from limber.robot.ur.arms import ARMS
-from limber.robot.virtual.controller import Controller, RuntimeState, SafetyMode
+from limber.robot.virtual.controller import Controller
+from limber.robot.virtual.controller_modes import RuntimeState, SafetyMode
 from limber.robot.virtual.force_sensor import E_SERIES, ForceSensor
 
 MOVE_JOINTS, MOVE_LINE, ZERO, SPEED, SERVO_JOINTS, SERVO_STOP = 1, 3, 8, 10, 11, 16

@@ -17,8 +17,8 @@ from limber.planning.constraints.limits import Limits, sampled_sizes
 from limber.planning.cost import resample
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import GraspModel
+from limber.planning.field.interpolation.local_error import LocalError
 from limber.planning.field.limited_quantities import limited
-from limber.planning.field.local_error import LocalError
 from limber.planning.field.sampling import solve_branch
 from limber.planning.field.solver_pool import SolverPool
 from limber.planning.field.stored_states import samples_of

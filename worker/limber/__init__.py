@@ -22,43 +22,43 @@ from limber.core.threads import one_thread as _one_thread
 from limber.version import VERSION as __version__
 
 if TYPE_CHECKING:
-    from limber.api.typed_results import EnergyField as EnergyField
-    from limber.api.typed_results import Estimate as Estimate
-    from limber.api.typed_results import Execution as Execution
-    from limber.api.typed_results import Generated as Generated
-    from limber.api.typed_results import Load as Load
-    from limber.api.typed_results import Plan as Plan
-    from limber.api.typed_results import Pull as Pull
-    from limber.api.typed_results import Result as Result
-    from limber.api.typed_results import Simulation as Simulation
-    from limber.api.typed_results import Written as Written
-    from limber.api.verbs import Branch as Branch
+    from limber.api.branch import Branch as Branch
+    from limber.api.motion_results import Load as Load
+    from limber.api.motion_results import Simulation as Simulation
+    from limber.api.path_results import EnergyField as EnergyField
+    from limber.api.path_results import Execution as Execution
+    from limber.api.path_results import Plan as Plan
+    from limber.api.path_results import Written as Written
+    from limber.api.pull_results import Estimate as Estimate
+    from limber.api.pull_results import Generated as Generated
+    from limber.api.pull_results import Pull as Pull
+    from limber.api.result import Result as Result
+    from limber.api.settings_table import settings as settings
     from limber.api.verbs import generate as generate
     from limber.api.verbs import mesh as mesh
     from limber.api.verbs import open as open
     from limber.api.verbs import reconstruct as reconstruct
-    from limber.api.verbs import settings as settings
 
 # Before any module of Limber loads a library, in each process: no result may depend on threads.
 _one_thread()
 
 _PLACES = {
-    "Branch": "api.verbs",
-    "EnergyField": "api.typed_results",
-    "Estimate": "api.typed_results",
-    "Execution": "api.typed_results",
-    "Generated": "api.typed_results",
-    "Load": "api.typed_results",
-    "Plan": "api.typed_results",
-    "Pull": "api.typed_results",
-    "Result": "api.typed_results",
-    "Simulation": "api.typed_results",
-    "Written": "api.typed_results",
+    "Branch": "api.branch",
+    "EnergyField": "api.path_results",
+    "Estimate": "api.pull_results",
+    "Execution": "api.path_results",
+    "Generated": "api.pull_results",
+    "Load": "api.motion_results",
+    "Plan": "api.path_results",
+    "Pull": "api.pull_results",
+    "Result": "api.result",
+    "Simulation": "api.motion_results",
+    "Written": "api.path_results",
     "generate": "api.verbs",
     "mesh": "api.verbs",
     "open": "api.verbs",
     "reconstruct": "api.verbs",
-    "settings": "api.verbs",
+    "settings": "api.settings_table",
 }
 
 __getattr__, __dir__ = _exports(__name__, _PLACES)

@@ -8,9 +8,10 @@ from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.forward.forward_model import Forward, under_its_weight
+from limber.estimation.forward.gripper_torque import uses_torque
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.point_directions import PointDirections
-from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
+from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace
 from limber.estimation.settings import EstimateSettings
 from limber.recordings.cell_errors import CalibrationEntry, calibration_of

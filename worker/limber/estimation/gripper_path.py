@@ -22,6 +22,7 @@ from limber.mechanics.dynamics.motion import DynamicResult
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
+from limber.recordings.synchronisation import Frames
 
 SETTINGS = StaticSettings(tolerance=1e-8)
 TURNED_PART = 0.7
@@ -259,3 +260,30 @@ def _shift_at_rest(model: BranchModel, grasp: Grasp) -> np.ndarray:
         return np.zeros(3)
     at_rest = solve_static(model).require()
     return grasp.weights @ at_rest.displacement[grasp.nodes]
+
+
+def measured_over_simulated(model: BranchModel, grasp: Grasp, frames: Frames, zero: np.ndarray,
+                            ) -> float | None:
+    """Return the measured force over the one that moves the model equally far; None if unknown.
+
+    The grasp point is not prescribed: at the recorded poses a branch with other ratios of E would
+    be stretched, and a slender branch responds to that with a thousandfold force.
+
+    Args:
+        model: The branch.
+        grasp: The recorded grasp on it.
+        frames: The recording.
+        zero: Zero of the force [N], shape [3].
+    """
+    known = np.flatnonzero(np.isfinite(frames.wrenches[:, :3]).all(axis=1))
+    travel = np.linalg.norm(frames.poses[:, :3] - frames.poses[0, :3], axis=1)[known]
+    row = known[int(np.argmin(np.abs(travel - 0.6 * travel.max())))]
+    force = frames.wrenches[row, :3] - zero
+    size = float(np.linalg.norm(force))
+    moved = float(np.linalg.norm(frames.poses[row, :3] - frames.poses[0, :3]))
+    if size <= 0 or moved <= 0:
+        return None
+    try:
+        return float(size / force_for_travel(model, grasp, force / size, moved))
+    except WorkError:
+        return None

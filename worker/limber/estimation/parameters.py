@@ -149,3 +149,18 @@ class ParameterSpace:
         width = share * (upper - lower)
         at = (free <= lower + width) | (free >= upper - width)
         return [name for name, flag in zip(self.names, at, strict=True) if flag]
+
+
+def equal_values(one: Values | None, other: Values) -> bool:
+    """Whether all parameters are the same."""
+    return one is not None and np.array_equal(one.young, other.young) and (
+        (one.poisson, one.density, one.damping, one.form)
+        == (other.poisson, other.density, other.damping, other.form))
+
+
+def mechanics_names(extra: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the parameters by their names in :mod:`limber.mechanics.sensitivities`."""
+    names = {"poisson": "poisson", "density": "log_density", "alpha": "damping_mass",
+             "beta": "damping_stiffness"}
+    # Parameters of the field's form come with log E.
+    return ("log_young", *(names[name] for name in extra if name in names))

@@ -2,34 +2,28 @@
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from limber.core.constants import GRAVITY
-from limber.core.errors import InputError
 from limber.core.numerics.compiled import for_kernels
 from limber.geometry.tets.mesh_checks import check_mesh, fixed_mask
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import PointMass, Tied, mass_entries, nodal_masses, tied
-from limber.mechanics.elements.forces import (
-    internal_force,
-    largest_stretch,
-    sparse_times,
-    strain_changes,
-    strains,
-    tangent_times,
-)
+from limber.mechanics.elements import forces
 from limber.mechanics.elements.principal_strain import largest_principal_strains
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.gripped_piece import stiffening
+from limber.mechanics.internal_state import InternalState, product_with
 from limber.mechanics.linear.equations import Equations, Viscous
 from limber.mechanics.materials.law import MaterialLaw, hooke_strain, hooke_stress
 from limber.mechanics.materials.material_registry import material_named
 from limber.mechanics.materials.materials import (
     RayleighDamping,
+    check_density,
     check_poisson,
     check_young,
     lame,
@@ -40,32 +34,6 @@ from limber.mechanics.prestress import Prestress, carried
 
 _NO_MEMORY = np.zeros((0, 0, 6))
 DEFAULT_DAMPING = RayleighDamping()
-
-
-@dataclass(frozen=True)
-class InternalState:
-    """Internal forces of one state.
-
-    Attributes:
-        force: Internal force on the nodes [N], shape [node_count, 3]; the gradient of ``energy``.
-        tet_energy: Strain energy of each tetrahedron relative to the mesh's shape [J], [tet_count].
-        min_det_f: Smallest determinant of the deformation gradient at a quadrature point.
-        weight_energy: Contribution of the weight of a hanging branch to the potential [J].
-    """
-
-    force: np.ndarray
-    tet_energy: np.ndarray
-    min_det_f: float
-    weight_energy: float = 0.0
-
-    @property
-    def strain_energy(self) -> float:
-        return float(self.tet_energy.sum())
-
-    @property
-    def energy(self) -> float:
-        """Potential above the mesh's shape [J]: strain and the weight of a hanging branch."""
-        return self.strain_energy + self.weight_energy
 
 
 class BranchModel:
@@ -87,8 +55,7 @@ class BranchModel:
         stiffening: Factor on the stiffness of a tetrahedron that a gripper holds (see
             :meth:`gripped`), shape [tet_count]; 1 without a gripper.
         lame_lambda, lame_mu: Lamé coefficients [Pa] with the stiffening, shape [tet_count].
-        hanging: How the mesh's shape carries the weight; None if the mesh is the unloaded shape,
-            which gravity bends. See :meth:`as_scanned`.
+        prestress: How the mesh's shape carries the weight (:meth:`as_scanned`); None if unloaded.
         gradients, weights: Strain operators at the quadrature points, from
             :mod:`limber.mechanics.elements.shape_functions`.
 
@@ -142,6 +109,11 @@ class BranchModel:
         """Mean length of an edge [m]."""
         return self._data.edge
 
+    def _copy(self, **changes: Any) -> "BranchModel":
+        other = copy.copy(self)
+        vars(other).update(changes)
+        return other
+
     def with_young(self, young: float | np.ndarray) -> "BranchModel":
         """Return the model with another Young's modulus [Pa], sharing all unchanged data."""
         return self.with_parameters(young=young)
@@ -152,9 +124,7 @@ class BranchModel:
                         damping: RayleighDamping | None = None,
                         gravity: Sequence[float] | None = None) -> "BranchModel":
         """Return the model with other parameters, sharing data that depend on the mesh alone."""
-        other = copy.copy(self)
-        if damping is not None:
-            other.damping = damping
+        other = self._copy() if damping is None else self._copy(damping=damping)
         if gravity is not None:
             # The stress that carries the weight now is not the one that carried it during the scan.
             other.gravity, other.prestress = np.asarray(gravity, float), None
@@ -173,20 +143,16 @@ class BranchModel:
                 if grasp.mode == "clamped" and grasp.held is not None]
         if not held and np.ndim(self.stiffening) == 0:
             return self
-        other = copy.copy(self)
-        other.stiffening = stiffening(np.max(held, axis=0)) if held else 1.0
+        other = self._copy(stiffening=stiffening(np.max(held, axis=0)) if held else 1.0)
         other._set(self.young, self.poisson, self.density)
         return other
 
     def with_rest_nodes(self, nodes: np.ndarray) -> "BranchModel":
         """Return the model with other rest positions [m] of the same tetrahedra."""
-        other = copy.copy(self)
-        other.prestress = None
-        other._data = self._data.moved(nodes)
-        other._mass = {}
         # Added masses stay with their nodes, not at their positions in space.
-        other.point_masses = tuple(one.moved(nodes - self.mesh.nodes) for one in self._ties)
-        return other
+        masses = tuple(one.moved(nodes - self.mesh.nodes) for one in self._ties)
+        return self._copy(prestress=None, _data=self._data.moved(nodes), _mass={},
+                          point_masses=masses)
 
     def as_scanned(self) -> "BranchModel":
         """Return the model that hangs in its mesh's shape: weight acts, and is carried there.
@@ -196,39 +162,31 @@ class BranchModel:
         Raises:
             NotPositiveDefiniteError: the mesh cannot carry any load.
         """
-        other = copy.copy(self)
-        other.prestress = None
+        other = self._copy(prestress=None)
         other.prestress = carried(other)
         return other
 
     def linear(self, young: float, poisson: float) -> "BranchModel":
         """Return the branch of one linear material, without carried weight and grippers."""
-        other = copy.copy(self)
-        other.prestress, other.stiffening = None, 1.0
-        other.material = material_named("linear")
+        other = self._copy(prestress=None, stiffening=1.0, material=material_named("linear"))
         other._set(young, poisson, self.density)
         return other
 
     def with_material(self, material: str | MaterialLaw) -> "BranchModel":
         """Return the model with another law of the same Lamé coefficients."""
-        other = copy.copy(self)
-        other.material = material_named(material)
-        return other
+        return self._copy(material=material_named(material))
 
     def with_point_masses(self, masses: Iterable[PointMass]) -> "BranchModel":
         """Return the model with more added masses."""
-        other = copy.copy(self)
-        other.point_masses, other._mass = (*self.point_masses, *masses), {}
-        return other
+        return self._copy(point_masses=(*self.point_masses, *masses), _mass={})
 
     def with_hung_mass(self, factor: float) -> "BranchModel":
         """Return the model with all added masses ``factor`` times as heavy.
 
         In a branch that hangs as scanned, the scanned shape carries that weight too.
         """
-        other = copy.copy(self)
-        other.point_masses = tuple(one.heavier(factor) for one in self.point_masses)
-        other._mass = {}
+        masses = tuple(one.heavier(factor) for one in self.point_masses)
+        other = self._copy(point_masses=masses, _mass={})
         if other.prestress is not None and other.prestress.added is not None:
             other.prestress = replace(other.prestress, added=other.prestress.added.scaled(factor))
         return other
@@ -237,9 +195,8 @@ class BranchModel:
         """Return the model without added masses."""
         if not self.point_masses:
             return self
-        other = copy.copy(self)
         # Cached as well: each step of a motion requests it when the density is estimated.
-        other.point_masses, other._mass = (), self._mass.setdefault("bare", {})
+        other = self._copy(point_masses=(), _mass=self._mass.setdefault("bare", {}))
         if other.prestress is not None:
             other.prestress = replace(other.prestress, added=None, mass_count=0)
         return other
@@ -256,10 +213,8 @@ class BranchModel:
                  lame_pair: tuple[np.ndarray, np.ndarray] | None = None) -> InternalState:
         """Return internal force and energy at a displacement [m], shape [node_count, 3].
 
-        Args:
-            viscous: Viscous part in motion.
-            lame_pair: Lamé coefficients instead of the model's, and no weight; the force is
-                linear in them.
+        ``viscous`` is the viscous part in motion; ``lame_pair`` are Lamé coefficients instead of
+        the model's, in which the force is linear, and no weight.
         """
         data = self._data
         lam, mu = lame_pair or (self.lame_lambda, self.lame_mu)
@@ -272,13 +227,14 @@ class BranchModel:
                       ).sum(axis=1)
             growth, memory = 0.0, self.bearing_strain(strain, viscous, lame_pair)
             lam, mu = self.lame_lambda, self.lame_mu
-        det = internal_force(for_kernels(displacement), layout.gradients,
-                             layout.weights, layout.per_element(lam), layout.per_element(mu),
-                             layout.nodes, self.material.kernel, growth, memory, force, energies)
+        det = forces.internal_force(
+            for_kernels(displacement), layout.gradients, layout.weights, layout.per_element(lam),
+            layout.per_element(mu), layout.nodes, self.material.kernel, growth, memory, force,
+            energies)
         energies = energies if of_law is None else of_law
         if lame_pair is not None or self.weight_stiffness is None:
             return InternalState(force, energies, float(det))
-        lifted = self._weight_times(displacement)
+        lifted = product_with(self.weight_stiffness, displacement)
         return InternalState(force + lifted, energies, float(det),
                              0.5 * float((lifted * displacement).sum()))
 
@@ -292,24 +248,21 @@ class BranchModel:
             strain = self.strains(displacement)
             growth, memory = 0.0, self.bearing_strain(strain, viscous)
             of_change = self._stress_change_force(displacement, direction, strain, viscous)
-        tangent_times(for_kernels(displacement), for_kernels(direction), layout.gradients,
-                      layout.weights, layout.per_element(self.lame_lambda),
-                      layout.per_element(self.lame_mu), layout.nodes, self.material.kernel, growth,
-                      memory, self.mesh.tet_count, product)
+        forces.tangent_times(
+            for_kernels(displacement), for_kernels(direction), layout.gradients, layout.weights,
+            layout.per_element(self.lame_lambda), layout.per_element(self.lame_mu), layout.nodes,
+            self.material.kernel, growth, memory, self.mesh.tet_count, product)
         if of_change is not None:
             product += of_change
-        return product if self.weight_stiffness is None else product + self._weight_times(direction)
+        weight = self.weight_stiffness
+        return product if weight is None else product + product_with(weight, direction)
 
     def bearing_strain(self, strain: np.ndarray, viscous: Viscous | None = None,
                        lame_pair: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
         """Return the strain for which Hooke's stress is the law's at ``strain``, [tet_count, q, 6].
 
-        The kernels take the stress of a law that is not compiled in this form.
-
-        Args:
-            strain: As for :meth:`strains`.
-            viscous: Viscous part in motion.
-            lame_pair: Lamé coefficients of the stress instead of the model's.
+        The kernels take the stress of a law that is not compiled in this form. Arguments as for
+        :meth:`strains` and :meth:`internal`.
         """
         if self.material.is_hookean:
             return strain if viscous is None else viscous.growth * strain + viscous.memory
@@ -337,26 +290,23 @@ class BranchModel:
         """Return the strain at the quadrature points, [tet_count, q, 6] (00 11 22 01 02 12)."""
         data = self._data
         out = np.empty((*data.weights.shape, 6))
-        strains(for_kernels(displacement), data.layout.gradients,
-                data.layout.nodes, self.material.kernel, out)
+        forces.strains(for_kernels(displacement), data.layout.gradients, data.layout.nodes,
+                       self.material.kernel, out)
         return out
 
     def largest_stretch(self, displacement: np.ndarray) -> tuple[float, int]:
         """Return the largest principal stretch of an element's mean deformation, and which."""
         layout = self._data.layout
-        stretch, tet = largest_stretch(for_kernels(displacement),
-                                       layout.mean_gradients, layout.nodes)
+        stretch, tet = forces.largest_stretch(for_kernels(displacement), layout.mean_gradients,
+                                              layout.nodes)
         return float(stretch), min(int(tet), self.mesh.tet_count - 1)
 
     def largest_principal_strains(self, displacement: np.ndarray,
                                   carried: np.ndarray | None = None) -> np.ndarray:
         """Return the largest principal Green-Lagrange strain of each element, [tet_count].
 
-        From its mean deformation, as :meth:`largest_stretch`; takes a millisecond for thousands.
-
-        Args:
-            carried: Strain that carries the weight in the mesh's shape, [tet_count, 6], to be added
-                (:func:`limber.mechanics.strain.carried_strain`).
+        From its mean deformation, as :meth:`largest_stretch`; ``carried`` is added: the strain that
+        carries the weight (:func:`limber.mechanics.strain.carried_strain`), [tet_count, 6].
         """
         layout, out = self._data.layout, np.empty(self.mesh.tet_count)
         largest_principal_strains(for_kernels(displacement), layout.mean_gradients, layout.nodes,
@@ -368,29 +318,22 @@ class BranchModel:
         """Return the derivative of :meth:`strains` along ``direction`` [m]."""
         data = self._data
         out = np.empty((*data.weights.shape, 6))
-        strain_changes(for_kernels(displacement), for_kernels(direction), data.layout.gradients,
-                       data.layout.nodes, self.material.kernel, out)
+        forces.strain_changes(for_kernels(displacement), for_kernels(direction),
+                              data.layout.gradients, data.layout.nodes, self.material.kernel, out)
         return out
 
     @property
     def weight_stiffness(self) -> sp.csr_matrix | None:
-        """Geometric stiffness of the carried weight [N/m], each axis; None if no weight is carried.
-
-        At small strains a carried weight has no effect.
-        """
+        """Geometric stiffness of the carried weight [N/m], each axis; None if none acts."""
         if self.prestress is None or self.material.is_linear:
             return None
         return self.prestress.total.stiffness
 
-    def _weight_times(self, field: np.ndarray) -> np.ndarray:
-        return product_with(self.weight_stiffness, field)
-
     @property
     def weight_force(self) -> np.ndarray:
         """Weight that the mesh's shape does not carry [N], shape [node_count, 3]."""
-        if self.prestress is None:
-            return self.mass_load[:, None] * self.gravity
-        later = nodal_masses(self._ties[self.prestress.mass_count:], self.mesh.node_count)
+        later = self.mass_load if self.prestress is None else nodal_masses(
+            self._ties[self.prestress.mass_count:], self.mesh.node_count)
         return later[:, None] * self.gravity
 
     @property
@@ -443,10 +386,7 @@ class BranchModel:
         before = self.density
         changed = density is not before
         self.density = per_tet("Density", density, count)
-        if self.density.min() <= 0:
-            raise InputError(f"The density is {self.density.min():g} kg/m3.",
-                             "It must be positive.",
-                             "Green wood has 500 to 1100 kg/m3.")
+        check_density(self.density)
         self.lame_lambda, self.lame_mu = lame(self.young * self.stiffening, self.poisson)
         if changed:
             # Shared by the models derived from this one with the same density.
@@ -456,8 +396,3 @@ class BranchModel:
             self.prestress = (self.prestress.with_density(float(ratio[0])) if np.ptp(ratio) < 1e-12
                             else carried(self))
 
-def product_with(matrix: sp.csr_matrix, field: np.ndarray) -> np.ndarray:
-    """Return the product of a matrix for each axis and a nodal field of shape [node_count, 3]."""
-    product = np.empty((matrix.shape[0], 3))
-    sparse_times(matrix.indptr, matrix.indices, matrix.data, for_kernels(field), product)
-    return product

@@ -13,9 +13,10 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.mechanics.grasp import Grasp
+from limber.mechanics.internal_state import product_with
 from limber.mechanics.linear.equations import Tangent, Viscous
 from limber.mechanics.materials.materials import lame_by_poisson
-from limber.mechanics.model import BranchModel, product_with
+from limber.mechanics.model import BranchModel
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.statics.result import StaticResult
 

@@ -13,8 +13,8 @@ from limber.planning.certificate.lower_bound import Certificate
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.field.interpolation.local_error import LocalError
 from limber.planning.field.limited_quantities import UNITS
-from limber.planning.field.local_error import LocalError
 from limber.planning.goals.allowed_poses import (
     GoalOverLimitsError,
     allowed_points,

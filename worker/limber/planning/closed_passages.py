@@ -14,8 +14,9 @@ import numpy as np
 
 from limber.core.progress import SILENT, Progress
 from limber.planning.constraints.limits import Limits, sampled_sizes
-from limber.planning.field.energy_field import EnergyField, GraspSamples
+from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import GraspModel
+from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.limited_quantities import limited
 from limber.planning.field.sampling import solve_branch
 from limber.planning.field.solver_pool import SolverPool

@@ -9,8 +9,8 @@ from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.mechanics import StaticResult
 from limber.planning.cost import PathMeasures, measure_path, resample
-from limber.planning.field.energy_field import LOADS
 from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.field.grasp_samples import LOADS
 from limber.planning.field.initial_guess import straight_on
 
 _APPROACH_STEP = 0.02  # [m] between poses on the path from rest to the start

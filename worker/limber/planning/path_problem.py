@@ -8,8 +8,8 @@ import numpy as np
 from limber.core.errors import NoPathError
 from limber.planning.cost import EdgeWeights, arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.field.interpolation.local_error import LocalError
 from limber.planning.field.limited_quantities import limited
-from limber.planning.field.local_error import LocalError
 from limber.planning.goals.goal import Goal
 
 _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked

@@ -8,8 +8,9 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.constraints.full_model_check import learnt
 from limber.planning.constraints.limits import Limits, sizes
 from limber.planning.cost import STEP, resample
-from limber.planning.field.energy_field import EnergyField, GraspSamples
+from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import GraspModel
+from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.limited_quantities import UNITS
 from limber.planning.goals.goal import Goal
 from limber.planning.goals.grasp_goal import near

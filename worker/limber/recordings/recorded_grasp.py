@@ -36,3 +36,10 @@ def pose_on(grasp: Grasp, entry: GraspEntry, pose: np.ndarray) -> np.ndarray:
     arm = grasp.centre - np.array(entry.point_m)
     turn = rotation_matrix(pose[3:]) if grasp.mode == "clamped" else np.eye(3)
     return np.concatenate([pose[:3] + turn @ arm, pose[3:]])
+
+
+def point_of(grasp: Grasp, entry: GraspEntry, pose: np.ndarray) -> np.ndarray:
+    """Return the recorded grasp point [m], shape [3], for a pose of a mesh's patch [m, rad]."""
+    arm = np.array(entry.point_m) - grasp.centre
+    turn = rotation_matrix(pose[3:]) if grasp.mode == "clamped" else np.eye(3)
+    return pose[:3] + turn @ arm

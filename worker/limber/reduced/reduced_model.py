@@ -22,6 +22,7 @@ from limber.core.numerics.rigid import pose_between
 from limber.mechanics.grasp import Grasp, check_pose
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.reduced.basis import Basis, GraspCoordinates
+from limber.reduced.reduced_workspace import FoundState, Workspace
 from limber.reduced.state import ReducedSensitivities, ReducedState, ReducedStaticSettings
 from limber.reduced.strain_polynomial import StrainPolynomial, evaluate_strain, strain_only
 from limber.reduced.training_poses import TrainingPoses
@@ -34,22 +35,6 @@ jump, as for the full model (limber.mechanics.statics.equilibrium_path).
 """
 _LEADING = 20
 """Modes that decide whether a state is like those of the training. Chosen, not measured."""
-
-
-@dataclass
-class Workspace:
-    """Arrays that the kernel writes to."""
-
-    strain: np.ndarray
-    jacobian: np.ndarray
-    gradient: np.ndarray
-    tangent: np.ndarray
-
-    @classmethod
-    def of(cls, linear: np.ndarray) -> "Workspace":
-        count, size = linear.shape
-        return cls(np.empty(count), np.empty((count, size)), np.empty(size),
-                   np.empty((size, size)))
 
 
 @dataclass
@@ -212,7 +197,7 @@ class ReducedModel:
         began = time.perf_counter()
         pose = check_pose(pose)
         load = self.load if nodal_forces is None else self.load + self.load_of(nodal_forces)
-        best: _Found | None = None
+        best: FoundState | None = None
         iterations = 0
         for at_pose, q in self._starts(pose, start)[:settings.start_count]:
             found = self._follow(at_pose, q, pose, load, settings,
@@ -313,7 +298,7 @@ class ReducedModel:
 
     def _follow(self, at_pose: np.ndarray, q: np.ndarray, pose: np.ndarray, load: np.ndarray,
                 settings: ReducedStaticSettings, most: int, *, steadily: bool = False,
-                ) -> "_Found":
+                ) -> "FoundState":
         """Newton to the pose in ``most`` iterations; if that fails, the step is halved, with
         ``steadily`` also if the branch may have jumped.
         """
@@ -337,7 +322,7 @@ class ReducedModel:
             if step < 0.5**settings.max_halvings:
                 return replace(found, converged=False, iterations=iterations)
 
-    def _came_from(self, q: np.ndarray, found: "_Found") -> bool:
+    def _came_from(self, q: np.ndarray, found: "FoundState") -> bool:
         """Whether an equilibrium continues the one at ``q``: every tangent along the path was
         positive definite, or the potential changed by the work of the gripper.
         """
@@ -353,7 +338,7 @@ class ReducedModel:
         return work - change <= _LOST * (abs(work) + abs(change))
 
     def _newton(self, q: np.ndarray, held: np.ndarray | None, load: np.ndarray,
-                settings: ReducedStaticSettings, most: int) -> "_Found":
+                settings: ReducedStaticSettings, most: int) -> "FoundState":
         """Iterate with the grasp's coordinates ``held``, or free where they are not."""
         count, q = 0 if held is None else self.basis.lift_count, q.copy()
         move, increment, steady = None if held is None else held - q[:count], None, True
@@ -368,15 +353,15 @@ class ReducedModel:
             q = q + increment
             gain = 0.5 * abs(right @ step)
             if not np.isfinite(gain) or np.abs(q).max() > 1e3 * self._largest.max():
-                return _Found(q, False, np.inf, iteration + 1, np.inf)
+                return FoundState(q, False, np.inf, iteration + 1, np.inf)
             if move is None and gain <= settings.tolerance * max(energy, 1e-12):
                 novelty = float((np.abs(q[self._known]) / self._largest[self._known]).max())
-                return _Found(q, stable, novelty, iteration + 1,
+                return FoundState(q, stable, novelty, iteration + 1,
                               self.energy(q) - float(load @ q), steady)
             move = None
-        return _Found(q, False, np.inf, most, np.inf)
+        return FoundState(q, False, np.inf, most, np.inf)
 
-    def _state(self, found: "_Found", pose: np.ndarray, load: np.ndarray, iterations: int,
+    def _state(self, found: "FoundState", pose: np.ndarray, load: np.ndarray, iterations: int,
                began: float, settings: ReducedStaticSettings) -> ReducedState:
         energy, force = self.energy_force(found.q)
         reaction, torque = self.wrench(pose, force - load)
@@ -392,25 +377,6 @@ class ReducedModel:
         """Return force and torque of the gripper from the forces on the grasp coordinates."""
         wrench = self.held.by_pose(pose).T @ out[:self.basis.lift_count]
         return wrench[:3], wrench[3:] if len(wrench) == 6 else np.zeros(3)
-
-
-@dataclass(frozen=True)
-class _Found:
-    q: np.ndarray
-    converged: bool
-    novelty: float
-    iterations: int
-    potential: float
-    steady: bool = False  # every tangent along the path was positive definite
-
-    def agrees(self, other: "_Found") -> bool:
-        """Whether both are the same equilibrium."""
-        return (self.converged and other.converged
-                and abs(self.potential - other.potential) <= 1e-6 * abs(other.potential))
-
-    def ranking(self, settings: ReducedStaticSettings) -> tuple[bool, bool, float]:
-        """Sort key: converged, then within the training, then the lower potential energy."""
-        return not self.converged, self.novelty >= settings.novelty_limit, self.potential
 
 
 def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bool]:

@@ -36,12 +36,8 @@ _CHUNK_POINTS = 1000
 _PAIRS = np.array([[0, 0], [1, 1], [2, 2], [0, 1], [0, 2], [1, 2]])
 _SHEAR = np.array([1.0, 1.0, 1.0, np.sqrt(2), np.sqrt(2), np.sqrt(2)])
 _TRACE = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-_SMALLEST = 1e-11
-"""Eigenvalue of the strain fields, relative to the largest, below which they are round-off."""
-
-
-_ALIKE = 1e-6
-"""Eigenvalue of the normalised fields' products under which they count as alike."""
+_SMALLEST = 1e-11  # eigenvalue of the fields over the largest; below it they are round-off
+_ALIKE = 1e-6  # eigenvalue of the normalised fields' products under which they count as alike
 
 
 @dataclass(frozen=True)

@@ -46,18 +46,19 @@ from limber.store.growing_files import Stream
 from limber.store.lock import commit_lock, run_lock
 from limber.store.manifest import (
     MANIFEST,
+    RESULTS,
     FileEntry,
     Manifest,
     StageEntry,
     checked_name,
     program_versions,
     read_manifest,
+    results_version,
+    version_entry,
 )
 from limber.store.verify import Checker, Damage, damage_error
 
 _STREAMS = ".streams"
-RESULTS = "results"
-"""Among a stage's programs: the version of its settings' results; see limber.core.settings."""
 
 
 class Stage:
@@ -322,7 +323,7 @@ class Branch:
         stored = (settings.without_retired(entry.settings) if isinstance(settings, Settings)
                   else entry.settings)
         return (intact and entry.reads == current and stored == plain(settings or {})
-                and entry.programs.get(RESULTS, "1") == _results_version(settings))
+                and entry.programs.get(RESULTS, "1") == results_version(settings))
 
     @contextmanager
     def stage(self, key: str, settings: BaseModel | Mapping[str, Any] | None = None, *,
@@ -348,7 +349,7 @@ class Branch:
                 entry = StageEntry(
                     settings=plain(settings or {}), reads=read, writes=stage.written(),
                     result=plain(stage.result),
-                    programs=program_versions() | _version_entry(settings),
+                    programs=program_versions() | version_entry(settings),
                     seconds=round(time.perf_counter() - started, 3),
                     finished=datetime.now(UTC).isoformat(timespec="seconds"))
                 self._commit(key, entry, stage, work)
@@ -389,15 +390,6 @@ class Branch:
                 "The stage that writes it has not been run.", "Run the earlier stages first.")
         self._check(reads)
         return {name: self.digest(name) for name in reads} | dict(digests or {})
-
-
-def _results_version(settings: BaseModel | Mapping[str, Any] | None) -> str:
-    return str(getattr(type(settings), "results_version", 1))
-
-
-def _version_entry(settings: BaseModel | Mapping[str, Any] | None) -> dict[str, str]:
-    version = _results_version(settings)
-    return {} if version == "1" else {RESULTS: version}
 
 
 def _short(key: str) -> str:

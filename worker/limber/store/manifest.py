@@ -5,6 +5,7 @@ import hashlib
 import json
 import platform
 import uuid
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from limber.version import VERSION
 FORMAT_VERSION = 2
 """1: until 0.1; 2: with the branch's UUID. Older ones are read, and written as this one."""
 MANIFEST = "branch.json"
+RESULTS = "results"
+"""Among a stage's programs: the version of its settings' results; see limber.core.settings."""
 REPORT = "report"
 """The stage that shows the results of all others."""
 _PROGRAMS = ("numpy", "scipy", "numba", "cvxopt", "pytetwild", "robust_laplacian", "ompl")
@@ -167,3 +170,14 @@ def _installed() -> tuple[tuple[str, str], ...]:
         except metadata.PackageNotFoundError:
             continue
     return tuple(found.items())
+
+
+def results_version(settings: BaseModel | Mapping[str, Any] | None) -> str:
+    """Return the version of the results of a stage with these settings."""
+    return str(getattr(type(settings), "results_version", 1))
+
+
+def version_entry(settings: BaseModel | Mapping[str, Any] | None) -> dict[str, str]:
+    """Return it as an entry of a stage's programs; the first version has none."""
+    version = results_version(settings)
+    return {} if version == "1" else {RESULTS: version}

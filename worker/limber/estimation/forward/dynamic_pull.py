@@ -9,9 +9,8 @@ from limber.core.not_none import present
 from limber.estimation.forward.force_motion import motion_response
 from limber.estimation.forward.forward_model import Forward, Simulated, under_its_weight
 from limber.estimation.forward.input_force import Response, nodal_loads
-from limber.estimation.forward.quasi_static import mechanics_names
 from limber.estimation.interpolation_prior import YoungField
-from limber.estimation.parameters import Values
+from limber.estimation.parameters import Values, mechanics_names
 from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel

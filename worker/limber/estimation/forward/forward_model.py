@@ -40,6 +40,16 @@ class Simulated:
     grasps: np.ndarray | None = None
     d_grasps: np.ndarray | None = None
 
+    @classmethod
+    def empty(cls, frames: int, points: int, torque: bool, parameters: int) -> "Simulated":
+        """Return arrays to fill, with derivatives to as many ``parameters``; 0: without."""
+        shape = (frames, points, 3)
+        return cls(np.empty(shape), np.empty((frames, 3)),
+                   np.empty((*shape, parameters)) if parameters else None,
+                   np.empty((frames, 3, parameters)) if parameters else None,
+                   np.empty((frames, 3)) if torque else None,
+                   np.empty((frames, 3, parameters)) if torque and parameters else None)
+
 
 def under_its_weight(model: BranchModel, entry: PullEntry) -> BranchModel:
     """Return the model with the weight that acted in a pull.

@@ -21,7 +21,7 @@ from limber.estimation.forward.key_frames import key_frames, smoothed
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.sensitivities import refined_solve
-from limber.recordings.recording import GraspEntry
+from limber.recordings.recording import GraspEntry, PullEntry
 from limber.recordings.synchronisation import Frames
 
 COURSE_MISFIT = 1.5
@@ -142,3 +142,24 @@ def compliance(model: BranchModel, displacement: np.ndarray, loads: np.ndarray) 
         return model.tangent_times(displacement, direction)
 
     return np.array([refined_solve(tangent, force, load, tolerance=1e-5) for load in loads])
+
+
+def response_of(spread: np.ndarray, at_keys: np.ndarray) -> Response:
+    """Return the response at all frames.
+
+    Args:
+        spread: Values at f frames from those at k key frames, shape [f, k].
+        at_keys: Response of the points at the key frames [m per N], shape [k, c, m, 3].
+    """
+    keys, components = at_keys.shape[:2]
+    points = np.einsum("fk,kcmi->fmikc", spread, at_keys)
+    wrenches = np.einsum("fk,cd->fckd", spread, np.eye(components))
+    return Response(points.reshape(*points.shape[:3], keys * components),
+                    wrenches.reshape(len(spread), components, keys * components))
+
+
+def wrench_sigma(entry: PullEntry, frames: Frames, components: int) -> np.ndarray:
+    """Return the standard deviation of the readings [N, N m], shape [f, components]."""
+    sensor = entry.sensor
+    each = [sensor.force_sigma_n] * 3 + [sensor.torque_sigma_nm] * (components - 3)
+    return np.array(each, float) / np.sqrt(np.maximum(frames.wrench_counts, 1))[:, None]

@@ -19,8 +19,8 @@ from limber.core.not_none import present
 from limber.core.numerics.rigid import principal_axes
 from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.forward.input_force import Response
-from limber.estimation.forward.quasi_static import QuasiStaticForward, equal_values
-from limber.estimation.parameters import Values
+from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.parameters import Values, equal_values
 
 AT_REST_M = 5e-3
 """Distance of a first pose from the grasp point below which the branch is at rest; the sensor's

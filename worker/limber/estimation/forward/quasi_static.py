@@ -6,37 +6,37 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import InputError
 from limber.core.not_none import present
-from limber.core.numerics.rigid import rotation_matrix
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.estimation.forward.forward_model import Forward, Simulated, under_its_weight
+from limber.estimation.forward.gripper_torque import require_torque, torque_slopes, uses_torque
 from limber.estimation.forward.input_force import (
     Course,
     Response,
     compliance,
     course_of,
     nodal_loads,
+    response_of,
+    wrench_sigma,
 )
 from limber.estimation.forward.key_frames import key_frames, travel
-from limber.estimation.gripper_path import force_for_travel
+from limber.estimation.gripper_path import measured_over_simulated
 from limber.estimation.interpolation_prior import YoungField
-from limber.estimation.parameters import Values
+from limber.estimation.parameters import Values, equal_values, mechanics_names
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
-from limber.mechanics.sensitivities import ParameterSet, explicit_forces, static_sensitivities
+from limber.mechanics.sensitivities import ParameterSet, static_sensitivities
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
-from limber.recordings.recorded_grasp import grasp_on, pose_on
+from limber.recordings.recorded_grasp import grasp_on, point_of, pose_on
 from limber.recordings.recording import PullEntry
 from limber.recordings.synchronisation import Frames
 
 SETTINGS = StaticSettings(tolerance=1e-6, total_iterations=200, way_back=False)
 """From the previous state, an equilibrium takes 3 to 10 iterations, from rest some tens. A branch
-with far too soft moduli, which a fit may try, folds up under its force. That is not a useful step
-of the fit, and finding its equilibrium may take minutes.
-"""
+with far too soft moduli folds up: no useful step of a fit, and minutes of solving."""
 ITERATIONS_A_KEY = 20
 """Most iterations per simulated frame, in addition to those of a single solve. Branches that did
 not fold needed at most 12 until the force had settled, and 4 in one simulation. Under a force that
@@ -47,9 +47,7 @@ FEW_KEYS = 4
 and 12 the resulting changes of the moduli agreed within 1.5 %.
 """
 YOUNG_STEP_LIMIT = 0.7
-"""Largest change of a log E for which a state is extrapolated by its derivative: a factor of two.
-Chosen, not measured; beyond it the solve only starts worse.
-"""
+"""Largest change of a log E for which a state is extrapolated by its derivative; chosen."""
 
 
 @dataclass
@@ -92,7 +90,7 @@ class QuasiStaticForward(Forward):
                              "Nothing would pull the branch.",
                              "Use --drive pose, or record the force.")
         if self.drive == "force" and entry.grasp.mode == "clamped":
-            _require_torque(name, entry, frames)
+            require_torque(name, entry, frames)
         self.weights = weights
         self.field = field or YoungField(weights)
         self.grasp = grasp_on(model.mesh, entry.grasp)
@@ -118,7 +116,8 @@ class QuasiStaticForward(Forward):
                             for pose in frames.poses[self.keys]]
         else:
             components = 6 if self.uses_torque else 3
-            self._course = course_of(frames, self._wrench_sigma(components), count, components)
+            sigma = wrench_sigma(self.entry, frames, components)
+            self._course = course_of(frames, sigma, count, components)
             self.keys, self.spread = self._course.keys, self._course.spread
             self._measured = self._course.values
             self._drives = list(self._measured)
@@ -160,7 +159,8 @@ class QuasiStaticForward(Forward):
                  ) -> Simulated | None:
         model = self.model_with(values)
         jump = None if self._values is None else np.log(values.young) - np.log(self._values.young)
-        found = self._room(len(values.young) + len(extra) if sensitivities else 0)
+        found = Simulated.empty(len(self.keys), len(self.rest_points), self.uses_torque,
+                                len(values.young) + len(extra) if sensitivities else 0)
         states: list[_Memory | None] = []
         before: np.ndarray | None = None
         is_asked = (sensitivities or self.watches_pose) and self.response is None and (
@@ -195,16 +195,6 @@ class QuasiStaticForward(Forward):
             for name, each in vars(replace(found, grasps=grasps, d_grasps=d_grasps)).items()}
         return Simulated(**at_frames)
 
-    def _room(self, count: int) -> Simulated:
-        """For the key frames, with derivatives to ``count`` parameters."""
-        keys, shape = len(self.keys), (len(self.keys), len(self.rest_points), 3)
-        return Simulated(
-            np.empty(shape), np.empty((keys, 3)),
-            np.empty((*shape, count)) if count else None,
-            np.empty((keys, 3, count)) if count else None,
-            np.empty((keys, 3)) if self.uses_torque else None,
-            np.empty((keys, 3, count)) if self.uses_torque and count else None)
-
     def _enter(self, found: Simulated, key: int, result: StaticResult) -> None:
         drive = self._drives[key]
         found.positions[key] = self.rest_points + self._observed(result.displacement)
@@ -224,8 +214,10 @@ class QuasiStaticForward(Forward):
         for column in range(slope.shape[-1]):
             points[key, ..., column] = self._observed(slope[..., column])
         if found.d_torques is not None:
-            found.d_torques[key] = 0.0 if self.drive == "force" else self._torque_slopes(
-                model, values, extra, result, slope, self.frames.poses[self.keys[key], :3])
+            names = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
+            found.d_torques[key] = 0.0 if self.drive == "force" else torque_slopes(
+                model, self.grasp, names, result.displacement, slope,
+                self.frames.poses[self.keys[key], :3])
         return slope
 
     def _held(self, _sensitivities: bool) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -257,14 +249,8 @@ class QuasiStaticForward(Forward):
 
     def _response(self, compliances: list[np.ndarray]) -> Response:
         self._compliances = compliances
-        components = len(self._loads[0])
-        at_keys = np.array([[self._observed(moved) for moved in each]
-                            for each in self._compliances])
-        points = np.einsum("fk,kcmi->fmikc", self.spread, at_keys)
-        wrenches = np.einsum("fk,cd->fckd", self.spread, np.eye(components))
-        count = len(self.keys) * components
-        return Response(points.reshape(*points.shape[:3], count),
-                        wrenches.reshape(len(self.spread), components, count))
+        return response_of(self.spread, np.array(
+            [[self._observed(moved) for moved in each] for each in compliances]))
 
     def _loads_at(self, frame: int) -> np.ndarray:
         return nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[frame],
@@ -309,15 +295,8 @@ class QuasiStaticForward(Forward):
 
     def grasp_position(self, displacement: np.ndarray) -> np.ndarray:
         """Position of the recorded grasp point [m], shape [3]."""
-        arm = np.array(self.entry.grasp.point_m) - self.grasp.centre
-        pose = self.grasp.pose_of(self.mesh.nodes, displacement)
-        turn = rotation_matrix(pose[3:]) if self.grasp.mode == "clamped" else np.eye(3)
-        return pose[:3] + turn @ arm
-
-    def _wrench_sigma(self, components: int) -> np.ndarray:
-        sensor = self.entry.sensor
-        each = [sensor.force_sigma_n] * 3 + [sensor.torque_sigma_nm] * (components - 3)
-        return np.array(each, float) / np.sqrt(np.maximum(self.frames.wrench_counts, 1))[:, None]
+        return point_of(self.grasp, self.entry.grasp,
+                        self.grasp.pose_of(self.mesh.nodes, displacement))
 
     def with_prescribed_poses(self, poses: np.ndarray) -> "QuasiStaticForward":
         made = type(self)(self.name, self._model, self.weights, self.entry,
@@ -351,9 +330,7 @@ class QuasiStaticForward(Forward):
         return made
 
     def begin_at(self, other: "QuasiStaticForward") -> None:
-        """Start from states and force of another simulation of the same pull, with the same number
-        of nodes.
-        """
+        """Start from states and force of another simulation of this pull with as many nodes."""
         if self.has_force_unknowns:
             self._drives = list((other.spread @ np.array(other._drives))[self.keys])
         states = other.displacements()
@@ -365,32 +342,12 @@ class QuasiStaticForward(Forward):
         self._hints = displacements
 
     def force_ratio(self, values: Values) -> float | None:
-        """Measured force over the force that moves a branch of these ``values`` equally far.
-
-        The grasp point is not prescribed: at the recorded poses a branch with other ratios of E
-        would be stretched, and a slender branch responds to that with a thousandfold force.
-        """
-        frames = self.frames
-        known = np.flatnonzero(np.isfinite(frames.wrenches[:, :3]).all(axis=1))
-        travel = np.linalg.norm(frames.poses[:, :3] - frames.poses[0, :3], axis=1)[known]
-        row = known[int(np.argmin(np.abs(travel - 0.6 * travel.max())))]
-        force = frames.wrenches[row, :3] - self._zero[:3]
-        size = float(np.linalg.norm(force))
-        moved = float(np.linalg.norm(frames.poses[row, :3] - frames.poses[0, :3]))
-        if size <= 0 or moved <= 0:
-            return None
-        try:
-            return float(size / force_for_travel(self.model_with(values), self.grasp,
-                                                 force / size, moved))
-        except WorkError:
-            return None
+        """Measured force over the force that moves a branch of these ``values`` equally far."""
+        return measured_over_simulated(self.model_with(values), self.grasp, self.frames,
+                                       self._zero[:3])
 
     def states(self) -> list[_Memory]:
-        """The states of all key frames under the last parameters.
-
-        Raises:
-            ValueError: one has not been simulated.
-        """
+        """The states of all key frames, all simulated, under the last parameters."""
         return [present(memory, "state of a key frame") for memory in self._memory]
 
     def displacements(self) -> list[np.ndarray]:
@@ -463,58 +420,3 @@ class QuasiStaticForward(Forward):
             model, result, self.grasp, None, mechanics_names(extra),
             is_held=self.drive == "pose", shares=self.field.shares(values, extra))
         return found.displacement, found.reaction_force
-
-    def _torque_slopes(self, model: BranchModel, values: Values, extra: tuple[str, ...],
-                       result: StaticResult, slope: np.ndarray, about: np.ndarray) -> np.ndarray:
-        """Derivative of the gripper's torque about a fixed point, shape [3, p]."""
-        parameters = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
-        held = self.grasp.nodes
-        arm = model.mesh.nodes[held] + result.displacement[held] - about
-        columns = []
-        for column, partial in enumerate(explicit_forces(
-                model, parameters, result.displacement)):
-            out = partial + model.tangent_times(result.displacement,
-                                                np.ascontiguousarray(slope[..., column]))
-            columns.append(np.cross(arm, out[held]).sum(axis=0))
-        return np.array(columns).T
-
-
-def uses_torque(entry: PullEntry, frames: Frames) -> bool:
-    """Whether the gripper's torque counts: for a clamped grasp, and a sensor with a stated torque
-    noise. Driven by pose it is an observation; driven by force it acts as a load.
-    """
-    return (entry.grasp.mode == "clamped" and entry.sensor.torque_sigma_nm is not None
-            and bool(np.isfinite(frames.wrenches[:, 3:]).all(axis=1).any()))
-
-
-def _require_torque(name: str, entry: PullEntry, frames: Frames) -> None:
-    """A clamped gripper also rotates the branch: its force alone does not determine the motion.
-
-    Raises:
-        InputError: its torque was not measured.
-    """
-    if not uses_torque(entry, frames):
-        raise InputError(
-            f"{name}: the force of a clamped gripper drives the simulation, but its torque is not "
-            "known.",
-            "A clamped gripper also bends the branch by a torque. A simulation with the force "
-            "alone would not reproduce the pull.",
-            "Use --drive pose, or record the torque and give torque_sigma_nm under [sensor] in "
-            'pull.toml. If the branch could turn in the gripper, set mode = "pinned" under '
-            "[grasp].")
-
-
-def equal_values(one: Values | None, other: Values) -> bool:
-    """Whether all parameters are the same."""
-    return one is not None and np.array_equal(one.young, other.young) and (
-        (one.poisson, one.density, one.damping, one.form)
-        == (other.poisson, other.density, other.damping, other.form))
-
-
-def mechanics_names(extra: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the parameters by their names in :mod:`limber.mechanics.sensitivities`."""
-    names = {"poisson": "poisson", "density": "log_density", "alpha": "damping_mass",
-             "beta": "damping_stiffness"}
-    # Parameters of the field's form come with log E.
-    return ("log_young", *(names[name] for name in extra if name in names))
-

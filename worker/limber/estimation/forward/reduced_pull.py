@@ -7,8 +7,8 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.core.not_none import present
 from limber.estimation.forward.forward_model import Forward, Simulated
+from limber.estimation.forward.gripper_torque import uses_torque
 from limber.estimation.forward.key_frames import key_frames, travel
-from limber.estimation.forward.quasi_static import uses_torque
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.points import point_operator

@@ -69,6 +69,13 @@ def check_young(young: np.ndarray) -> None:
                          "A modulus must be positive.", "Green wood has 1e8 to 1e10 Pa.")
 
 
+def check_density(density: np.ndarray) -> None:
+    """Raise InputError unless the density [kg/m^3] is positive."""
+    if density.min() <= 0:
+        raise InputError(f"The density is {density.min():g} kg/m3.", "It must be positive.",
+                         "Green wood has 500 to 1100 kg/m3.")
+
+
 def check_poisson(poisson: np.ndarray) -> None:
     """Raise InputError unless Poisson's ratio is in (-1, MAX_POISSON]."""
     worst = poisson[np.argmax(np.abs(poisson))]

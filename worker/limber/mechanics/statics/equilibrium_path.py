@@ -7,8 +7,8 @@ import numpy as np
 from limber.core.numerics.rigid import pose_between
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import Progress
+from limber.mechanics.internal_state import InternalState
 from limber.mechanics.linear.equations import Tangent
-from limber.mechanics.model import InternalState
 from limber.mechanics.solve_status import Status
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.snap_through import settle

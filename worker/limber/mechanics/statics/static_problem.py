@@ -8,8 +8,9 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.mechanics.grasp import Grasp, check_pose
+from limber.mechanics.internal_state import InternalState
 from limber.mechanics.linear.equations import Equations
-from limber.mechanics.model import BranchModel, InternalState
+from limber.mechanics.model import BranchModel
 from limber.mechanics.solve_status import Status
 from limber.mechanics.statics.result import StaticResult, StaticSettings
 from limber.mechanics.strain import Place

@@ -2,9 +2,10 @@
 
 Off the shell, a force grows a hundred times as fast as along it. Cubic cells must therefore be tiny
 before they show that a limit is broken in all of them. Here cells are cut in the chart's
-coordinates (:mod:`limber.planning.field.chart`), along the undecided axes, and only where they are
-open. If open cells do not connect the start's cell to one that may contain a point of the goal, no
-path exists. If cells that keep all limits at their corners do, a path usually exists.
+coordinates (:mod:`limber.planning.field.interpolation.chart`), along the undecided axes, and only
+where they are open. If open cells do not connect the start's cell to one that may contain a point
+of the goal, no path exists. If cells that keep all limits at their corners do, a path usually
+exists.
 
 Values and slopes at a cell's corners bound the limited quantity from below in the cell
 (:mod:`limber.planning.certificate.cell_bounds`). This holds for the field. The branch itself may
@@ -23,8 +24,8 @@ from scipy.spatial import cKDTree
 
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, off_zero
 from limber.planning.cost import resample
-from limber.planning.field.chart import Chart
-from limber.planning.field.valid_region import nearest_of
+from limber.planning.field.interpolation.chart import Chart
+from limber.planning.field.interpolation.valid_region import nearest_of
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.path_problem import GentleProblem, least_over
 

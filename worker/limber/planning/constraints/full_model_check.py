@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from limber.planning.constraints.limits import Limits
-from limber.planning.field.energy_field import EnergyField, GraspSamples
+from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import GraspModel
+from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.goals.goal import Goal
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 

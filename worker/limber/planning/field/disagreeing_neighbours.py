@@ -15,9 +15,9 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from limber.core.progress import SILENT, Progress
-from limber.planning.field.chart import Chart
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.initial_guess import extrapolated, midpoint_blend
+from limber.planning.field.interpolation.chart import Chart
 from limber.planning.field.solver_pool import SolverPool
 from limber.planning.field.stored_states import Solved, taken
 

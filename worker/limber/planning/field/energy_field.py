@@ -8,8 +8,7 @@ The field also gives the natural rotation of the grasped piece, and the position
 tip.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,43 +18,25 @@ from limber.core.errors import InputError, WorkError
 from limber.core.files.reading import read_arrays, require_shapes
 from limber.core.numerics.compiled import compiled
 from limber.core.progress import SILENT, Progress
-from limber.planning.field.chart import Chart, mapped, pulled_back_size
-from limber.planning.field.local_error import LocalError, Slack, slack_at, slack_of
-from limber.planning.field.radial import RadialInterpolant, gradient_at, value_at
-from limber.planning.field.valid_region import TrustRegion, trusted_at
+from limber.planning.field.fit_choice import (
+    CHARTS_TRIED,
+    SMOOTHING,
+    FitChoice,
+    chosen_fits,
+    cross_validated_errors,
+    misplaced_tips,
+    slopes_on,
+    with_slopes,
+)
+from limber.planning.field.grasp_samples import LOADS, GraspSamples
+from limber.planning.field.interpolation.chart import Chart, mapped, pulled_back_size
+from limber.planning.field.interpolation.local_error import LocalError, Slack, slack_at, slack_of
+from limber.planning.field.interpolation.radial import RadialInterpolant, gradient_at, value_at
+from limber.planning.field.interpolation.valid_region import TrustRegion, trusted_at
 
-
-@dataclass(frozen=True)
-class FitChoice:
-    """Choices of a field's fit: kernel and shape; stretch and depth of the chart (in radii)."""
-
-    kernel: str
-    shape: float
-    stretch: float = 1.0
-    depth: float = np.inf
-
-    def on(self, chart: Chart) -> Chart:
-        """Return the chart with this stretch and depth."""
-        return replace(chart, stretch=self.stretch, depth=self.depth * (chart.radius or 1.0))
-
-
-KERNELS_TRIED = (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0), ("multiquadric", 2.0))
-CHARTS_TRIED = ((1.0, np.inf), (2.0, np.inf), (4.0, np.inf), (8.0, np.inf), (5.0, 0.02),
-                (12.0, 0.02), (30.0, 0.02), (12.0, 0.005), (30.0, 0.005), (80.0, 0.005))
-"""Stretch and depth; they depend on the curvature off the shell, for any kernel."""
-_FINALISTS = 3  # best charts with the first kernel; the other kernels are tried on them
-_SMOOTHING = 1e-6  # fraction of the scaled system; more blurs, less invites rounding errors
-_CHOSEN_BY = ("energy_error_median", "energy_error_most", "force_error_median", "force_error_most")
-_MOST = 0.95  # quantile of the samples
-_MOST_TIPS = 0.9  # the same; beyond it the branch may buckle either way
 _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
              "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n", "reduced": "reduced"}
-LOADS = ("strain", "stress", "axial_force", "torque", "closeness")
-"""Loads of a pose besides energy and force: largest strain and stress [Pa] by magnitude; the
-gripper's force along the branch [N], outward positive, and its torque [Nm]; closeness of the branch
-to an obstacle, 1 where it touches one. A plan's constraints may add more.
-"""
 _WHAT = "an energy field (`limber energy --force` creates one)"
 _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
            "min_det_f": ("m",), "rejected_poses": ("q", 6)}
@@ -73,91 +54,6 @@ _OPTIONAL_SHAPES = {
            "polynomial": (f"{fit} p", f"{fit} c"), "powers": (f"{fit} p", 3)}.items()}}
 """Shapes of the arrays in a file; equal letters are equal lengths."""
 """In any unit here: with larger numbers, sums would not be finite."""
-_CHOOSE_FROM = 150  # most samples; more change the choice little but take time
-
-
-@dataclass(frozen=True)
-class GraspSamples:
-    """Results of the branch model at ``m`` accepted grasp poses, rest pose first.
-
-    Attributes:
-        poses: Position [m] and natural rotation vector of the grasped piece [rad], [m, 6].
-        energies: Potential of strain and weight above the hanging state [J], shape [m].
-        forces: Force that the gripper exerts on the branch [N], shape [m, 3].
-        tips: Position of the branch's tip [m], shape [m, 3].
-        min_det_f: Least determinant of the deformation gradient, shape [m].
-        rejected_poses: Poses without an acceptable solution, shape [q, 6].
-        strains: Largest principal Green-Lagrange strain by magnitude, shape [m].
-        targets: Positions of the named targets [m], shape [m, targets, 3].
-        torques: Torque that the gripper exerts about the pose's position [Nm], shape [m, 3].
-        strain_places: Position of that strain in the rest shape [m], shape [m, 3].
-        stresses: Largest principal Cauchy stress by magnitude [Pa], shape [m].
-        shape_slopes: Slopes of natural rotation, tip and targets to the grasp's position, shape
-            [m, 3, 6 + 3 targets].
-        axial_forces: Component of the force along the branch at the grasp, outward [N], shape [m].
-        reduced: Whether the reduced model found the sample, corrected once by the full one; the
-            full model alone found the others, and all of a file without this entry; shape [m].
-        added: Quantities of a plan's constraints, by their names, shape [m] each; in no file.
-    """
-
-    poses: np.ndarray
-    energies: np.ndarray
-    forces: np.ndarray
-    tips: np.ndarray
-    min_det_f: np.ndarray
-    rejected_poses: np.ndarray
-    strains: np.ndarray | None
-    targets: np.ndarray | None = None
-    torques: np.ndarray | None = None
-    strain_places: np.ndarray | None = None
-    stresses: np.ndarray | None = None
-    shape_slopes: np.ndarray | None = None
-    axial_forces: np.ndarray | None = None
-    reduced: np.ndarray | None = None
-    added: dict[str, np.ndarray] = field(default_factory=dict)
-
-    @property
-    def positions(self) -> np.ndarray:
-        return self.poses[:, :3]
-
-    @property
-    def shape(self) -> np.ndarray:
-        """Natural rotation, tip and targets, shape [m, 6 + 3 targets]."""
-        known = [self.poses[:, 3:], self.tips]
-        if self.targets is not None:
-            known.append(self.targets.reshape(len(self.poses), -1))
-        return np.hstack(known)
-
-    @property
-    def loads(self) -> dict[str, np.ndarray | None]:
-        """Loads by the names of ``LOADS`` and of added ones, shape [m] each; None if not known."""
-        torque = None if self.torques is None else np.linalg.norm(self.torques, axis=1)
-        known = (self.strains, self.stresses, self.axial_forces, torque, None)
-        return dict(zip(LOADS, known, strict=True)) | self.added
-
-    @property
-    def load_table(self) -> np.ndarray:
-        """The same as columns, shape [m, loads]; 0 if not known."""
-        nothing = np.zeros(len(self.poses))
-        return np.column_stack([nothing if one is None else one for one in self.loads.values()])
-
-    def joined(self, other: "GraspSamples") -> "GraspSamples":
-        """Return these samples followed by those of ``other``."""
-        if self.reduced is not None and other.reduced is None:
-            other = replace(other, reduced=np.zeros(len(other.poses), bool))
-        added = {name: np.concatenate([values, other.added[name]])
-                 for name, values in self.added.items()}
-        return replace(self, added=added, **{
-            name: np.concatenate([values, getattr(other, name)])
-            for name, values in vars(self).items()
-            if name != "added" and values is not None and getattr(other, name) is not None})
-
-    def take(self, index: np.ndarray) -> "GraspSamples":
-        """Return the samples of ``index``; rejected poses stay."""
-        added = {name: values[index] for name, values in self.added.items()}
-        return replace(self, added=added, **{
-            name: values[index] for name, values in vars(self).items()
-            if name not in ("added", "rejected_poses") and values is not None})
 
 
 class FieldArrays(NamedTuple):
@@ -379,46 +275,11 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
         raise WorkError(f"Only {len(samples.poses)} grasp poses were accepted.",
                         f"A field in three coordinates needs at least {needed}.",
                         "Sample more poses, or use a smaller deflection.")
-    charts = CHARTS_TRIED if base is not None else CHARTS_TRIED[:1]
     if radius is None:
         radius = 0.0 if base is None else float(np.linalg.norm(samples.positions[0] - base))
     region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3], base, radius)
-    chart = region.chart
-    picked = _spread_out(region.is_face(), _CHOOSE_FROM)
-    some, face = samples.take(picked), region.is_face()[picked]
-    sure = _with_slopes(some)
-    bending, inside = some.take(sure), ~face[sure]
-
-    def energy_missed(choice: FitChoice) -> float:
-        errors = cross_validated_errors(some, choice.on(chart), choice, face)[0]
-        # Each relative to its own value: a few stiff poses, compressed and buckled, dominate means.
-        return float(np.prod([errors[name] for name in _CHOSEN_BY]))
-
-    def shape_missed(choice: FitChoice) -> float:
-        size = _misplaced(bending, choice, chart)[inside, 0]
-        return float(np.median(size) * np.quantile(size, _MOST_TIPS))
-
-    choice = _least(energy_missed, charts, progress.part(0.0, 0.5))
-    return _fitted(samples, choice, _least(shape_missed, charts, progress.part(0.5, 1.0)), region)
-
-
-def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, float]],
-           progress: Progress) -> FitChoice:
-    """Return the choice with the least ``missed``: the first kernel on all charts, then every other
-    kernel on the best of those.
-    """
-    first, *others = KERNELS_TRIED
-    asked = [FitChoice(*first, *chart) for chart in charts]
-    scores: dict[FitChoice, float] = {}
-    while asked:
-        for choice in asked:
-            progress(len(scores) / (len(charts) + _FINALISTS * len(others)),
-                     "choosing the interpolation")
-            scores[choice] = missed(choice)
-        best = sorted(scores, key=scores.__getitem__)
-        asked = [replace(chosen, kernel=kernel, shape=shape) for kernel, shape in others
-                 for chosen in best[:_FINALISTS]] if len(scores) == len(charts) else []
-    return best[0]
+    charts = CHARTS_TRIED if base is not None else CHARTS_TRIED[:1]
+    return _fitted(samples, *chosen_fits(samples, region, charts, progress), region)
 
 
 def _errors_in(arrays: dict[str, np.ndarray], samples: GraspSamples,
@@ -435,39 +296,6 @@ def _errors_in(arrays: dict[str, np.ndarray], samples: GraspSamples,
         whole[:, :known.shape[1]] = known
         found.append(whole)
     return found[0], found[1]
-
-
-def _misplaced(samples: GraspSamples, choice: FitChoice, chart: Chart, channels: slice = slice(3),
-               ) -> np.ndarray:
-    """Return the tip's error at each sample in the fit to all the others [m], and its targets' with
-    more ``channels`` than those of the tip, shape [m, channels / 3].
-    """
-    chart = choice.on(chart)
-    slopes = _slopes_on(chart, samples)
-    missed = RadialInterpolant.leave_one_out(
-        chart.map(samples.positions), samples.shape[:, 3:][:, channels],
-        None if slopes is None else slopes[:, :, 3:][:, :, channels],
-        kernel=choice.kernel, shape=choice.shape, smoothing=_SMOOTHING)[:, 0]
-    return np.linalg.norm(missed.reshape(len(missed), -1, 3), axis=2)
-
-
-def _with_slopes(samples: GraspSamples) -> np.ndarray:
-    """Return the samples of the shape's fit: those with known slopes, which are unknown at a snap;
-    all if hardly any are known.
-    """
-    everything = np.arange(len(samples.poses))
-    if samples.shape_slopes is None:
-        return everything
-    known = np.flatnonzero(np.isfinite(samples.shape_slopes).all(axis=(1, 2)))
-    return known if len(known) >= 0.5 * len(everything) else everything
-
-
-def _slopes_on(chart: Chart, samples: GraspSamples) -> np.ndarray | None:
-    """Return the slopes of the shape to the chart's coordinates, [m, 3, channels], if all known."""
-    if samples.shape_slopes is None or not np.isfinite(samples.shape_slopes).all():
-        return None
-    return np.stack([chart.push_forward(samples.positions, samples.shape_slopes[:, :, c])
-                     for c in range(samples.shape_slopes.shape[2])], axis=2)
 
 
 def refit(field: EnergyField, added: GraspSamples) -> EnergyField:
@@ -490,75 +318,6 @@ def _as_before(field: EnergyField, samples: GraspSamples) -> EnergyField:
     return _fitted(samples, energy, shape, region)
 
 
-def _spread_out(face: np.ndarray, count: int) -> np.ndarray:
-    """Return at most ``count`` indices, those on the hull's face and others at even steps."""
-    if len(face) <= count:
-        return np.arange(len(face))
-    inner = np.flatnonzero(~face)
-    left = max(count - int(face.sum()), count // 2)
-    picked = inner[np.linspace(0, len(inner) - 1, min(left, len(inner))).astype(int)]
-    return np.sort(np.concatenate([np.flatnonzero(face), picked]))
-
-
-def cross_validated_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face: np.ndarray,
-                           ) -> tuple[dict[str, float], np.ndarray]:
-    """Return errors on each sample of the fit to all the others, in closed form.
-
-    Only samples inside the hull count: the planner never leaves it.
-
-    Args:
-        face: Whether each sample is on the hull's face, bool [m].
-
-    Returns:
-        The measures of :func:`error_measures`, and prediction less truth of energy [J] and force
-        [N], shape [m, 4].
-    """
-    if not (~face).any():
-        raise WorkError(f"{len(samples.poses)} grasp poses are too few for cross-validation.",
-                        "The error of the energy field cannot be measured.",
-                        "Sample more poses.")
-    in_chart = chart.map(samples.positions)
-    missed = RadialInterpolant.leave_one_out(
-        in_chart, samples.energies, chart.push_forward(samples.positions, samples.forces),
-        kernel=choice.kernel, shape=choice.shape, smoothing=_SMOOTHING)[:, :, 0]
-    energy = np.maximum(samples.energies - missed[:, 0], 0.0)
-    off = -chart.pull_back(samples.positions, missed[:, 1:])
-    inside = np.flatnonzero(~face)
-    measures = error_measures(samples.take(inside), energy[inside], (samples.forces + off)[inside])
-    return measures, np.column_stack([energy - np.maximum(samples.energies, 0.0), off])
-
-
-def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
-                   ) -> dict[str, float]:
-    """Return the errors of predictions at ``truth``'s poses.
-
-    Returns:
-        ``energy_error`` and ``force_error``: root mean square error over root mean square of the
-        branch model's values; ``energy_error_median`` and ``force_error_median``: median of
-        the error of each sample over its own value; ``energy_error_most`` and
-        ``force_error_most``: 95 % of those are no larger; ``gentle_energy_error``: like the first,
-        over the half of the samples with the least energy, where gentle paths run;
-        ``held_out_count``.
-    """
-    true_energies = np.maximum(truth.energies, 0.0)
-    energy_off = np.abs(energy - true_energies)
-    force_off = np.linalg.norm(force - truth.forces, axis=1)
-    size = np.linalg.norm(truth.forces, axis=1)
-    felt = (true_energies > 1e-3 * true_energies.max()) & (size > 1e-3 * size.max())
-    gentle = true_energies <= np.median(true_energies)
-    energy_share, force_share = energy_off[felt] / true_energies[felt], force_off[felt] / size[felt]
-    return {
-        "energy_error": _rms(energy_off) / _rms(true_energies),
-        "force_error": _rms(force_off) / _rms(size),
-        "energy_error_median": float(np.median(energy_share)),
-        "force_error_median": float(np.median(force_share)),
-        "energy_error_most": float(np.quantile(energy_share, _MOST)),
-        "force_error_most": float(np.quantile(force_share, _MOST)),
-        "gentle_energy_error": _rms(energy_off[gentle]) / _rms(true_energies[gentle]),
-        "held_out_count": float(len(energy)),
-    }
-
-
 def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: TrustRegion,
             ) -> EnergyField:
     chart = choice.on(region.chart)
@@ -566,18 +325,18 @@ def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: T
     in_chart = chart.map(samples.positions)
     forces = chart.push_forward(samples.positions, samples.forces)
     energy = RadialInterpolant.fit(in_chart, samples.energies, forces, kernel=choice.kernel,
-                                   shape=choice.shape, smoothing=_SMOOTHING)
+                                   shape=choice.shape, smoothing=SMOOTHING)
     shape_chart = bent.on(region.chart)
     in_chart = shape_chart.map(samples.positions)
-    options = {"kernel": bent.kernel, "shape": bent.shape, "smoothing": _SMOOTHING}
-    sure = _with_slopes(samples)
+    options = {"kernel": bent.kernel, "shape": bent.shape, "smoothing": SMOOTHING}
+    sure = with_slopes(samples)
     bending = samples.take(sure)
-    shape = RadialInterpolant.fit(in_chart[sure], bending.shape, _slopes_on(shape_chart, bending),
+    shape = RadialInterpolant.fit(in_chart[sure], bending.shape, slopes_on(shape_chart, bending),
                                   **options)
     loads = RadialInterpolant.fit(in_chart, samples.load_table, **options)
     off = -RadialInterpolant.leave_one_out(in_chart, samples.load_table, **options)[:, 0]
     off[:, [one is None for one in samples.loads.values()]] = np.nan
-    found = _misplaced(bending, bent, region.chart, slice(None))
+    found = misplaced_tips(bending, bent, region.chart, slice(None))
     misplaced = np.full((len(samples.poses), found.shape[1]), np.nan)
     misplaced[sure] = found
     inside = ~region.is_face()[sure]
@@ -588,10 +347,6 @@ def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: T
 
 def _rows(points: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(points, float).reshape(-1, 3)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 @compiled

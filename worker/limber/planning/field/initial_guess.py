@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from limber.planning.field.grasp_model import GraspModel, Guess
-from limber.planning.field.radial import RadialInterpolant
+from limber.planning.field.interpolation.radial import RadialInterpolant
 from limber.planning.field.stored_states import Solved
 
 _STATES = 6  # states around a position that are used

@@ -16,11 +16,11 @@ import scipy
 
 from limber.core.errors import ConvergenceError, WorkError
 from limber.core.progress import SILENT, Progress
-from limber.planning.field.chart import Chart
 from limber.planning.field.disagreeing_neighbours import ask_between
-from limber.planning.field.energy_field import GraspSamples
 from limber.planning.field.grasp_model import GraspModel, Reach
+from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.initial_guess import guess_of
+from limber.planning.field.interpolation.chart import Chart
 from limber.planning.field.low_energy_surface import LowEnergySurface, walk_energy_surface
 from limber.planning.field.solver_pool import SolverPool
 from limber.planning.field.stored_states import Solved, samples_of, taken

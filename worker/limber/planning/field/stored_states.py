@@ -7,8 +7,8 @@ import numpy as np
 
 from limber.mechanics import StaticResult
 from limber.mechanics.solve_status import Status
-from limber.planning.field.energy_field import GraspSamples
 from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.reduced_grasp import CorrectedResult
 
 

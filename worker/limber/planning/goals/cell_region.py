@@ -15,9 +15,9 @@ import numpy as np
 from limber.core.errors import InputError, NoPathError
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import GraspModel
+from limber.planning.field.interpolation.valid_region import nearest_of
 from limber.planning.field.sampling import solve_branch
 from limber.planning.field.solver_pool import SolverPool
-from limber.planning.field.valid_region import nearest_of
 from limber.planning.goals.goal import CellPlace, GoalKind, GoalRequest
 from limber.planning.goals.target_goal import TargetGoal, target_of
 from limber.planning.path_on_full_model import SolvedPoses

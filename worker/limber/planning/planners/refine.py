@@ -8,8 +8,8 @@ path often runs along the face of the sampled region or in a valley a tenth of a
 wide: steps that are merely refused there stop far from it.
 
 The variables are corners in the chart of the shell that the grasp follows
-(:mod:`limber.planning.field.chart`), off it in units that are smaller in proportion to the branch's
-stiffness: chords in space leave the valley between their ends.
+(:mod:`limber.planning.field.interpolation.chart`), off it in units that are smaller in proportion
+to the branch's stiffness: chords in space leave the valley between their ends.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,8 +19,8 @@ import numpy as np
 import scipy
 
 from limber.planning.cost import resample
-from limber.planning.field.local_error import slacks_at
-from limber.planning.field.valid_region import nearest_of
+from limber.planning.field.interpolation.local_error import slacks_at
+from limber.planning.field.interpolation.valid_region import nearest_of
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.smoothing import smooth_cost
 

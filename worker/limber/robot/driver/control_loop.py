@@ -22,7 +22,8 @@ from limber.robot.driver.deadline import CONNECT_SECONDS, RenewedDeadline, set_d
 from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_samples import Senses
 from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain, open_sensor
-from limber.robot.driver.guard import Guard, GuardSettings, State
+from limber.robot.driver.guard import Guard
+from limber.robot.driver.guard_states import GuardSettings, State
 from limber.robot.driver.messages import Words
 from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
 from limber.robot.interface import ArmControl, Sample

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.robot.driver.guard import Decision, Guard, Verdict
+from limber.robot.driver.guard import Guard
+from limber.robot.driver.guard_states import Decision, Verdict
 from limber.robot.interface import ArmControl, Sample
 from limber.robot.motion.trajectory import Trajectory
 

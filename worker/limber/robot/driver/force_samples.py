@@ -11,7 +11,8 @@ from limber.robot.cell.cell import Cell
 from limber.robot.driver.current_motion import UnderWay
 from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain
-from limber.robot.driver.guard import Guard, Verdict
+from limber.robot.driver.guard import Guard
+from limber.robot.driver.guard_states import Verdict
 from limber.robot.interface import ArmControl, Sample
 from limber.robot.motion.followed_path import FollowedPathFile, read_followed_path
 from limber.robot.motion.retreat import RetreatPath

@@ -9,136 +9,32 @@ safety function and claims no standard: the controller's own limits and the butt
 protect people.
 """
 
-from dataclasses import dataclass, field, replace
-from enum import Enum
+from dataclasses import replace
 
 import numpy as np
 
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
-from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
 from limber.robot.cell.controller_settings import SteadySettings
+from limber.robot.driver.expected_force import DEVIATIONS, allowed_difference, difference_name
+from limber.robot.driver.guard_states import (
+    GO,
+    SAFETY_MODES,
+    Decision,
+    GuardMemory,
+    GuardSettings,
+    Relief,
+    State,
+    Verdict,
+)
 from limber.robot.interface import Arm, Sample
 from limber.robot.load_ratings import within_ratings
 
 _RUNNING, _NORMAL = 7, 1
 _SAME = 1e-9  # N, N m
-_DEVIATIONS = 2.0  # standard deviations of a prediction that are allowed
-_MOSTLY = 0.8  # cosine of the angle to the predicted force that a difference opposes
-_MOSTLY_AT_ONCE = 0.5  # the same for a sudden change: a sliding piece pulls sideways
 _PLACE_SLACK = 0.01  # rad of a joint, or of the distance from a singularity, during a retreat
 _CERTAIN = np.zeros((6, 6))
 _RISES = "the {} rises during the return"
-_UNLIKE = "the force differs from the predicted one [N]"
-_SHORT = "less force than predicted: the branch slipped, broke or is softer [N]"
-_FELL = "the predicted force dropped suddenly: the branch slipped, broke or came loose [N]"
-
-
-class State(Enum):
-    """What the guard currently allows."""
-
-    IDLE = "idle"
-    MOVING = "moving"
-    PAUSED = "paused"
-    STOPPED = "stopped"
-
-
-class Verdict(Enum):
-    """Action to take after a sample."""
-
-    GO = "go"
-    PAUSE = "pause"
-    STOP = "stop"
-
-
-@dataclass(frozen=True)
-class Decision:
-    """A verdict and its reason."""
-
-    verdict: Verdict
-    reason: str = ""
-    value: float = 0.0
-    limit: float = 0.0
-
-    def __str__(self) -> str:
-        if self.limit:
-            return f"{self.reason} ({self.value:.3g}, allowed {self.limit:.3g})"
-        return self.reason
-
-
-_GO = Decision(Verdict.GO)
-
-
-@dataclass(frozen=True)
-class GuardSettings:
-    """Limits of the guard.
-
-    Attributes:
-        limits: Limits of the cell. The guard reduces them to what the arm's table allows.
-        workspace: Box that contains the grasp, branch frame, or None.
-        joint_limits: [rad], shape [6, 2].
-        longest_silence: Age at which data is lost [s].
-        frozen_time: Longest time for which a wrench may repeat to the last digit [s]; a working
-            sensor's noise never does.
-        filter_time: Time constant of the force that is compared with the predicted one [s]. The
-            hard limits apply to every single reading.
-        off_path: Largest distance from the target [m].
-        lost_share: Fraction of its force that a held branch loses when it slips or breaks.
-        loss_time: Time in which such a loss counts as sudden [s].
-        least_force: Force below which a loss cannot be distinguished from noise [N].
-        largest_torque_error: Largest difference between the torque and the predicted one [N m].
-        relief_distance: Path of a retreat over which a force above the soft limit falls by at least
-            ``least_force`` [m].
-        relief_time: The same for a slow retreat [s].
-    """
-
-    limits: LimitsEntry
-    joint_limits: np.ndarray
-    workspace: WorkspaceEntry | None = None
-    longest_silence: float = 0.05
-    frozen_time: float = 0.05
-    filter_time: float = 0.01
-    off_path: float = 0.01
-    lost_share: float = 0.4
-    loss_time: float = 0.5
-    least_force: float = 1.0
-    largest_torque_error: float = 1.0
-    relief_distance: float = 0.02
-    relief_time: float = 10.0
-
-
-@dataclass
-class _Relief:
-    """Progress of a retreat in reducing the values that exceeded their limits.
-
-    Attributes:
-        force, torque: Least values since it began [N], [N m].
-        excess: Least excess over each limit of the arm's position.
-        marked_force, marked_clock, marked_grasp: Start of the next measurement of a fall.
-    """
-
-    force: float
-    torque: float
-    excess: dict[str, float] = field(default_factory=dict)
-    marked_force: float = np.inf
-    marked_clock: float = -np.inf
-    marked_grasp: np.ndarray | None = None
-
-
-@dataclass
-class _Memory:
-    """The guard's record of the last samples."""
-
-    clock: float | None = None
-    raw: np.ndarray | None = None
-    frozen_since: float = 0.0
-    filtered: np.ndarray | None = None
-    peak: float = 0.0
-    usual_off: np.ndarray | None = None
-    grasp: np.ndarray | None = None
-    travel: np.ndarray | None = None
-    relief: _Relief | None = None
-    by_joints: bool = False
 
 
 class Guard:
@@ -158,7 +54,7 @@ class Guard:
                                  joint_limits=joints)
         self.state = State.IDLE
         self.reason = ""
-        self._memory = _Memory()
+        self._memory = GuardMemory()
         self._is_tared = False
         self._set = SteadySettings(arm)
 
@@ -186,7 +82,7 @@ class Guard:
             raise SafetyStop("The force sensor is not tared.", "Its bias would be taken for a "
                              "force on the branch.", "Tare it with the gripper hanging free.")
         self.state = State.MOVING
-        self._memory = _Memory(by_joints=by_joints)
+        self._memory = GuardMemory(by_joints=by_joints)
 
     def begin_retreat(self, wrench: np.ndarray) -> None:
         """Allow a motion back along the path that was followed: a person has chosen it.
@@ -209,7 +105,7 @@ class Guard:
                              "the return.", "Open the gripper.")
         self.state = State.IDLE
         self.begin()
-        self._memory.relief = _Relief(length(wrench[:3]), length(wrench[3:]))
+        self._memory.relief = Relief(length(wrench[:3]), length(wrench[3:]))
 
     def end(self) -> None:
         """The motion is over."""
@@ -218,11 +114,7 @@ class Guard:
             self.state = State.IDLE
 
     def resume(self) -> None:
-        """Continue after a pause.
-
-        Raises:
-            SafetyStop: it is not paused.
-        """
+        """Continue after a pause; raises SafetyStop without one."""
         if self.state != State.PAUSED:
             raise SafetyStop(f"The robot is {self.state.value}, not paused.", self.reason,
                              "Only a pause can be continued; after a stop, choose what to do.")
@@ -240,7 +132,7 @@ class Guard:
         """No sample has arrived for ``age`` [s]."""
         if age > self._settings.longest_silence:
             return self._stop("no data from the robot [s]", age, self._settings.longest_silence)
-        return _GO
+        return GO
 
     def event(self, reason: str) -> Decision:
         """An event that no sample shows: a lost connection, a parent that has ended."""
@@ -257,8 +149,8 @@ class Guard:
             raw: The reading as received and rotated to the flange's axes, shape [2, 6]. A frozen
                 sensor repeats one of them to the last digit, however the robot rotates.
             expected: The same wrench as predicted by the model, or None.
-            doubt: Covariance of that prediction, shape [6, 6]: it widens the allowed difference by
-                twice its standard deviations, but never by more than the soft force limit.
+            uncertainty: Covariance of that prediction, shape [6, 6]: it widens the allowed
+                difference by two standard deviations, at most by the soft force limit.
             grasp: Position of the grasp, branch frame [m], shape [3].
             sent: Target of the tool at this time, base frame [m], shape [3], or None.
         """
@@ -280,7 +172,7 @@ class Guard:
                             self._settings.limits.soft_force_n)
         if self.state == State.PAUSED:
             return Decision(Verdict.PAUSE, self.reason)
-        return _GO
+        return GO
 
     def permit(self, current: np.ndarray, target: np.ndarray, seconds: float) -> np.ndarray:
         """Return a target [6] that keeps the speed limits, on the path from ``current`` to it.
@@ -307,23 +199,24 @@ class Guard:
         if not np.isfinite(sample.clock):
             return self._stop("the controller's clock gives no number")
         if last is None:
-            return _GO
+            return GO
         passed = sample.clock - last
         if passed <= 0:
             return self._stop("the controller's clock ran backwards [s]", passed, self._step)
         if passed > self._settings.longest_silence + self._step:
             return self._stop("the controller's clock jumped [s]", passed,
                               self._settings.longest_silence)
-        return _GO
+        return GO
 
     def _check_modes(self, sample: Sample) -> Decision:
         if sample.safety_mode != _NORMAL:
-            return self._stop(_SAFETY.get(sample.safety_mode, f"safety mode {sample.safety_mode}"))
+            return self._stop(SAFETY_MODES.get(sample.safety_mode,
+                                               f"safety mode {sample.safety_mode}"))
         if sample.robot_mode != _RUNNING:
             return self._stop(f"robot mode {sample.robot_mode}: the robot is not running")
         if self.state in (State.MOVING, State.PAUSED) and not sample.program_runs:
             return self._stop("the program on the controller was stopped")
-        return _GO
+        return GO
 
     def _check_wrench(self, sample: Sample, wrench: np.ndarray, raw: np.ndarray) -> Decision:
         numbers = np.concatenate((wrench, sample.wrench, sample.pose, sample.joints, sample.speed))
@@ -341,14 +234,14 @@ class Guard:
 
     def _check_settings(self, sample: Sample) -> Decision:
         changed = self._set.change(sample)
-        return _GO if changed is None else self._stop(changed)
+        return GO if changed is None else self._stop(changed)
 
     def feel(self, wrench: np.ndarray) -> Decision:
         """Judge a force [6] by the hard limits alone: it arrived between two samples."""
         limits = self._settings.limits
         if not self._is_tared:
             # No motion yet, and before its tare a sensor shows its bias.
-            return _GO
+            return GO
         if np.isnan(wrench).any():
             return self._stop("a sensor gives no number")
         if np.isinf(wrench).any():
@@ -364,16 +257,16 @@ class Guard:
             return self._stop(limit_text.format("force") + " [N]", force, most_force)
         if torque > most_torque:
             return self._stop(limit_text.format("torque") + " [N m]", torque, most_torque)
-        return _GO
+        return GO
 
-    def _relieved_force(self, relief: _Relief) -> float:
+    def _relieved_force(self, relief: Relief) -> float:
         return relief.force + max(self._settings.limits.unexpected_force_n,
                                   self._settings.least_force)
 
-    def _relieved_torque(self, relief: _Relief) -> float:
+    def _relieved_torque(self, relief: Relief) -> float:
         return relief.torque + self._settings.largest_torque_error
 
-    def _check_relief(self, relief: _Relief, sample: Sample, wrench: np.ndarray,
+    def _check_relief(self, relief: Relief, sample: Sample, wrench: np.ndarray,
                       grasp: np.ndarray | None) -> Decision:
         """Judge a sample of a retreat: a value over its limit falls, or the retreat stops."""
         settings, limits = self._settings, self._settings.limits
@@ -395,7 +288,7 @@ class Guard:
                                   limits.soft_force_n)
             relief.marked_force, relief.marked_clock, relief.marked_grasp = (
                 force, sample.clock, grasp)
-        return _GO
+        return GO
 
     def _is_over(self, name: str, excess: float, slack: float) -> bool:
         """Whether a limit of the arm's position is exceeded by ``excess``; a retreat allows this
@@ -440,16 +333,16 @@ class Guard:
             off = length(sample.pose[:3] - sent)
             if off > settings.off_path:
                 return self._stop("the robot left its path [m]", off, settings.off_path)
-        return _GO
+        return GO
 
     def _check_expected(self, wrench: np.ndarray, expected: np.ndarray | None,
                         uncertainty: np.ndarray | None) -> Decision:
         settings, memory = self._settings, self._memory
         if self.state not in (State.MOVING, State.PAUSED):
-            return _GO
+            return GO
         if memory.relief is not None:
             # A sudden fall of the force is the purpose of a retreat.
-            return _GO
+            return GO
         filtered = self._filtered(wrench)
         force = length(filtered[:3])
         if expected is None:
@@ -463,12 +356,12 @@ class Guard:
             if lost > max(settings.lost_share * memory.peak, settings.least_force):
                 return self._stop("the force dropped suddenly: slip or break [N]", lost,
                                   max(settings.lost_share * memory.peak, settings.least_force))
-            return _GO
+            return GO
         uncertainty = _CERTAIN if uncertainty is None else uncertainty
         expected_size = length(expected[:3])
         if expected_size > settings.least_force:
             along = float(filtered[:3] @ expected[:3]) / expected_size
-            margin = _DEVIATIONS * float(np.sqrt(max(
+            margin = DEVIATIONS * float(np.sqrt(max(
                 expected[:3] @ uncertainty[:3, :3] @ expected[:3], 0.0))) / expected_size
             if along < (1 - settings.lost_share) * expected_size - settings.least_force - margin:
                 return self._stop("the branch slipped, broke or was never held: force in the "
@@ -482,11 +375,12 @@ class Guard:
                  settings.largest_torque_error, limits.hard_torque_nm)):
             error = length(off[part])
             if error > allowed:
-                within = _allowed(off[part], uncertainty[part, part], allowed, most)
+                within = allowed_difference(off[part], uncertainty[part, part], allowed, most)
                 if error > within:
-                    return self._stop(name or self._force_named(off[:3], expected[:3], before),
+                    return self._stop(name or difference_name(
+                        off[:3], expected[:3], before, settings.least_force),
                                       error, within)
-        return _GO
+        return GO
 
     def _usual_off(self, off: np.ndarray) -> np.ndarray:
         """Return the usual difference to the expected force [3] so far; ``off`` then updates it."""
@@ -496,22 +390,6 @@ class Guard:
         memory.usual_off = kept * before + (1 - kept) * off
         return before
 
-    def _force_named(self, off: np.ndarray, expected: np.ndarray, before: np.ndarray) -> str:
-        """Return the most probable name of a difference to the expected force [3].
-
-        Args:
-            off: The difference, shape [3].
-            before: The usual difference so far, shape [3].
-        """
-        expected_size, missing = length(expected), -float(off @ expected)
-        if expected_size <= self._settings.least_force:
-            return _UNLIKE
-        size = length(off)
-        at_once = length(off - before) > 0.5 * size
-        if at_once and missing > _MOSTLY_AT_ONCE * expected_size * size:
-            return _FELL
-        return _SHORT if missing > _MOSTLY * expected_size * size else _UNLIKE
-
     def _stop(self, reason: str, value: float = 0.0, limit: float = 0.0) -> Decision:
         decision = Decision(Verdict.STOP, reason, value, limit)
         self._memory.relief = None
@@ -519,20 +397,3 @@ class Guard:
             self.state = State.STOPPED
             self.reason = str(decision)
         return decision
-
-
-def _allowed(off: np.ndarray, covariance: np.ndarray, least: float, most: float) -> float:
-    """Largest allowed difference in the direction of ``off`` [3], which is not 0.
-
-    The bound is an ellipsoid: ``least``, widened by standard deviations of the prediction up to
-    ``most``.
-    """
-    squares, axes = np.linalg.eigh(covariance)
-    radii = least**2 + np.minimum(_DEVIATIONS**2 * np.maximum(squares, 0.0), most**2)
-    along = axes.T @ (off / length(off))
-    return float(1.0 / np.sqrt((along**2 / radii).sum()))
-
-
-_SAFETY = {2: "reduced mode: the controller holds other limits", 3: "protective stop",
-           4: "recovery mode", 5: "safeguard stop", 6: "emergency stop", 7: "emergency stop",
-           8: "safety violation", 9: "safety fault"}

@@ -18,7 +18,8 @@ from limber.core.numerics.rigid_kernels import frame_of, turn_between, turned_wr
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import Reading, WrenchChain
-from limber.robot.driver.guard import Decision, Guard, GuardSettings, Verdict
+from limber.robot.driver.guard import Guard
+from limber.robot.driver.guard_states import Decision, GuardSettings, Verdict
 from limber.robot.interface import Sample
 from limber.robot.motion.followed_path import FollowedPathFile, read_followed_path
 from limber.robot.motion.retreat import RetreatPath

@@ -6,8 +6,6 @@ returns what they request. One call of :meth:`Controller.step` is one step of it
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ from limber.robot.known_arms import arm_named
 from limber.robot.ur.arms import UrArm
 from limber.robot.ur.factory_calibration import FactoryCalibration, one_arm
 from limber.robot.virtual.arm_motions import STOP_DECELERATION, Braking, Motion, Unreachable
+from limber.robot.virtual.controller_modes import RobotMode, RuntimeState, SafetyMode, SensorFault
 from limber.robot.virtual.force_sensor import CB3_ESTIMATE, E_SERIES, FT300, ForceSensor
 from limber.robot.virtual.payload import Load, Nothing, RobotiqRegisters
 from limber.robot.virtual.program import ControlProgram
@@ -26,49 +25,6 @@ from limber.robot.virtual.step_kernels import tool_state
 
 _TRACKER_SIGMA_M = 1e-3
 _SLOW_HZ = 125.0  # the rate of a CB3
-
-
-class SafetyMode(IntEnum):
-    """As in RTDE's ``safety_mode`` (Universal Robots, "RTDE guide", controller output data)."""
-
-    NORMAL = 1
-    REDUCED = 2
-    PROTECTIVE_STOP = 3
-    SAFEGUARD_STOP = 5
-    ROBOT_EMERGENCY_STOP = 7
-
-
-class RuntimeState(IntEnum):
-    """As in RTDE's ``runtime_state``."""
-
-    STOPPED = 1
-    PLAYING = 2
-    PAUSED = 4
-
-
-class RobotMode(IntEnum):
-    """As in RTDE's ``robot_mode``."""
-
-    POWER_OFF = 3
-    IDLE = 5
-    RUNNING = 7
-
-
-@dataclass
-class SensorFault:
-    """Faults of the force readings, for tests.
-
-    Attributes:
-        added: Wrench added to the sensor's report, flange frame [N, N m].
-        frozen: Repeats the last reading.
-        nan: Reports no numbers.
-        joints_nan: Reports no numbers as joint angles.
-    """
-
-    added: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    frozen: bool = False
-    nan: bool = False
-    joints_nan: bool = False
 
 
 class Controller:

@@ -1,11 +1,7 @@
 """The dashboard server's answers: a text protocol, one line per command."""
 
-from limber.robot.virtual.controller import (
-    Controller,
-    RobotMode,
-    RuntimeState,
-    SafetyMode,
-)
+from limber.robot.virtual.controller import Controller
+from limber.robot.virtual.controller_modes import RobotMode, RuntimeState, SafetyMode
 
 GREETING = "Connected: Universal Robots Dashboard Server"
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -18,6 +17,12 @@ from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
 from limber.stages.inputs import NOT_KEPT, BranchInputs, by_name, required
+from limber.stages.paths.execute_summary import (
+    arm_line,
+    execution_summary,
+    outcome_line,
+    write_preview,
+)
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -98,7 +103,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     branch, cell, settings, motion, result = planned_motion(
         folder, name, cell_file, settings, progress=progress, is_to_move=options.arm)
     if not options.arm:
-        _write_preview(branch, name, settings, cell, motion)
+        write_preview(branch, name, settings, cell, motion)
         return result | {"armed": False, "reached": None, "stop_reason": None,
                          "after_stop": None, "peak_force_n": None, "path_error_m": None}
     require_confirmation(name, options.confirm, cell, progress)
@@ -145,7 +150,7 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
                                 progress)
     progress(0.4, "inverse kinematics")
     motion = robot_motion(cell, predicted, model.reach.axis, **asked)
-    result = _summary(cell, motion) | clear.describe() | {"legs": legs_in_cell(
+    result = execution_summary(cell, motion) | clear.describe() | {"legs": legs_in_cell(
         cell, clear.obstacles, motion, predicted.poses[:, :3], np.array(clear.surfaces),
         present(settings.hold, "time at the path's end"), progress)}
     _check_limits(cell, predicted.poses, predicted.wrenches[:, :3])
@@ -236,50 +241,6 @@ def _check_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:
             raise InputError(f"The path leaves the workspace at ({position}) m.",
                              "The guard would stop there.", "Plan inside it, or correct the cell "
                                                             "file.")
-
-
-def _summary(cell: Cell, motion: RobotMotion) -> dict[str, Any]:
-    steps = np.concatenate([motion.approach.times,
-                            motion.approach.duration + motion.path.times[1:]])
-    felt = motion.path.expected
-    assert felt is not None
-    largest = np.linalg.eigvalsh(felt.covariance[:, :3, :3])[:, -1].max()
-    return {
-        "robot": cell.arm.name, "duration_s": 2 * (motion.approach.duration + motion.path.duration),
-        "pose_count": len(motion.path.times),
-        "predicted_peak_force_n": float(np.linalg.norm(felt.wrenches[:, :3], axis=1).max()),
-        "predicted_force_sigma_n": float(np.sqrt(max(largest, 0.0))),
-        "singularity_distance": motion.joints.singularity,
-        "joint_limit_margin_rad": motion.joints.limit_margin,
-        "joint_speed_share": motion.joints.speed_share(cell.arm, steps),
-        "gripper_rotation": motion.rotation, "start_pose_base": motion.approach.poses[0],
-        "start_joints_rad": motion.joints.joints[0]}
-
-
-def _write_preview(branch: Branch, name: str, settings: ExecuteSettings, cell: Cell,
-                   motion: RobotMotion) -> None:
-    """The robot's motion for the viewport: poses in the branch's frame, joints, forces."""
-    from limber.core.numerics.rigid import matrices, pose_vectors
-
-    base = matrices(np.array(cell.base.pose))
-    rows = []
-    begin = 0.0
-    first = len(motion.approach.times)
-    for trajectory, joints in ((motion.approach, motion.joints.joints[:first]),
-                               (motion.path, motion.joints.joints[first - 1:])):
-        poses = pose_vectors(base @ matrices(trajectory.poses))
-        assert trajectory.expected is not None
-        rows.append(np.column_stack([begin + trajectory.times, poses, joints,
-                                     trajectory.expected.wrenches[:, :3]]))
-        begin += trajectory.duration + 0.5
-    header = ["t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
-              *(f"q{number + 1}_rad" for number in range(motion.joints.joints.shape[1])),
-              "fx_n", "fy_n", "fz_n"]
-    lines = [",".join(header), *(",".join(f"{x:.7g}" for x in row) for row in np.vstack(rows))]
-    with branch.stage(f"execute-preview:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
-        stage.path(f"executions/{name}-preview.csv").write_text("\n".join(lines) + "\n",
-                                                               encoding="utf-8")
-        stage.result.update(model=cell.robot.model, base_pose=list(cell.base.pose))
 
 
 def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
@@ -402,29 +363,12 @@ def _followed_to_its_end(link: RobotLink, trajectory: Trajectory) -> dict[str, A
         raise
 
 
-def _outcome_line(result: Mapping[str, Any]) -> str:
-    if not result["armed"]:
-        return (f"Dry run: a {result['robot']} can follow the path, there and back in "
-                f"{result['duration_s']:.0f} s, with up to "
-                f"{result['predicted_peak_force_n']:.3g} N. Nothing was moved.")
-    return ("The robot followed the path and returned." if result["reached"]
-            else f"The robot stopped: {result['stop_reason']}.")
-
-
-def _arm_line(result: Mapping[str, Any]) -> str:
-    from limber.results.findings import force_remark
-
-    remark = force_remark(max(result["predicted_peak_force_n"], result.get("peak_force_n") or 0.0),
-                          result["robot"])
-    return f"The peak force is {remark}." if remark else ""
-
-
 STAGE = StageDescription(
     "execute", 110, by_name(execute, folder="branch_folder", cell_file="cell"), ExecuteInputs,
     ExecuteSettings, ExecuteOptions, key="execute:{name}",
     reads=("plans/{name}.csv", "mesh.vtu", "skeleton.swc"),
     writes=("executions/{name}/samples.csv", "executions/{name}/report.json"),
-    found=(_outcome_line, "Predicted peak force {predicted_peak_force_n:N}, measured "
-           "{peak_force_n:N}; at most {path_error_m:m} off the path.", _arm_line),
+    found=(outcome_line, "Predicted peak force {predicted_peak_force_n:N}, measured "
+           "{peak_force_n:N}; at most {path_error_m:m} off the path.", arm_line),
     then="limber report {branch_folder}", step="robot", label="Check With Robot",
     moves_robot="when armed")

@@ -3,7 +3,8 @@
 Radial functions extrapolate freely, and wrongly. A point is trusted inside the convex hull of the
 accepted samples, unless a pose that the branch model refused is nearer than any accepted one. The
 samples lie along a curved shell, whose flat facets would cut off the very poses that gentle paths
-take: the hull is taken in coordinates that flatten it (:mod:`limber.planning.field.chart`).
+take: the hull is taken in coordinates that flatten it
+(:mod:`limber.planning.field.interpolation.chart`).
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from limber.core.errors import WorkError
 from limber.core.numerics.compiled import compiled
-from limber.planning.field.chart import Chart, mapped
+from limber.planning.field.interpolation.chart import Chart, mapped
 
 _EDGE = 1e-9  # [m] a sample on the hull belongs to it despite rounding
 _OUTLINE = 24  # points per side of the grid that outlines the region

@@ -1,0 +1,1 @@
+"""Interpolation of samples over grasp positions: coordinates, radial functions, trust, errors."""
