@@ -3,8 +3,19 @@
 import numpy as np
 import pytest
 
+from limber.core.errors import NoPathError
+from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.cell.cell import Cell
-from limber.robot.pull_plausibility import LOOKED_M, PredictedPull, PullPlausibility, off_axis
+from limber.robot.motion.trajectory import Trajectory
+from limber.robot.pull_plausibility import (
+    LOOKED_M,
+    NUDGE_M,
+    PredictedPull,
+    PullPlausibility,
+    nudge_direction,
+    off_axis,
+)
+from limber.stages.pulls.record_nudge import nudge
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6})
 WAY = np.array([1.0, 0.0, 0.0])
@@ -123,3 +134,58 @@ def test_a_tool_off_by_five_millimetres_is_told_before_a_pull():
     assert "5.0 mm off the branch's axis; the calibration explains 3.7" in off_axis(
         good, place, 0.005)
     assert off_axis(good, place, 0.003) is None and off_axis(CELL, place, 0.005) is None
+
+
+def seen_along(way: np.ndarray, response: np.ndarray, farthest: float, seed: int) -> str | None:
+    """The doubt of a branch of 60 N/m that is moved along ``way`` [3] and read by ``response``."""
+    rng = np.random.default_rng(seed)
+    ways = np.r_[np.zeros(50), np.arange(0, farthest, 0.01 / 500), np.full(250, farthest)]
+    samples = np.full((len(ways), 37), np.nan)
+    samples[:, 0] = np.arange(len(ways)) / 500
+    samples[:, 1:4] = ways[:, None] * way
+    samples[:, 7:10] = 60.0 * samples[:, 1:4] @ response.T + 0.15 * rng.standard_normal(
+        (len(ways), 3))
+    samples[:, 13:16] = samples[:, 7:10]
+    places = np.array([0.0, farthest])
+    doubt = PullPlausibility(CELL, PredictedPull(places, 60.0 * places[:, None] * way, None))
+    for batch in np.array_split(samples, len(samples) // 10):
+        doubt.take(batch)
+    return doubt.reason
+
+
+def test_axes_exchanged_about_the_pull_itself_show_in_a_nudge_across_it():
+    """Along the diagonal the pull's force is right; so is the nudge's of a right sensor."""
+    diagonal = np.ones(3) / np.sqrt(3)
+    for seed in range(10):
+        axis = np.cross(diagonal, np.random.default_rng(100 + seed).standard_normal(3))
+        stiffness = np.eye(3) + 99 * np.outer(axis, axis) / (axis @ axis)
+        side = nudge_direction(diagonal, stiffness)
+        # Across the pull, and not along the branch, which is stiff.
+        assert side @ diagonal == pytest.approx(0, abs=1e-12)
+        assert side @ axis == pytest.approx(0, abs=1e-12)
+        assert seen_along(diagonal, SWAPPED, 0.01, seed) is None
+        assert "predicted one: the sensor's" in seen_along(side, SWAPPED, NUDGE_M, seed)
+        assert seen_along(side, np.eye(3), NUDGE_M, seed) is None
+
+
+def test_a_nudge_goes_across_and_back_on_the_side_that_is_free():
+    tool = matrices(np.array(CELL.tool.grasp_pose))
+    joints = np.array(CELL.arm.home)
+    start = pose_vectors(CELL.arm.forward(joints) @ tool)
+    pull = Trajectory(np.array([0.0, 1.0]), np.array([start, start + [0.006, 0, 0, 0, 0, 0]]))
+    sample = np.full(37, np.nan)
+    sample[1:7], sample[19:25] = start, joints
+
+    def ended(blocked) -> np.ndarray:
+        motion = nudge(CELL, np.diag([200.0, 100.0, 9e3]), sample, pull, blocked)
+        assert motion.poses[-1] == pytest.approx(motion.poses[0])
+        gone = motion.poses[:, :3] - start[:3]
+        return gone[np.linalg.norm(gone, axis=1).argmax()]
+    # No more than half of a short pull.
+    first = ended(None)
+    assert np.abs(first) == pytest.approx([0, 0.003, 0], abs=1e-9)
+    other = ended(lambda flange, _: NoPathError("a wall", "", "") if (
+        (flange[:, :3, 3] - flange[0, :3, 3]) @ first > 1e-6).any() else None)
+    assert other == pytest.approx(-first, abs=1e-9)
+    assert nudge(CELL, np.eye(3), sample, pull,
+                 lambda *_: NoPathError("walls", "", "")) is None

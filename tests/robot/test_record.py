@@ -109,7 +109,7 @@ def test_a_cell_of_another_branch_is_refused(branch_folder, tmp_path):
 
 def test_a_stop_keeps_what_was_recorded(branch_folder, tmp_path, robot):
     """A force limit that the pull breaks: exit 4, a recording that says where it ended."""
-    cell = cell_at(branch_folder, robot.address, soft_force_n=1.0, hard_force_n=1.2)
+    cell = cell_at(branch_folder, robot.address, soft_force_n=1.2, hard_force_n=1.4)
     with pytest.raises(SafetyStop, match=r"force limit.*samples are in"):
         record(branch_folder, cell_file(cell, tmp_path), "stopped", sideways_pull(branch_folder),
                RecordOptions(confirm="stopped"))
@@ -151,14 +151,14 @@ def test_what_goes_wrong_during_a_pull_is_noticed_within_ten_millimetres(
         branch_folder, tmp_path, robot, action, values, told):
     """Slow: two pulls in real time, beside those of the other tests.
 
-    From 4 mm on the branch slides in the jaws; the tool is set anew on the pendant.
+    From 6 mm on, which the nudge does not reach, the branch slides in the jaws; the tool is set anew on the pendant.
     """
     path = cell_file(cell_at(branch_folder, robot.address), tmp_path)
     begin = flange_of(robot)
-    with after_a_way(robot, 0.004, action, **values), pytest.raises(SafetyStop, match=told):
+    with after_a_way(robot, 0.006, action, **values), pytest.raises(SafetyStop, match=told):
         record(branch_folder, path, "wrong", sideways_pull(branch_folder, distance=0.03),
                RecordOptions(confirm="wrong"))
-    assert 0.004 < np.linalg.norm(flange_of(robot) - begin) < 0.014
+    assert 0.006 < np.linalg.norm(flange_of(robot) - begin) < 0.016
     assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
 
 
@@ -193,7 +193,9 @@ def test_a_killed_recording_is_taken_over(branch_folder, tmp_path, robot):
          "--distance", "0.03", "--speed", "0.006", "--json"],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     end = time.monotonic() + 60
-    while np.linalg.norm(robot.state["tool_speed"][:3]) < 2e-3:
+    # Rows begin with the pull, after the nudge.
+    while not any(path.read_text().count("\n") > 50 for path in branch_folder.rglob("robot.csv")
+                  if path.parent.name == "cut"):
         assert time.monotonic() < end and process.poll() is None, process.stdout.read()
         time.sleep(0.02)
     begin = robot.state["clock"]

@@ -1,7 +1,7 @@
 """A cell or a sensor that is wrong: refused before the motion, or stopped in its first 10 mm.
 
-The driver's loop steps the virtual controller itself. The branch is a linear spring; its pull is
-judged as `limber record` judges it, with moduli known to a factor of two.
+The driver's loop steps the virtual controller itself. The branch is a linear spring; its nudge and
+its pull are judged as `limber record` judges them, with moduli known to a factor of two.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,15 @@ from limber.robot.cell.cell import Cell
 from limber.robot.driver.link import COLUMNS
 from limber.robot.interface import Sample
 from limber.robot.motion.trajectory import along, densely
-from limber.robot.pull_plausibility import PredictedPull, PullPlausibility
+from limber.robot.pull_plausibility import (
+    NUDGE_M,
+    NUDGE_M_S,
+    NUDGE_SECONDS,
+    PredictedPull,
+    PullPlausibility,
+    certain_directions,
+    nudge_direction,
+)
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.payload import Nothing
 
@@ -94,21 +102,37 @@ def _way_of(wrong: _Wrong, seed: int) -> float | None:
     spring = branch_spring(rng, start[:3], way)
     told = np.eye(3) if wrong.sensor is None else wrong.sensor
     controller.load = _Misread(spring, told)
+    side = nudge_direction(way, spring.stiffness)
+    line = densely(np.array([start, start + np.r_[NUDGE_M * side, 0, 0, 0]]))
+    out = along(line, NUDGE_M_S, 0.3)
+    nudge = {"times": np.r_[out, 2 * out[-1] + NUDGE_SECONDS - out[::-1]],
+             "poses": np.concatenate([line, line[::-1]])}
+    noticed = _moved(wrong, controller, nudge, NUDGE_M * side, spring.stiffness, None)
+    if noticed is not None:
+        return noticed
     poses = densely(np.array([start, start + np.r_[_WAY_M * way, 0, 0, 0]]))
-    order = {"order": "follow", "times": along(poses, 0.02, 0.3), "poses": poses, "expected": None,
-             "start_joints": controller.joints.tolist()}
+    return _moved(wrong, controller, {"times": along(poses, 0.02, 0.3), "poses": poses},
+                  _WAY_M * way, spring.stiffness, _later(wrong, controller, flange))
+
+
+def _moved(wrong: _Wrong, controller: Controller, motion: dict[str, Any], way: np.ndarray,
+           stiffness: np.ndarray, later: Callable[[Sample], None] | None) -> float | None:
+    """Way [m] after which a wrong state was noticed in a motion along ``way`` [3] [m]."""
+    start, flange = controller.pose[:3].copy(), controller.flange[:3, 3].copy()
+    order = {"order": "follow", "expected": None, "start_joints": controller.joints.tolist()
+             } | motion
     if wrong.order is not None:
         order = wrong.order(order, controller.joints)
     with patched() as patches:
         run = Run(_CELL, controller, patches)
-        run.control.each_sample = _later(wrong, controller, flange)
+        if later is not None:
+            run.control.each_sample = later
         event = run.follow(order, seconds=10.0)
     if event["event"] == "refused":
         return 0.0
-    gone = run.rows[:, 1:4] - start[:3]
     if event["event"] == "stopped":
         return float(np.linalg.norm(controller.flange[:3, 3] - flange))
-    return _doubted(run.rows, np.linalg.norm(gone, axis=1), spring.stiffness @ way)
+    return _doubted(run.rows, np.linalg.norm(run.rows[:, 1:4] - start, axis=1), way, stiffness)
 
 
 def _later(wrong: _Wrong, controller: Controller, flange: np.ndarray) -> Callable[[Sample], None]:
@@ -121,14 +145,17 @@ def _later(wrong: _Wrong, controller: Controller, flange: np.ndarray) -> Callabl
     return step
 
 
-def _doubted(rows: np.ndarray, ways: np.ndarray, growth: np.ndarray) -> float | None:
-    """Way [m] after which `limber record` doubts the pull's force; None if it does not."""
-    places = np.array([0.0, 0.0035, 0.007, _WAY_M])
-    doubt = PullPlausibility(_CELL, PredictedPull(places, places[:, None] * growth, _FACTOR))
+def _doubted(rows: np.ndarray, ways: np.ndarray, way: np.ndarray, stiffness: np.ndarray,
+             ) -> float | None:
+    """Way [m] after which `limber record` doubts the motion's force; None if it does not."""
+    places = np.array([0.0, 0.35, 0.7, 1.0])
+    doubt = PullPlausibility(_CELL, PredictedPull(
+        places * np.linalg.norm(way), places[:, None] * (stiffness @ way), _FACTOR,
+        certain_directions(stiffness, way)))
     begin = int(np.argmax(ways > 1e-5))
     padded = np.full((len(rows), len(COLUMNS)), np.nan)
     padded[:, :rows.shape[1]] = rows
     for first in range(max(begin - 20, 0), len(rows), 10):
         if doubt.take(padded[first:first + 10]):
-            return float(ways[min(first + 9, len(rows) - 1)])
+            return float(ways[:first + 10].max())
     return None

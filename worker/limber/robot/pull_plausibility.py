@@ -1,13 +1,14 @@
 """Plausibility of a force sensor, by the first millimetres of a pull and by its end.
 
 A pull measures the stiffness of a branch. The direction of the force is known before: a force
-predicted along one direction does not appear along another, nor with the opposite sign. If the
-moduli are known already, its magnitude is predicted as well. If not, its growth still is: one
-factor scales all of the predicted force. A branch that slips slowly in the gripper, or gives way,
-stops to follow it.
+predicted along one direction does not appear along another, nor with the opposite sign. A sensor
+whose axes are turned about that very direction shows this force correctly; a small nudge across the
+pull is judged in the same way. If the moduli are known already, the force's magnitude is predicted
+as well. If not, its growth still is: one factor scales all of the predicted force. A branch that
+slips slowly in the gripper, or gives way, stops to follow it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from limber.robot.cell.cell import Cell
 
 LOOKED_M = 0.01
 """Travel by which a wrong sensor has been detected."""
+NUDGE_M, NUDGE_M_S, NUDGE_SECONDS = 0.004, 0.01, 0.5
+"""Way, speed and rest at its end of a nudge: a branch of 50 N/m is judged by it with certainty."""
 
 _NOISES = 4.0  # times the noise of a smoothed force; less is not significant
 _MOSTLY = 0.5  # cosine of the angle to the predicted force
@@ -33,6 +36,7 @@ _LARGER = ("the force is larger than the known moduli allow: the sensor's unit i
 _SMALLER = ("the force is smaller than the known moduli allow: the sensor's unit is wrong, or the "
             "branch is not held")
 _BASE_DEVIATIONS, _AXIS_M = 2.0, 0.002  # of a calibration; error of a scanned axis
+_TURNED_RAD, _UNCERTAIN = 0.1, 0.5  # of a model; fraction of its force that it may change
 _TURNED_M = 1e-3  # back from the farthest point: the outward motion is over
 
 
@@ -55,6 +59,39 @@ def off_axis(cell: Cell, gripper: np.ndarray, distance: float) -> str | None:
             "calibrate again.")
 
 
+def nudge_direction(pull: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+    """Return the unit vector [3] of the softest nudge whose force is across that of a pull [3].
+
+    Args:
+        stiffness: Of the held branch [N/m], shape [3, 3].
+    """
+    force = stiffness @ pull
+    # Rows that span what is across the pull's force.
+    across = np.linalg.svd(force[None])[2][1:]
+    compliance = np.linalg.inv(0.5 * (stiffness + stiffness.T))
+    softest = np.linalg.eigh(across @ compliance @ across.T)[1][:, -1] @ across
+    nudge = compliance @ softest
+    return nudge / np.linalg.norm(nudge)
+
+
+def certain_directions(stiffness: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """Return the projection [3, 3] onto directions in which a pull's force can be predicted.
+
+    A branch is so stiff along itself that a model turned by a few degrees predicts another force
+    along it; only the rest tells what the sensor does.
+
+    Args:
+        stiffness: Of the held branch [N/m], shape [3, 3].
+        way: Of the gripper, shape [3].
+    """
+    force = stiffness @ way
+    # The force of the model turned about each axis.
+    changes = [np.cross(axis, force) - stiffness @ np.cross(axis, way) for axis in np.eye(3)]
+    directions, sizes, _ = np.linalg.svd(_TURNED_RAD * np.column_stack(changes))
+    certain = directions[:, sizes < _UNCERTAIN * np.linalg.norm(force)]
+    return certain @ certain.T
+
+
 @dataclass(frozen=True)
 class PredictedPull:
     """Forces along the first outward motion of a pull, by the branch's model.
@@ -64,11 +101,13 @@ class PredictedPull:
         forces: Forces of the gripper on the branch [N], branch frame, shape [n, 3].
         factor: Factor by which a force may be larger or smaller, if the moduli are known; else
         None.
+        certain: As :func:`certain_directions`, shape [3, 3]; the force's direction is judged there.
     """
 
     travels: np.ndarray
     forces: np.ndarray
     factor: float | None
+    certain: np.ndarray = field(default_factory=lambda: np.eye(3))
 
     def at(self, travel: float | np.ndarray) -> np.ndarray:
         """Return the force at a travel [m], shape [3]; at travels [n], shape [n, 3]."""
@@ -158,6 +197,55 @@ class _Growth:
         return (product - rest * predicted) / square, sigma
 
 
+class _Direction:
+    """The direction in which a force grows, against the predicted one.
+
+    Args:
+        noise: Standard deviation of a single reading [N].
+    """
+
+    def __init__(self, noise: float):
+        self._noise = noise
+        self._rest_count, self._rest = 0, np.zeros(3)
+        # Sums: predicted magnitudes, their squares, and products of the measured force with the
+        # magnitudes and with the predicted forces.
+        self._size = self._square = self._along = 0.0
+        self._predicted, self._measured = np.zeros(3), np.zeros(3)
+
+    def take(self, travels: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> None:
+        """Take readings and predictions [N], shape [n, 3] each, at travels [m], shape [n]."""
+        rests = travels < _BIN_M
+        self._rest_count += int(rests.sum())
+        self._rest += measured[rests].sum(axis=0)
+        used = (travels >= _FROM_M) & (travels <= LOOKED_M)
+        predicted, measured = predicted[used], measured[used]
+        sizes = np.linalg.norm(predicted, axis=1)
+        self._size += float(sizes.sum())
+        self._square += float((sizes**2).sum())
+        self._along += float((measured * predicted).sum())
+        self._predicted += predicted.sum(axis=0)
+        self._measured += sizes @ measured
+
+    def suspicion(self) -> str | None:
+        """Return why the direction cannot be right; None if noise explains it."""
+        if not self._rest_count or not self._square > 0.0:
+            return None
+        rest = self._rest / self._rest_count
+        along = (self._along - rest @ self._predicted) / self._square
+        size = float(np.linalg.norm(self._measured - rest * self._size)) / self._square
+        sigma = self._noise * float(np.sqrt(
+            1.0 / self._square + (self._size / self._square) ** 2 / self._rest_count))
+        if along + _CERTAIN * sigma >= _MOSTLY * size:
+            return None
+        angle = np.degrees(np.arccos(np.clip(along / size, -1.0, 1.0)))
+        angle_text = f"it grows at {angle:.0f} degrees to it"
+        if along < -_MOSTLY * size:
+            return ("the force points against the predicted one: the sensor's sign or pose "
+                    f"(sensor.pose) is wrong ({angle_text})")
+        return ("the force lies across the predicted one: the sensor's axes or pose (sensor.pose) "
+                f"are wrong, or another part is pulled ({angle_text})")
+
+
 class PullPlausibility:
     """Checks the samples of a pull as they arrive.
 
@@ -173,6 +261,7 @@ class PullPlausibility:
         self._noise = _NOISES * cell.sensor.force_sigma_n / np.sqrt(_SMOOTHED)
         self._drift = cell.sensor.drift_n_per_minute / 60.0
         self._predicted = predicted
+        self._direction = _Direction(cell.sensor.force_sigma_n)
         self._growth = _Growth(cell.sensor.force_sigma_n, float(predicted.travels[-1]))
         self._start: np.ndarray | None = None
         self._began = self._peak = 0.0
@@ -193,7 +282,7 @@ class PullPlausibility:
                 self._agree(self._suspicion(float(travel), force))
         self._grow(samples, travels)
         if self.reason is None:
-            self.reason = self._slip() or self._scale()
+            self.reason = self._direction.suspicion() or self._slip() or self._scale()
         return self.reason
 
     def left_at_end(self, samples: np.ndarray) -> str | None:
@@ -219,9 +308,11 @@ class PullPlausibility:
 
     def _grow(self, samples: np.ndarray, travels: np.ndarray) -> None:
         # Before it moves nothing is predicted, but the direction is known.
-        predicted = self._predicted.at(np.maximum(travels, _MOVED_M))
+        predicted = self._predicted.at(np.maximum(travels, _MOVED_M)) @ self._predicted.certain
         sizes = np.linalg.norm(predicted, axis=1)
         good = np.isfinite(samples[:, _RAW]).all(axis=1) & (sizes > 0.0)
+        self._direction.take(travels[good], predicted[good],
+                             samples[good, _RAW] @ self._predicted.certain)
         along = (samples[good, _RAW] * predicted[good]).sum(axis=1) / sizes[good]
         self._growth.take(travels[good], sizes[good], along)
 
@@ -246,21 +337,12 @@ class PullPlausibility:
                 f"{100 * max(share, 0.0):.0f} % of what came before)")
 
     def _suspicion(self, travel: float, force: np.ndarray) -> str:
-        predicted = self._predicted.at(travel)
-        size, measured = float(np.linalg.norm(predicted)), float(np.linalg.norm(force))
-        if size < 1e-9:
+        factor, predicted = self._predicted.factor, self._predicted.at(travel)
+        size = float(np.linalg.norm(predicted))
+        if size < 1e-9 or factor is None:
             return ""
         along = float(force @ predicted) / size
         when = f"after {1000 * travel:.1f} mm"
-        if measured > self._noise and along < -_MOSTLY * measured:
-            return ("the force points against the predicted one: the sensor's sign or pose "
-                    f"(sensor.pose) is wrong ({measured:.2g} N {when})")
-        if measured > self._noise and along < _MOSTLY * measured:
-            return ("the force lies across the predicted one: the sensor's axes or pose "
-                    f"(sensor.pose) are wrong, or another part is pulled ({measured:.2g} N {when})")
-        factor = self._predicted.factor
-        if factor is None:
-            return ""
         if along > factor * size + self._noise:
             return f"{_LARGER} ({along:.2g} N {when}, {size:.2g} N predicted)"
         if along < size / factor - self._noise:

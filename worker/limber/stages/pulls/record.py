@@ -22,6 +22,7 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell
     from limber.robot.driver.link import RobotLink
+    from limber.robot.driver.live_force import LiveForce
     from limber.robot.motion.execution import Blocked
     from limber.robot.motion.trajectory import Trajectory
     from limber.robot.pull_plausibility import PullPlausibility
@@ -97,9 +98,10 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
            options: RecordOptions, *, progress: Progress = SILENT) -> dict[str, Any]:
     """Record a pull.
 
-    The sensor is tared with the gripper empty; then the gripper closes, pulls and returns. Every
-    sample of the controller is written to ``robot.csv`` at once; after a kill or a stop at most the
-    last second is missing.
+    The sensor is tared with the gripper empty. The gripper closes and nudges the branch across the
+    pull, which shows a sensor whose axes are wrong; then it pulls and returns. Every sample of the
+    pull is written to ``robot.csv`` at once; after a kill or a stop at most the last second is
+    missing.
 
     Returns:
         ``ended`` (``reached`` or the reason of a stop), ``after_stop`` (after a stop, as
@@ -133,7 +135,8 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
     require_confirmation(name, options.confirm, cell, progress)
     with branch.writing(f"the recording {name}"):
         ended = _recorded(branch, cell, name, settings, options, blocked, progress)
-        result = _finish(branch, name, settings, ended)
+        # Nothing is recorded of a stop before the pull: the name stays free.
+        result = _finish(branch, name, settings, ended) if ended["sample_count"] else ended
     if ended["ended"] != "reached":
         raise SafetyStop(f"The recording was stopped: {ended['ended']}.",
                          f"{ended['after_stop']['outcome']} {result['sample_count']} samples are "
@@ -146,9 +149,10 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
               options: RecordOptions, blocked: Blocked, progress: Progress) -> dict[str, Any]:
     from limber.robot.driver.link import RobotLink
     from limber.robot.driver.live_force import LiveForce
-    from limber.robot.pull_plausibility import PullPlausibility, off_axis
+    from limber.robot.pull_plausibility import off_axis
     from limber.robot.recorder import MarkerStream, PullRecorder
-    from limber.stages.pulls.record_prediction import predicted_pull
+    from limber.stages.pulls.record_nudge import nudge_and_checks
+    from limber.stages.pulls.record_path import grasp_point
 
     tracker = (MarkerStream(cell.robot.address, options.markers, cell.base.pose)
                if options.markers else None)
@@ -166,11 +170,11 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             if recorders:
                 recorders[0].take(rows)
             live.take(rows)
-            if doubts and doubts[0].reason is None and doubts[0].take(rows):
+            if doubts and doubts[-1].reason is None and doubts[-1].take(rows):
                 link.stop()
         with live, RobotLink(cell, take) as link:
             sample = link.wait_for_samples()
-            point, off = _grasp_point(branch, sample[1:4])
+            point, off = grasp_point(branch, sample[1:4])
             if warning := off_axis(cell, sample[1:4], off):
                 progress.warn(warning)
             recorder = PullRecorder(stream, point, cell.tool.compliance_m_per_n)
@@ -178,17 +182,24 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             # Before the tare: during long work the sensor would drift.
             trajectory = _pull(branch, cell, point, sample, settings, blocked,
                                progress.part(0.02, 0.1))
-            predicted = predicted_pull(branch, cell, point, trajectory, progress.part(0.08, 0.1))
+            across, predicted = nudge_and_checks(branch, cell, point, sample, trajectory, blocked,
+                                                 progress.part(0.08, 0.1))
             progress(0.1, "taring: keep the gripper free")
             live.at("taring")
             tared = link.tare(_TARE_SECONDS)
             grip(cell, link, close=True, progress=progress)
             time.sleep(_SETTLE_SECONDS)
+            if across is not None:
+                doubts.append(predicted[1])
+                event = _nudged(link, live, recorder, across, progress)
+                if event["event"] != "reached":
+                    return {"ended": _how_it_ended(event, doubts), "after_stop": retreat_if_chosen(
+                        cell, link, options.after_stop, progress), "sample_count": 0}
             _write_entry(entry_lines, cell, point, tared, trajectory.duration, tracker,
                          marker_lines)
             recorder.close_gripper()
             live.at("pulling")
-            doubts += [] if predicted is None else [PullPlausibility(cell, predicted)]
+            doubts += predicted[:1]
             link.start(trajectory)
             event = _watched(link, tracker, marker_lines, recorder, trajectory, progress)
             ended = {"ended": _how_it_ended(event, doubts)}
@@ -204,6 +215,17 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                         "warnings": list(link.warnings)}
     finally:
         _close_lines([stream, entry_lines, marker_lines], recorders, tracker)
+
+
+def _nudged(link: RobotLink, live: LiveForce, recorder: PullRecorder, across: Trajectory,
+            progress: Progress) -> dict[str, Any]:
+    """Nudge the branch across the pull and back, which is not recorded; return how it ended."""
+    progress(0.13, "nudging the branch across the pull")
+    live.at("nudging")
+    link.start(across)
+    event = _watched(link, None, None, recorder, across, progress.part(0.13, 0.15))
+    time.sleep(_SETTLE_SECONDS)
+    return event
 
 
 def _close_lines(streams: list[Stream | None], recorders: list[PullRecorder],
@@ -222,7 +244,7 @@ def _how_it_ended(event: dict[str, Any], doubts: list[PullPlausibility]) -> str:
     """``reached``, or why the pull was stopped: by the guard, or by an implausible force."""
     if event["event"] == "reached":
         return "reached"
-    reason = doubts[0].reason if doubts else None
+    reason = doubts[-1].reason if doubts else None
     return event["reason"] if reason is None else f"implausible: {reason}"
 
 
@@ -230,7 +252,7 @@ def _warn_of_what_is_left(doubts: list[PullPlausibility], recorder: PullRecorder
                           progress: Progress) -> None:
     """Warn of a remaining force once the gripper is back at its start."""
     if doubts and recorder.last is not None and (
-            warning := doubts[0].left_at_end(recorder.last[None])):
+            warning := doubts[-1].left_at_end(recorder.last[None])):
         progress.warn(f"{warning}.")
 
 
@@ -297,28 +319,6 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
         frames[1, :3, 3] += distance * direction / length
     return there_and_back(cell, frames, speed=settings.speed, cycles=settings.cycles,
                           pause=settings.pause, start=joints, blocked=blocked)
-
-
-def _grasp_point(branch: Branch, gripper: np.ndarray) -> tuple[np.ndarray, float]:
-    """The branch's axis nearest to the gripper's middle [3], branch frame [m], shape [3]; and how
-    far away it is [m]."""
-    from limber.store.loading import load_skeleton
-
-    skeleton = load_skeleton(branch)
-    nearest, distance = skeleton.nodes[0], np.inf
-    for child, parent in enumerate(skeleton.parent):
-        if parent < 0:
-            continue
-        start, vectors = skeleton.nodes[parent], skeleton.nodes[child] - skeleton.nodes[parent]
-        part = np.clip((gripper - start) @ vectors / max(vectors @ vectors, 1e-18), 0, 1)
-        off = float(np.linalg.norm(gripper - start - part * vectors))
-        if off < distance:
-            nearest, distance = start + part * vectors, off
-    if distance > 0.03:
-        raise InputError(f"The gripper is {1000 * distance:.0f} mm away from the branch's axis.",
-                         "It would close on nothing, or the calibration is wrong.",
-                         "Move it onto the branch, or calibrate again.")
-    return nearest, distance
 
 
 def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, Any],

@@ -40,6 +40,32 @@ class _Suggested(FileContent):
     best: _Pull
 
 
+def grasp_point(branch: Branch, gripper: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the place on the branch's axis nearest to the gripper's middle [3], branch frame [m],
+    shape [3]; and how far away it is [m].
+
+    Raises:
+        InputError: it is too far away.
+    """
+    from limber.store.loading import load_skeleton
+
+    skeleton = load_skeleton(branch)
+    nearest, distance = skeleton.nodes[0], np.inf
+    for child, parent in enumerate(skeleton.parent):
+        if parent < 0:
+            continue
+        start, vectors = skeleton.nodes[parent], skeleton.nodes[child] - skeleton.nodes[parent]
+        part = np.clip((gripper - start) @ vectors / max(vectors @ vectors, 1e-18), 0, 1)
+        off = float(np.linalg.norm(gripper - start - part * vectors))
+        if off < distance:
+            nearest, distance = start + part * vectors, off
+    if distance > 0.03:
+        raise InputError(f"The gripper is {1000 * distance:.0f} mm away from the branch's axis.",
+                         "It would close on nothing, or the calibration is wrong.",
+                         "Move it onto the branch, or calibrate again.")
+    return nearest, distance
+
+
 def arc_path(branch: Branch, point: np.ndarray, direction: np.ndarray, distance: float,
              progress: Progress) -> np.ndarray:
     """Return frames [n, 4, 4] that move the held piece from its position along its arc.

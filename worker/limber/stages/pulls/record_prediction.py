@@ -1,4 +1,4 @@
-"""Predicted force along the first outward motion of a recorded pull, by the branch's model."""
+"""Predicted force along the first outward motion of a pull or a nudge, by the branch's model."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from limber.core.errors import LimberError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
-from limber.robot.pull_plausibility import LOOKED_M, PredictedPull
+from limber.robot.pull_plausibility import LOOKED_M, PredictedPull, certain_directions
 from limber.stages.pulls.record_path import GRASP_RADIUS_M
 from limber.store import Branch
 
@@ -17,48 +16,73 @@ if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell
     from limber.robot.motion.trajectory import Trajectory
 
-_SHARES = (0.35, 0.7, 1.0)  # of the travel within which a wrong sensor is noticed
-_STEP_M = 0.02  # between positions beyond it
-_BENT = 1.1  # times the distance from the start: a longer path is no longer one direction
+_SHARES = (0.35, 0.7, 1.0)  # of the travel in which a wrong sensor is noticed
+_STEP_M = 0.02  # between places beyond it
+_SMALL_M = 3e-4  # displacements by which the stiffness is found
+_BENT = 1.1  # times the distance from the start: a longer way is no longer one direction
 _DEVIATIONS, _LEAST_FACTOR = 3.0, 2.0
 
 
-def predicted_pull(branch: Branch, cell: Cell, point: np.ndarray, trajectory: Trajectory,
-                   progress: Progress) -> PredictedPull | None:
-    """Return the forces on the first outward motion of a pull; None without a usable model.
-
-    Beyond the first :data:`.LOOKED_M` they end where the model does not converge any more.
+class PullModel:
+    """The branch's model, clamped where the gripper holds it.
 
     Args:
         point: Position of the grasp, branch frame [m], shape [3].
-        trajectory: Trajectory of the gripper, base frame.
-    """
-    from limber.mechanics import Grasp, follow_poses
-    from limber.store.loading import load_branch, young_deviation
 
-    try:
+    Attributes:
+        stiffness: Force over displacement of the gripper that does not turn [N/m], shape [3, 3].
+
+    Raises:
+        LimberError: there is no usable model.
+    """
+
+    def __init__(self, branch: Branch, cell: Cell, point: np.ndarray, progress: Progress):
+        from limber.mechanics import Grasp
+        from limber.store.loading import load_branch, young_deviation
+
         model = load_branch(branch, progress=progress).model
         deviation = young_deviation(branch)
-        grasp = Grasp.gripping(model.mesh, point, GRASP_RADIUS_M)
-        frames = matrices(np.array(cell.base.pose)) @ matrices(trajectory.poses)
+        self._factor = None if deviation is None else max(
+            float(np.exp(_DEVIATIONS * deviation)), _LEAST_FACTOR)
+        self._grasp = Grasp.gripping(model.mesh, point, GRASP_RADIUS_M)
+        self._model = model.gripped(self._grasp)
+        self._base = matrices(np.array(cell.base.pose))
+        self._rest = np.eye(4)
+        self._rest[:3, 3] = point
+        self.stiffness = self._stiffness()
+
+    def _stiffness(self) -> np.ndarray:
+        from limber.mechanics import solve_static
+
+        def force(step: np.ndarray) -> np.ndarray:
+            pose = pose_vectors(self._rest) + np.r_[step, np.zeros(3)]
+            found = solve_static(self._model, grasp=self._grasp, pose=pose)
+            return found.require().reaction_force
+        still = force(np.zeros(3))
+        return np.column_stack([(force(_SMALL_M * unit) - still) / _SMALL_M for unit in np.eye(3)])
+
+    def predicted(self, trajectory: Trajectory) -> PredictedPull:
+        """Return the forces on the first outward motion of a trajectory of the gripper, base frame.
+
+        Beyond the first :data:`.LOOKED_M` they end where the model does not converge any more.
+
+        Raises:
+            ConvergenceError: it does not converge before.
+        """
+        from limber.mechanics import follow_poses
+
+        frames = self._base @ matrices(trajectory.poses)
         chosen, away = _prediction_rows(frames[:, :3, 3])
-        rest = np.eye(4)
-        rest[:3, 3] = point
-        poses = pose_vectors(frames[chosen] @ inverted(frames[0]) @ rest)
-        results = follow_poses(model.gripped(grasp), grasp, poses)
+        poses = pose_vectors(frames[chosen] @ inverted(frames[0]) @ self._rest)
+        results = follow_poses(self._model, self._grasp, poses)
         forces = [result.require().reaction_force for result in results[:len(_SHARES)]]
         for result in results[len(_SHARES):]:
             if not result.converged:
                 break
             forces.append(result.reaction_force)
-    except LimberError as error:
-        progress.warn(f"The force of this pull could not be predicted ({error}), so the sensor's "
-                      "sign and axes are not checked by it.")
-        return None
-    factor = None if deviation is None else max(float(np.exp(_DEVIATIONS * deviation)),
-                                                _LEAST_FACTOR)
-    return PredictedPull(np.r_[0.0, away[:len(forces)]],
-                         np.vstack([np.zeros(3), *forces]), factor)
+        way = frames[chosen[len(_SHARES) - 1], :3, 3] - frames[0, :3, 3]
+        return PredictedPull(np.r_[0.0, away[:len(forces)]], np.vstack([np.zeros(3), *forces]),
+                             self._factor, certain_directions(self.stiffness, way))
 
 
 def _prediction_rows(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
