@@ -151,7 +151,8 @@ def test_what_goes_wrong_during_a_pull_is_noticed_within_ten_millimetres(
         branch_folder, tmp_path, robot, action, values, told):
     """Slow: two pulls in real time, beside those of the other tests.
 
-    From 6 mm on, which the nudge does not reach, the branch slides in the jaws; the tool is set anew on the pendant.
+    From 6 mm on, which the nudge does not reach, the branch slides in the jaws; the tool is set
+    anew on the pendant.
     """
     path = cell_file(cell_at(branch_folder, robot.address), tmp_path)
     begin = flange_of(robot)

@@ -1,12 +1,12 @@
 """The door to ROS 2, against a rosbridge server in the test: followed, guarded, stopped in time."""
 
+import ast
 import base64
-import gc
 import json
-import os
 import threading
 import time
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -16,7 +16,6 @@ from limber.cli.commands.ros import command
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.cell.cell import Cell, write_cell
-from limber.robot.driver.real_time import claim_real_time
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.trajectory import Trajectory, along, densely
@@ -31,19 +30,6 @@ CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
 ROOT = Path(__file__).parents[2]
 HOME = np.array(CELL.arm.home)
 TOOL = matrices(np.array(CELL.tool.grasp_pose))
-
-
-@pytest.fixture
-def _first_in_line():
-    """This process before others, as the command claims it, and the server's threads with it."""
-    claim_real_time()
-    # A whole search for garbage through all that a test process holds takes longer than 50 ms.
-    gc.collect()
-    gc.freeze()
-    yield
-    gc.unfreeze()
-    if hasattr(os, "sched_setscheduler"):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def line(way: float, speed: float = 0.05) -> Trajectory:
@@ -61,7 +47,7 @@ def robot_at(bridge: RosBridge, taken: list | None = None) -> RosRobot:
 
 
 @pytest.mark.real_time
-@pytest.mark.usefixtures("_first_in_line")
+@pytest.mark.usefixtures("first_in_line")
 def test_a_plan_is_followed_and_a_force_stops_it_in_time():
     """All samples at 125 Hz; then a push: stop topic and cancel within 0.1 s, and standstill."""
     with RosBridge(HOME) as server:
@@ -98,7 +84,7 @@ def test_a_plan_is_followed_and_a_force_stops_it_in_time():
 
 @pytest.mark.slow
 @pytest.mark.real_time
-@pytest.mark.usefixtures("_first_in_line")
+@pytest.mark.usefixtures("first_in_line")
 def test_after_a_stop_it_goes_back_along_its_way_until_no_force_is_left(monkeypatch, tmp_path):
     """Slow: there and back in real time. Another program goes back, by the tare of the first."""
     monkeypatch.setenv("LIMBER_STATE", str(tmp_path))
@@ -122,7 +108,7 @@ def test_after_a_stop_it_goes_back_along_its_way_until_no_force_is_left(monkeypa
 
 
 @pytest.mark.real_time
-@pytest.mark.usefixtures("_first_in_line")
+@pytest.mark.usefixtures("first_in_line")
 @pytest.mark.parametrize("fault, told", [
     (lambda server: server.silent.add("/joint_states"), "no data from the robot"),
     (lambda server: server.silent.add("/force_torque_sensor_broadcaster/wrench"),
@@ -201,7 +187,7 @@ def test_a_goal_carries_times_and_ends_at_rest():
 
 
 def test_the_example_node_stops_on_a_word_and_on_silence(monkeypatch):
-    """What it decides by; the node itself needs ROS, and is compiled only."""
+    """What it decides by; the node itself needs ROS. The package declares all that it needs."""
     package = ROOT / "scripts" / "examples" / "ros2" / "limber_stop"
     monkeypatch.syspath_prepend(str(package))
     from limber_stop.watch import Watch
@@ -211,8 +197,17 @@ def test_the_example_node_stops_on_a_word_and_on_silence(monkeypatch):
     assert not watch.heard(False, 100.0) and not watch.is_silent(100.2)
     assert watch.is_silent(100.31) and not watch.is_silent(100.4)
     assert watch.heard(True, 101.0) and not watch.is_silent(102.0)
+    manifest = ElementTree.parse(package / "package.xml")
+    declared = {each.text for each in manifest.iter("exec_depend")}
     for path in package.rglob("*.py"):
-        compile(path.read_text(encoding="utf-8"), str(path), "exec")
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        imported = {node.module.split(".")[0] for node in ast.walk(tree)
+                    if isinstance(node, ast.ImportFrom)}
+        imported |= {name.name for node in ast.walk(tree) if isinstance(node, ast.Import)
+                     for name in node.names}
+        started = {keyword.value.value for node in ast.walk(tree) if isinstance(node, ast.Call)
+                   for keyword in node.keywords if keyword.arg == "package"}
+        assert imported | started <= declared | {"limber_stop", "setuptools"}, path
     assert guarded_robot._BEAT_SECONDS < 0.3 / 2
 
 

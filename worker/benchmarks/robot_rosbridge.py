@@ -24,6 +24,9 @@ class RosBridge:
         stood_at: When the last goal was cancelled, and the arm stood [s, monotonic].
         heard: Operations that came, each with its time.
         silent: Topics that send nothing.
+        drift: Speeds at which another program moves the arm [rad/s], shape [6].
+        answers: Of services that a client offers.
+        sent: Messages of topics that were sent: time of their step [s], topic, content.
     """
 
     def __init__(self, joints):
@@ -32,6 +35,8 @@ class RosBridge:
         self.followed, self.stood_at = [], None
         self.load = lambda joints: np.zeros(6)
         self.gripper_status = 4
+        self.drift, self.answers, self.sent = np.zeros(6), [], []
+        self._subscribed, self._offering = set(), None
         self._goal, self._open = None, []
         self._rng = np.random.default_rng(0)
 
@@ -55,6 +60,9 @@ class RosBridge:
         self._open.append(socket)
         listening = threading.Thread(target=self._listen, args=(socket,), daemon=True)
         listening.start()
+        # One that only offers a service is sent nothing, and does not step the arm.
+        while listening.is_alive() and socket not in self._subscribed:
+            time.sleep(STEP)
         began, count = time.monotonic(), 0
         try:
             while listening.is_alive():
@@ -75,11 +83,13 @@ class RosBridge:
         if topic not in self.silent:
             seconds = count * STEP
             stamp = {"sec": int(seconds), "nanosec": round(1e9 * (seconds % 1))}
-            socket.send(json.dumps({"op": "publish", "topic": topic, "msg": {
-                "header": {"stamp": stamp, "frame_id": ""}, **message}}))
+            message = {"header": {"stamp": stamp, "frame_id": ""}, **message}
+            self.sent.append((seconds, topic, message))
+            socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
 
     def _step(self, socket):
         before = self.joints.copy()
+        self.joints = self.joints + STEP * self.drift
         if self._goal is not None:
             goal, times, ways, at = self._goal
             at = min(at + STEP, times[-1])
@@ -98,7 +108,15 @@ class RosBridge:
 
         with contextlib.suppress(ConnectionClosed):
             for text in socket:
-                self._hear(socket, json.loads(text))
+                order = json.loads(text)
+                if order["op"] == "subscribe":
+                    self._subscribed.add(socket)
+                elif order["op"] == "advertise_service":
+                    self._offering = socket
+                elif order["op"] == "service_response":
+                    self.answers.append(order)
+                else:
+                    self._hear(socket, order)
 
     def _hear(self, socket, order):
         self.heard.append((time.monotonic(), order))
@@ -117,7 +135,49 @@ class RosBridge:
         elif order["op"] == "cancel_action_goal":
             self._goal, self.stood_at = None, time.monotonic()
 
+    def call_service(self, name, times):
+        """Call a service that a client offers, as any node may; then hang up."""
+        while self._offering is None:
+            time.sleep(STEP)
+        for number in range(times):
+            self._offering.send(json.dumps({"op": "call_service", "id": f"call-{number}",
+                                            "service": name, "args": {}}))
+            while len(self.answers) <= number:
+                time.sleep(STEP)
+        offering, self._offering = self._offering, None
+        offering.close()
+
     def publish(self, topic, message):
         """Publish a message to every client, as any node may."""
         for socket in self._open:
             socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
+
+
+class ReplayedBridge(RosBridge):
+    """Sends recorded messages at their times to one client; its arm moves as it was recorded.
+
+    Args:
+        messages: Times [s], topics and contents, by time.
+    """
+
+    def __init__(self, messages):
+        super().__init__(np.zeros(6))
+        self._messages = messages
+
+    def _serve(self, socket):
+        from websockets.exceptions import ConnectionClosed
+
+        self._open.append(socket)
+        listening = threading.Thread(target=self._listen, args=(socket,), daemon=True)
+        listening.start()
+        begin, first = time.monotonic(), self._messages[0][0]
+        with contextlib.suppress(ConnectionClosed):
+            for seconds, topic, message in self._messages:
+                time.sleep(max(begin + seconds - first - time.monotonic(), 0.0))
+                socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
+            if self._goal is not None:
+                goal = self._goal[0]
+                socket.send(json.dumps({"op": "action_result", "id": goal["id"], "status": 4,
+                                        "action": goal["action"], "values": {"error_code": 0},
+                                        "result": True}))
+        listening.join()

@@ -1,4 +1,4 @@
-"""Move a robot through ROS 2 by rosbridge: `limber ros check`, `describe`, `follow`, `retreat`."""
+"""Move a robot through ROS 2 by rosbridge: `limber ros check`, `follow`, `retreat`, `serve`."""
 
 from __future__ import annotations
 
@@ -208,6 +208,64 @@ def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: st
     return result
 
 
+@stage_command("serve")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+@click.option("--service", default="/limber/retreat", show_default=True,
+              help="Name of the service (std_srvs/srv/Trigger).")
+@click.option("--arm", "armed", is_flag=True, help="Move the robot when the service is called. "
+              "Default: answer what would be done.")
+@click.option("--confirm", help="The word retreat, to confirm that the robot may move.")
+@_url
+def serve(run: Run, cell_file: Path, service: str, armed: bool, confirm: str | None, url: str,
+          ) -> dict[str, Any]:
+    """Offer the retreat as a service in ROS, until Ctrl-C or until rosbridge ends.
+
+    `ros2 service call /limber/retreat std_srvs/srv/Trigger` then does what `limber ros retreat`
+    does, and answers how it ended. A call while the arm moves is refused.
+    """
+    from limber.core.errors import InputError, SafetyStop
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.ros.bridge import Bridge
+    from limber.robot.ros.trigger_service import TriggerService
+
+    cell = read_cell(cell_file)
+    if armed and confirm != "retreat":
+        raise InputError("Nobody confirmed that the robot may move.", "Whoever calls the service "
+                         "moves it.", "Give --confirm retreat, with a hand at the emergency stop.")
+    bridge, count = Bridge(url), 0
+    try:
+        with TriggerService(bridge, service, lambda: _answered(run, cell, armed, url)) as offered:
+            run.progress(0.0, f"offering {service}")
+            while True:
+                if (values := offered.answer()) is not None:
+                    count += 1
+                    run.progress(0.0, f"{service}: {values['message']}")
+    except ConnectionError as error:
+        raise SafetyStop(f"{error}.", f"{service} is no longer offered.", "Start it again.",
+                         result={"calls": count}) from error
+    finally:
+        bridge.close()
+
+
+def _answered(run: Run, cell: Cell, armed: bool, url: str) -> tuple[bool, str]:
+    """Retreat for a call of the service; whether the branch is free, and in words."""
+    from limber.core.errors import LimberError
+    from limber.robot.motion.followed_path import followed_path
+
+    try:
+        way = followed_path(cell, "Open the gripper, and free the branch by hand.")
+        if not armed:
+            return False, (f"Not armed: it would go back along {len(way.poses)} places. Start "
+                           "limber ros serve with --arm.")
+        event = _followed(run, cell, None, url, is_held=True)
+    except LimberError as error:
+        return False, str(error)
+    if event["event"] != "reached":
+        return False, (f"Stopped: {event['reason']}. The force on the branch is "
+                       f"{event['force_n']:.1f} N. Open the gripper, and free it by hand.")
+    return True, f"Back at the start of the path; the force is {event['force_n']:.1f} N."
+
+
 @stage_command("gripper")
 @click.argument("cell_file", type=click.Path(path_type=Path))
 @click.option("--position", type=float, required=True,
@@ -279,5 +337,5 @@ def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, 
     return event
 
 
-for each in (check, describe, scan, follow, gripper, retreat):
+for each in (check, describe, scan, follow, gripper, retreat, serve):
     command.add_command(each)

@@ -41,6 +41,7 @@ _BEAT_SECONDS = 0.1
 _OLDEST_READING_SECONDS = 0.05
 _STANDS_RAD_S = 1e-3
 _SETTLE_SECONDS = 0.3
+_STILL_RAD = 1e-3  # while it settles
 _SUCCEEDED = 4  # action_msgs/msg/GoalStatus
 _OFF_PATH_M = 0.02  # a ROS controller lags its trajectory by an unknown time
 
@@ -199,8 +200,7 @@ class RosRobot:
         require_start(sample.pose, sample.joints, trajectory.poses[0], trajectory.joints[0],
                       self._cell.arm.joint_names)
         if np.abs(sample.joint_speeds).max() > _STANDS_RAD_S:
-            raise SafetyStop("The arm moves already.", "Something else drives it.",
-                             "Stop it, and begin again.")
+            raise _moves_already()
         self.guard.begin()
         self._way.begin(sample, trajectory, goes_on=goes_on)
         return self._watched_goal(trajectory)
@@ -212,9 +212,14 @@ class RosRobot:
             ``reached``, or ``stopped`` with its reason; and ``force_n``, the force that is left.
 
         Raises:
-            SafetyStop: no path is known, the arm left it, or the guard refuses.
+            SafetyStop: the arm moves, no path is known, the arm left it, or the guard refuses.
         """
+        assert self.last is not None
+        before = self.last.joints
         sample = self._settled()
+        # By the way, not by the speed: its noise must not refuse a retreat that is needed.
+        if not np.abs(sample.joints - before).max() <= _STILL_RAD:
+            raise _moves_already()
         back = self._way.from_here(sample, self._cell.limits.acceleration_m_s2)
         self.guard.begin_retreat(self.smooth)
         event = self._watched_goal(back)
@@ -334,3 +339,8 @@ class RosRobot:
             if sample is not None and np.abs(sample.joint_speeds).max() < _STANDS_RAD_S:
                 return event | {"stands": True}
         return event | {"stands": False}
+
+
+def _moves_already() -> SafetyStop:
+    return SafetyStop("The arm moves already.", "Something else drives it.",
+                      "Stop it, and begin again.")
