@@ -1,6 +1,7 @@
 """The viewport's table: cost of the add-on inside Blender.
 
 In the Blender of LIMBER_BLENDER, else in the bpy package; without a window, so nothing is drawn.
+Only the part "window" has one, on the screen of DISPLAY or a virtual one.
 """
 
 import json
@@ -9,7 +10,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +23,14 @@ from limber.geometry.generated import generate_branch
 from limber.results.scene.contents import scene_data
 from limber.store import Branch
 
+_SCREEN = (1280, 800)
 _ROOT = Path(__file__).parents[2]
 _FRAME = Asked("frame write of 50,000 vertices", "0.5 ms")
 _GRAB = (Asked("grab loop on Blender's side, median / 95 %", "1 / 2 ms"),
          Asked("pose to drawn mesh (without drawing), median / 95 %", "under 33 ms"),
          Asked("memory over grabs", "flat"))
+_WINDOW = (Asked("grab in a window, frames per second", "30"),
+           Asked("grab in a window, mouse to drawn frame, median / 95 %", "95 %: 60 ms"))
 _IMPORT = (Asked("import of 1,000,000 points", "3 s"),
            Asked("the interface stands while it is read / shown", "50 / 250 ms"))
 _REGISTER = Asked("registering", "100 ms")
@@ -52,14 +57,56 @@ def _measured(place: Path, setting: Setting, part: str) -> dict[str, Any]:
     settings.write_text(json.dumps({
         "addon": str(_ROOT / "addon"), "branch": str(branch), "cloud": str(place / "scan.ply"),
         "large_cloud": str(place / "million.ply"), "quick": setting.quick, "seed": setting.seed,
-        "part": part, "seconds": setting.budget.remaining}))
-    probe = str(Path(__file__).with_name("viewport_probe.py"))
-    blender = os.environ.get("LIMBER_BLENDER")
-    command = [blender, "-b", "--factory-startup", "--python", probe] if blender else (
-        [sys.executable, probe])
+        "part": part, "seconds": setting.budget.remaining,
+        "grab_seconds": 5.0 if setting.quick else 20.0}))
     environment = {"LIMBER_PYTHON": sys.executable} | os.environ
-    process = subprocess.Popen([*command, "--", str(settings)], env=environment, text=True,
-                               stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    with _screen(part) as display:
+        if part == "window" and not display:
+            return {}
+        return _said([*_command(part), "--", str(settings)], environment | display)
+
+
+def _command(part: str) -> list[str]:
+    """The program that measures a part: Blender with a window or without, or this Python."""
+    blender = os.environ.get("LIMBER_BLENDER")
+    here = Path(__file__)
+    if part == "window":
+        return [str(blender), "--factory-startup", "--enable-event-simulate", "--window-geometry",
+                "0", "0", *map(str, _SCREEN), "--python",
+                str(here.with_name("viewport_window.py"))]
+    probe = str(here.with_name("viewport_probe.py"))
+    return [blender, "-b", "--factory-startup", "--python", probe] if blender else (
+        [sys.executable, probe])
+
+
+@contextmanager
+def _screen(part: str) -> Iterator[dict[str, str]]:
+    """The screen for a window: the user's, else a virtual one; nothing if there is neither."""
+    if part != "window" or not os.environ.get("LIMBER_BLENDER") or (
+            "DISPLAY" not in os.environ and shutil.which("Xvfb") is None):
+        yield {}
+        return
+    if display := os.environ.get("DISPLAY"):
+        yield {"DISPLAY": display}
+        return
+    read, write = os.pipe()
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "{}x{}x24".format(*_SCREEN),
+         "-nolisten", "tcp"], pass_fds=[write], stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL)
+    os.close(write)
+    try:
+        with os.fdopen(read) as stream:
+            yield {"DISPLAY": f":{stream.readline().strip()}"}
+    finally:
+        server.terminate()
+        server.wait(10)
+
+
+def _said(command: list[str], environment: dict[str, str]) -> dict[str, Any]:
+    """Run a program; return what it printed, by measure."""
+    process = subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE,
+                               stderr=subprocess.STDOUT)
     found: dict[str, Any] = {}
     said: list[str] = []
     for line in process.stdout:
@@ -96,6 +143,15 @@ def _grab_rows(setting: Setting) -> list[Row]:
                         m["drawn_high_ms"] < 33)),
         _row(found, "grab memory", _GRAB[2], "grabs",
              lambda m: (f"{m['grown_mb']:+.1f} MB over the last 4/5", m["grown_mb"] < 5))]
+
+
+def _window_rows(setting: Setting) -> list[Row]:
+    found = _probed(setting, "window")
+    return [
+        _row(found, "window", _WINDOW[0], "frames",
+             lambda m: (f"{m['per_second']:.0f} ({m['who']})", m["per_second"] >= 30)),
+        _row(found, "window", _WINDOW[1], "frames",
+             lambda m: (f"{m['median_ms']:.0f} / {m['high_ms']:.0f} ms", m["high_ms"] <= 60))]
 
 
 def _import_rows(setting: Setting) -> list[Row]:
@@ -139,6 +195,7 @@ def _row(found: dict[str, Any], name: str, asked: Asked, count: str | None,
 PARTS = {
     "frame-write": Part(_frame_rows, 15, (_FRAME,)),
     "grab": Part(_grab_rows, 240, _GRAB),
+    "window": Part(_window_rows, 120, _WINDOW),
     "import": Part(_import_rows, 20, _IMPORT),
     "register": Part(_register_rows, 15, (_REGISTER,)),
     "undo": Part(_undo_rows, 40, (_UNDO,), grows=True),
