@@ -38,13 +38,14 @@ def clear():
 def is_tab_open():
     """Show Limber's tab; the step for it."""
     # The tabs are known once the sidebar has been drawn.
-    draw()
+    with override("UI"):
+        bpy.ops.wm.redraw_timer(type="DRAW", iterations=1)
     view("UI")[2].active_panel_category = "Limber"
     return True
 
 
-def override():
-    window, area, region = view()
+def override(kind="WINDOW"):
+    window, area, region = view(kind)
     return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)
 
 

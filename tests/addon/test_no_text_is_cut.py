@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from fontTools.fontBuilder import FontBuilder
 from fontTools.pens.ttGlyphPen import TTGlyphPen
+from PIL import Image
 from scipy import ndimage
 from tests.addon.catalogue import told
 from tests.addon.window import driven, require_screen
@@ -45,8 +46,6 @@ def write_font(path) -> None:
 
 def cuts(path) -> list[tuple[int, int]]:
     """Return where in a picture of the sidebar texts are cut: x, y [pixels]."""
-    from PIL import Image
-
     pixels = np.asarray(Image.open(path).convert("RGB").crop(SIDEBAR)).astype(int)
     light = np.where(np.ptp(pixels, axis=2) < 12, pixels.sum(axis=2), 0)
     low, high = ndimage.minimum_filter(light, BLOCK), ndimage.maximum_filter(light, BLOCK)
