@@ -225,14 +225,14 @@ def extension_zip(tmp_path_factory) -> Path:
     return Path(done.stdout.splitlines()[-1])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def has_worker(extension_zip) -> bool:
     """Whether the zip brings the worker along, as wheels."""
     with zipfile.ZipFile(extension_zip) as content:
         return any(name.endswith(".whl") for name in content.namelist())
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def environment(tmp_path_factory, worker_python, has_worker) -> dict[str, str]:
     """An environment whose Blender keeps its settings in a folder of the test, with our worker or
     with none but the zip's own."""
@@ -244,7 +244,7 @@ def environment(tmp_path_factory, worker_python, has_worker) -> dict[str, str]:
                 "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(blender, environment, extension_zip):
     """A function that runs Blender with the extension installed and enabled."""
     def run(*arguments, timeout=120, **extra):

@@ -68,7 +68,15 @@ def is_imported():
 
 
 def is_made():
-    return "scan" in bpy.data.collections and not part("jobs").is_running() and waited(1.0)
+    """The worker has made a branch folder of the scan, and its result was opened by itself."""
+    if "scan" not in bpy.data.collections or part("jobs").is_running() or not waited(1.0):
+        return False
+    cloud, surface = bpy.data.objects["scan scan"], bpy.data.collections["scan"].objects["scan"]
+    seen["points"] = len(cloud.data.vertices)
+    seen["scan_beside_branch_m"] = max(
+        (surface.closest_point_on_mesh(at)[1] - at).length
+        for at in (cloud.matrix_world @ vertex.co for vertex in cloud.data.vertices))
+    return True
 
 
 def point_at_grasp():

@@ -34,13 +34,15 @@ def test_an_own_scan_to_a_planned_path(run, blender, environment, tmp_path):
     home.mkdir()
     if is_planned:
         (tmp_path / "plan").touch()
-    generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud.write_ply(
-        home / "scan.ply")
+    scan = generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud
+    scan.write_ply(home / "scan.ply")
     caches = environment.get("XDG_CACHE_HOME", str(Path.home() / ".cache"))
     seen = driven("drive_own_scan.py", blender,
                   environment | {"HOME": str(home), "XDG_CACHE_HOME": caches}, tmp_path,
                   (1280, 720), seconds=500)
     assert seen["clicks"] == 6 + is_planned
+    assert seen["points"] == len(scan.points)
+    assert seen["scan_beside_branch_m"] < 0.01, "the scan lies on the branch made of it"
     assert seen["file"] == "scan.ply" and seen["goal_from_grasp_m"] > 0.03
     assert seen["goal"] == pytest.approx(seen["ball"], abs=1e-6)
     for name in ("browser", "chosen", "scan", "branch", "goal"):

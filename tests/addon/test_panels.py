@@ -380,3 +380,18 @@ def test_the_next_step_is_a_button(bpy, panels, tmp_path):
     menu = Layout()
     bpy.types.LIMBER_MT_colours.draw(SimpleNamespace(layout=menu), bpy.context)
     assert len(menu.names("operator")) == 7
+
+
+@pytest.mark.slow
+def test_a_scan_is_reconstructed_next(bpy, registered, tmp_path):
+    """Imported, it has no branch yet: that comes next. Nothing does where neither is there, or
+    where it failed."""
+    steps = importlib.import_module("limber_addon.panels.steps")
+    scene = bpy.context.scene
+    assert steps.next_stage(scene) is None
+    (tmp_path / "twig.xyz").write_text("0 0 0\n0 0 0.1\n0 0 0.2\n")
+    bpy.ops.limber.import_cloud(filepath=str(tmp_path / "twig.xyz"))
+    assert steps.next_stage(scene).name == "reconstruct"
+    with pytest.raises(RuntimeError, match="points"):
+        bpy.ops.limber.reconstruct()
+    assert steps.next_stage(scene) is None
