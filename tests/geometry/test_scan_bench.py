@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks import scan_runs, scans
 from benchmarks.budget import Budget
-from benchmarks.scan_probabilities import TWIG_SIGNS, fitted
+from benchmarks.scan_probabilities import SIGNS, fitted
 from benchmarks.scan_runs import CaseRun
 from benchmarks.table import Row, Setting
 from limber.core.progress import SILENT
@@ -62,6 +62,6 @@ def test_the_fit_of_probabilities_finds_the_odds_that_made_them() -> None:
     rows = rng.normal(size=(20_000, 5))
     true = np.array([0.5, 1.2, -0.6, -0.8, -0.3, -1.0])
     there = rng.uniform(size=len(rows)) < 1 / (1 + np.exp(-(true[0] + rows @ true[1:])))
-    found = fitted(rows, there, TWIG_SIGNS)
+    found = fitted(rows, there, SIGNS["twigs"])
     assert found[[0, 1, 3, 4, 5]] == pytest.approx(true[[0, 1, 3, 4, 5]], abs=0.2)
     assert found[2] == 0

@@ -189,7 +189,10 @@ def test_a_search_comes_back_to_its_last_bit(tmp_path) -> None:
     place, points = rng.normal(size=3), rng.normal(size=(40, 3))
     found = replace(
         result_of_skeleton(skeleton, points), noise=0.1 / 3, loops=[1 / 7], pruned=4, leafy=True,
-        second_base=place, bridges=[{"from": place, "to": -place, "length": 1 / 3, "price": 2.0}],
+        second_base=place, root_probability=2 / 3, bridges=[
+            {"from": place, "to": -place, "length": 1 / 3, "price": 2.0},
+            {"from": place, "to": -place, "length": 1 / 3, "price": 2.0, "thickness": 1 / 7,
+             "probability": 1 / 3, "rival_from": place, "rival_to": None, "rival_price": None}],
         split_off=[{"points": 7, "distance": 0.7 / 3, "at": place}],
         unlikely=[{"length": 1e-9 / 3, "at": place, "probability": 0.3}])
     path = tmp_path / "found.npz"

@@ -1,10 +1,10 @@
-"""Fits the probabilities that skeletons state to the outcomes on generated scans with truth.
+"""Fits the probabilities that skeletons state to the outcomes on scans with truth.
 
 ``python -m benchmarks.scan_probabilities --first SEED --count N --out DIR`` reconstructs N scans of
-each kind of the bench `scans` with no twig dropped, keeps the skeletons in DIR (a stopped run
-continues), and fits the logistic coefficients of :mod:`limber.geometry.skeleton.confidence`: by
-likelihood, slopes held to their sign and weakly to 0. The fit to each half of the scans is compared
-with the other half in tenths of the stated probability, as the bench does.
+each kind of the bench `scans` and of the worlds with no twig dropped, keeps the skeletons in DIR (a
+stopped run continues), and fits the logistic models of twigs, nodes, bridges and roots: by
+likelihood, slopes held to their sign and weakly to 0. Each source in turn is left out of the fit,
+and what the fit says of it is compared with the outcome, in tenths of the stated probability.
 """
 
 import argparse
@@ -12,17 +12,23 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from benchmarks.budget import Budget
 from benchmarks.scan_cases import ScanCase
 from benchmarks.scan_runs import KINDS, case_source
 from benchmarks.scan_scores import Dense, doubled, fork_matches, seen_part
-from benchmarks.trial_log import keep, read_trials
+from benchmarks.trial_log import go_on, read_trials
+from benchmarks.worlds.sources import BARE_VIEWS, SOURCES, WORLDS
 from limber.core.errors import LimberError
+from limber.core.json_values import plain
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.io.skeletons import read_cylinders, write_cylinders
@@ -30,13 +36,17 @@ from limber.geometry.leaf_removal import without_leaves
 from limber.geometry.reconstruction import seen_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.confidence import evidence
+from limber.geometry.skeleton.joining.rivals import bridge_evidence
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
-TWIG_SIGNS = (1, 1, -1, -1, -1)
-NODE_SIGNS = (-1, -1, -1)
+SIGNS = {"twigs": (1, 1, -1, -1, -1), "nodes": (-1, -1, -1), "bridges": (1, -1, -1), "roots": (1,)}
+OWN = "own"
+"""Source of the kinds of the project's own generator."""
 _RIDGE = 0.002  # of a slope's square, against the mean loss: weak
-_FIT_KINDS = tuple(kind for kind in KINDS if kind != "leafy")
+_FIT_KINDS = (*(kind for kind in KINDS if kind != "leafy"), *(
+    f"{source}:{view}" for view in BARE_VIEWS for source in SOURCES))
+_DETOUR, _AROUND = 1.5, 3.0  # longest true path of a true bridge, in its lengths plus these radii
 
 
 @dataclass
@@ -49,29 +59,29 @@ class Skeletonised:
     noise: float = 0.0
     failure: str = ""
     seconds: float = 0.0
+    root_probability: float = 1.0
+    bridges: list[dict] = field(default_factory=list)
 
 
 @dataclass
 class Outcomes:
-    """Evidence and outcomes of many scans, row by row.
+    """Evidence [k, columns], outcome [k] and source [k] of twigs, nodes, bridges or roots."""
 
-    Attributes:
-        twig, twig_there: Evidence and outcome of side runs, shapes [k, 5] and [k].
-        node, node_there, length: The same of a sample of places on runs that are there, and their
-        length.
-        half: 0 or 1 by the scan's seed, for twigs and nodes.
+    evidence: list[np.ndarray] = field(default_factory=list)
+    there: list[np.ndarray] = field(default_factory=list)
+    source: list[str] = field(default_factory=list)
+
+    def add(self, evidence: np.ndarray, there: np.ndarray, source: str) -> None:
+        self.evidence.append(evidence)
+        self.there.append(there)
+        self.source += [source] * len(there)
+
+
+def skeletonised(case: ScanCase) -> tuple[Skeleton, float, float, list[dict]]:
+    """The skeleton of a case in its file's frame, with no twig dropped; the noise [m], the root's
+    probability, and the bridges.
     """
-
-    twig: list[np.ndarray] = field(default_factory=list)
-    twig_there: list[np.ndarray] = field(default_factory=list)
-    node: list[np.ndarray] = field(default_factory=list)
-    node_there: list[np.ndarray] = field(default_factory=list)
-    half: tuple[list[int], list[int]] = field(default_factory=lambda: ([], []))
-
-
-def skeletonised(case: ScanCase) -> tuple[Skeleton, float]:
-    """The skeleton of a case in its file's frame, with no twig dropped; and the noise [m]."""
-    settings = ReconstructSettings(**case.settings, twig_probability=0.0)
+    settings = ReconstructSettings(**case.settings | {"twig_probability": 0.0})
     up = np.array(settings.up, float)
     prepared = prepare(Cloud(case.points), 1.0, settings, up=up)
     if case.leaf is not None:
@@ -79,51 +89,77 @@ def skeletonised(case: ScanCase) -> tuple[Skeleton, float]:
     found = skeletonise(prepared.cloud.points, settings, up=up, camera=prepared.view is not None)
     if prepared.view is not None:
         found, _ = seen_skeleton(found, prepared)
-    return found.skeleton.moved(found.skeleton.nodes + prepared.origin), found.noise
+    found = found.moved(lambda points: points + prepared.origin)
+    return found.skeleton, found.noise, found.root_probability, found.bridges
 
 
-def collect(first: int, count: int, out: Path, kinds: Sequence[str] = _FIT_KINDS,
+def _collected(task: tuple[str, int], out: Path, source: str) -> Skeletonised:
+    kind, seed = task
+    one, began = Skeletonised(kind, seed, source), time.perf_counter()
+    try:
+        skeleton, one.noise, one.root_probability, bridges = skeletonised(
+            (KINDS | WORLDS)[kind](seed))
+        one.bridges = plain(bridges)
+        write_cylinders(skeleton, _file(one, out))
+    except LimberError as error:
+        one.failure = str(error)
+    one.seconds = time.perf_counter() - began
+    print(f"{kind} {seed}: {one.seconds:.1f} s {one.failure[:80]}", flush=True)
+    return one
+
+
+def _file(one: Skeletonised, out: Path) -> Path:
+    return out / f"{one.kind.replace(':', '_')}_{one.seed}.csv"
+
+
+def collect(first: int, count: int, out: Path, seconds: float, kinds: Sequence[str] = _FIT_KINDS,
             ) -> list[Skeletonised]:
     """Skeletons of ``count`` seeds of each kind, including those in ``out``."""
     kept, source = out / "skeletons.jsonl", case_source()
-    known = {(one.kind, one.seed): one for one in read_trials(Skeletonised, kept)
-             if one.source == source}
-    done = []
-    for kind in kinds:
-        for seed in range(first, first + count):
-            one = known.get((kind, seed))
-            if one is None:
-                one, began = Skeletonised(kind, seed, source), time.perf_counter()
-                try:
-                    skeleton, one.noise = skeletonised(KINDS[kind](seed))
-                    write_cylinders(skeleton, out / f"{kind}_{seed}.csv")
-                except LimberError as error:
-                    one.failure = str(error)
-                one.seconds = time.perf_counter() - began
-                keep(one, kept)
-                print(f"{kind} {seed}: {one.seconds:.1f} s {one.failure}", flush=True)
-            done.append(one)
-    return done
+    tasks = [(kind, seed) for seed in range(first, first + count) for kind in kinds]
+    return go_on(read_trials(Skeletonised, kept), tasks, lambda one: (one.kind, one.seed), partial(
+        _collected, out=out, source=source), source, kept, Budget(seconds))
 
 
-def outcomes(done: list[Skeletonised], out: Path) -> Outcomes:
-    """Evidence of each twig and of places on them, and whether they are there."""
-    told = Outcomes()
+def outcomes(done: list[Skeletonised], out: Path) -> dict[str, Outcomes]:
+    """Evidence of each twig, of places on them, of bridges and roots, and the outcomes."""
+    told = {name: Outcomes() for name in SIGNS}
     for one in done:
         if one.failure:
             continue
-        case = KINDS[one.kind](one.seed)
-        found = read_cylinders(out / f"{one.kind}_{one.seed}.csv")
+        case = (KINDS | WORLDS)[one.kind](one.seed)
+        source = one.kind.split(":")[0] if ":" in one.kind else OWN
+        found, truth = read_cylinders(_file(one, out)), seen_part(case.truth, case.points)
         twig, node = evidence(found, case.points, one.noise)
-        there, near_true, high = _there(seen_part(case.truth, case.points), found)
-        told.twig.append(twig[1:])
-        told.twig_there.append(there[1:])
+        there, near_true, high = _there(truth, found)
+        told["twigs"].add(twig[1:], there[1:], source)
         held = there[found.branch[high]]  # a node's own odds are those on a run that is there
-        told.node.append(node[high[held]])
-        told.node_there.append(near_true[held])
-        for halves, number in zip(told.half, (len(there) - 1, int(held.sum())), strict=True):
-            halves += [one.seed % 2] * number
+        told["nodes"].add(node[high[held]], near_true[held], source)
+        told["bridges"].add(*_bridge_outcomes(one.bridges, truth), source)
+        odds = np.log(max(one.root_probability, 1e-12) / max(1 - one.root_probability, 1e-12))
+        off = np.linalg.norm(found.nodes[0] - truth.nodes[0])
+        told["roots"].add(np.array([[odds]]), np.array([off <= 2 * truth.radius[0]]), source)
     return told
+
+
+def _bridge_outcomes(bridges: list[dict], truth: Skeleton) -> tuple[np.ndarray, np.ndarray]:
+    """Evidence of bridges, and whether the truth joins their ends by about as short a path."""
+    here = Dense.of(truth)
+    tree = cKDTree(here.points)
+    length = np.linalg.norm(truth.nodes[1:] - truth.nodes[truth.parent[1:]], axis=1)
+    graph = coo_matrix((length, (truth.parent[1:], np.arange(1, truth.node_count))),
+                       (truth.node_count,) * 2).tocsr()
+    rows, there = [], []
+    for bridge in bridges:
+        away, near = tree.query(np.array([bridge["from"], bridge["to"]]))
+        one, other = here.high[near]
+        path = dijkstra(graph, directed=False, indices=int(one))[other]
+        radius = float(here.radius[near].max())
+        there.append(bool((away < 2 * np.maximum(here.radius[near], 0.001)).all()
+                          and path <= _DETOUR * bridge["length"] + _AROUND * radius))
+        rows.append(bridge_evidence(*(bridge[name] for name in (
+            "price", "length", "thickness", "rival_price"))))
+    return np.array(rows).reshape(-1, 3), np.array(there, bool)
 
 
 def _there(truth: Skeleton, found: Skeleton) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -164,16 +200,22 @@ def bins(stated: np.ndarray, there: np.ndarray) -> str:
         for k in np.unique(place))
 
 
-def tell(name: str, rows: np.ndarray, there: np.ndarray, half: np.ndarray,
-         signs: tuple[int, ...]) -> None:
-    """Print the coefficients, and the accuracy of the fit to one half on the other."""
-    odds = fitted(rows, there, signs)
-    print(f"{name}: {len(there)}, {100 * there.mean():.1f} % there; odds "
+def tell(name: str, told: Outcomes, left_out: Sequence[str]) -> None:
+    """Print the coefficients, and the accuracy of fits without a source on that source."""
+    rows, there = np.vstack(told.evidence), np.concatenate(told.there)
+    source = np.array(told.source)
+    signs = SIGNS[name]
+    inside = ~np.isin(source, left_out)
+    odds = fitted(rows[inside], there[inside], signs)
+    print(f"{name}: {inside.sum()}, {100 * there[inside].mean():.1f} % there; odds "
           f"({', '.join(f'{value:.2f}' for value in odds)})")
-    for own in (0, 1):
-        one = fitted(rows[half == own], there[half == own], signs)
-        stated = 1 / (1 + np.exp(-(one[0] + rows[half != own] @ one[1:])))
-        print(f"  fitted to half {own}, on the other: {bins(stated, there[half != own])}")
+    every = np.zeros(len(there))
+    for one in np.unique(source):
+        own = source == one
+        fit = odds if one in left_out else fitted(rows[inside & ~own], there[inside & ~own], signs)
+        every[own] = 1 / (1 + np.exp(-(fit[0] + rows[own] @ fit[1:])))
+        print(f"  {one}, left out: {bins(every[own], there[own])}")
+    print(f"  all, each left out: {bins(every, there)}")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -182,14 +224,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--first", type=int, required=True, help="first seed of each kind")
     parser.add_argument("--count", type=int, default=20, help="seeds of each kind")
     parser.add_argument("--out", type=Path, required=True, help="folder for the skeletons")
+    parser.add_argument("--seconds", type=float, default=600.0, help="time for new skeletons")
     parser.add_argument("--kinds", nargs="+", choices=_FIT_KINDS, default=_FIT_KINDS)
+    parser.add_argument("--left-out", nargs="+", default=["weber-penn"],
+                        help="sources that the printed coefficients are not fitted to")
     options = parser.parse_args(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
-    told = outcomes(collect(options.first, options.count, options.out, options.kinds), options.out)
-    for name, rows, there, half, signs in (
-            ("twigs", told.twig, told.twig_there, told.half[0], TWIG_SIGNS),
-            ("places", told.node, told.node_there, told.half[1], NODE_SIGNS)):
-        tell(name, np.vstack(rows), np.concatenate(there), np.array(half), signs)
+    done = collect(options.first, options.count, options.out, options.seconds, options.kinds)
+    for name, told in outcomes(done, options.out).items():
+        tell(name, told, options.left_out)
     return 0
 
 

@@ -6,11 +6,11 @@ With ``--out``, every case is also drawn.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
-from benchmarks.scan_files import REAL_ROW, SCANS, real_rows, same_tree_asked, same_tree_rows
+from benchmarks.same_tree import same_tree_asked, same_tree_rows, subjects
+from benchmarks.scan_files import REAL_ROW, real_rows
 from benchmarks.scan_runs import Outcomes, outcomes
 from benchmarks.table import Asked, Part, Row, Setting
 from benchmarks.worlds import rows as worlds
@@ -233,4 +233,4 @@ of the same tree's row.
 """
 PARTS |= {f"same-tree:{name}": Part(
     partial(same_tree_rows, only=name), 60, (same_tree_asked(name),), grows=True, alone=True)
-    for name in (Path(file).stem for file in SCANS)}
+    for name in subjects()}

@@ -41,7 +41,7 @@ def test_a_foot_that_contraction_split_into_strands_is_the_root():
                for number, x in enumerate((-0.25, 0.25))]
     drooping = ([(0.3 * k, 0.0, 6.0 - 0.15 * k) for k in range(1, 12)], 25, 0.2, 12)
     graph, points = _graph([rim, trunk, *strands, drooping])
-    start, _ = root_node(graph, points, None, _UP)
+    start, *_ = root_node(graph, points, None, _UP)
     assert graph.nodes[start, 2] < 0.2
 
 
@@ -49,5 +49,5 @@ def test_a_foot_with_few_points_is_judged_by_what_follows_it():
     foot = (_upwards(0.0, 0.0, 0.3, 4), -1, 0.1, 1)
     stem = (_upwards(0.0, 0.4, 8.0, 60), 3, 0.3, 12)
     graph, points = _graph([foot, stem])
-    start, _ = root_node(graph, points, None, _UP)
+    start, *_ = root_node(graph, points, None, _UP)
     assert graph.nodes[start, 2] == 0.0

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from limber.geometry.skeleton.alternatives import SearchDoubts
 from limber.geometry.skeleton.confidence import likely
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.totals import total_length, total_volume, totals
@@ -50,7 +51,8 @@ def test_a_dropped_twig_still_counts_by_its_probability() -> None:
     """Whether a twig just stays or is just dropped hardly changes what is to be expected."""
     stays, goes = (likely(_with_chances(_tree(), 0.99, chance), 0.5) for chance in (0.51, 0.49))
     assert stays[0].branch_count == goes[0].branch_count + 1
-    kept, dropped = total_length(*stays), total_length(*goes)
+    kept, dropped = (total_length(skeleton, SearchDoubts(unlikely=unlikely))
+                     for skeleton, unlikely in (stays, goes))
     assert kept.expected == pytest.approx(dropped.expected, abs=0.008)
     assert kept.sigma == pytest.approx(dropped.sigma, rel=0.05)
     assert kept.interval[0] < stays[0].length < kept.interval[1]

@@ -30,6 +30,7 @@ from limber.geometry.pruned_twigs import (
     twig_mass,
 )
 from limber.geometry.settings import ReconstructSettings
+from limber.geometry.skeleton.alternatives import alternatives, entries
 from limber.geometry.skeleton.checkpoint import FoundSkeleton
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.edits import Edit, edited
@@ -171,7 +172,9 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         meshed = replace(meshed, masses=[*meshed.masses, *hung])
         warnings.append(leaves_text(hung, float(cloud.attributes["leaf"].mean())))
         progress.warn(warnings[-1])
+    graphs = alternatives(found.skeleton, found.doubts)
     numbers = meshed.numbers | found.report() | {
+        "alternatives": entries(graphs, lambda edit: edit.in_file(alignment)),
         "leaf_count": len(hung), "leaf_mass_kg": sum(leaf["mass_kg"] for leaf in hung),
         "leaf_area_m2": sum(leaf["area_m2"] for leaf in hung),
         "point_count": len(cloud), "dropped_points": prepared.counts, "gravity_m_s2": gravity,

@@ -62,7 +62,7 @@ class FoundSkeleton:
         result = self.result
         values = {name: getattr(result, name) for name in (
             "noise", "bridges", "split_off", "loops", "pruned", "second_base", "other_root",
-            "leafy", "unlikely")} | {
+            "leafy", "unlikely", "root_probability")} | {
             "iterations": result.contraction.iterations, "status": result.contraction.status,
             "leaves": [{"count": len(leaf.points), "area": leaf.area} for leaf in self.leaves]}
         np.savez(path, told=np.array(json.dumps(plain(values))), **asdict(result.skeleton),
@@ -96,7 +96,8 @@ class FoundSkeleton:
             [bridge.found() for bridge in stored.bridges],
             [piece.found() for piece in stored.split_off], stored.loops, stored.pruned,
             _position_array(stored.second_base), _position_array(stored.other_root), stored.leafy,
-            [twig.found() for twig in stored.unlikely]), _leaves(path, arrays, stored))
+            [twig.found() for twig in stored.unlikely], stored.root_probability),
+            _leaves(path, arrays, stored))
 
 
 class _Part(BaseModel):
@@ -106,7 +107,7 @@ class _Part(BaseModel):
 
     def found(self) -> dict[str, Any]:
         return {name: np.array(value) if isinstance(value, tuple) else value
-                for name, value in self.model_dump(by_alias=True).items()}
+                for name, value in self.model_dump(by_alias=True, exclude_unset=True).items()}
 
 
 class _Bridge(_Part):
@@ -114,6 +115,11 @@ class _Bridge(_Part):
     to: _Place
     length: float
     price: float
+    thickness: float | None = None
+    probability: float | None = Field(None, ge=0, le=1)
+    rival_from: _Place | None = None
+    rival_to: _Place | None = None
+    rival_price: float | None = None
 
 
 class _Piece(_Part):
@@ -123,6 +129,8 @@ class _Piece(_Part):
 
 
 class _Twig(_Part):
+    start: _Place | None = Field(None, alias="from")
+    radius: float | None = Field(None, gt=0)
     length: float
     at: _Place
     probability: float
@@ -147,6 +155,7 @@ class _Stored(BaseModel):
     other_root: _Place | None
     leafy: bool
     unlikely: list[_Twig]
+    root_probability: float = Field(1.0, ge=0, le=1)
     iterations: int
     status: ContractionStatus
     leaves: list[_Leaf]

@@ -80,18 +80,19 @@ def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
     """Drop side runs with a probability below ``least``, and what they carry.
 
     Returns:
-        The skeleton, and for each dropped run its ``length`` [m], the position ``at`` [m] of its
-        tip and its ``probability``.
+        The skeleton, and for each dropped run its ``length`` [m], the positions ``from`` [m] of
+        its fork and ``at`` of its tip, its median ``radius`` [m] and its ``probability``.
     """
     runs = skeleton.runs()
     probability = np.ones(len(runs))
     for run, members in enumerate(runs[1:], start=1):
         probability[run] = min(float(skeleton.probability[members[1:]].max()),
                                probability[skeleton.branch[members[0]]])
-    dropped = [{"length": float(np.linalg.norm(np.diff(skeleton.nodes[runs[run]], axis=0),
-                                               axis=1).sum()),
-                "at": skeleton.nodes[runs[run][-1]], "probability": float(probability[run])}
-               for run in np.flatnonzero(probability < least)]
+    dropped = [{
+        "length": float(np.linalg.norm(np.diff(skeleton.nodes[runs[run]], axis=0), axis=1).sum()),
+        "from": skeleton.nodes[runs[run][0]], "at": skeleton.nodes[runs[run][-1]],
+        "radius": float(np.median(skeleton.radius[runs[run][1:]])),
+        "probability": float(probability[run])} for run in np.flatnonzero(probability < least)]
     return (skeleton.subset(probability[skeleton.branch] >= least) if dropped
             else skeleton), dropped
 

@@ -24,7 +24,7 @@ from limber.core.json_values import validated
 from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, Skeleton
 
 Place = tuple[float, float, float]
-_FAR = 4.0  # radii from an axis beyond which a point is not on it
+FAR = 4.0  # radii from an axis beyond which a point is not on it
 _KNOWN = 0.02  # standard deviation of a radius that a user gave, over the radius
 _SAME = 1e-3  # radii within which two positions are the same; files round
 
@@ -106,8 +106,16 @@ class ConfirmBranch(_Edit):
     do: Literal["confirm"] = "confirm"
 
 
-Edit = Annotated[MoveNode | DeleteBranch | MergeBranch | Bridge | SplitBranch | SetRoot | SetRadius
-                 | ConfirmBranch, Field(discriminator="do")]
+class AddBranch(_Edit):
+    """Add a straight branch from the node nearest to ``at`` to its tip ``to``."""
+
+    do: Literal["add"] = "add"
+    to: Place
+    radius: float = Field(gt=0)
+
+
+Edit = Annotated[AddBranch | MoveNode | DeleteBranch | MergeBranch | Bridge | SplitBranch | SetRoot
+                 | SetRadius | ConfirmBranch, Field(discriminator="do")]
 
 
 def read_edits(path: Path) -> list[Edit]:
@@ -126,7 +134,7 @@ def read_edits(path: Path) -> list[Edit]:
         raise InputError(
             f"{path}: {where}{field + ': ' if field else ''}{first['msg']}.",
             "Edits are a JSON list of objects such as {\"do\": \"delete\", \"at\": [x, y, z]}. The "
-            "field do is move, delete, merge, bridge, split, root, radius or confirm.",
+            "field do is add, move, delete, merge, bridge, split, root, radius or confirm.",
             "Correct the file. Give positions in the coordinates of the scan file.") from error
 
 
@@ -149,8 +157,9 @@ def edited(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str] | None 
     Raises:
         InputError: a position is not on an axis, or the result would not be a tree.
     """
-    doing = {"move": _moved, "delete": _deleted, "merge": _merged, "bridge": _bridged,
-             "split": _split, "root": _rooted, "radius": _with_radius, "confirm": _confirmed}
+    doing = {"add": _added, "move": _moved, "delete": _deleted, "merge": _merged,
+             "bridge": _bridged, "split": _split, "root": _rooted, "radius": _with_radius,
+             "confirm": _confirmed}
     for number, edit in enumerate(edits, start=1):
         try:
             skeleton = doing[edit.do](skeleton, edit)
@@ -198,7 +207,7 @@ def effects_of(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str],
 def _nearest(skeleton: Skeleton, at: Place) -> int:
     distance = np.linalg.norm(skeleton.nodes - np.array(at), axis=1)
     node = int(np.argmin(distance))
-    if distance[node] > _FAR * skeleton.radius[node]:
+    if distance[node] > FAR * skeleton.radius[node]:
         raise InputError(f"({', '.join(f'{value:.3f}' for value in at)}) m in the branch's frame "
                          f"is {1000 * distance[node]:.0f} mm from the nearest node.",
                          "The position does not belong to any branch.",
@@ -253,27 +262,57 @@ def _bridged(skeleton: Skeleton, edit: Bridge) -> Skeleton:
 
 
 def _split(skeleton: Skeleton, edit: SplitBranch) -> Skeleton:
-    return _hung(skeleton, _nearest(skeleton, edit.at), _nearest(skeleton, edit.to))
+    node, onto = _nearest(skeleton, edit.at), _nearest(skeleton, edit.to)
+    above, children = _path_to_root(skeleton, onto), skeleton.child_counts()
+    if node in above:
+        raise _circle()
+    keep = np.ones(skeleton.node_count, bool)
+    before = int(skeleton.parent[node])
+    # A path through a gap that now leads nowhere goes too.
+    while skeleton.radius_state[before] == BRIDGED and children[before] == 1 and (
+            before not in above):
+        keep[before] = False
+        before = int(skeleton.parent[before])
+    parent = skeleton.parent.copy()
+    parent[node] = onto
+    moved = skeleton.subset(keep, parent)
+    return _hung(moved, *(int(np.argmin(np.linalg.norm(moved.nodes - place, axis=1)))
+                          for place in skeleton.nodes[[node, onto]]))
 
 
 def _hung(skeleton: Skeleton, node: int, onto: int) -> Skeleton:
     """Attach a node, with all that it carries, to another one; nodes are added along a long gap."""
     if node in _path_to_root(skeleton, onto):
         raise _circle()
+    thick = float(skeleton.radius[node])
     vector = skeleton.nodes[node] - skeleton.nodes[onto]
-    thick = skeleton.radius[node]
     count = int(np.linalg.norm(vector) / (2 * max(thick, 1e-12)))
     share = (np.arange(count) + 1)[:, None] / (count + 1)
     parent = skeleton.parent.copy()
-    chain = skeleton.node_count + np.arange(count)
-    parent[node] = chain[-1] if count else onto
-    data = _data(skeleton)
-    filled = {"radius_sigma": data["radius_sigma"][node], "radius_state": BRIDGED,
-              "probability": data["probability"][node]}
+    parent[node] = skeleton.node_count + count - 1 if count else onto
+    return _with_chain(skeleton, parent, onto, skeleton.nodes[onto] + share * vector, thick, {
+        "radius_sigma": skeleton.radius_sigma[node], "radius_state": BRIDGED,
+        "probability": skeleton.probability[node]})
+
+
+def _added(skeleton: Skeleton, edit: AddBranch) -> Skeleton:
+    onto = _nearest(skeleton, edit.at)
+    vector = np.array(edit.to) - skeleton.nodes[onto]
+    count = max(int(np.linalg.norm(vector) / (2 * edit.radius)), 2)
+    share = (np.arange(count) + 1)[:, None] / count
+    return _with_chain(
+        skeleton, skeleton.parent, onto, skeleton.nodes[onto] + share * vector, edit.radius, {
+            "radius_sigma": _KNOWN * edit.radius, "radius_state": MEASURED, "probability": 1.0})
+
+
+def _with_chain(skeleton: Skeleton, parent: np.ndarray, onto: int, places: np.ndarray,
+                radius: float, filled: dict[str, float]) -> Skeleton:
+    """Add a chain of nodes at ``places`` [m], shape [k, 3], to node ``onto``."""
+    count, data = len(places), _data(skeleton)
+    before = np.concatenate([[onto], skeleton.node_count + np.arange(count - 1)])[:count]
     return Skeleton.from_edges(
-        np.vstack([skeleton.nodes, skeleton.nodes[onto] + share * vector]),
-        np.concatenate([parent, np.concatenate([[onto], chain[:-1]])[:count]]),
-        np.concatenate([skeleton.radius, np.full(count, thick)]),
+        np.vstack([skeleton.nodes, places]), np.concatenate([parent, before.astype(np.int64)]),
+        np.concatenate([skeleton.radius, np.full(count, radius)]),
         **{name: np.concatenate([values, np.full(count, filled[name], values.dtype)])
            for name, values in data.items()})
 

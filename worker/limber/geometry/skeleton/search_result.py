@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.geometry.skeleton.alternatives import SearchDoubts
 from limber.geometry.skeleton.confidence import shares
 from limber.geometry.skeleton.contraction.laplacian_contraction import (
     Contraction,
@@ -15,6 +16,8 @@ from limber.geometry.skeleton.plausibility import Where, warnings
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.totals import totals
+
+_PLACES = ("from", "to", "at", "rival_from", "rival_to")  # positions in the report's entries
 
 
 @dataclass(frozen=True)
@@ -27,16 +30,18 @@ class SkeletonResult:
         node_of_point: Skeleton node of each point, shape [m].
         residual: Distance of each point from its cylinder [m], shape [m].
         noise: Robust standard deviation of the residuals [m].
-        bridges: Gaps closed: ``from``, ``to``, ``length`` [m].
+        bridges: Gaps closed, as in
+            :class:`~limber.geometry.skeleton.contraction.curve_graph.CurveGraph`.
         split_off: Discarded pieces: ``points``, ``distance`` [m], ``at``.
         loops: Lengths [m] of closed loops that were opened.
         pruned: Number of spurs pruned.
         second_base: Position where the plant seems to reach the ground a second time [m], shape
         [3].
         other_root: Another end that is about as likely to be the root [m], shape [3].
-        unlikely: Dropped twigs, more likely absent than not: ``length`` [m], ``at`` [m, 3],
-            ``probability``.
+        unlikely: Dropped twigs, more likely absent than not, as
+            :func:`~limber.geometry.skeleton.confidence.likely` returns them.
         leafy: Most points were on no cylinder, and axes were placed in the middle of leaves.
+        root_probability: That the root is the chosen end, and not the next likely one.
     """
 
     skeleton: Skeleton
@@ -52,6 +57,7 @@ class SkeletonResult:
     other_root: np.ndarray | None = None
     leafy: bool = False
     unlikely: list[dict] = field(default_factory=list)
+    root_probability: float = 1.0
 
     @property
     def warnings(self) -> list[str]:
@@ -62,12 +68,17 @@ class SkeletonResult:
         """Warnings for the user, with positions transformed by ``where`` to other coordinates."""
         return warnings(self, where)
 
+    @property
+    def doubts(self) -> SearchDoubts:
+        """What the search left open."""
+        return SearchDoubts(self.bridges, self.unlikely, self.other_root, self.root_probability)
+
     def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> "SkeletonResult":
         """Return the result in another frame; ``move`` transforms points [n, 3] to it."""
-        bridges = [bridge | {"from": move(bridge["from"][None])[0],
-                             "to": move(bridge["to"][None])[0]} for bridge in self.bridges]
-        split_off, unlikely = ([part | {"at": move(part["at"][None])[0]} for part in parts]
-                               for parts in (self.split_off, self.unlikely))
+        bridges, split_off, unlikely = (
+            [part | {name: move(part[name][None])[0] for name in _PLACES
+                     if part.get(name) is not None} for part in parts]
+            for parts in (self.bridges, self.split_off, self.unlikely))
         base, other = (None if position is None else move(position[None])[0]
                        for position in (self.second_base, self.other_root))
         return replace(self, skeleton=self.skeleton.moved(move(self.skeleton.nodes)),
@@ -76,13 +87,14 @@ class SkeletonResult:
 
     def report(self) -> dict[str, Any]:
         """Numbers for the stage's result."""
-        return totals(self.skeleton, self.unlikely) | {
+        return totals(self.skeleton, self.doubts) | {
                 "contraction_iterations": self.contraction.iterations,
                 "contraction_status": self.contraction.status, "noise_m": self.noise,
                 "bridges": self.bridges, "length_shares": shares(self.skeleton),
                 "doubtful_run_count": len({int(run) for run in self.skeleton.branch[
                     self.skeleton.probability < 0.5]}), "split_off": self.split_off,
-                "unlikely_twigs": self.unlikely,
+                "unlikely_twigs": self.unlikely, "other_root": self.other_root,
+                "root_probability": self.root_probability,
                 "loop_lengths_m": self.loops, "pruned_spur_count": self.pruned}
 
 

@@ -14,7 +14,7 @@ from limber.geometry.skeleton.confidence import likely
 from limber.geometry.skeleton.contraction.curve_graph import CurveGraph, curve_graph, rooted
 from limber.geometry.skeleton.contraction.laplacian_contraction import contract
 from limber.geometry.skeleton.contraction.level_sets import POINT_LIMIT, is_sparse, level_graph
-from limber.geometry.skeleton.contraction.root_end import root_node
+from limber.geometry.skeleton.contraction.root_end import RootChoice, root_node
 from limber.geometry.skeleton.joining.plants import second_base
 from limber.geometry.skeleton.leaf_axes import through_leaves
 from limber.geometry.skeleton.plausibility import (
@@ -92,7 +92,7 @@ class _Search:
         return curve_graph(points, drawn, **self._joining())
 
     def root(self, graph: CurveGraph, points: np.ndarray, near: np.ndarray | None,
-             ) -> tuple[int, np.ndarray | None]:
+             ) -> RootChoice:
         """The root's node, and another end that is about as likely to be the root."""
         return root_node(graph, points, near, self.up)
 
@@ -100,7 +100,7 @@ class _Search:
                   ) -> tuple[CurveGraph, int]:
         """The tree of the scan's own levels from ``base`` [m], and its root's node."""
         graph = level_graph(points, base, width=width, **self._joining())
-        return graph, self.root(graph, points, base)[0]
+        return graph, self.root(graph, points, base).node
 
     def pruned(self, graph: CurveGraph, start: int) -> tuple[Skeleton, int]:
         """A skeleton with first radii and without spurs, and the number of dropped spurs."""
@@ -138,7 +138,7 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     graph = search.connected(thin, contraction.drawn)
     check_one_plant(graph, len(thin), search.diagonal, settings.plants,
                     lambda place: where(own.outside(place)))
-    start, other_root = search.root(graph, thin, root)
+    start, other_root, certainty = search.root(graph, thin, root)
     if is_sparse(thin, contraction.drawn):
         thin, loops = points[thinned(points, POINT_LIMIT)], graph.loops
         graph, start = search.in_levels(thin, graph.nodes[start])
@@ -161,4 +161,4 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     progress(1.0, "skeleton", nodes=skeleton.node_count)
     return SkeletonResult(skeleton, contraction, segment, residual, fitted.noise, graph.bridges,
                           graph.split_off, graph.loops, pruned + more, second_base(skeleton, up),
-                          other_root, leafy, unlikely)
+                          other_root, leafy, unlikely, certainty)

@@ -1,16 +1,17 @@
 """Length and volume of all wood, as far as a scan determines them: expectation and uncertainty.
 
-An uncertain twig counts by its probability, whether the skeleton has it or dropped it as unlikely.
+An uncertain twig counts by its probability, whether the skeleton has it or dropped it as unlikely;
+so does the other place of a piece that may be attached there.
 So two scans of one plant agree, even if one shows a twig a little better. What a scan does not show
 at all is not counted.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from limber.geometry.skeleton.alternatives import SearchDoubts, attachments
 from limber.geometry.skeleton.confidence import probability_given_carrier
 from limber.geometry.skeleton.qsm_tables import cylinders
 from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
@@ -19,6 +20,7 @@ _TOGETHER = 10.0  # length, in median radii of a run, over which radius errors a
 _COMMON = 0.1  # fraction of the volume: its most certain radii show the common error
 _BRIDGED = 0.1  # fraction of its length to which the path through a gap is known
 _SURE = 1.96  # standard deviations to each side of an interval that covers 95 %
+_NOTHING_OPEN = SearchDoubts()
 
 
 @dataclass(frozen=True)
@@ -40,12 +42,12 @@ class Total:
         return [max(self.expected - reach, 0.0), self.expected + reach]
 
 
-def total_length(skeleton: Skeleton, dropped: Sequence[dict[str, Any]] = ()) -> Total:
+def total_length(skeleton: Skeleton, doubts: SearchDoubts = _NOTHING_OPEN) -> Total:
     """Return the length of all axes [m].
 
     Args:
         skeleton: With the probabilities of its nodes.
-        dropped: Twigs no longer in the skeleton, each with ``length`` [m] and ``probability``.
+        doubts: Twigs no longer in the skeleton, and pieces that may be attached elsewhere.
     """
     runs = skeleton.runs()
     own, spread = np.empty(len(runs)), np.empty(len(runs))
@@ -57,8 +59,11 @@ def total_length(skeleton: Skeleton, dropped: Sequence[dict[str, Any]] = ()) -> 
         spread[run] = np.linalg.norm([skeleton.radius[members[-1]], skeleton.radius[members[0]],
                                       _BRIDGED * gap])
     mean, variance = _of_tree(skeleton, own, spread**2)
-    chance = np.array([twig["probability"] for twig in dropped])
-    length = np.array([twig["length"] for twig in dropped])
+    elsewhere = attachments(skeleton, doubts.bridges)
+    chance = np.array([*(twig["probability"] for twig in doubts.unlikely),
+                       *(1 - one.probability for one in elsewhere)])
+    length = np.array([*(twig["length"] for twig in doubts.unlikely),
+                       *(one.longer for one in elsewhere)])
     return Total(mean + float(chance @ length),
                  float(np.sqrt(variance + (chance * (1 - chance)) @ length**2)))
 
@@ -88,12 +93,12 @@ def total_volume(skeleton: Skeleton) -> Total:
     return Total(mean, float(np.hypot(np.sqrt(variance), 2 * common * mean)))
 
 
-def totals(skeleton: Skeleton, dropped: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
+def totals(skeleton: Skeleton, doubts: SearchDoubts = _NOTHING_OPEN) -> dict[str, Any]:
     """Return both as numbers of a stage's result, with intervals that cover 95 %.
 
     ``volume_interval_m3`` is None where no radius has a deviation, as for a given skeleton.
     """
-    length, volume = total_length(skeleton, dropped), total_volume(skeleton)
+    length, volume = total_length(skeleton, doubts), total_volume(skeleton)
     known = bool(skeleton.radius_sigma.any())
     return {"expected_length_m": length.expected, "length_interval_m": length.interval,
             "expected_volume_m3": volume.expected,

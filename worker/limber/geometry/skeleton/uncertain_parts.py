@@ -22,6 +22,8 @@ class DoubtfulKind(StrEnum):
     bridged = "bridged gap"
     kink = "kink"
     backwards = "starts backwards"
+    attachment = "attachment"
+    root = "root"
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,8 @@ class DoubtfulPart:
         at: A position on it [m], shape [3].
         length: Length of the part [m]; 0 for a single node.
         radius: Median radius there [m].
-        value: Probability of an unlikely branch; standard deviation over radius of an unresolved
-            one; angle [rad] of a kink; NaN for a gap.
+        value: Probability of an unlikely branch, an attachment or a root; standard deviation over
+            radius of an unresolved one; angle [rad] of a kink; NaN for a gap.
     """
 
     kind: DoubtfulKind

@@ -255,6 +255,7 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
             :class:`limber.geometry.skeleton.uncertain_parts.Doubt`.
     """
     value_formats = {"unlikely branch": "probability {:.2f}",
+                     "attachment": "probability {:.2f}", "root": "probability {:.2f}",
                      "unresolved radius": "sigma {:.0%} of the radius",
                      "kink": "{:.0f} degrees", "starts backwards": "{:.0f} degrees"}
     rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "uncertainty"]]
@@ -267,6 +268,23 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
                      f"{1e3 * part['length_m']:.0f}", f"{1e3 * part['radius_m']:.2f}",
                      value_formats[part["kind"]].format(value) if part["kind"] in value_formats
                      else "no points"])
+    return rows
+
+
+def alternative_rows(graphs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the most likely skeletons, the one in use first.
+
+    Args:
+        graphs: Each with ``probability``, ``length_m`` and ``edits``, as of `limber skeleton`.
+    """
+    used = max(graphs[0]["probability"], 1e-300)
+    rows = [["number", "against the one in use", "length [mm]", "what differs"]]
+    for number, graph in enumerate(graphs, start=1):
+        texts = [" ".join([edit["do"], *(
+            f"{name} {' '.join(f'{value:.5g}' for value in edit[name])}"
+            for name in ("at", "to") if name in edit)]) for edit in graph["edits"]]
+        rows.append([str(number), f"{graph['probability'] / used:.2g} times as likely",
+                     f"{1e3 * graph['length_m']:.0f}", "; ".join(texts) or "in use"])
     return rows
 
 

@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 
 from limber.geometry.skeleton import qsm_tables
+from limber.geometry.skeleton.alternatives import SearchDoubts, open_questions
 from limber.geometry.skeleton.qsm_tables import Caliper
 from limber.geometry.skeleton.uncertain_parts import DoubtfulPart, doubtful_parts
 from limber.results.report import figures
 from limber.results.report.report_tables import (
+    alternative_rows,
     caliper_rows,
     diameter_rows,
     doubtful_rows,
@@ -52,9 +54,15 @@ def scan_section(branch: Branch) -> Section:
                                         "known; one colour per branching order.")
     result = branch.made.result if branch.made else {}
     section.text += result.get("warnings") or []
-    doubtful = doubtful_parts(load_skeleton(branch))
+    skeleton = load_skeleton(branch)
+    doubtful = [*doubtful_parts(skeleton), *open_questions(skeleton, SearchDoubts.of(result))]
     if doubtful:
         section.tables.append(_doubt_table(doubtful))
+    graphs = result.get("alternatives") or []
+    if len(graphs) > 1:
+        section.tables.append((
+            "Alternatives to the skeleton, positions in the scan's coordinates (`limber skeleton "
+            "--alternative` applies one)", alternative_rows(graphs)))
     if result.get("clamped_radius_count"):
         section.text.append(f"{result['clamped_radius_count']} radii were limited to the cloud's "
                             "scale.")

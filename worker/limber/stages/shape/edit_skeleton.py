@@ -12,8 +12,12 @@ scan's file, as in the list of doubtful parts:
   {"do": "root", "at": [x, y, z]}                      here is the root
   {"do": "radius", "at": [...], "radius": r}           with "to": all along the axes to there
   {"do": "confirm", "at": [x, y, z]}                   the branch is there, no more doubt
+  {"do": "add", "at": [...], "to": [...], "radius": r} a straight branch from there to its tip
 
-They are kept in the branch folder and applied again by each reconstruct. With --frame branch,
+The most likely alternatives to the skeleton in use are listed with their probabilities and edits;
+--alternative N applies those of one of them.
+
+Edits are kept in the branch folder and applied again by each reconstruct. With --frame branch,
 positions and radii are in the branch's frame [m]; with --append they are added to the existing
 edits.
 """
@@ -50,8 +54,9 @@ _SHOWN = 30  # doubtful parts in the table; the JSON result has all
 class SkeletonInputs(BranchInputs):
     """A branch folder, edits of its skeleton, and where to write the skeleton."""
 
-    groups: ClassVar[Groups] = {"input": ("edits", "frame", "append"), "output": ("output",)}
-    common = ("edits",)
+    groups: ClassVar[Groups] = {"input": ("edits", "frame", "append", "alternative"),
+                                "output": ("output",)}
+    common = ("edits", "alternative")
 
     edits: Path | None = Field(
         None, description="Edits (JSON) that replace those of the branch. An empty list removes "
@@ -60,6 +65,8 @@ class SkeletonInputs(BranchInputs):
         "scan", description="Coordinates of the edits: those of the scan's file, or the branch's "
         "frame [m].")
     append: bool = Field(False, description="Append the edits to those of the branch.")
+    alternative: int | None = Field(
+        None, ge=2, description="Append the edits of this alternative, numbered as listed.")
     output: Path | None = Field(
         None, description="Also write the edited skeleton in the scan's coordinates: .swc, or "
         ".csv with intervals and probabilities.", json_schema_extra={"short": "-o"})
@@ -67,7 +74,8 @@ class SkeletonInputs(BranchInputs):
 
 def review_skeleton(folder: Path, *, edits_path: Path | None = None,
                     frame: Literal["scan", "branch"] = "scan", append: bool = False,
-                    output: Path | None = None, progress: Progress = SILENT) -> dict[str, Any]:
+                    alternative: int | None = None, output: Path | None = None,
+                    progress: Progress = SILENT) -> dict[str, Any]:
     """List the doubtful parts of a branch's skeleton, after applying edits if there are any.
 
     Args:
@@ -76,28 +84,37 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
         frame: Frame of the edits' positions: the scan file's coordinates, or the branch's frame
         [m].
         append: Add the edits to those of the branch instead of replacing them.
+        alternative: Number of the alternative whose edits are added too.
         output: ``.swc`` or ``.csv`` to write, in the scan file's coordinates and unit.
         progress: Called during the work; receives warnings for the user.
 
     Returns:
         ``doubtful``: a list of ``kind``, ``branch``, ``at`` (in the scan's coordinates), ``at_m``
-        (in the branch's frame), ``length_m``, ``radius_m`` and ``value``; ``edits``, those that
-        are applied; ``edit_effects``, of each the node that it took (``at``, ``at_m``), how far
-        that is from the requested position (``off_m``) and the change of the branches' length
-        (``length_change_m``); ``mesh``: ``current``, ``out of date`` or ``missing``; ``unit`` of
-        ``at``.
+        (in the branch's frame), ``length_m``, ``radius_m`` and ``value``; ``alternatives``: the
+        most likely graphs, the one in use first, each with ``probability``, ``length_m`` and
+        ``edits``; ``edits``, those that are applied; ``edit_effects``, of each the node that it
+        took (``at``, ``at_m``), how far that is from the requested position (``off_m``) and the
+        change of the branches' length (``length_change_m``); ``mesh``: ``current``, ``out of
+        date`` or ``missing``; ``unit`` of ``at``.
 
     Raises:
         InputError: an edit does not fit. MeshingError: the edited skeleton cannot be meshed. The
             folder is then unchanged.
     """
+    from limber.geometry.skeleton.alternatives import SearchDoubts, open_questions
     from limber.geometry.skeleton.uncertain_parts import doubtful_parts
 
-    if edits_path is not None:
+    if edits_path is not None or alternative is not None:
         branch = Branch.open(folder)
-        _remade(branch, _requested_edits(branch, edits_path, frame, append), progress)
+        edits = _applied(branch) if edits_path is None else _requested_edits(
+            branch, edits_path, frame, append)
+        chosen = [] if alternative is None else _edits_of(branch, alternative)
+        _remade(branch, [*edits, *chosen], progress)
     branch = Branch.read(folder)
     skeleton, alignment, mesh = _latest(branch)
+    # An older skeleton than the mesh's has its own open questions.
+    result = branch.made.result if mesh == "current" and branch.made else {}
+    doubtful = [*doubtful_parts(skeleton), *open_questions(skeleton, SearchDoubts.of(result))]
     if mesh == "out of date":
         progress.warn("This skeleton is that of the last reconstruct, which made no mesh. The "
                       "mesh is that of an earlier one.")
@@ -105,9 +122,8 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
         _write(skeleton.in_file(alignment), output, branch.manifest.source.get("unit", "m"))
     applied = _applied(branch)
     return {
-        "doubtful": [
-            _part_entry(uncertain_part, alignment) for uncertain_part in doubtful_parts(skeleton)
-        ],
+        "doubtful": [_part_entry(uncertain_part, alignment) for uncertain_part in doubtful],
+        "alternatives": result.get("alternatives", []),
         "node_count": skeleton.node_count,
         "branch_count": skeleton.branch_count,
         "length_m": skeleton.length,
@@ -127,6 +143,21 @@ def _requested_edits(branch: Branch, path: Path, frame: str, append: bool) -> li
     if frame == "branch":
         edits = [edit.in_file(branch.manifest.alignment) for edit in edits]
     return [*_applied(branch), *edits] if append else edits
+
+
+def _edits_of(branch: Branch, number: int) -> list[Edit]:
+    """The edits of an alternative, numbered from 1."""
+    from limber.core.json_values import validated
+    from limber.geometry.skeleton.edits import Edit
+
+    known = branch.made.result.get("alternatives", []) if branch.made else []
+    if number > len(known):
+        raise InputError(
+            f"Alternative {number} was requested, but the skeleton in use has "
+            f"{max(len(known) - 1, 0)} alternatives.",
+            "Alternatives are numbered from 2; number 1 is the skeleton in use.",
+            "Choose one of those listed, or reconstruct again if there are none.")
+    return validated(list[Edit], known[number - 1]["edits"])
 
 
 def _applied(branch: Branch) -> list[Edit]:
@@ -197,6 +228,7 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     """Apply edits to the skeleton as found; make surface and mesh of the result."""
     from limber.geometry.io.clouds import read_points
     from limber.geometry.reconstruction import labelled, mesh_skeleton
+    from limber.geometry.skeleton.alternatives import SearchDoubts, alternatives, entries
     from limber.geometry.skeleton.confidence import shares
     from limber.geometry.skeleton.edits import edited, edits_text
     from limber.geometry.skeleton.totals import totals
@@ -225,8 +257,10 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
             stage.path(EDITS).write_text(edits_text(edits), encoding="utf-8")
         else:
             stage.remove(EDITS)
-        stage.result.update(made.result | meshed.numbers | totals(
-            skeleton, made.result.get("unlikely_twigs", [])) | {
+        doubts = SearchDoubts.of(made.result)
+        stage.result.update(made.result | meshed.numbers | totals(skeleton, doubts) | {
+            "alternatives": entries(alternatives(skeleton, doubts),
+                                    lambda edit: edit.in_file(alignment)),
             "length_shares": shares(skeleton), "warnings": warnings})
 
 
@@ -261,8 +295,8 @@ def _part_entry(uncertain_part: DoubtfulPart, alignment: Alignment) -> dict[str,
 
 
 def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
-    """Return what the edits did, and the doubtful parts, as tables."""
-    from limber.results.report.report_tables import doubtful_rows, edit_rows
+    """Return what the edits did, the doubtful parts and the alternatives, as tables."""
+    from limber.results.report.report_tables import alternative_rows, doubtful_rows, edit_rows
 
     doubtful = result["doubtful"]
     places = f"places in the scan's coordinates [{result['unit']}]"
@@ -272,6 +306,8 @@ def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
     if doubtful:
         more = f" ({len(doubtful) - _SHOWN} more with --json)" if len(doubtful) > _SHOWN else ""
         shown.append((f"Doubtful parts, {places}{more}", doubtful_rows(doubtful[:_SHOWN])))
+    if len(result["alternatives"]) > 1:
+        shown.append((f"Alternatives, {places}", alternative_rows(result["alternatives"])))
     return shown
 
 

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.joining.join_pieces import join_pieces
 from limber.geometry.skeleton.joining.pieces import Joined, edge_matrix, specks
+from limber.geometry.skeleton.joining.rivals import bridge_evidence, bridge_probability
 from limber.geometry.skeleton.repair.false_connections import untied
 
 _Z = np.array([0.0, 0.0, 1.0])
@@ -27,7 +28,9 @@ class CurveGraph:
         thickness: Distance [m] by which a node's points were contracted: a first radius, shape [n].
         support: Number of points of each node, shape [n].
         bridges: Each closed gap: ``from``, ``to`` [m, 3], ``length`` [m], ``price`` (1: a straight
-            continuation of an end; higher: less plausible).
+            continuation of an end; higher: less plausible), ``thickness`` [m] of the thinner end,
+            ``probability``; and another place for the piece that it attaches: ``rival_from``,
+            ``rival_to`` [m, 3], ``rival_price`` [m], or None.
         split_off: Each discarded piece: ``points``, ``distance`` [m], ``at``.
         loops: Length of each closed loop that was opened [m].
         plants: Pieces that look like plants of their own: ``points`` of the smaller, ``distance``
@@ -185,17 +188,26 @@ def keep_largest(graph: CurveGraph, joined: Joined, gap: float) -> np.ndarray:
     main = joined.label == int(np.argmax(weight))
     graph.nodes, graph.thickness, graph.support = joined.nodes, joined.thickness, joined.support
     graph.edges = joined.edges
-    for (one, other), price in zip(joined.bridges, joined.prices, strict=True):
-        length = float(np.linalg.norm(graph.nodes[one] - graph.nodes[other]))
-        if main[one] and length > gap:
-            graph.bridges.append({"from": graph.nodes[one], "to": graph.nodes[other],
-                                  "length": length, "price": float(price)})
+    for number in np.flatnonzero(main[joined.bridges[:, 0]] & (joined.lengths() > gap)):
+        graph.bridges.append(_bridge(joined, int(number)))
     graph.plants = [{"points": int(weight[joined.label[pair]].min()),
                      "distance": float(np.linalg.norm(np.subtract(*graph.nodes[pair]))),
                      "at": graph.nodes[pair].mean(axis=0)} for pair in joined.plants]
     if not main.all():
         _leave_away(graph, main, joined.label)
     return main
+
+
+def _bridge(joined: Joined, number: int) -> dict:
+    """The report on a bridge, as in :class:`CurveGraph`."""
+    one, other = joined.bridges[number]
+    length, price = float(joined.lengths()[number]), float(joined.prices[number])
+    thick, rival = float(joined.thickness[[one, other]].min()), joined.rivals[number]
+    return {"from": joined.nodes[one], "to": joined.nodes[other], "length": length, "price": price,
+            "thickness": thick, "probability": bridge_probability(bridge_evidence(
+                price, length, thick, rival.price if rival else None)),
+            "rival_from": rival.end if rival else None, "rival_to": rival.to if rival else None,
+            "rival_price": rival.price if rival else None}
 
 
 def _leave_away(graph: CurveGraph, main: np.ndarray, label: np.ndarray) -> None:

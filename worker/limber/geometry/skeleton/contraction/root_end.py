@@ -1,5 +1,7 @@
 """Choice of a curve graph's root: the lowest of the thick ends, or the user's."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from limber.geometry.skeleton.contraction.curve_graph import CurveGraph, rooted
@@ -11,10 +13,26 @@ _END_POINTS, _END_REACHES = 30, 4  # points that show an end's thickness; its le
 # Radii of its carrier up to which a side arm may be a strand around the rim of a ragged foot.
 _STRAND = 5.0
 _ROOT_EVEN = 1.0  # difference in these at which two ends are equally likely
+# Logistic model of the chosen end against the next: a constant, and a slope of that difference.
+ROOT_ODDS = (0.0, 1.0)
+
+
+class RootChoice(NamedTuple):
+    """The chosen root.
+
+    Attributes:
+        node: Its node.
+        other: Another end that is about as likely [m], shape [3]; None: there is none.
+        probability: That the chosen one is the root, and not the next likely end.
+    """
+
+    node: int
+    other: np.ndarray | None
+    probability: float
 
 
 def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up: np.ndarray,
-              ) -> tuple[int, np.ndarray | None]:
+              ) -> RootChoice:
     """The end nearest to ``root``, or the lowest of the thick ends; and another about as likely.
 
     The thickness of an end follows from its smallest extent and the distance that its points moved:
@@ -29,7 +47,8 @@ def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up
     neighbours = _pruned_neighbours(graph, parent, SPUR_REACH)
     tips = np.array([node for node, near in enumerate(neighbours) if len(near) == 1])
     if root is not None:
-        return int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))]), None
+        return RootChoice(int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))]),
+                          None, 1.0)
     thick = _end_thickness(graph, points, neighbours, tips)
     # Where few points show a thick foot, contraction leaves strands around its rim. Each strand
     # gives as little evidence of the foot as a twig.
@@ -45,7 +64,10 @@ def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up
     odds[chosen] = -np.inf
     rival = int(np.argmax(odds)) if len(tips) > 1 else chosen
     other = graph.nodes[tips[rival]] if odds[rival] > -_ROOT_EVEN else None
-    return int(tips[chosen]), other
+    start, slope = ROOT_ODDS
+    with np.errstate(over="ignore"):
+        probability = float(1 / (1 + np.exp(odds[rival] * slope - start)))
+    return RootChoice(int(tips[chosen]), other, probability)
 
 
 def _pruned_neighbours(graph: CurveGraph, parent: np.ndarray, factor: float) -> list[list[int]]:

@@ -8,6 +8,7 @@ from limber.geometry.skeleton.joining.bridge_choice import mutual
 from limber.geometry.skeleton.joining.bridges import Hypotheses, hypotheses
 from limber.geometry.skeleton.joining.pieces import Joined, Round, Rules, labels
 from limber.geometry.skeleton.joining.plants import plants_apart
+from limber.geometry.skeleton.joining.rivals import rivals
 
 _ODD = 1.9  # price of a bridge over its length above which its neighbours are tried without it
 _AROUND = 2.0  # neighbourhood, in lengths of that bridge
@@ -43,6 +44,7 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
     rules = Rules(gap, bridge_limit, up, join_plants)
     state = _reconsidered(_joined(first, rules), rules)
     plants = plants_apart(state.nodes, state.thickness, state.support, state.label, up)
+    state.rivals = rivals(state, rules)
     state.plants = np.array(plants, np.int64).reshape(-1, 2)
     return state
 

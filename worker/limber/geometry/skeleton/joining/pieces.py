@@ -1,6 +1,7 @@
 """Pieces of a scan and their state during joining."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -34,6 +35,7 @@ class Joined:
         piece: The given piece of each node, -1 along bridges, shape [n].
         known: Results for ends and axes found during joining.
         rounds: The rounds that led to this state, see :class:`Round`.
+        rivals: For each bridge the other place for the piece that it attaches, if there is one.
     """
 
     nodes: np.ndarray
@@ -49,6 +51,7 @@ class Joined:
     piece: np.ndarray
     known: Known = field(default_factory=Known)
     rounds: list["Round"] = field(default_factory=list)
+    rivals: list[Any] = field(default_factory=list)
 
     def copy(self, rounds: list["Round"]) -> "Joined":
         """A copy of the state that changes independently, after these ``rounds``."""
