@@ -187,3 +187,22 @@ def test_a_bridge_bends_as_its_ends_do() -> None:
     chord = 0.5 * (1 - np.cos(0.1))
     assert len(curve) > 5 and off.max() < 0.4 * chord
     assert thick == pytest.approx(0.004)
+
+
+def test_a_twig_between_two_stems_has_the_other_stem_as_its_rival() -> None:
+    """The nearly even choice gets a rival at about the same price; a clear one a dear rival."""
+    ratios = []
+    for near in (0.05, 0.025):
+        left, right = _line([0, 0, 0], [0, 0, 0.6], 40), _line([0.1, 0, 0], [0.1, 0, 0.6], 40)
+        base = _line([0.004, 0, 0], [0.096, 0, 0], 8)
+        twig = _line([near, 0.03, 0.35], [near, 0.2, 0.45], 10)
+        nodes, edges = _forest(left, right, base, twig)
+        edges = np.vstack([edges, [[0, 80], [87, 40]]])
+        joined = _joined(nodes, edges, np.repeat([0.006, 0.006, 0.006, 0.003], [40, 40, 8, 10]))
+        bridge = int(np.argmax(joined.lengths()))
+        rival = joined.rivals[bridge]
+        taken = joined.nodes[joined.bridges[bridge]]
+        assert rival.end == pytest.approx(twig[0])
+        assert np.linalg.norm(taken - rival.to, axis=1).max() > joined.lengths()[bridge]
+        ratios.append(rival.price / (joined.prices[bridge] * joined.lengths()[bridge]))
+    assert 0.9 < ratios[0] < 1.2 and ratios[1] > 1.3 * ratios[0]

@@ -63,7 +63,9 @@ def _rival(state: Joined, able: Hypotheses, end: int, onto: int) -> Rival | None
     own, to = own[rows], to[rows]
     same_end = np.linalg.norm(nodes[own] - nodes[end], axis=1) <= _ELSEWHERE * thick[end]
     away = np.linalg.norm(nodes[to] - nodes[onto], axis=1)
-    elsewhere = away > _ELSEWHERE * np.maximum(thick[onto], thick[to])
+    # A long bridge does not show its foot to more than its own length.
+    elsewhere = away > np.maximum(_ELSEWHERE * np.maximum(thick[onto], thick[to]),
+                                  np.linalg.norm(nodes[end] - nodes[onto]))
     rows = rows[same_end & elsewhere]
     if len(rows) == 0:
         return None
