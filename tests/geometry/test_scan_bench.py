@@ -2,18 +2,22 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from benchmarks import scan_runs, scans
 from benchmarks.budget import Budget
+from benchmarks.same_tree import _CHANGED, SameTreeRun
 from benchmarks.scan_probabilities import SIGNS, fitted
 from benchmarks.scan_runs import CaseRun
 from benchmarks.table import Row, Setting
 from limber.core.progress import SILENT
+from limber.geometry.cloud.cloud import Cloud
 
 _SCORES = {"forks": 2, "forks_found": 2, "forks_false": 0, "centre_radii": 0.1, "centre_m": 1e-4,
            "radius_error": 0.01, "radius_bias": 0.01, "covered": 0.95, "volume": 0.01, "shown": 1.0,
            "root_diameters": 0.1, "main_axis_radii": 0.3, "length_held": True, "volume_held": True,
-           "told_forks": [[0.95, 1.0]], "told_nodes": [[1.0, 0.9, 1.0, 1.0]] * 10}
+           "told_forks": [[0.95, 1.0]], "told_bridges": [[0.7, 1.0]],
+           "told_nodes": [[1.0, 0.9, 1.0, 1.0]] * 10}
 
 
 def test_parts_take_what_other_parts_kept(monkeypatch, tmp_path) -> None:
@@ -44,7 +48,7 @@ def test_parts_take_what_other_parts_kept(monkeypatch, tmp_path) -> None:
     assert len(made) == count + 8
     # Of cases for which there is no time a row says nothing.
     monkeypatch.setattr(scan_runs, "case_source", lambda: "last")
-    assert [row.count for row in rows("probabilities", -1.0)] == [1, 1]
+    assert [row.count for row in rows("probabilities", -1.0)] == [1, 1, 1]
 
 
 def test_a_case_that_fails_is_counted(monkeypatch, tmp_path) -> None:
@@ -65,3 +69,26 @@ def test_the_fit_of_probabilities_finds_the_odds_that_made_them() -> None:
     found = fitted(rows, there, SIGNS["twigs"])
     assert found[[0, 1, 3, 4, 5]] == pytest.approx(true[[0, 1, 3, 4, 5]], abs=0.2)
     assert found[2] == 0
+
+
+@pytest.mark.parametrize("change", list(_CHANGED))
+def test_a_changed_scan_goes_back_to_the_original(change: str) -> None:
+    """Its points, taken back, are the original's; the root that the user states moves along."""
+    rng = np.random.default_rng(5)
+    points = rng.normal(size=(400, 3)) * [0.1, 0.1, 0.5]
+    settings = {"up": (0.0, 0.1, 1.0), "root": tuple(points[7].tolist())}
+    cloud, changed, back = _CHANGED[change](Cloud(points), settings, rng)
+    away, _ = cKDTree(points).query(back(cloud.points))
+    added = {"outliers": 4, "ground": 200}.get(change, 0)
+    assert (away < 1e-9).sum() == len(cloud) - added
+    assert len(cloud) == {"half": 200, "duplicates": 480}.get(change, 400 + added)
+    factor = 1000.0 if changed.get("unit") == "mm" else 1.0
+    assert np.linalg.norm(back(np.array([changed["root"]])) - points[7]) < 1e-9 * factor
+
+
+def test_forks_of_two_trees_are_compared_with_their_probabilities() -> None:
+    one = SameTreeRun("a", "b", 0, "", forks=[[0, 0, 0, 0.01, 0.99], [0, 0, 1, 0.01, 0.7]])
+    other = SameTreeRun("a", "c", 0, "", forks=[[0, 0.02, 0, 0.01, 0.95], [0, 1, 0, 0.01, 0.9]])
+    assert one.other_forks(other) == (2, 1)
+    assert one.other_forks(one) == (0, 0)
+    assert one.other_forks(SameTreeRun("a", "d", 0, "")) == (2, 1)

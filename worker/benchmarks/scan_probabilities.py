@@ -17,14 +17,12 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from benchmarks.budget import Budget
 from benchmarks.scan_cases import ScanCase
 from benchmarks.scan_runs import KINDS, case_source
-from benchmarks.scan_scores import Dense, doubled, fork_matches, seen_part
+from benchmarks.scan_scores import Dense, bridges_right, doubled, fork_matches, seen_part
 from benchmarks.trial_log import go_on, read_trials
 from benchmarks.worlds.sources import BARE_VIEWS, SOURCES, WORLDS
 from limber.core.errors import LimberError
@@ -46,7 +44,6 @@ OWN = "own"
 _RIDGE = 0.002  # of a slope's square, against the mean loss: weak
 _FIT_KINDS = (*(kind for kind in KINDS if kind != "leafy"), *(
     f"{source}:{view}" for view in BARE_VIEWS for source in SOURCES))
-_DETOUR, _AROUND = 1.5, 3.0  # longest true path of a true bridge, in its lengths plus these radii
 
 
 @dataclass
@@ -135,31 +132,13 @@ def outcomes(done: list[Skeletonised], out: Path) -> dict[str, Outcomes]:
         told["twigs"].add(twig[1:], there[1:], source)
         held = there[found.branch[high]]  # a node's own odds are those on a run that is there
         told["nodes"].add(node[high[held]], near_true[held], source)
-        told["bridges"].add(*_bridge_outcomes(one.bridges, truth), source)
+        told["bridges"].add(np.array([bridge_evidence(*(bridge[name] for name in (
+            "price", "length", "thickness", "rival_price"))) for bridge in one.bridges]).reshape(
+                -1, 3), bridges_right(one.bridges, truth), source)
         odds = np.log(max(one.root_probability, 1e-12) / max(1 - one.root_probability, 1e-12))
         off = np.linalg.norm(found.nodes[0] - truth.nodes[0])
         told["roots"].add(np.array([[odds]]), np.array([off <= 2 * truth.radius[0]]), source)
     return told
-
-
-def _bridge_outcomes(bridges: list[dict], truth: Skeleton) -> tuple[np.ndarray, np.ndarray]:
-    """Evidence of bridges, and whether the truth joins their ends by about as short a path."""
-    here = Dense.of(truth)
-    tree = cKDTree(here.points)
-    length = np.linalg.norm(truth.nodes[1:] - truth.nodes[truth.parent[1:]], axis=1)
-    graph = coo_matrix((length, (truth.parent[1:], np.arange(1, truth.node_count))),
-                       (truth.node_count,) * 2).tocsr()
-    rows, there = [], []
-    for bridge in bridges:
-        away, near = tree.query(np.array([bridge["from"], bridge["to"]]))
-        one, other = here.high[near]
-        path = dijkstra(graph, directed=False, indices=int(one))[other]
-        radius = float(here.radius[near].max())
-        there.append(bool((away < 2 * np.maximum(here.radius[near], 0.001)).all()
-                          and path <= _DETOUR * bridge["length"] + _AROUND * radius))
-        rows.append(bridge_evidence(*(bridge[name] for name in (
-            "price", "length", "thickness", "rival_price"))))
-    return np.array(rows).reshape(-1, 3), np.array(there, bool)
 
 
 def _there(truth: Skeleton, found: Skeleton) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -21,7 +21,13 @@ from benchmarks.scan_cases import (
     single_view_case,
 )
 from benchmarks.scan_plants import crown_case, leafy_case
-from benchmarks.scan_scores import cylinder_volume, points_on_axes, score, seen_part
+from benchmarks.scan_scores import (
+    bridges_right,
+    cylinder_volume,
+    points_on_axes,
+    score,
+    seen_part,
+)
 from benchmarks.table import Setting
 from benchmarks.trial_log import go_on, read_trials, source_digest
 from benchmarks.worlds.dropped_points import dropped_points
@@ -153,11 +159,16 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
     result = reconstruct(path, branch, ReconstructSettings(**case.settings))
     manifest = json.loads((branch / "branch.json").read_text())
     aligned = read_cylinders(branch / "skeleton.csv")
-    found = aligned.moved(Alignment.model_validate(manifest["alignment"]).undo(aligned.nodes))
+    alignment = Alignment.model_validate(manifest["alignment"])
+    found = aligned.moved(alignment.undo(aligned.nodes))
+    bridges = [bridge | {end: alignment.undo(np.array(bridge[end])) for end in ("from", "to")}
+               for bridge in result["bridges"]]
     seen = seen_part(case.truth, case.points)
     # Wood without points is in no mesh; it is reported separately.
     shown = cylinder_volume(seen) / cylinder_volume(case.truth)
     scored = score(seen, found)
+    scored["told_bridges"] = [[bridge["probability"], bool(right)] for bridge, right in zip(
+        bridges, bridges_right(bridges, seen), strict=True)]
     scored |= {"seed": case.seed, "left_out": result["left_out_twigs"], "shown": shown,
                "unsaid_m": unsaid_length(aligned, branch),
                "length_held": held(result["length_interval_m"], seen.length),

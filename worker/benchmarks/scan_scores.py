@@ -3,12 +3,15 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
 
 _STEP = 0.001  # [m] between the places on the axes that are compared
+_DETOUR, _AROUND = 1.5, 3.0  # longest true path of a true bridge, in its lengths plus these radii
 
 
 @dataclass(frozen=True)
@@ -127,6 +130,27 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
         "told_nodes": _told_nodes(found.probability[here.high], right, found.branch[here.high]),
         "recall": float((back < np.maximum(there.radius, 0.001)).mean()),
         "right": float(right.mean())}
+
+
+def bridges_right(bridges: list[dict], truth: Skeleton) -> np.ndarray:
+    """Whether the truth joins the ends of each bridge by about as short a path, shape [bridges].
+
+    Args:
+        bridges: Each with ``from``, ``to`` [m, 3], in the truth's frame, and ``length`` [m].
+        truth: The true axes.
+    """
+    here = Dense.of(truth)
+    tree = cKDTree(here.points)
+    graph = coo_matrix((truth.steps[1:], (truth.parent[1:], np.arange(1, truth.node_count))),
+                       (truth.node_count,) * 2).tocsr()
+    there = []
+    for bridge in bridges:
+        away, near = tree.query(np.array([bridge["from"], bridge["to"]], float))
+        path = dijkstra(graph, directed=False, indices=int(here.high[near[0]]))[here.high[near[1]]]
+        radius = np.maximum(here.radius[near], _STEP)
+        there.append(bool((away < 2 * radius).all()
+                          and path <= _DETOUR * bridge["length"] + _AROUND * radius.max()))
+    return np.array(there, bool)
 
 
 def twig_lengths(there: Dense, back: np.ndarray, truth: Skeleton, here: Dense,

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks.probability_rows import probability_asked, probability_rows
 from benchmarks.same_tree import same_tree_asked, same_tree_rows, subjects
 from benchmarks.scan_files import REAL_ROW, real_rows
 from benchmarks.scan_runs import Outcomes, outcomes
@@ -18,7 +19,6 @@ from benchmarks.worlds import rows as worlds
 _COUNTS = {"one-sided": 60, "2-mm": 60, "3-mm": 60, "round": 60, "single-view": 20, "gaps": 60,
            "crowns": 12, "leafy": 8}
 _QUICK = 15  # times as few
-_BINOMIAL = 1.96  # standard deviations of a share of few, that its row tells beside it
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,6 @@ def noise_asked(kind: str) -> tuple[Asked, ...]:
     return (Asked(f"{name}: radius bias", "under 8 %"),
             Asked(f"{name}: stated sigma covers the error", "88-99 %"),
             Asked(f"{name}: forks; centreline failures", "report"))
-
-
-def probability_asked(name: str) -> tuple[Asked, ...]:
-    """Requirements for stated probabilities; ``name`` identifies the cases."""
-    return tuple(Asked(f"stated probability of {what}{name} against outcome, 10 bins",
-                       "within 10 points (and the binomial error)") for what in ("forks", "nodes"))
 
 
 def _view_rows(one: Outcomes, view: View) -> list[Row]:
@@ -125,40 +119,6 @@ def gap_rows(gaps: Outcomes) -> list[Row]:
     held = int((off <= 1).sum())
     return [Row(*GAP_ROW, f"{held} of {gaps.count} (worst {off.max():.1f} radii); forks "
                 f"{gaps.forks()[0]}{gaps.told()}", held >= 0.95 * gaps.count, gaps.count)]
-
-
-def probability_rows(name: str, kinds: list[Outcomes]) -> list[Row]:
-    """Stated probabilities of forks and of nodes against their actual frequency, in tenths.
-
-    Nodes are counted by length; the number of their branches gives the certainty of their fraction.
-    """
-    forks = np.array([told for one in kinds for score in one.scores
-                      for told in score["told_forks"]], float).reshape(-1, 2)
-    place = np.minimum((10 * forks[:, 0]).astype(int), 9)
-    counted = np.stack([np.bincount(place, values, 10) for values in (
-        np.ones(len(forks)), forks[:, 0], forks[:, 1], np.ones(len(forks)))], axis=1)
-    nodes = sum((np.array(score["told_nodes"]) for one in kinds for score in one.scores),
-                np.zeros((10, 4)))
-    count = sum(len(one.scores) for one in kinds)
-    return [_probability_row(asked, bins, count) for asked, bins in zip(
-        probability_asked(name), (counted, nodes), strict=True)] if count else []
-
-
-def _probability_row(asked: Asked, bins: np.ndarray, cases: int) -> Row:
-    """For each tenth: count, sum stated, sum correct, number of independent ones."""
-    texts, good, worst = [], True, 0.0
-    for low, (count, stated, right, members) in enumerate(bins):
-        if count == 0:
-            continue
-        said, was = stated / count, right / count
-        slack = _BINOMIAL * np.sqrt(max(was * (1 - was), 0.25 / (members + 2)) / members)
-        off = abs(said - was)
-        worst = max(worst, off)
-        good &= bool(off <= 0.10 + slack)
-        texts.append(f"{low / 10:.1f}: said {100 * said:.0f}, were {100 * was:.0f} "
-                     f"(+-{100 * slack:.0f}) of {members:.0f}")
-    return Row(*asked, f"worst {100 * worst:.0f}; " + "; ".join(texts), good and bool(texts),
-               cases)
 
 
 def _crown_rows(crowns: Outcomes) -> list[Row]:

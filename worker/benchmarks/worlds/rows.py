@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks.probability_rows import probability_asked, probability_rows
 from benchmarks.scan_runs import Outcomes, outcomes
 from benchmarks.table import Asked, Part, Row, Setting
 from benchmarks.worlds.real_scans import BARE as REAL_BARE
@@ -112,12 +113,18 @@ def world_rows(setting: Setting, source: str | None = None) -> list[Row]:
                     | dressed)
     rows = [row for view in BARE_VIEWS for name in chosen
             for row in source_rows(name, view, done[f"{name}:{view}"])]
+    rows += probability_rows(_of_worlds(source), [done[f"{name}:{view}"] for name in chosen
+                                                  for view in BARE_VIEWS])
     if source:
         return rows
     dress = {key: [done[f"{name}:{key}"] for name in chosen]
              for key in (*BARE_VIEWS, "leafy", "potted")}
     return [*rows, *dropped_rows(dress["one-sided"] + dress["round"]), *leafy_rows(dress["leafy"]),
             *potted_rows(dress["potted"])]
+
+
+def _of_worlds(source: str | None) -> str:
+    return f", worlds, {source}" if source else ", worlds"
 
 
 def _together(several: list[Outcomes]) -> Outcomes:
@@ -133,11 +140,13 @@ def _failures(one: Outcomes) -> str:
 
 PARTS = {
     "worlds": Part(world_rows, 120, (*(source_asked(source, view) for view in BARE_VIEWS
-                                       for source in SOURCES), DROPPED, LEAFY, POTTED),
+                                       for source in SOURCES), *probability_asked(
+                                           _of_worlds(None)), DROPPED, LEAFY, POTTED),
                    grows=True),
     "worlds-real": Part(real_scan_rows, 90, (REAL, REAL_BARE, WORSE), grows=True)}
 """Parts of the bench `scans`; ``--only`` also accepts one source."""
 PARTS |= {f"worlds:{source}": Part(
-    partial(world_rows, source=source), 60, tuple(source_asked(source, view)
-                                                  for view in BARE_VIEWS), grows=True, alone=True)
+    partial(world_rows, source=source), 60, (
+        *(source_asked(source, view) for view in BARE_VIEWS),
+        *probability_asked(_of_worlds(source))), grows=True, alone=True)
     for source in SOURCES}
