@@ -63,6 +63,24 @@ def test_a_kept_skeleton_given_back_is_used_as_it_is(made, tmp_path) -> None:
 
 
 @pytest.mark.slow
+def test_an_alternative_is_applied_by_its_number(made, tmp_path) -> None:
+    """The twig of a scan far away, in millimetres, is gone; a number that there is not is refused.
+    """
+    folder, result = made
+    target = shutil.copytree(folder / "a.branch", tmp_path / "n.branch")
+    listed = review_skeleton(target)["alternatives"]
+    assert listed == result["alternatives"] and listed[0]["edits"] == []
+    assert [edit["do"] for edit in listed[1]["edits"]] == ["delete"]
+    with pytest.raises(InputError, match=f"has {len(listed) - 1} alternatives"):
+        review_skeleton(target, alternative=9)
+    chosen = review_skeleton(target, alternative=2)
+    assert chosen["branch_count"] == result["branch_count"] - 1
+    assert chosen["length_m"] == pytest.approx(listed[1]["length_m"], rel=1e-6)
+    low, high = result["length_interval_m"]
+    assert low <= result["length_m"] <= high
+
+
+@pytest.mark.slow
 def test_edits_outlive_a_new_reconstruct(made, tmp_path) -> None:
     """The mesh follows an edit; the folder keeps it; a misfit is told; an empty list undoes it."""
     folder, result = made

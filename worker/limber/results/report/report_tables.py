@@ -281,7 +281,7 @@ def alternative_rows(graphs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     rows = [["number", "against the one in use", "length [mm]", "what differs"]]
     for number, graph in enumerate(graphs, start=1):
         texts = [" ".join([edit["do"], *(
-            f"{name} {' '.join(f'{value:.5g}' for value in edit[name])}"
+            f"{name} {' '.join(f'{value:.8g}' for value in edit[name])}"
             for name in ("at", "to") if name in edit)]) for edit in graph["edits"]]
         rows.append([str(number), f"{graph['probability'] / used:.2g} times as likely",
                      f"{1e3 * graph['length_m']:.0f}", "; ".join(texts) or "in use"])
