@@ -21,7 +21,7 @@ from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners import refine as refine_module
 from limber.planning.planners.detour import plan_detour
-from limber.planning.planners.eikonal import plan_gentle
+from limber.planning.planners.eikonal import plan_gentle, plan_gentle_all
 from limber.planning.planners.refine import Limited, refine
 from limber.planning.planners.smoothing import smooth_cost
 from limber.planning.settings import PlanSettings
@@ -79,8 +79,8 @@ def test_gradient_of_the_subsolution_stays_below_the_cost_by_brute_force(across,
     monkeypatch.setattr(lower_bound, "subsolution", kept)
     grids = []
     bound = lower_bound._bound
-    monkeypatch.setattr(lower_bound, "_bound", lambda problem, grid, cell: (
-        grids.append(grid), bound(problem, grid, cell))[1])
+    monkeypatch.setattr(lower_bound, "_bound", lambda problem, land, grid, cell: (
+        grids.append(grid), bound(problem, land, grid, cell))[1])
     certify(problem, lambda _path: found.cost)
     generator = np.random.default_rng(2)
     checked = 0
@@ -90,7 +90,7 @@ def test_gradient_of_the_subsolution_stays_below_the_cost_by_brute_force(across,
         cells = np.argwhere(ground.open_cells & ~inside)
         cells = cells[generator.integers(len(cells), size=3000)]
         place = generator.uniform(size=(len(cells), 3))
-        slope = np.linalg.norm(_spline_slope(u, cells, place), axis=1) / grid.spacing
+        slope = np.linalg.norm(_spline_slope(u, cells, place) / grid.edges, axis=1)
         points = grid.points(cells + place)
         rate = problem.weights.length + problem.weights.energy * problem.energy_field.energy(points)
         assert (slope <= rate * (1 + 1e-9)).all()
@@ -210,11 +210,11 @@ def test_a_grid_too_coarse_for_a_valley_proves_nothing(well_field, monkeypatch, 
     """The next grid is asked; and a path that keeps the limits is a better proof than any."""
     problem, spacings, bound = problem_on(well_field), [], lower_bound._bound
 
-    def blind(problem, grid, cell):
+    def blind(problem, land, grid, cell):
         spacings.append(grid.spacing)
         if len(spacings) <= wrong_grids:
             raise NoPathError("No path exists", "Proven on a grid")
-        return bound(problem, grid, cell)
+        return bound(problem, land, grid, cell)
 
     monkeypatch.setattr(lower_bound, "_bound", blind)
     found = plan_gentle(problem)
@@ -264,11 +264,11 @@ def test_the_next_grid_is_as_fine_as_the_gap_asks_and_holds_what_was_kept(well_f
     generator = np.random.default_rng(0)
     inside = np.argwhere(keep)[generator.integers(3, size=300)] + generator.uniform(size=(300, 3))
     points = grid.points(inside)
-    for ratio in (1.0 / 3.0, 0.47, 0.75):
+    for ratio in (1.0 / 3.0, 0.47, 0.75, np.array([1.0, 0.6, 1.0 / 3.0])):
         finer, own = refined(grid, keep, keep, cell, ratio)
-        assert finer.spacing == pytest.approx(ratio * grid.spacing)
+        assert np.allclose(finer.edges, ratio * grid.edges)
         assert np.allclose(finer.points(own[None] + 0.5), START)
-        numbers = np.floor((points - finer.origin) @ finer.axes.T / finer.spacing).astype(int)
+        numbers = np.floor((points - finer.origin) @ finer.axes.T / finer.edges).astype(int)
         assert finer.open_cells[tuple(numbers.T)].all()
         edge = np.ones(finer.open_cells.shape, bool)
         edge[3:-3, 3:-3, 3:-3] = False
@@ -354,6 +354,48 @@ def test_costs_of_two_seeds_compare(ridge_field):
         "D-RRT*, not smoothed"}
 
 
+def test_bounds_together_are_those_of_each_alone_and_ask_the_field_once(
+        ridge_field, monkeypatch):
+    """Two weights of length on common grids: each bound is below its path, as close as was asked,
+    and no corner is evaluated twice on a grid."""
+    one = problem_on(ridge_field)
+    two = replace(one, weights=one.weights._replace(length=4.0 * one.weights.length))
+    asked, grids, land = [], [], lower_bound._land
+    energy = type(ridge_field).energy
+    monkeypatch.setattr(type(ridge_field), "energy", lambda self, points: (
+        asked.append(len(points)), energy(self, points))[1])
+
+    def counted(problem, grid, cell):
+        asked.clear()
+        found = land(problem, grid, cell)
+        grids.append((asked[:], len(found.corners)))
+        return found
+    monkeypatch.setattr(lower_bound, "_land", counted)
+    together = plan_gentle_all([one, two], enough=[0.05, 0.05])
+    count = len(grids)
+    assert count >= 2 and all(numbers == [corners] for numbers, corners in grids)
+    for problem, found in zip((one, two), together, strict=True):
+        alone = plan_gentle(problem, enough=0.05)
+        assert 0.0 < found.certificate.lower <= found.cost <= 1.05 * found.certificate.lower
+        assert found.cost == pytest.approx(alone.cost, rel=0.01)
+        assert found.certificate.lower <= alone.cost and alone.certificate.lower <= found.cost
+
+
+def test_cells_are_flat_where_energy_bends_off_a_shell(well_field):
+    """Ten times the bends along the last axis: it is cut more, up to the largest ratio of edges,
+    and bends shrink as a common ratio would make them."""
+    grid, cell = first_grid(problem_on(well_field))
+    ground = lower_bound._terrain(problem_on(well_field), lower_bound._land(
+        problem_on(well_field), grid, cell), grid)
+    bends = np.ones_like(ground.bends) * np.array([1.0, 1.0, 10.0]).reshape(3, 1, 1, 1)
+    ratios = lower_bound._ratios(ground._replace(bends=bends), ground.open_cells, 0.7)
+    assert ratios[0] == ratios[1] > 2.0 * ratios[2]
+    assert (ratios**2 * [1.0, 1.0, 10.0]).sum() <= 0.7**2 * 12.0 * (1 + 1e-9)
+    flat = lower_bound._ratios(ground._replace(bends=bends**4), ground.open_cells, 0.34)
+    edges = flat * grid.edges
+    assert edges.max() / edges.min() <= 4.0 + 1e-9
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
@@ -372,12 +414,16 @@ def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
     curve = sorted(held.curve, key=lambda point: point.weight)
     assert curve[0].length_m >= curve[-1].length_m
     assert curve[0].energy_integral_jm <= curve[-1].energy_integral_jm
-    for path in bulges(problem, 40):
+    lines = [point for point in held.curve if point.lower_bound_jm is not None]
+    assert len(lines) >= 3, "a band needs bounds at several weights"
+    for path in [*bulges(problem, 40), held.found.points]:
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
         if length <= held.longest:
             middles = (path[1:] + path[:-1]) / 2
             pieces = np.linalg.norm(np.diff(path, axis=0), axis=1)
-            assert ridge_field.energy(middles) @ pieces >= held.energy_bound
+            energy = ridge_field.energy(middles) @ pieces * (1 + 1e-4)
+            assert energy >= held.energy_bound
+            assert all(energy >= one.lower_bound_jm - one.metre_jm * length for one in lines)
 
 
 def test_no_path_short_enough_leaves_the_cells_that_count(well_field):

@@ -88,9 +88,9 @@ def test_no_allowed_pose_lies_in_a_closed_cell_nor_costs_less_than_is_claimed(
     rate = problem.weights.length + problem.weights.energy * bowing_field.energy(poses)
     original, asked = lower_bound._bound, []
 
-    def bound(problem, grid, cell):
-        found = original(problem, grid, cell)
-        place = (poses - grid.origin) @ grid.axes.T / grid.spacing
+    def bound(problem, land, grid, cell):
+        found = original(problem, land, grid, cell)
+        place = (poses - grid.origin) @ grid.axes.T / grid.edges
         number = np.floor(place).astype(int)
         within = ((number >= 0) & (number < grid.open_cells.shape)).all(axis=1)
         within[within] = grid.open_cells[tuple(number[within].T)]

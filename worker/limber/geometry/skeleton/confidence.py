@@ -10,7 +10,6 @@ from limber.geometry.skeleton.radii.shared_errors import shared_error
 from limber.geometry.skeleton.radii.unresolved_radii import SPACINGS, point_spacing, weighed
 from limber.geometry.skeleton.skeleton import BRIDGED, STATES, UNRESOLVED, Skeleton
 from limber.geometry.skeleton.sweep import stretches
-from limber.geometry.skeleton.uncertain_parts import start_angle
 
 _GAP = 4.0  # radii without a point that make a gap
 _BRIDGED_SIGMA = 0.15  # fraction of a radius in a gap

@@ -35,7 +35,7 @@ def neighbours(active):
 
 
 @compiled
-def march(rate, near, known, values, spacing):
+def march(rate, near, known, values, edges):
     """Return arrival costs ``u`` [n]; infinite at unreachable nodes.
 
     Args:
@@ -43,14 +43,14 @@ def march(rate, near, known, values, spacing):
         near: As :func:`neighbours` gives them, shape [n, 6].
         known: Nodes whose value is given, bool [n].
         values: Their values, shape [n].
-        spacing: Distance between nodes [m].
+        edges: Distance between nodes along each axis [m], shape [3].
     """
     count = len(rate)
     u = np.full(count, np.inf)
     done = np.zeros(count, np.bool_)
     heap = np.empty(count, np.int32)
     heap_index = np.full(count, -1, np.int32)
-    used = np.empty((3, 3))
+    used = np.empty((4, 3))
     size = 0
     for node in range(count):
         if known[node]:
@@ -64,7 +64,7 @@ def march(rate, near, known, values, spacing):
             other = near[node, side]
             if other < 0 or done[other] or known[other]:
                 continue
-            cost = _arrival(other, u, done, rate[other] * spacing, near, used)
+            cost = _arrival(other, u, done, rate[other], edges, near, used)
             if cost < u[other]:
                 u[other] = cost
                 if heap_index[other] < 0:
@@ -75,10 +75,10 @@ def march(rate, near, known, values, spacing):
 
 
 @compiled
-def _arrival(node, u, done, step, near, used):
-    """Solve sum_i w_i (u - t_i)^2 = step^2 over the axes whose upwind neighbour is done.
+def _arrival(node, u, done, rate, edges, near, used):
+    """Solve sum_i w_i (u - t_i)^2 = rate^2 over the axes whose upwind neighbour is done.
 
-    ``used`` [3, 3] is room for t, w and the neighbour's value of each axis.
+    ``used`` [4, 3] is room for t, w, the neighbour's value and the edge of each axis.
     """
     count = 0
     for axis in range(3):
@@ -89,14 +89,16 @@ def _arrival(node, u, done, step, near, used):
                 best, value = side, u[other]
         if best < 0:
             continue
-        used[0, count], used[1, count], used[2, count] = value, 1.0, value
+        weight = 1.0 / (edges[axis] * edges[axis])
+        used[0, count], used[1, count], used[2, count] = value, weight, value
+        used[3, count] = edges[axis]
         far = near[near[node, best], best]
         if far >= 0 and done[far] and u[far] <= value:
-            used[0, count], used[1, count] = (4.0 * value - u[far]) / 3.0, 2.25
+            used[0, count], used[1, count] = (4.0 * value - u[far]) / 3.0, 2.25 * weight
         count += 1
     # Drop the axis with the highest neighbour until the solution exceeds all used neighbours.
     while count > 0:
-        a, b, c, top = 0.0, 0.0, -step * step, -np.inf
+        a, b, c, top = 0.0, 0.0, -rate * rate, -np.inf
         last = 0
         for i in range(count):
             t, w = used[0, i], used[1, i]
@@ -111,9 +113,9 @@ def _arrival(node, u, done, step, near, used):
             if solution >= top:
                 return solution
         if count == 1:
-            return used[2, 0] + step
+            return used[2, 0] + rate * used[3, 0]
         count -= 1
-        for k in range(3):
+        for k in range(4):
             used[k, last] = used[k, count]
     return np.inf
 

@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR
-from limber.planning.certificate.grid import COARSEST, Grid, spread
+from limber.planning.certificate.grid import Grid, spread
 from limber.planning.certificate.subsolution import Terrain, corner_values, second_differences
 from limber.planning.path_problem import GentleProblem
 
@@ -37,7 +37,7 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     A spline with a function's values as coefficients differs from it by ``h^2 / 8 sum_i max |second
     derivative|``.
     """
-    h, shape = ground.spacing, ground.open_cells.shape
+    edges, shape = ground.edges, ground.open_cells.shape
     cells = np.argwhere(ground.active & grid.about_goal)
     nothing = np.zeros(shape, bool)
     if len(cells) == 0:
@@ -51,14 +51,14 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     open_cells = ground.open_cells[box]
     distance = spread(open_cells.shape, cells - low, away)
     filled = np.nan_to_num(distance, nan=np.inf)
-    growth = _growth(distance, np.abs(filled) <= 4.0 * h, h)
+    growth = _growth(distance, np.abs(filled) <= 4.0 * edges.max(), edges)
     corners = tuple(map(slice, low, high + 1))
     rate = np.where(ground.level[box], ground.floor,
                     corner_values(ground.rate[corners]).mean(axis=0))
-    cost = _cost_left(distance / growth, goal.tolerance / growth, rate, h)
+    cost = _cost_left(distance / growth, goal.tolerance / growth, rate, edges)
     curved = CURVATURE_FACTOR / 8.0 * sum(
         scipy.ndimage.maximum_filter(second, 3) for second in second_differences(cost))
-    half = 0.5 * h * np.sqrt(3.0)
+    half = 0.5 * float(np.linalg.norm(edges))
     touching = open_cells & (filled <= growth * half)
     inside = filled < -growth * half
     border = touching & ~inside
@@ -68,16 +68,17 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
         out = np.zeros(shape, part.dtype)
         out[box] = part
         return out
-    # A cell of the next grid queries up to 4 of its edges away; its centre is within ``half`` of
-    # this one's.
+    # A cell of the next grid queries up to 4 of its edges away, 7 times half its diagonal; its
+    # centre is within ``half`` of this one's.
     return AboutGoal(whole(filled <= growth * 3.0 * half), whole(np.nan_to_num(cost)),
                       whole(inside), slack, bool(touching.any()),
-                      whole(filled <= growth * (half + 6.0 * h * COARSEST)))
+                      whole(filled <= growth * 8.0 * half))
 
 
-def _cost_left(length: np.ndarray, depth: float, rate: np.ndarray, h: float) -> np.ndarray:
-    """Return the cost of a ``length`` [m] to the goal, at the ``rate`` half-way, for cells with an
-    edge of ``h`` [m]; nan where not known.
+def _cost_left(length: np.ndarray, depth: float, rate: np.ndarray, edges: np.ndarray,
+               ) -> np.ndarray:
+    """Return the cost of a ``length`` [m] to the goal, at the ``rate`` half-way, for cells with
+    ``edges`` [3] [m]; nan where not known.
 
     A single rate for all sides of the goal would be the smallest of them. Inside, where no
     condition holds, the length flattens out to a goal's middle ``depth`` [m] below its surface: it
@@ -85,17 +86,18 @@ def _cost_left(length: np.ndarray, depth: float, rate: np.ndarray, h: float) -> 
     """
     flat = np.maximum(length, -depth)
     flat = np.where(flat < 0.0, flat + flat**2 / (2.0 * depth), flat)
-    growing = sum(np.gradient(rate, h, axis=axis) * np.gradient(length, h, axis=axis)
+    growing = sum(np.gradient(rate, edges[axis], axis=axis)
+                  * np.gradient(length, edges[axis], axis=axis)
                   for axis in range(3))
     mid_rate = rate - 0.5 * length * np.nan_to_num(growing)
     return flat * np.where(length > 0.0, np.clip(mid_rate, 0.5 * rate, 1.5 * rate), rate)
 
 
-def _growth(distance: np.ndarray, near: np.ndarray, h: float) -> float:
+def _growth(distance: np.ndarray, near: np.ndarray, edges: np.ndarray) -> float:
     """Return the largest growth of the goal's distance per metre, among cells ``near`` it."""
     growth = 1.0
     for axis in range(3):
-        step = np.abs(np.diff(distance, axis=axis)) / h
+        step = np.abs(np.diff(distance, axis=axis)) / edges[axis]
         first, second = (np.take(near, range(k, near.shape[axis] - 1 + k), axis=axis)
                          for k in (0, 1))
         growth = max(growth, float(np.max(step, where=first & second, initial=0.0)))

@@ -11,9 +11,10 @@ undecided cell stays open, so the bound stays valid. If closed cells separate st
 proves that no path exists.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -43,9 +44,10 @@ from limber.planning.path_problem import (
 )
 from limber.planning.search_files import CostToGo
 
-_MOST_CELLS = 450_000  # in any grid's tube; a further refinement is skipped
+_MOST_CELLS = 400_000  # in any grid's tube; a further refinement is skipped
 _LEVELS = 6
 _RESERVE = 0.8  # fraction of the edge that would suffice
+_FLATTEST = 4.0  # largest ratio of a cell's edges
 ENOUGH = 0.015  # gap below which refinement is not worth its time
 _NEAR = np.ones((3, 3, 3))
 COST, ENERGY = "cost", "energy_integral_jm"
@@ -105,20 +107,69 @@ def certify(problem: GentleProblem, improve: Improve, *, enough: float = ENOUGH,
     Raises:
         NoPathError: closed cells separate start and goal; it is proven that no path exists.
     """
-    search = _Search(problem, improve, enough, *first_grid(problem))
+    return certify_all([problem], [improve], enough=[enough], progress=progress)[0]
+
+
+def certify_all(problems: Sequence[GentleProblem], improve: Sequence[Improve], *,
+                enough: Sequence[float], progress: Progress = SILENT) -> list[Certificate]:
+    """Return the same for each of problems that differ in the weight of length alone.
+
+    They share the grids and, on each, the energies of the field.
+
+    Raises:
+        NoPathError: as for one.
+    """
+    searches = [_Search(*each) for each in zip(problems, improve, enough, strict=True)]
+    following: tuple[Grid, np.ndarray] | None = first_grid(problems[0])
     stopped = False
     try:
         for level in range(_LEVELS):
-            progress(level / _LEVELS, "bounding the best path", lower=search.lower,
-                     upper=search.upper)
-            if search.is_done_after(level):
+            if following is None:
                 break
+            progress(level / _LEVELS, "bounding the best path", lower=searches[0].lower,
+                     upper=searches[0].upper)
+            following = _next_grid([one for one in searches if not one.is_done], *following,
+                                   is_first=level == 0)
     except (Cancelled, KeyboardInterrupt) as stop:
-        if not (search.levels and search.upper < np.inf):
+        if not all(one.levels and one.upper < np.inf for one in searches):
             raise Cancelled from stop
         stopped = True
-    return Certificate(search.lower, search.upper, search.levels, problem.field_error,
-                       search.to_go, stopped)
+    return [Certificate(one.lower, one.upper, one.levels, one.problem.field_error, one.to_go,
+                        stopped) for one in searches]
+
+
+def _next_grid(searches: "list[_Search]", grid: Grid, cell: np.ndarray, *, is_first: bool,
+               ) -> tuple[Grid, np.ndarray] | None:
+    """Bound on a grid; return the next one, None if a finer grid is not worth its time."""
+    keep, near, ratios = np.zeros(grid.open_cells.shape, bool), grid.about_goal, np.ones(3)
+    try:
+        land = _land(searches[0].problem, grid, cell)
+        for one in searches:
+            found = _bound(one.problem, land, grid, cell)
+            one.take(found, grid, is_first=is_first)
+            if not one.is_done:
+                own, near = found.keep(one.upper), found.about_goal
+                ratios = np.minimum(ratios, _ratios(found.ground, own, one.ratio()))
+                keep |= own
+            del found
+    except NoPathError:
+        if is_first:
+            # Corners this far apart do not resolve a narrow valley.
+            for one in searches:
+                one.upper = one.improve(None)
+            return refined(grid, grid.open_cells, grid.about_goal, cell)
+        if not all(one.upper < np.inf for one in searches):
+            raise
+        # A path that keeps the limits is the stronger proof.
+        for one in searches:
+            one.note(grid, 0)
+        return None
+    if not keep.any():
+        return None
+    # No more cells than are allowed.
+    ratios = np.minimum(1.0, ratios * max(
+        np.cbrt(keep.sum() / ratios.prod() / _MOST_CELLS), 1.0))
+    return None if ratios.prod() > COARSEST**3 else refined(grid, keep, near, cell, ratios)
 
 
 @dataclass
@@ -128,47 +179,27 @@ class _Search:
     problem: GentleProblem
     improve: Improve
     enough: float
-    grid: Grid
-    cell: np.ndarray
     lower: float = 0.0
     upper: float = np.inf
     levels: list[dict[str, float]] = field(default_factory=list)
     to_go: CostToGo | None = None
     began: float = field(default_factory=perf_counter)
 
-    def is_done_after(self, level: int) -> bool:
-        """Bound on the grid and refine it; return whether a finer grid is not worth its time."""
-        try:
-            found = _bound(self.problem, self.grid, self.cell)
-        except NoPathError:
-            if level == 0:
-                # Corners this far apart do not resolve a narrow valley.
-                self.grid, self.cell = refined(self.grid, self.grid.open_cells,
-                                               self.grid.about_goal, self.cell)
-                self.upper = self.improve(None)
-                return False
-            if self.upper < np.inf:
-                # A path that keeps the limits is the stronger proof.
-                self._note(0)
-                return True
-            raise
+    @property
+    def is_done(self) -> bool:
+        return self.upper <= (1.0 + self.enough) * self.lower
+
+    def take(self, found: "_Bounds", grid: Grid, *, is_first: bool) -> None:
+        """Keep the bound on a grid, and refine the path that it shows."""
         if self.to_go is None:
-            self.to_go = found.to_go(self.grid)
-        if level == 0:
+            self.to_go = found.to_go(grid)
+        if is_first:
             self.upper = self.improve(None)  # after a bound that may prove that there is no path
         self.upper = min(self.upper, self.improve(found.rough_path))
         self.lower = max(self.lower, min(found.lower, self.upper))
-        self._note(int(found.open_cells.sum()))
-        if self.upper <= (1.0 + self.enough) * self.lower:
-            return True
-        keep = found.keep(self.upper)
-        ratio = max(self._ratio(), float(np.cbrt(keep.sum() / _MOST_CELLS)))
-        if ratio > COARSEST:
-            return True
-        self.grid, self.cell = refined(self.grid, keep, found.about_goal, self.cell, ratio)
-        return False
+        self.note(grid, int(found.open_cells.sum()))
 
-    def _ratio(self) -> float:
+    def ratio(self) -> float:
         """Return the ratio of the next grid's cell edge to this one's: as fine as needed to close
         the gap, which is proportional to the square of the edge.
         """
@@ -177,10 +208,24 @@ class _Search:
             return FINEST
         return float(np.clip(_RESERVE * np.sqrt(self.enough / gap), FINEST, COARSEST))
 
-    def _note(self, open_cells: int) -> None:
-        self.levels.append({"spacing_m": self.grid.spacing, "open_cells": open_cells,
+    def note(self, grid: Grid, open_cells: int) -> None:
+        self.levels.append({"spacing_m": grid.spacing, "open_cells": open_cells,
                             "lower": self.lower, "upper": self.upper,
                             "seconds": perf_counter() - self.began})
+
+
+def _ratios(ground: Terrain, keep: np.ndarray, ratio: float) -> np.ndarray:
+    """Return the ratios of the next grid's edges to this one's, [3], for the cells ``keep``.
+
+    Together they lower what the bends of c take off it as a common ``ratio`` would, with the fewest
+    cells: equal bends along each axis. None is too flat for the sub-solution, which bends along all
+    axes near start and goal.
+    """
+    bends = np.array([axis[keep].mean() for axis in ground.bends])
+    ratios = ratio * np.sqrt(bends.mean() / np.maximum(bends, 1e-9 * bends.mean() + 1e-300))
+    ratios = np.clip(ratios, FINEST, 1.0)
+    edges = ratios * ground.edges
+    return np.minimum(edges, _FLATTEST * edges.min()) / ground.edges
 
 
 @dataclass(frozen=True)
@@ -203,7 +248,7 @@ class _Bounds:
         """Return the bound at the centres of open cells."""
         reached = self.open_cells & np.isfinite(self.to_goal)
         costs = np.where(reached, np.maximum(self.to_goal - self.slack, 0.0), np.nan)
-        return CostToGo(grid.origin, grid.axes, grid.spacing, costs)
+        return CostToGo(grid.origin, grid.axes, grid.spacing, costs)  # of cubes: the first grid
 
     def keep(self, upper: float) -> np.ndarray:
         """Return the cells through which a path could still be cheaper than ``upper``."""
@@ -212,31 +257,23 @@ class _Bounds:
         return self.open_cells & np.isfinite(through) & (through - self.slack <= upper)
 
 
-def _bound(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Bounds:
-    ground, over = _ground(problem, grid, cell)
-    goal = about_goal(problem, grid, ground)
-    if not goal.meets:
-        centres = grid.points(np.argwhere(ground.open_cells) + 0.5)
-        if (problem.bounded_goal.uncertainty(problem.energy_field, centres) > 0.0).any():
-            raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
-                            "of reach, but by less than the error of the energy field.")
-        wall = over & scipy.ndimage.binary_dilation(ground.open_cells, _NEAR)
-        raise _separated(problem, grid, ground.open_cells, grid.points(np.argwhere(wall) + 0.5))
-    if problem.longest < np.inf:
-        ground = ground._replace(
-            open_cells=_short_enough(problem, grid, ground.open_cells, goal.near, cell))
-    to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
-    slack = factor * goal.slack
-    lower = spline_value(to_goal, cell) - slack
-    return _Bounds(max(lower, 0.0), ground, to_goal, cell, slack, descent(grid, to_goal, cell),
-                   goal.near)
+class _Land(NamedTuple):
+    """What a grid has for any weight of length.
 
-
-def _ground(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> tuple[Terrain, np.ndarray]:
-    """Return the terrain of the cells connected to the start's, and the cells that limits close.
-
-    What is evaluated for it is not kept: that would be most of the memory of what follows.
+    Attributes:
+        open_cells: Cells connected to the start's. over: Those that limits close.
+        corners: Numbers of the evaluated corners [n, 3].
+        energy, slopes: There, energy [J] [n], and its growth along a cell's edges [n, 3].
     """
+
+    open_cells: np.ndarray
+    over: np.ndarray
+    corners: np.ndarray
+    energy: np.ndarray
+    slopes: np.ndarray
+
+
+def _land(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Land:
     open_cells = grid.open_cells & ~_surely_outside(problem, grid)
     # One corner more than the active cells': for the second differences there.
     corners = np.argwhere(widened(corners_of(widened(open_cells, RIM))))
@@ -249,13 +286,38 @@ def _ground(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> tuple[Terra
         raise _separated(problem, grid, open_cells, grid.points(cell[None] + 0.5))
     # Only cells connected to the start, also by an edge or a corner of a cell.
     together = scipy.ndimage.label(open_cells, _NEAR)[0]
-    open_cells = together == together[tuple(cell)]
-    raw = energy - problem.field_error
+    return _Land(together == together[tuple(cell)], over, corners, energy,
+                 grid.along_edges(force))
+
+
+def _terrain(problem: GentleProblem, land: _Land, grid: Grid) -> Terrain:
+    """Return the terrain of a problem's own weights."""
+    raw = land.energy - problem.field_error
     rate = problem.weights.length + problem.weights.energy * np.maximum(raw, 0.0)
-    slopes = problem.weights.energy * grid.along_edges(force)
-    return terrain(grid.spread(corners, rate), grid.spread(corners, slopes),
-                   grid.spread(corners, raw) > 0.0, open_cells, grid.spacing,
-                   problem.weights.length), over
+    return terrain(grid.spread(land.corners, rate),
+                   grid.spread(land.corners, problem.weights.energy * land.slopes),
+                   grid.spread(land.corners, raw) > 0.0, land.open_cells, grid.edges,
+                   problem.weights.length)
+
+
+def _bound(problem: GentleProblem, land: _Land, grid: Grid, cell: np.ndarray) -> _Bounds:
+    ground = _terrain(problem, land, grid)
+    goal = about_goal(problem, grid, ground)
+    if not goal.meets:
+        centres = grid.points(np.argwhere(ground.open_cells) + 0.5)
+        if (problem.bounded_goal.uncertainty(problem.energy_field, centres) > 0.0).any():
+            raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
+                            "of reach, but by less than the error of the energy field.")
+        wall = land.over & scipy.ndimage.binary_dilation(ground.open_cells, _NEAR)
+        raise _separated(problem, grid, ground.open_cells, grid.points(np.argwhere(wall) + 0.5))
+    if problem.longest < np.inf:
+        ground = ground._replace(
+            open_cells=_short_enough(problem, grid, ground.open_cells, goal.near, cell))
+    to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
+    slack = factor * goal.slack
+    lower = spline_value(to_goal, cell) - slack
+    return _Bounds(max(lower, 0.0), ground, to_goal, cell, slack, descent(grid, to_goal, cell),
+                   goal.near)
 
 
 def _short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, near: np.ndarray,
@@ -263,34 +325,35 @@ def _short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, ne
     """Return the open cells that a path no longer than allowed may enter: an ellipsoid's, about the
     start and the cells ``near`` the goal."""
     numbers = np.argwhere(open_cells)
-    nearest = scipy.ndimage.distance_transform_edt(~near, return_distances=False,
-                                                   return_indices=True)[:, *numbers.T].T
-    away = np.linalg.norm(numbers - cell, axis=1) + np.linalg.norm(numbers - nearest, axis=1)
+    nearest = scipy.ndimage.distance_transform_edt(
+        ~near, sampling=grid.edges, return_distances=False, return_indices=True)[:, *numbers.T].T
+    away = sum(np.linalg.norm(grid.edges * (numbers - other), axis=1) for other in (cell, nearest))
     within = np.zeros_like(open_cells)
     # Half a diagonal in the cell itself, as much in the goal's, and at both ends of the path there.
-    within[tuple(numbers.T)] = grid.spacing * (away - 1.5 * np.sqrt(3.0)) <= problem.longest
+    within[tuple(numbers.T)] = away - 1.5 * np.linalg.norm(grid.edges) <= problem.longest
     within[tuple(cell)] = True
     together = scipy.ndimage.label(within, _NEAR)[0]
     return together == together[tuple(cell)]
 
 
 def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:
-    h = ground.spacing
-    offsets = [(np.arange(n) - k).reshape([-1 if a == axis else 1 for a in range(3)])
-               for axis, (n, k) in enumerate(zip(ground.open_cells.shape, cell, strict=True))]
-    away = h * np.sqrt(sum(offset**2 for offset in offsets))
+    h = float(ground.edges.max())
+    offsets = [(edge * (np.arange(n) - k)).reshape([-1 if a == axis else 1 for a in range(3)])
+               for axis, (n, k, edge) in enumerate(zip(
+                   ground.open_cells.shape, cell, ground.edges, strict=True))]
+    away = np.sqrt(sum(offset**2 for offset in offsets))
     rounded = np.sqrt(away**2 + 4.0 * h**2) - 2.0 * h  # a cone with a rounded tip, without a kink
     nothing = np.zeros(ground.open_cells.shape, bool)
     u, factor = subsolution(ground, away <= 3.0 * h, rounded, nothing, rounds=2)
     # At the start, the spline exceeds the zero of its blunt tip by at most its error there.
-    return u - factor * CURVATURE_FACTOR * 3.0 * h / 16.0
+    return u - factor * CURVATURE_FACTOR * float((ground.edges**2).sum()) / (16.0 * h)
 
 
 def _surely_outside(problem: GentleProblem, grid: Grid) -> np.ndarray:
     """Return the open cells in which no point is trusted and in the workspace."""
     limits, outside = problem.limits, np.zeros(grid.open_cells.shape, bool)
     cells = np.argwhere(grid.open_cells)
-    centres, halves = grid.points(cells + 0.5), 0.5 * grid.spacing * grid.axes
+    centres, halves = grid.points(cells + 0.5), 0.5 * grid.edges[:, None] * grid.axes
     beyond = np.maximum(limits.low - centres, centres - limits.high) > np.abs(halves).sum(axis=0)
     outside[tuple(cells.T)] = beyond.any(axis=1) | problem.energy_field.region.surely_outside(
         centres, halves)

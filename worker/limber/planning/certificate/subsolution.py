@@ -47,7 +47,7 @@ class Terrain(NamedTuple):
     """A grid of cells, which of them are open, and the cost per metre there.
 
     Attributes:
-        spacing: Edge of a cell [m].
+        edges: Of a cell [m], shape [3].
         open_cells: Cells that a path may enter, bool [nx, ny, nz]; none at the grid's border.
         rate: c at the corners [1/m], shape [nx + 1, ny + 1, nz + 1].
         bends: Subtracted from it half-way along each axis, [3, *shape of open_cells].
@@ -55,7 +55,7 @@ class Terrain(NamedTuple):
         floor: Lower bound of c [1/m].
     """
 
-    spacing: float
+    edges: np.ndarray
     open_cells: np.ndarray
     rate: np.ndarray
     bends: np.ndarray
@@ -85,7 +85,7 @@ def widened(cells: np.ndarray, times: int = 1) -> np.ndarray:
 
 
 def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cells: np.ndarray,
-            spacing: float, floor: float) -> Terrain:
+            edges: np.ndarray, floor: float) -> Terrain:
     """Return the terrain of ``rate`` at the corners, nowhere below ``floor`` [1/m].
 
     ``slopes`` [..., 3] are its growth per cell edge there, along each axis; ``positive`` marks the
@@ -97,7 +97,7 @@ def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cel
     bends *= 0.25
     np.maximum(_bends(rate, open_cells), bends, out=bends)
     level = with_corner(positive) & with_corner(~positive)
-    return Terrain(spacing, open_cells, np.nan_to_num(rate, nan=floor), bends, level, floor)
+    return Terrain(edges, open_cells, np.nan_to_num(rate, nan=floor), bends, level, floor)
 
 
 @compiled
@@ -209,7 +209,7 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
     rate, beside = bound, held
     least, best, of_best, idle = np.inf, bound, factor, 0
     for _ in range(rounds):
-        values = march(rate, near, held, factor * lengths, ground.spacing)
+        values = march(rate, near, held, factor * lengths, ground.edges)
         u.ravel()[indices] = values
         over = np.ones(len(indices))
         over[own] = np.maximum(_excess(u, *ground, asked), 1.0)
@@ -336,7 +336,7 @@ def _slope_first(source, out):
 
 
 @compiled
-def _excess(u, spacing, open_cells, rate, bends, level, floor, asked):
+def _excess(u, edges, open_cells, rate, bends, level, floor, asked):
     """Return for each of the open cells ``asked`` [n, 3] the largest |grad u| relative to the
     allowed value there, else 0.
     """
@@ -360,8 +360,9 @@ def _excess(u, spacing, open_cells, rate, bends, level, floor, asked):
         for p in range(3):
             for q in range(3):
                 for r in range(3):
-                    one[p, q, r] = np.sqrt(two[p, q, r]**2 + three[p, q, r]**2
-                                           + along[p, q, r]**2) / spacing
+                    one[p, q, r] = np.sqrt((two[p, q, r] / edges[0])**2
+                                           + (three[p, q, r] / edges[1])**2
+                                           + (along[p, q, r] / edges[2])**2)
         worst = one.max() / floor
         if level[i, j, k]:
             over[n] = worst

@@ -11,8 +11,12 @@ smallest weights give the best bound. If it does, the best weight is the saving 
 metre: the slope of the gentlest path's energy over the length. If the length jumps at a weight
 (energy over length is not convex: one path round a ridge, or the other), the remaining gap of the
 bound is the jump's.
+
+The whole trade-off needs several weights: each gives a path of its own length, and a line below
+which no path of any allowed length lies. The first bounds share their grids and energies.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +27,7 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.lower_bound import ENERGY
 from limber.planning.cost import arc_lengths, resample
 from limber.planning.path_problem import GentleProblem
-from limber.planning.planners.eikonal import GentlePath, plan_gentle
+from limber.planning.planners.eikonal import GentlePath, plan_gentle_all
 from limber.planning.planners.refine import refine
 
 _LIGHT = 1e-2  # fraction of the given weight of a metre: energy alone counts, nearly
@@ -33,6 +37,10 @@ _BINDS = 0.998  # fraction of the allowed length above which the length binds
 _ENOUGH = 0.03  # gap of the energy below which a finer grid is not worth its time
 _UNUSED = 0.004  # fraction of the energy that the weight of an unused length may cost the bound
 _FINEST_GAP = 1e-3  # gap of the weighted cost that is asked for
+_LADDER = (1.0, 1.0 / 3.0, 3.0)
+"""Weights of the trade-off, relative to what a metre saves on average up to the shortest path."""
+_APART = 1.5  # ratio of two weights that have a bound each
+_LOOSE = 3.0  # factor on the gap asked of the other weights
 _MOST_BOUNDS = 3
 _STRIDE = 2.5
 _SPACING = 0.001  # [m] spacing of a path's integral
@@ -90,13 +98,14 @@ def plan_detour(problem: GentleProblem, shortest: np.ndarray, max_detour: float,
     search = _Search(problem, shortest, (1.0 + max_detour) * least)
     progress(0.0, "refining paths of the allowed length")
     search.begin(others)
-    weight: float | None = search.first_weight()
+    weights = search.first_weights()
     for number in range(_MOST_BOUNDS):
         part = progress.part(0.2 + 0.8 * number / _MOST_BOUNDS, 0.2 + 0.8 * (number + 1)
                              / _MOST_BOUNDS)
-        weight = search.bound(weight, part)
+        weight = search.bound(weights, part)
         if weight is None:
             break
+        weights = [weight]
     return search.result(least)
 
 
@@ -142,11 +151,17 @@ class _Search:
                     self._note(self._own_weight(), length, integral)
                     break
 
-    def first_weight(self) -> float:
-        """Return the weight whose bound is computed first."""
+    def first_weights(self) -> list[float]:
+        """Return the weights of the first bounds: the question's, then those of the trade-off."""
         spare = max(self.longest - self.length, (1.0 - _BINDS) * self.longest)
         light = _UNUSED * self.integral / spare
-        return max(self.slope, min(light, self.integral / self.longest)) / self._metre
+        weights = [max(self.slope, min(light, self.integral / self.longest)) / self._metre]
+        length, integral = _measured(self.shortest, self.problem)
+        if self.length > length and integral > self.integral:
+            mean = (integral - self.integral) / (self.length - length) / self._metre
+            weights += [mean * share for share in _LADDER]
+        return [one for k, one in enumerate(weights) if all(
+            not 1.0 / _APART < one / other < _APART for other in weights[:k])]
 
     @property
     def _metre(self) -> float:
@@ -157,28 +172,25 @@ class _Search:
         """Return the weight at which the path would be the gentlest."""
         return max(self.slope / self._metre, _LIGHT)
 
-    def bound(self, weight: float, progress: Progress) -> float | None:
-        """Bound at a weight; return the next one, None if none is worth its time."""
-        energy, metre = self.problem.weights.energy, weight * self._metre
-        asked = replace(_weighed(self.problem, weight), longest=self.longest)
-        # The requested gap is the energy's, which is a part of the weighted cost.
-        least_cost = self.integral / (1.0 + _ENOUGH) + metre * self.longest
-        enough = max((self.integral + metre * self.length) / least_cost - 1.0, _FINEST_GAP)
-        found = plan_gentle(asked, [self.path], enough=enough, progress=progress)
-        self._take(found.points)
-        length, integral = _measured(found.points, self.problem)
-        lower = found.certificate.lower / energy
-        self._note(weight, length, integral, lower, metre)
-        value = lower - metre * self.longest
-        if value > self.value:
-            self.best, self.best_weight, self.value = found, weight, value
-            self.levels = [level | {"lower": max(
-                level["lower"] / energy - metre * self.longest, 0.0), "upper": self.integral}
-                for level in found.certificate.levels]
-        if found.certificate.stopped or self.integral <= (1.0 + _ENOUGH) * value:
+    def bound(self, weights: Sequence[float], progress: Progress) -> float | None:
+        """Bound at the first of ``weights``, and less closely at the others; return the next one,
+        None if none is worth its time.
+        """
+        asked = [replace(_weighed(self.problem, one), longest=self.longest) for one in weights]
+        enough = [self._enough(one) * (_LOOSE if k else 1.0) for k, one in enumerate(weights)]
+        every = plan_gentle_all(asked, [self.path, self.shortest], enough=enough,
+                                progress=progress)
+        for one in every:
+            self._take(one.points)
+        for weight, one in zip(weights, every, strict=True):
+            self._bounded(weight, one)
+        weight, found = weights[0], every[0]
+        if found.certificate.stopped or self.integral <= (1.0 + _ENOUGH) * self.value:
             return None
+        metre, energy = weight * self._metre, self.problem.weights.energy
+        length, _ = _measured(found.points, self.problem)
         spare = metre * (self.longest - length)
-        uncertainty = found.cost / energy - lower
+        uncertainty = (found.cost - found.certificate.lower) / energy
         if spare < uncertainty and self.length >= _BINDS * self.longest:
             self.low = weight
         elif spare > uncertainty:
@@ -188,6 +200,24 @@ class _Search:
         if self.low > 0.0 and self.high < np.inf:
             return float(np.sqrt(self.low * self.high))
         return weight * _STRIDE if self.low > 0.0 else weight / _STRIDE
+
+    def _enough(self, weight: float) -> float:
+        """Return the gap of the weighted cost with which the energy, a part of it, has its own."""
+        metre = weight * self._metre
+        least_cost = self.integral / (1.0 + _ENOUGH) + metre * self.longest
+        return max((self.integral + metre * self.length) / least_cost - 1.0, _FINEST_GAP)
+
+    def _bounded(self, weight: float, found: GentlePath) -> None:
+        """Keep the bound found at a weight."""
+        energy, metre = self.problem.weights.energy, weight * self._metre
+        lower = found.certificate.lower / energy
+        self._note(weight, *_measured(found.points, self.problem), lower, metre)
+        value = lower - metre * self.longest
+        if value > self.value:
+            self.best, self.best_weight, self.value = found, weight, value
+            self.levels = [level | {"lower": max(
+                level["lower"] / energy - metre * self.longest, 0.0), "upper": self.integral}
+                for level in found.certificate.levels]
 
     def _take(self, path: np.ndarray) -> None:
         """Keep a path if it is short enough, allowed and gentler than the known ones."""

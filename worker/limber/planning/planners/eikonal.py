@@ -6,14 +6,16 @@ limits, next come a path through cells that do, if there is one
 (:mod:`limber.planning.certificate.feasibility`), else the path that exceeds the limits least.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import Verdict, judge
-from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
+from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify_all
 from limber.planning.cost import arc_lengths
 from limber.planning.path_problem import BlockedError, GentleProblem, no_path_error, not_found
 from limber.planning.planners.least_violation import easiest_path
@@ -42,42 +44,62 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
     Raises:
         BlockedError: it is proven that there is none, or none was found; states which.
     """
-    best: list = [None, np.inf]
-    verdicts: list[Verdict] = []
-    in_vain: list[bool] = []
+    return plan_gentle_all([problem], others, enough=[enough], progress=progress)[0]
 
-    def found_from(paths: list[np.ndarray]) -> bool:
+
+def plan_gentle_all(problems: Sequence[GentleProblem], others: list[np.ndarray] | None = None, *,
+                    enough: Sequence[float], progress: Progress = SILENT) -> list[GentlePath]:
+    """Return the same for each of problems that differ in the weight of length alone; their bounds
+    share the energies of the field.
+
+    Raises:
+        NoWayError: as for one.
+    """
+    found = [_Gentlest(problem, others or []) for problem in problems]
+    certificates = certify_all(problems, found, enough=enough, progress=progress)
+    return [GentlePath(present(one.points, "path"), one.cost, certificate)
+            for one, certificate in zip(found, certificates, strict=True)]
+
+
+class _Gentlest:
+    """The gentlest path of a problem so far."""
+
+    def __init__(self, problem: GentleProblem, others: list[np.ndarray]):
+        self.problem, self._others = problem, others
+        self.points: np.ndarray | None = None
+        self.cost = np.inf
+        self._verdict: Verdict | None = None
+        self._is_in_vain = False
+
+    def __call__(self, rough: np.ndarray | None) -> float:
+        """Return the cost after refining a ``rough`` path [n, 3]; None: those known before."""
+        problem, before = self.problem, self.cost
+        along = rough is not None and self.points is not None and _is_along(rough, self.points)
+        if along and self._is_in_vain:
+            return before  # leads to the same optimum
+        if self._found_from([_straight(problem), *self._others] if rough is None else [rough]):
+            self._is_in_vain |= along and self.cost > (1.0 - _GAIN) * before
+            return self.cost
+        if self._verdict is not None:
+            # Coarser cells than those that left it open will not decide it.
+            raise not_found(problem, f"The question is undecided on {_grid(self._verdict)}.")
+        verdict = self._verdict = judge(problem)
+        # A path that keeps the limits is a better proof than cells that separate.
+        path = verdict.path
+        known = (path is not None and self._found_from([path])) or self._found_from(
+            _easiest(problem))
+        if not known and verdict.proven:
+            raise separated(problem, verdict)
+        return self.cost
+
+    def _found_from(self, paths: list[np.ndarray]) -> bool:
         for path in paths:
             if len(path) < 2 or not arc_lengths(path)[-1] > 0.0:
                 continue
-            points, cost = refine(path, problem)
-            if cost < best[1]:
-                best[:] = points, cost
-        return best[0] is not None
-
-    def improve(rough: np.ndarray | None) -> float:
-        starts = [_straight(problem), *(others or [])] if rough is None else [rough]
-        before, along = best[1], rough is not None and best[0] is not None and _is_along(
-            rough, best[0])
-        if along and in_vain:
-            return before  # leads to the same optimum
-        if found_from(starts):
-            if along and best[1] > (1.0 - _GAIN) * before:
-                in_vain.append(True)
-            return best[1]
-        if rough is not None:
-            # Coarser cells than those that left it open will not decide it.
-            raise not_found(problem, f"The question is undecided on {_grid(verdicts[0])}.")
-        verdicts.append(judge(problem))
-        # A path that keeps the limits is a better proof than cells that separate.
-        path = verdicts[0].path
-        known = (path is not None and found_from([path])) or found_from(_easiest(problem))
-        if not known and verdicts[0].proven:
-            raise separated(problem, verdicts[0])
-        return best[1]
-
-    certificate = certify(problem, improve, enough=enough, progress=progress)
-    return GentlePath(best[0], best[1], certificate)
+            points, cost = refine(path, self.problem)
+            if cost < self.cost:
+                self.points, self.cost = points, cost
+        return self.points is not None
 
 
 def separated(problem: GentleProblem, verdict: Verdict) -> BlockedError:
