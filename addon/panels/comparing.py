@@ -37,8 +37,11 @@ def draw_paths(layout: bpy.types.UILayout, context: bpy.types.Context, result: d
     strength = result.get("strength") or {}
     is_over = bool(strength.get("over")) or stress_share > 1.0
     gap = (result.get("certificate") or {}).get("gap_percent")
+    longest = (result.get("detour") or {}).get("longest_m")
+    least = "the minimum" if longest is None else (
+        f"the least energy of a path up to {1e3 * longest:.3g} mm")
     draw_text(layout, context, "No bound was proven" if gap is None else
-              f"Proven on the field: at most {gap:.1f} % above the minimum",
+              f"Proven on the field: at most {gap:.1f} % above {least}",
               "QUESTION" if gap is None else "BLANK1" if is_over else "CHECKMARK")
     if strength.get("over"):
         draw_text(layout, context,

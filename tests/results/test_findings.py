@@ -50,6 +50,12 @@ def test_a_path_stands_with_its_numbers_and_what_is_proven():
         "Its cost is at most 0.6 % on the energy field (proven) and 1.2 % on the full model, by "
         "the field's error at 95 % of the samples, above the least possible.")
     assert certificate_sentence({}) == "No bound on its cost is proven."
+    within = {"detour": {"longest_m": 0.1912}}
+    assert certificate_sentence(PLAN | within) == (
+        "Its energy along the path is at most 0.6 % on the energy field (proven) and 1.2 % on the "
+        "full model, by the field's error at 95 % of the samples, above that of the gentlest path "
+        "no longer than 191 mm.")
+    assert certificate_sentence(within) == "No bound on its energy along the path is proven."
     same = PLAN | {"energy_saved_percent": -0.0, "length_added_percent": 0.0}
     assert path_sentence(same).endswith("no shorter one was found.")
     short = {"plan": {"length_m": 0.2}, "energy_saved_percent": None}

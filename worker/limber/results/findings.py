@@ -85,15 +85,20 @@ def path_sentence(plan: Mapping[str, Any]) -> str:
 
 
 def certificate_sentence(plan: Mapping[str, Any]) -> str:
-    """Return how far a plan's cost can be above the optimum, and what is proven of it."""
-    certificate = plan.get("certificate") or {}
+    """Return how far a plan's cost can be above the optimum, or within an allowed length its
+    energy, and what is proven of it.
+    """
+    certificate, detour = plan.get("certificate") or {}, plan.get("detour")
+    quantity = "energy along the path" if detour else "cost"
     gaps = [(certificate.get("gap_percent"), "on the energy field (proven)"),
             ((certificate.get("full_model") or {}).get("gap_percent"),
              "on the full model, by the field's error at 95 % of the samples,")]
     known = [f"{gap:.1f} % {where}" for gap, where in gaps if gap is not None]
     if not known:
-        return "No bound on its cost is proven."
-    return f"Its cost is at most {' and '.join(known)} above the least possible."
+        return f"No bound on its {quantity} is proven."
+    least = (f"that of the gentlest path no longer than {1e3 * detour['longest_m']:.3g} mm"
+             if detour else "the least possible")
+    return f"Its {quantity} is at most {' and '.join(known)} above {least}."
 
 
 def remarks_on(plan: Mapping[str, Any]) -> dict[str, str]:

@@ -3,7 +3,7 @@
 from limber.core.errors import InputError
 from limber.core.files.reading import read_arrays
 from limber.planning.field.energy_field import EnergyField
-from limber.results.findings import beyond_sentence
+from limber.results.findings import beyond_sentence, certificate_sentence
 from limber.results.report import execution_section as execution
 from limber.results.report import figures
 from limber.results.report.report_tables import comparison_rows, leg_rows
@@ -46,18 +46,7 @@ def plan_section(branch: Branch, name: str) -> Section:
         if saved is None or added is None else
         f"The gentle path saves {saved:.1f} % of the energy along the path and changes the length "
         f"by {added:+.1f} %.") + f" Seed {plan['seed']}.")
-    if (gap := (plan.get("certificate") or {}).get("gap_percent")) is not None:
-        detour = plan.get("detour")
-        section.text.append(
-            f"Certificate: on the energy field, its cost is at most {gap:.1f} % above that of the "
-            "best possible path. No path costs less than the lower bound." if not detour else
-            f"Certificate: on the energy field, its energy is at most {gap:.1f} % above that of "
-            f"the gentlest path no longer than {detour['longest_m']:.3f} m.")
-    if whole := (plan.get("certificate") or {}).get("full_model"):
-        if whole["gap_percent"] is not None:
-            section.text.append(
-                f"On the full model, this is at most {whole['gap_percent']:.1f} %; the field has "
-                f"an error of {1e3 * whole['field_error_j']:.2g} mJ.")
+    section.text.append(certificate_sentence(plan))
     if moving := plan.get("in_motion"):
         peaks = ", ".join(f"{key} {peak['moving']:.3g} ({peak['standing']:.3g} quasi-static)"
                           for key, peak in moving["peaks"].items())

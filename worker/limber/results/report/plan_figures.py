@@ -54,10 +54,12 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
                                 "Both paths over the lower bound on the cost of any path from "
                                 "there to the goal, in the same plane. The gentlest path follows "
                                 "its steepest descent."))
+        what = "Energy" if plan.summary.get("detour") else "Cost"
+        within = " within the allowed length" if plan.summary.get("detour") else ""
         figures.append((certificate(plan),
-                        "Cost of the gentle path, and lower bound on the cost of "
-                        "every path on the energy field, as the grid of the certificate is "
-                        "refined."))
+                        f"{what} of the gentle path, and lower bound on the {what.lower()} of "
+                        f"every path{within} on the energy field, as the grid of the certificate "
+                        "is refined."))
     if branch.has(f"plans/{name}-damage.csv"):
         damage = DamageAlong.read(branch.path(f"plans/{name}-damage.csv"))
         figures.append((damage_along_branch(damage), (
@@ -70,7 +72,8 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
     if any(point["lower_bound_jm"] is not None
            for point in (plan.summary.get("detour") or {}).get("curve", ())):
         figures.append((trade_off(plan), "Energy against length of the gentlest paths for several "
-                        "weights of distance. No path is below the dashed line."))
+                        "weights of distance. No path up to the allowed length is below the "
+                        "dashed line; what is proven ends there."))
     return figures
 
 
@@ -264,17 +267,18 @@ def trade_off(plan: PlanFile) -> "Figure":
     curve = sorted(detour["curve"], key=lambda point: point["length_m"])
     length = 1e3 * np.array([point["length_m"] for point in curve])
     energy = 1e3 * np.array([point["energy_integral_jm"] for point in curve])
-    span = np.linspace(1e3 * detour["shortest_m"], max(length.max(), 1e3 * detour["longest_m"]), 80)
+    # Bounds are of paths within the allowed length.
+    span = np.linspace(1e3 * detour["shortest_m"], 1e3 * detour["longest_m"], 200)
     bounded = [point for point in curve if point["lower_bound_jm"] is not None]
     lines = [1e3 * point["lower_bound_jm"] - point["metre_jm"] * span for point in bounded]
     floor = np.maximum(np.max(lines, axis=0), 0.0)
     figure, axis = chart(6, 3.6, "length of the path [mm]", "energy along the path [mJ m]",
                          has_grid=True)
-    # The set of paths with a larger length limit includes the shorter ones, so the curve only
-    # falls.
+    # Paths within a length include the shorter ones: the best known one changes in steps.
     best = np.minimum.accumulate(energy)
-    axis.fill_between(span, floor, np.interp(span, length, best), where=span >= length.min(),
-                      color=PATH_COLOURS["plan"], alpha=0.15, label="range of the best path")
+    known = best[np.maximum(np.searchsorted(length, span + 1e-6, side="right") - 1, 0)]
+    axis.fill_between(span, floor, np.maximum(known, floor), color=PATH_COLOURS["plan"], alpha=0.15,
+                      label="range of the best path")
     axis.plot(span, floor, "--", color=PATH_COLOURS["plan"], lw=1, label="proven bound")
     axis.plot(length, energy, "o-", color=PATH_COLOURS["plan"], ms=4, label="gentlest found")
     axis.axvline(1e3 * detour["longest_m"], color="black", lw=1, ls=":", label="allowed length")

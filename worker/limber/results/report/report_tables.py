@@ -89,7 +89,9 @@ def _below(plan: Mapping[str, Any]) -> list[list[str]]:
     rows = []
     gap = (plan.get("certificate") or {}).get("gap_percent")
     if gap is not None:
-        rows.append(["above the best possible path, at most [%]", "", f"{gap:.1f}", ""])
+        words = "energy above the gentlest within the length" if plan.get("detour") else (
+            "cost above the best possible path's")
+        rows.append([f"{words}, at most [%]", "", f"{gap:.1f}", ""])
     if strength := plan.get("strength"):
         share = strength["peak_strain"] / strength["median_strain"]
         rows.append([f"largest strain over that at break ({strength['source']})", "",
