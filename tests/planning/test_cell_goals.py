@@ -1,6 +1,7 @@
 """Goals that a robot's cell gives: the target where the second arm takes it, or the camera sees it.
 """
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -13,14 +14,15 @@ from limber.planning.constraints.obstacles import Box
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals.allowed_poses import goal_points, with_near_side
 from limber.planning.goals.cell_region import CellGoal
-from limber.planning.goals.goal import CellPlace
+from limber.planning.goals.goal import CellPlace, GoalRequest
+from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.goals.regions import Ball
 from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.plan_file import read_plan
 from limber.robot.cell.cell import Cell, write_cell
 from limber.stages.paths.plan import plan as plan_paths
-from limber.stages.paths.plan_cell import cell_positions, require_seen
+from limber.stages.paths.plan_cell import cell_positions, hiding
 from limber.store import Branch
 
 SETTINGS = PlanSettings(iterations=300, field_error=20.0, inertia=False)
@@ -38,16 +40,16 @@ def cell_of(**content):
                    "limits": {"soft_force_n": 60.0, "hard_force_n": 80.0}} | content)
 
 
-def left_half(what, place, _surface):
+def left_half(place, _surface):
     """A place that does for targets on the side where y is below 0."""
-    if place[1] >= 0.0:
-        raise NoPathError("Not there.", "", "")
+    return "a wall is there" if place[1] >= 0.0 else ""
 
 
-def side_goal(field, small_model, require=left_half):
+def side_goal(field, small_model, blocked=left_half):
     middle = tuple(field.tip(field.rest[None])[0])
-    place = CellPlace(Ball(middle, 0.5), require, False, "Nobody takes {what}")
-    return CellGoal(place.region, cell_place=place, grasp_model=small_model)
+    place = CellPlace(Ball(middle, 0.5), blocked, False, "arm's length", "Nobody takes {what}",
+                      "Move the wall")
+    return CellGoal(place.region, advice=place.advice, cell_place=place, grasp_model=small_model)
 
 
 def test_a_region_of_which_half_does_has_its_border_there(field, small_model):
@@ -60,17 +62,90 @@ def test_a_region_of_which_half_does_has_its_border_there(field, small_model):
     assert inside[y < -0.03].mean() > 0.95 and inside[y > 0.0].mean() < 0.02
     assert (goal.uncertainty(field, points) == np.inf).all()
     reached = goal_points(goal, field, field.limited())
-    assert len(reached) == 200 and field.tip(reached)[:, 1].max() < 0.01
-    everywhere = side_goal(field, small_model, lambda *_: None).learnt(field)
+    assert len(reached) == 200 and field.tip(reached)[:, 1].max() < 0.015
+    everywhere = side_goal(field, small_model, lambda *_: "").learnt(field)
     assert np.array_equal(everywhere.distance(field, points),
                           TargetGoal.distance(everywhere, field, points))
     stated = everywhere.uncertainty(field, points)
     assert 0.0 < stated.min() < stated.max() <= field.position_error()
+    with pytest.raises(NoPathError) as refused:
+        side_goal(field, small_model, lambda *_: "a wall is there").learnt(field)
+    assert re.match(r"Nobody takes the tip at any of the \d+ poses that were checked: a wall is "
+                    r"there at each\. At these poses the tip lies within arm's length\. Move the "
+                    r"wall, or sample farther", str(refused.value))
 
-    def nowhere(*_):
-        raise NoPathError("No.", "", "")
-    with pytest.raises(NoPathError, match=r"Nobody takes the tip at any of the \d+ poses"):
-        side_goal(field, small_model, nowhere).learnt(field)
+
+def test_a_refusal_counts_its_causes(field, small_model):
+    """Each cause with the number of poses, the most frequent one first."""
+    goal = side_goal(field, small_model, lambda place, _surface: (
+        "a wall is there" if place[1] >= 0.0 else "the floor is there")).learnt
+    with pytest.raises(NoPathError) as refused:
+        goal(field)
+    found = re.search(r"checked: (.*) at (\d+), (.*) at (\d+)\.", str(refused.value))
+    assert {found[1], found[3]} == {"a wall is there", "the floor is there"}
+    assert int(found[2]) >= int(found[4]) > 0
+
+
+def test_a_refusal_describes_its_region_in_words(field, small_model):
+    """No refusal prints stored data, and each advises what its own kind of goal can change."""
+    far, cell = (9.0, 0.0, 0.5), cell_of(
+        second_arm={"model": "ur5", "base_pose": (9.0, 0, 0, 0, 0, 0)},
+        camera=camera_cell(1.0).camera.model_copy(update={"pose": (9.0, 0, 0, 0, 0, 0)}))
+    asked = {
+        "goal": (far, "the grasp within 0.010 m of (9.000, 0.000, 0.500) m", "--goal-tolerance"),
+        "tip_goal": (far, "the tip within 0.010 m of (9.000, 0.000, 0.500) m", "--goal-tolerance"),
+        "target_box": ((9.0, 0, 0, 9.1, 1, 1), "the tip within the box from (9.000, 0.000, 0.000) "
+                       "to (9.100, 1.000, 1.000) m", "a larger --target-box"),
+        "in_view": (True, "the tip within the image of the camera at (9.000, 0.000, 0.000) m that "
+                    "looks along (0.000, 0.000, 1.000), 0.300 to 1.000 m ahead of it",
+                    "Move the camera"),
+        "second_arm": (True, "of the shoulder of the second arm (ur5) at (9.000, ",
+                       "Move the second arm")}
+    for name, (value, words, advice) in asked.items():
+        settings = SETTINGS.model_copy(update={name: value})
+        goal = goal_of(GoalRequest(field, small_model, settings, field.limited(),
+                                   cell_positions(cell)))
+        with pytest.raises(NoPathError) as refused:
+            goal_points(goal, field, field.limited())
+        text = str(refused.value)
+        assert words in text and advice in text and "{" not in text
+        assert ("--goal-tolerance" in text) == ("--goal-tolerance" in advice)
+
+
+def test_the_sight_is_refined_on_the_branch_model(field, small_model):
+    """Between a pose that hides the target and one that does not, states of the branch are solved;
+    the border found there is the one of their surface, and not the field's."""
+    def half(place, surface):
+        assert surface is not None
+        return "it is hidden" if place[1] >= 0.0 else ""
+    goal = side_goal(field, small_model, half)
+    goal = replace(goal, cell_place=replace(goal.cell_place, of_surface=True)).learnt(field)
+    assert set(goal.causes) == {"it is hidden"} and len(goal.causes) == len(goal.refused)
+    assert field.tip(goal.taken)[:, 1].max() < 0.01
+    border = np.linalg.norm(goal.taken[-4:] - goal.refused[-4:], axis=1)
+    others = np.linalg.norm(goal.taken[:-4, None] - goal.refused[None, :-4], axis=2)
+    assert border.max() < 0.2 * others.min(axis=0).max()
+
+
+def test_a_plan_ends_deeper_in_a_region_than_the_field_is_wrong(field):
+    """Poses of the goal less the margin are inside by the stated error; where that leaves none, a
+    fraction of it, and a bound is for all of the goal."""
+    middle = tuple(field.tip(field.region.draw(1, np.random.default_rng(2)))[0])
+    goal = TargetGoal(Ball(middle, 0.05))
+    inner = goal.with_margin(field, field.limited())
+    points = goal_points(inner, field, field.limited())
+    depth = -goal.region.distance(field.tip(points))
+    stated = field.place_errors(None, points, 0.95)
+    assert inner.margin == 1.0 and stated.min() > 0.0
+    assert (depth >= np.minimum(stated, 0.4 * 0.05) - 1e-9).all()
+    assert (inner.uncertainty(field, points) > goal.uncertainty(field, points)).all()
+    # A ball that the tip only touches: nothing is left of it with the whole margin.
+    tips = field.tip(field.region.draw(4000, np.random.default_rng(3)))
+    far = tips[np.argmax(tips[:, 0])]
+    touched = TargetGoal(Ball(tuple(far + [0.2998, 0.0, 0.0]), 0.3))
+    assert touched.with_margin(field, field.limited()).margin < 1.0
+
+
 
 
 def test_states_of_a_plan_refine_the_border(field, small_model):
@@ -83,7 +158,7 @@ def test_states_of_a_plan_refine_the_border(field, small_model):
     assert len(goal.drawn_in(wrong).refused) == len(goal.refused) + 1
     assert len(goal.drawn_in(right).taken) == len(goal.taken) + 1
     assert goal.drawn_in(wrong).distance(field, wrong.poses[:, :3])[0] > goal.tolerance
-    with pytest.raises(NoPathError, match="Not there"):
+    with pytest.raises(NoPathError, match=r"Nobody takes the tip at the end of the path: a wall"):
         goal.require_end(small_model, wrong)
 
 
@@ -131,9 +206,8 @@ def test_an_obstacle_hides_what_is_behind_it():
     view = cell_positions(camera_cell(1.0))["in_view"].region
     place = np.array([0.1, 0.0, 0.45])
     box = Box("the post", np.full(3, 0.02), np.array([0.05, -0.4, 0.47]), np.eye(3))
-    require_seen(view, (), "the tip", place, None)
-    with pytest.raises(NoPathError, match="the post hides the tip"):
-        require_seen(view, (box,), "the tip", place, None)
+    assert hiding(view, (), place, None) == ""
+    assert hiding(view, (box,), place, None) == "the post hides it"
 
 
 def camera_cell(far):

@@ -35,6 +35,8 @@ class SideGoal:
     x: float
     tolerance: float
     what = "the grasp"
+    where = "to the plane"
+    advice = "Choose another plane"
 
     def distance(self, field, points):
         return np.abs(np.asarray(points)[:, 0] - self.x)

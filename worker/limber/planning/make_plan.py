@@ -5,7 +5,7 @@ finite elements along the paths found; the error of the field is reported beside
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as fresh
 from time import perf_counter
 from typing import Any
@@ -27,6 +27,7 @@ from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import displacements_at
 from limber.planning.goals.goal import CellPlace, Goal, GoalRequest
 from limber.planning.goals.goal_kinds import goal_of
+from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.path_on_full_model import ResolvedPath, resolve_side_by_side
 from limber.planning.path_problem import BlockedError
 from limber.planning.path_start import start_of
@@ -98,7 +99,8 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     start, limits = start_of(field, goal, settings), limits or own
     if limits.constraints:
         field = _knowing(field, grasp_model, limits, workers, progress)
-    rounds = _Rounds(grasp_model, settings, limits, goal, start, uncertainty, workers, field, goal,
+    aim = goal.with_margin(field, limits.on(field)) if isinstance(goal, TargetGoal) else goal
+    rounds = _Rounds(grasp_model, settings, limits, goal, start, uncertainty, workers, field, aim,
                      limits, pace or Pace(settings.speed, settings.acceleration), progress)
     count = _REPLANS + 1
     for number in range(count):
@@ -179,9 +181,7 @@ class _Rounds:
             BlockedError: none was found, or none exists and the full model confirms it.
         """
         try:
-            return plan_within(self.field, self.start, self.aim, self.settings,
-                               self.planned_limits, asked=self.limits, asked_goal=self.goal,
-                               before=self.pair, progress=ahead.part(0.0, 0.3))
+            return self._within_goal(ahead.part(0.0, 0.3))
         except BlockedError as none:
             found = None if is_last else solved_if_undecided(
                 self.field, self.grasp_model, self.start, self.aim, self.planned_limits,
@@ -194,6 +194,30 @@ class _Rounds:
                 f"{found.summary}.")
             self.field = refit(self.field, found.learnt)
             return None
+
+    def _within_goal(self, ahead: Progress) -> PathPair:
+        """Return paths on the field that end as deep in the goal as the field's error asks for; if
+        none is found, paths that end anywhere in it.
+
+        Raises:
+            NoPathError: neither was found.
+        """
+        def paths(aim: Goal, ahead: Progress) -> PathPair:
+            return plan_within(self.field, self.start, aim, self.settings, self.planned_limits,
+                               asked=self.limits, asked_goal=self.goal, before=self.pair,
+                               progress=ahead)
+        try:
+            return paths(self.aim, ahead.part(0.0, 0.5))
+        except NoPathError as none:
+            proven = isinstance(none, BlockedError) and none.is_proven
+            if proven or not (isinstance(self.aim, TargetGoal) and self.aim.margin):
+                raise
+            self.progress.warn(
+                f"No path was found that ends deeper in the goal than the energy field's error of "
+                f"{self.aim.what}'s position. The path is planned without this margin. The full "
+                "model decides whether its end is in the goal.")
+            self.aim = replace(self.aim, margin=0.0)
+            return paths(self.aim, ahead.part(0.5, 1.0))
 
     def _closed(self, none: BlockedError, is_last: bool, ahead: Progress) -> None:
         """Pass on that there is no path, or learn evidence against it.

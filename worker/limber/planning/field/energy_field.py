@@ -9,6 +9,7 @@ tip.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -144,16 +145,24 @@ class EnergyField:
         return float(np.max(off, where=np.isfinite(off), initial=0.0)) if (
             np.isfinite(off).any()) else np.inf
 
-    def place_errors(self, target: int | None, points: np.ndarray) -> np.ndarray:
+    def place_errors(self, target: int | None, points: np.ndarray, covered: float = 1.0,
+                     ) -> np.ndarray:
         """Return the possible error of the tip's position, or a target's, with the grasp at
-        ``points`` [n, 3]: no left-out sample exceeded it, nowhere more than :meth:`position_error`
-        [m], shape [n].
+        ``points`` [n, 3]: a fraction ``covered`` of the left-out samples keeps it, nowhere more
+        than :meth:`position_error` [m], shape [n].
         """
-        inner, chart = ~self.region.is_face(), self.region.chart.plain
-        error = LocalError.of(chart.map(self.samples.positions)[inner],
-                              self.misplaced[inner, 0 if target is None else 1 + target], 1.0,
-                              self.position_error(target))
-        return error.at(chart.map(_rows(points)))
+        chart, known = self.region.chart.plain, self._known_place_errors
+        if (target, covered) not in known:
+            inner = ~self.region.is_face()
+            known[target, covered] = LocalError.of(
+                chart.map(self.samples.positions)[inner],
+                self.misplaced[inner, 0 if target is None else 1 + target], covered,
+                self.position_error(target))
+        return known[target, covered].at(chart.map(_rows(points)))
+
+    @cached_property
+    def _known_place_errors(self) -> dict[tuple[int | None, float], LocalError]:
+        return {}
 
     def tip_gradient(self, points: np.ndarray, target: int | None = None) -> np.ndarray:
         """Return d tip_c / d x_k, shape [n, 3 (k), 3 (c)]."""

@@ -7,6 +7,7 @@ from limber.core.numerics.compiled import compiled
 from limber.planning.field.energy_field import EnergyField, FieldArrays, allowed_at, energy_at
 from limber.planning.field.limited_quantities import limited
 from limber.planning.goals.goal import Goal
+from limber.planning.goals.regions import position_text
 
 _MILLIMETRES = 30.0  # times the sampled region's size; a goal is never so far away
 
@@ -103,15 +104,14 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
     points = field.region.draw(2000, np.random.default_rng(seed))
     distance = goal.distance(field, points)
     nearest = points[np.argmin(distance)]
-    position = ", ".join(f"{value:.3f}" for value in nearest)
+    missed = max(float(distance.min()) - goal.tolerance, 0.0)
     return NoPathError(
-        f"No sampled pose brings {goal.what} to the goal; the nearest misses it by "
-        f"{distance.min():.3f} m, with the grasp at ({position})"
-        f"{unit_uncertainty(float(distance.min()), field)}.",
-        f"The tolerance is {goal.tolerance:.3f} m and the branch was sampled from "
-        f"{_position_text(field.region.low)} to {_position_text(field.region.high)}.",
-        "Choose a goal nearer to this region, raise --goal-tolerance, or sample farther (`limber "
-        "energy --deflection`).")
+        f"No sampled pose brings {goal.what} {goal.where}; the nearest misses it by "
+        f"{missed:.3f} m, with the grasp at {position_text(nearest)} m"
+        f"{unit_uncertainty(missed, field)}.",
+        "The branch was sampled with its grasp from "
+        f"{position_text(field.region.low)} to {position_text(field.region.high)} m.",
+        f"{goal.advice}, or sample farther (`limber energy --deflection`).")
 
 
 def unit_uncertainty(off: float, field: EnergyField) -> str:
@@ -120,7 +120,3 @@ def unit_uncertainty(off: float, field: EnergyField) -> str:
     """
     size = float(np.linalg.norm(field.region.high - field.region.low))
     return " (in millimetres? Lengths are in metres)" if off > _MILLIMETRES * size else ""
-
-
-def _position_text(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.3f}" for value in point) + ")"

@@ -4,10 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.core.errors import NoPathError
-from limber.planning.goals.regions import Convex
-
-_OWN = 0.003  # [m] of surface around a target that does not hide it
+from limber.planning.goals.regions import Convex, position_text
 
 
 @dataclass(frozen=True)
@@ -41,6 +38,12 @@ class View(Convex):
                         for y in (top, bottom)])
         return own @ self.frame[:3, :3].T + self.frame[:3, 3]
 
+    @property
+    def words(self) -> str:
+        near, far = self.range_m
+        return (f"the image of the camera at {position_text(self.frame[:3, 3])} m that looks along "
+                f"{position_text(self.frame[:3, 2])}, {near:.3f} to {far:.3f} m ahead of it")
+
     def describe(self) -> dict:
         return {"camera_m": self.frame[:3, 3].tolist(), "axis": self.frame[:3, 2].tolist(),
                 "range_m": list(self.range_m)}
@@ -64,11 +67,3 @@ class View(Convex):
         t = np.einsum("ij,ij->i", second, turned) / safe
         hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
         return bool((hit & (t < 1.0 - slack / np.linalg.norm(ray))).any())
-
-    def require_seen(self, what: str, point: np.ndarray, triangles: np.ndarray) -> None:
-        """Raise NoPathError if the branch's surface hides ``what`` at a position."""
-        if self.hidden_by(triangles, point, _OWN):
-            raise NoPathError(
-                f"At the end of the path the branch hides {what} from the camera.",
-                "The line of sight is checked on the full model at the end of each plan.",
-                "Choose a --target-box on the camera's side, or move the camera.")

@@ -9,11 +9,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from limber.core.errors import NoPathError
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals.regions import Region
+from limber.planning.goals.regions import Region, position_text
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
+
+NEARER = "Choose a goal nearer to this region, raise --goal-tolerance"
+"""Advice for a ball that nothing reaches."""
 
 
 class Goal(Protocol):
@@ -22,6 +26,8 @@ class Goal(Protocol):
     Attributes:
         tolerance: Largest ``distance`` at which the branch is in the goal [m].
         what: The part of the branch to be brought there, in words.
+        where: Where it is brought, in words, after "brings it".
+        advice: What a user may change if nothing reaches it, a clause.
     """
 
     @property
@@ -29,6 +35,12 @@ class Goal(Protocol):
 
     @property
     def what(self) -> str: ...
+
+    @property
+    def where(self) -> str: ...
+
+    @property
+    def advice(self) -> str: ...
 
     def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
         """Return the branch's distance from the goal with its grasp at ``points`` [m], [n]."""
@@ -76,16 +88,28 @@ class CellPlace:
 
     Attributes:
         region: Contains every valid position.
-        require: Raises NoPathError if a position [3] in it is not valid for something, given in
-            words, while the branch's surface is at triangles [f, 3, 3]; None: not known.
+        blocked: Why a position [3] in it is not valid while the branch's surface is at triangles
+            [f, 3, 3] (None: not known), as a clause; empty if it is valid.
         of_surface: Whether that surface counts.
-        refusal: Message if no position is valid, with ``{what}``.
+        words: The region in words, after "within".
+        refusal: Sentence without full stop if no position is valid, with ``{what}``.
+        advice: What a user may change then, a clause.
     """
 
     region: Region
-    require: Callable[[str, np.ndarray, np.ndarray | None], None]
+    blocked: Callable[[np.ndarray, np.ndarray | None], str]
     of_surface: bool
+    words: str
     refusal: str
+    advice: str
+
+    def require(self, what: str, position: np.ndarray, surface: np.ndarray | None) -> None:
+        """Raise NoPathError if ``position`` [3] is not valid for something, given in words."""
+        if cause := self.blocked(position, surface):
+            raise NoPathError(
+                f"{self.refusal.format(what=what)} at the end of the path: {cause}.",
+                f"{what[0].upper()}{what[1:]} is at {position_text(position)} m there.",
+                f"{self.advice}.")
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ import numpy as np
 
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals.goal import GoalKind
-from limber.planning.goals.regions import ball
+from limber.planning.goals.goal import NEARER, GoalKind
+from limber.planning.goals.regions import ball, position_text
 from limber.planning.path_on_full_model import SolvedPoses
 
 
@@ -19,6 +19,11 @@ class GraspGoal:
     tolerance: float
 
     what = "the grasp"
+    advice = NEARER
+
+    @property
+    def where(self) -> str:
+        return f"within {self.tolerance:.3f} m of {position_text(self.position)} m"
 
     def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(np.asarray(points) - self.position, axis=1)

@@ -3,6 +3,7 @@
 Each has a signed distance: negative inside, and outside at most the true one.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -30,6 +31,11 @@ class Region(Protocol):
         """Return ``count`` points of the region, shape [count, 3]."""
         ...
 
+    @property
+    def words(self) -> str:
+        """The region as a user gave it, after "within": lengths in metres."""
+        ...
+
     def describe(self) -> dict:
         """Return it as plain data."""
         ...
@@ -55,6 +61,10 @@ class Ball:
 
     def draw(self, count: int, generator: np.random.Generator) -> np.ndarray:
         return self.middle + 0.9 * self.radius * ball(count, generator)
+
+    @property
+    def words(self) -> str:
+        return f"{self.radius:.3f} m of {position_text(self.centre)} m"
 
     def describe(self) -> dict:
         return {"position_m": list(map(float, self.centre)), "tolerance_m": self.radius}
@@ -103,8 +113,17 @@ class BoxRegion(Convex):
         return np.array([[ends[i, 0], ends[j, 1], ends[k, 2]]
                          for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
+    @property
+    def words(self) -> str:
+        return f"the box from {position_text(self.low)} to {position_text(self.high)} m"
+
     def describe(self) -> dict:
         return {"low_m": list(map(float, self.low)), "high_m": list(map(float, self.high))}
+
+
+def position_text(point: Sequence[float] | np.ndarray) -> str:
+    """Return a position [3] in words, to millimetres."""
+    return "(" + ", ".join(f"{value + 0.0:.3f}" for value in point) + ")"
 
 
 def ball(count: int, generator: np.random.Generator) -> np.ndarray:

@@ -7,12 +7,17 @@ from typing import Self
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.planning.field.energy_field import EnergyField
+from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals.goal import GoalKind, GoalRequest
+from limber.planning.goals.allowed_poses import allowed_points
+from limber.planning.goals.goal import NEARER, GoalKind, GoalRequest
 from limber.planning.goals.regions import Ball, BoxRegion, Region
 from limber.planning.path_on_full_model import SolvedPoses
 
+_COVERED = 0.95  # fraction of the samples that the margin covers
+_MOST = 0.4  # fraction of a region's depth; where the field is worse, the full model decides
+_SHARES = (1.0, 0.5, 0.2)  # fractions of the margin that are tried
+_DRAWN = 200  # poses with which they are
 _SMALL = 0.02  # [m] depth of a region up to which targets are drawn in all of it
 _HALVINGS = 12  # halvings of a path into a region
 
@@ -25,13 +30,17 @@ class TargetGoal:
         region: Region for the point.
         target: Number of the named target; None: the branch's tip.
         name: Name of the target.
-        inset: Distance that plans keep from the region's outside [m]: the field's error there.
+        inset: Distance that plans keep from the region's outside [m]: what an earlier one missed.
+        margin: Fraction of the field's error at each pose that plans keep from it as well.
+        advice: As for any goal.
     """
 
     region: Region
     target: int | None = None
     name: str = "tip"
     inset: float = 0.0
+    margin: float = 0.0
+    advice: str = NEARER
 
     @property
     def tolerance(self) -> float:
@@ -42,12 +51,36 @@ class TargetGoal:
     def what(self) -> str:
         return f"the {self.name}"
 
+    @property
+    def where(self) -> str:
+        return f"within {self.region.words}"
+
     def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
         outside = self.region.distance(field.tip(points, self.target))
-        return outside + self.tolerance + self.inset
+        return outside + self.tolerance + self._kept_off(field, points)
 
     def uncertainty(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
-        return self.inset + field.place_errors(self.target, points)
+        return self._kept_off(field, points) + field.place_errors(self.target, points)
+
+    def _kept_off(self, field: EnergyField, points: np.ndarray) -> np.ndarray | float:
+        """Return the distance from the region's outside that plans keep at ``points`` [m], [n]."""
+        if self.margin == 0.0:
+            return self.inset
+        stated = field.place_errors(self.target, points, _COVERED)
+        stated = np.where(np.isfinite(stated), stated, 0.0)  # not known: the full model decides
+        return self.inset + self.margin * np.minimum(stated, _MOST * self.tolerance)
+
+    def with_margin(self, field: EnergyField, limits: FieldArrays) -> Self:
+        """Return the goal less the field's error in the target's position, or the largest of a few
+        fractions of it with which a drawn pose keeps ``limits``.
+        """
+        for share in _SHARES:
+            part = replace(self, margin=share)
+            points = part.guess(field, _DRAWN, np.random.default_rng(0))
+            reached = part.distance(field, points) <= part.tolerance
+            if allowed_points(np.ascontiguousarray(points[reached]), limits).any():
+                return part
+        return self
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
         # A small region is a thin bent lens in grasp space: draw everywhere, then walk onto it.
@@ -67,7 +100,9 @@ class TargetGoal:
 
     def _walked(self, field: EnergyField, points: np.ndarray, generator: np.random.Generator,
                 ) -> np.ndarray:
-        """Return ``points`` [n, 3] moved so that the target approaches places in the region."""
+        """Return ``points`` [n, 3] moved so that the target approaches places in the region; none
+        leaves the box that was sampled, beyond which the field knows nothing.
+        """
         if not len(points):
             return points
         is_inside = self._entered(field.tip(points, self.target),
@@ -76,7 +111,8 @@ class TargetGoal:
             outside = self.distance(field, points) > 0.5 * self.tolerance
             steps = _damped_steps(field.tip_gradient(points, self.target),
                                   is_inside - field.tip(points, self.target))
-            points = points + np.where(outside[:, None], steps, 0.0)
+            points = np.clip(points + np.where(outside[:, None], steps, 0.0), field.region.low,
+                             field.region.high)
         return points
 
     def _entered(self, positions: np.ndarray, is_inside: np.ndarray) -> np.ndarray:
@@ -158,7 +194,8 @@ def _in_box(asked: GoalRequest, corners: tuple[float, ...]) -> TargetGoal:
         raise InputError(f"The box from {low} to {high} m is empty.",
                          "Its lower corner must be below the upper one in x, y and z.",
                          "Correct --target-box.")
-    return TargetGoal(BoxRegion(low, high), *target_of(asked))
+    return TargetGoal(BoxRegion(low, high), *target_of(asked),
+                      advice="Choose a larger --target-box, or one nearer to this region")
 
 
 IN_BALL = GoalKind("tip_goal", _in_ball, is_of_target=True, is_place=True)

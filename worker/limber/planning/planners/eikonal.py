@@ -53,7 +53,7 @@ def plan_gentle_all(problems: Sequence[GentleProblem], others: list[np.ndarray] 
     share the energies of the field.
 
     Raises:
-        NoWayError: as for one.
+        BlockedError: as for one.
     """
     found = [_Gentlest(problem, others or []) for problem in problems]
     certificates = certify_all(problems, found, enough=enough, progress=progress)

@@ -19,7 +19,7 @@ from limber.planning.constraints.obstacles import Box, Obstacle, Solid, closest
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.goals.camera_view import View
 from limber.planning.goals.goal import CellPlace
-from limber.planning.goals.regions import Ball
+from limber.planning.goals.regions import Ball, position_text
 from limber.planning.plan_file import PlanPath
 from limber.robot.cell.cell import BoxEntry, Cell, SecondArmEntry, read_cell
 from limber.robot.cell.compatibility import check_branch
@@ -36,6 +36,7 @@ _ROD_SPACING = 0.02  # [m] between points along a part of gripper or arm
 _POSE_SPACING = 0.01  # [m] largest step of a part between checked poses
 _BETWEEN = 0.006  # [m] added to the parts' radii for the motion between poses
 _SIGHT_SPACING = 0.005  # [m] between points on a line of sight
+_OWN_SURFACE = 0.003  # [m] of surface around a target that does not hide it
 _DEVIATIONS = 2.0  # standard deviations of the branch's position that a clearance covers
 _AT_REST = 0.9  # fraction of the clearance at rest that is kept at most if none was requested
 _CLAMPED = 0.001  # [m] by which a piece that is clamped, not only held, moves the branch at most
@@ -82,16 +83,20 @@ def cell_positions(cell: Cell, obstacles: tuple[Obstacle, ...] = ()) -> dict[str
     """Return the cell's constraints on goals: its camera's view and its second arm's reach."""
     found = {}
     if (view := _view_of(cell)) is not None:
-        found["in_view"] = CellPlace(view, partial(require_seen, view, obstacles), True,
-                                     "The camera does not see {what}")
+        found["in_view"] = CellPlace(
+            view, partial(hiding, view, obstacles), True, view.words,
+            "The camera does not see {what}",
+            "Move the camera in the cell file to a side without branch or obstacles")
     if cell.second_arm is not None:
         arm = arm_named(cell.second_arm.model)
         shoulder = matrices(np.array(cell.second_arm.base_pose)) @ np.r_[arm.shoulder, 1.0]
         x, y, z = map(float, shoulder[:3])
+        reach = _outer_reach(arm, cell.second_arm)
         found["second_arm"] = CellPlace(
-            Ball((x, y, z), _outer_reach(arm, cell.second_arm)),
-            partial(require_taken, cell.second_arm), False,
-            f"The second arm ({arm.name}) cannot take {{what}}")
+            Ball((x, y, z), reach), partial(_untaken, cell.second_arm), False,
+            f"{reach:.3f} m of the shoulder of the second arm ({arm.name}) at "
+            f"{position_text((x, y, z))} m", f"The second arm ({arm.name}) cannot take {{what}}",
+            "Move the second arm in the cell file")
     return found
 
 
@@ -106,23 +111,23 @@ def _outer_reach(arm: Arm, entry: SecondArmEntry) -> float:
                  + np.linalg.norm(entry.grasp_pose[:3]))
 
 
-def require_seen(view: View, obstacles: tuple[Obstacle, ...], what: str, point: np.ndarray,
-                 surface: np.ndarray | None) -> None:
-    """Raise NoPathError if the branch's surface or an obstacle hides ``what`` at ``point`` [3].
+def hiding(view: View, obstacles: tuple[Obstacle, ...], point: np.ndarray,
+           surface: np.ndarray | None) -> str:
+    """Return in words that the branch's surface or an obstacle hides a target at ``point`` [3] from
+    the camera; empty if nothing does.
     """
-    if surface is not None:
-        view.require_seen(what, point, surface)
+    if surface is not None and view.hidden_by(surface, point, _OWN_SURFACE):
+        return "the branch hides it"
     eye = view.frame[:3, 3]
     count = int(np.ceil(np.linalg.norm(point - eye) / _SIGHT_SPACING)) + 1
     hit = closest(obstacles, eye + np.linspace(0.0, 1.0, count)[:, None] * (point - eye))
-    if hit:
-        raise NoPathError(f"{hit[0]} hides {what} from the camera at the end of the path.",
-                          "It lies between them.",
-                          "Choose a --target-box on the camera's side, or move the camera.")
+    return f"{hit[0]} hides it" if hit else ""
 
 
-def require_taken(entry: SecondArmEntry, what: str, place: np.ndarray, _surface: object) -> None:
-    """Raise NoPathError if an arm cannot grasp ``what`` at ``place`` [3] from any side."""
+def _untaken(entry: SecondArmEntry, place: np.ndarray, _surface: object) -> str:
+    """Return in words that an arm cannot grasp a target at ``place`` [3] from any side; empty if it
+    can.
+    """
     arm = arm_named(entry.model)
     turns = Rotation.random(_TURNS, rng=np.random.default_rng(0)).as_matrix()
     frames = np.tile(np.eye(4), (_TURNS, 1, 1))
@@ -130,11 +135,8 @@ def require_taken(entry: SecondArmEntry, what: str, place: np.ndarray, _surface:
     flange = inverted(matrices(np.array(entry.base_pose))) @ frames @ inverted(
         matrices(np.array(entry.grasp_pose)))
     if np.isnan(arm.inverse(flange)).any(axis=-1).all():
-        where = ", ".join(f"{x:.3f}" for x in place)
-        raise NoPathError(f"The second arm ({arm.name}) cannot take {what} at ({where}) m.",
-                          f"The inverse kinematics has no solution for any of {_TURNS} "
-                          "directions.",
-                          "Move the arm, or give a --target-box.")
+        return f"its inverse kinematics has no solution from any of {_TURNS} directions"
+    return ""
 
 
 def _view_of(cell: Cell) -> View | None:
