@@ -96,7 +96,7 @@ def _planned(sure: Sure, subject: Subject, known: EnergyField, uncertain_part: Y
                 settings.model_copy(
                     update={"max_force": cap, "confidence": CONFIDENCE, "goal": end}
                 ),
-                uncertain_part=uncertain_part,
+                uncertainty=uncertain_part,
                 workers=1,
             ), cap
         except NoPathError:
