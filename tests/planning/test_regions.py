@@ -7,6 +7,7 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.planning.baseline_and_plan import plan_pair
+from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import fit_field
 from limber.planning.goals.allowed_poses import goal_points
 from limber.planning.goals.camera_view import View
@@ -14,6 +15,7 @@ from limber.planning.goals.goal import GoalRequest
 from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.goals.regions import Ball, BoxRegion
 from limber.planning.goals.target_goal import TargetGoal
+from limber.planning.path_start import random_start
 from limber.planning.settings import PlanSettings
 
 # A camera a metre along x that looks back at the origin; its picture is 0.6 m wide there.
@@ -90,11 +92,29 @@ def test_a_start_in_the_goal_stays_there(ridge_field):
     assert np.allclose(found.approach[[0, -1]], [ridge_field.rest, start])
 
 
+def test_an_empty_workspace_names_its_axis():
+    """The side that is wrong, and none of those that were not given."""
+    asked = PlanSettings(workspace_low=(-1.0, 0.2, 0.0), workspace_high=(1.0, 0.1, 1.0))
+    with pytest.raises(InputError, match=r"workspace is empty along y, from 0\.200 to 0\.100 m"):
+        Limits.of(asked)
+    inner = Limits.of(PlanSettings(workspace_low=(-1.0, -1.0, -1.0)))
+    with pytest.raises(InputError, match=r"empty along x, from -1\.000 to -2\.000 m"):
+        inner.with_cell(None, np.array([-2.0, 1.0, 1.0]), np.inf, ())
+
+
+def test_a_random_start_lies_outside_a_large_goal(ridge_field):
+    """Also where the goal is deeper than a start is far from rest."""
+    goal = TargetGoal(Ball((0.0, 0.9, 0.3), 0.8))
+    for seed in range(4):
+        start = random_start(ridge_field, goal, PlanSettings(), seed)
+        assert goal.distance(ridge_field, start[None])[0] > goal.tolerance
+
+
 @pytest.mark.parametrize(("settings", "words"), [
     ({"goal": (0, 0, 1), "target_box": (0, 0, 0, 1, 1, 1)}, "--goal and --target-box"),
     ({"target": "flower"}, "without a goal for it"),
     ({"target": "flower", "tip_goal": (0, 0, 1)}, "no target named flower"),
-    ({"target_box": (0, 0, 1, 1, 1, 0)}, "empty"),
+    ({"target_box": (0, 0, 1, 1, 1, 0)}, r"box is empty along z, from 1\.000 to 0\.000 m"),
     ({"in_view": True}, r"without a cell that has a \[camera\]"),
     ({"second_arm": True}, r"without a cell that has a \[second_arm\]"),
 ])

@@ -18,6 +18,7 @@ from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.interpolation.local_error import LocalError, slack_of
 from limber.planning.field.limited_quantities import UNITS
+from limber.planning.goals.regions import empty_along
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
 
@@ -70,7 +71,7 @@ class Limits:
                        high=self.high if high is None else np.minimum(self.high, high))
         if not (both.low < both.high).all():
             raise InputError("The given workspace and the cell's workspace do not overlap.",
-                             f"Their intersection from {both.low} to {both.high} m is empty.",
+                             f"Their intersection is empty {empty_along(both.low, both.high)}.",
                              "Correct --workspace-low and --workspace-high, or the cell file.")
         return both
 
@@ -104,7 +105,7 @@ class Limits:
         low = np.array(settings.workspace_low or [-np.inf] * 3, float)
         high = np.array(settings.workspace_high or [np.inf] * 3, float)
         if not (low < high).all():
-            raise InputError(f"The workspace from {low} to {high} m is empty.",
+            raise InputError(f"The workspace is empty {empty_along(low, high)}.",
                              "Its lower corner must be below the upper one in x, y and z.",
                              "Correct --workspace-low and --workspace-high.")
         return cls(settings.max_energy or np.inf, settings.max_force or np.inf,

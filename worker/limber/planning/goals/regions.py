@@ -121,6 +121,12 @@ class BoxRegion(Convex):
         return {"low_m": list(map(float, self.low)), "high_m": list(map(float, self.high))}
 
 
+def empty_along(low: Sequence[float] | np.ndarray, high: Sequence[float] | np.ndarray) -> str:
+    """Return in words along which axis a box from ``low`` [3] to ``high`` [3] [m] is empty."""
+    axis = int(np.flatnonzero(~np.less(low, high))[0])
+    return f"along {'xyz'[axis]}, from {low[axis]:.3f} to {high[axis]:.3f} m"
+
+
 def position_text(point: Sequence[float] | np.ndarray) -> str:
     """Return a position [3] in words, to millimetres."""
     return "(" + ", ".join(f"{value + 0.0:.3f}" for value in point) + ")"

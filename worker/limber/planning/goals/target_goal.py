@@ -11,7 +11,7 @@ from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.goals.goal import NEARER, GoalKind, GoalRequest
-from limber.planning.goals.regions import Ball, BoxRegion, Region
+from limber.planning.goals.regions import Ball, BoxRegion, Region, empty_along
 from limber.planning.path_on_full_model import SolvedPoses
 
 _COVERED = 0.95  # fraction of the samples that the margin covers
@@ -191,7 +191,7 @@ def _in_box(asked: GoalRequest, corners: tuple[float, ...]) -> TargetGoal:
     x, y, z, *far = corners
     low, high = (x, y, z), (far[0], far[1], far[2])
     if not np.all(np.less(low, high)):
-        raise InputError(f"The box from {low} to {high} m is empty.",
+        raise InputError(f"The target's box is empty {empty_along(low, high)}.",
                          "Its lower corner must be below the upper one in x, y and z.",
                          "Correct --target-box.")
     return TargetGoal(BoxRegion(low, high), *target_of(asked),
