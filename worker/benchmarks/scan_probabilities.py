@@ -84,7 +84,7 @@ def skeletonised(case: ScanCase) -> tuple[Skeleton, float, float, list[dict]]:
     prepared = prepare(Cloud(case.points), 1.0, settings, up=up)
     if case.leaf is not None:
         prepared, _ = without_leaves(prepared)
-    found = skeletonise(prepared.cloud.points, settings, up=up, camera=prepared.view is not None)
+    found = skeletonise(prepared.cloud.points, settings, up=up, view=prepared.view)
     if prepared.view is not None:
         found, _ = seen_skeleton(found, prepared)
     found = found.moved(lambda points: points + prepared.origin)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.skeleton import BRIDGED, UNRESOLVED, Skeleton
+from limber.geometry.skeleton.skeleton import BRIDGED, LIMITED, UNRESOLVED, Skeleton
 from limber.geometry.skeleton.uncertain_parts import DoubtfulKind, doubtful_parts
 
 
@@ -15,18 +15,20 @@ def test_a_sound_skeleton_has_no_doubtful_parts(y_skeleton) -> None:
 
 
 def test_each_doubt_is_found_with_its_place(y_skeleton) -> None:
-    """An unlikely twig, an unresolved stretch and a gap: length, radius and value."""
+    """An unlikely twig, an unresolved and a limited stretch, a gap: length, radius and value."""
     state = y_skeleton.radius_state.copy()
-    state[3:6], state[8:10] = BRIDGED, UNRESOLVED
+    state[1:3], state[3:6], state[8:10] = LIMITED, BRIDGED, UNRESOLVED
     sigma = np.where(state == UNRESOLVED, 0.4 * y_skeleton.radius, 0.0)
     told = doubtful_parts(replace(
         y_skeleton, radius_state=state, radius_sigma=sigma,
         probability=np.where(y_skeleton.branch == 1, 0.3, 1.0)))
     assert [uncertainty.kind for uncertainty in told] == [
-        DoubtfulKind.unlikely, DoubtfulKind.unresolved, DoubtfulKind.bridged]
-    unlikely, unresolved, bridged = told
+        DoubtfulKind.unlikely, DoubtfulKind.unresolved, DoubtfulKind.limited,
+        DoubtfulKind.bridged]
+    unlikely, unresolved, limited, bridged = told
     assert unlikely.branch == 1 and unlikely.value == pytest.approx(0.3)
     assert unresolved.length == pytest.approx(0.1) and unresolved.value == pytest.approx(0.4)
+    assert limited.length == pytest.approx(0.1) and limited.branch == 0
     assert bridged.length == pytest.approx(0.15)
     np.testing.assert_allclose(bridged.at, y_skeleton.nodes[4])
 

@@ -1,7 +1,5 @@
 """A skeleton against the image that it came from."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,19 +9,9 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
 from limber.geometry.cloud.single_view import View
 from limber.geometry.generated import generate_branch
-from limber.geometry.skeleton.radii.silhouette import (
-    within_silhouette,
-    without_edges,
-    without_hidden_twigs,
-)
-from limber.geometry.skeleton.skeleton import (
-    INTERPOLATED,
-    LIMITED,
-    MEASURED,
-    UNRESOLVED,
-    Skeleton,
-)
-from limber.perception.simulated_camera import render_depth, with_noise
+from limber.geometry.skeleton.radii.silhouette import without_hidden_twigs
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.perception.simulated_camera import render_depth
 from limber.stages.shape.reconstruct import reconstruct
 
 EYE = np.array([1.0, 0.0, 0.3])
@@ -52,37 +40,6 @@ def test_a_twig_must_be_seen_beside_its_carrier(direction, stays):
     assert without_hidden_twigs(skeleton, View(EYE, 1e-3), 0.0)[0] is skeleton
 
 
-def test_no_branch_is_thicker_than_its_silhouette():
-    """Radii twice too large come down to the truth, a quarter and a pixel; true ones stay."""
-    branch = generate_branch(81, length=0.6, fork_count=2)
-    truth = branch.skeleton
-    middle = (truth.nodes.min(axis=0) + truth.nodes.max(axis=0)) / 2
-    camera = D455.looking(eye=middle + [0.9, 0.1, 0.0], target=middle, up=(0.0, 1.0, 0.0))
-    depth = with_noise(camera, render_depth(camera, branch.surface.vertices, branch.surface.faces),
-                       np.random.default_rng(81), flying_share=0.0)
-    points = depth_to_cloud(camera, depth).points
-    view = View(camera.origin, 1 / camera.fx)
-    same, _ = within_silhouette(truth, points, view)
-    assert np.mean(same.radius < 0.97 * truth.radius) < 0.03
-    fat = Skeleton.from_edges(truth.nodes, truth.parent, 2 * truth.radius)
-    thinner, count = within_silhouette(fat, points, view)
-    pixel = 1.1 / camera.fx
-    assert np.mean(thinner.radius <= 1.25 * truth.radius + pixel) > 0.8
-    assert np.all(thinner.radius > 0.9 * truth.radius)
-    assert count == (thinner.radius_state == LIMITED).sum() > 0.8 * truth.node_count
-    # A fit that depth noise made collapse is not believed: the silhouette tells the radius.
-    hidden = Skeleton.from_edges(truth.nodes, truth.parent, 0.2 * truth.radius, radius_state=(
-        np.full(truth.node_count, UNRESOLVED, np.int8)))
-    told, _ = within_silhouette(hidden, points, view)
-    assert abs(np.median(told.radius / truth.radius) - 1) < 0.15
-    assert np.mean(np.abs(told.radius - truth.radius) < 1.96 * told.radius_sigma) > 0.8
-    # Of half of the pixels too: there are as many places for them.
-    few = points[np.random.default_rng(3).uniform(size=len(points)) < 0.5]
-    thin, _ = within_silhouette(hidden, few, View(camera.origin, 1 / camera.fx, 0.5))
-    assert abs(np.median(thin.radius / told.radius) - 1) < 0.03
-    assert (told.radius_state == UNRESOLVED).all()
-
-
 def test_a_depth_cameras_place_goes_with_the_cloud():
     """`prepare` hands on where the camera stood, in the cloud's new frame."""
     branch = generate_branch(82, length=0.5)
@@ -108,18 +65,3 @@ def test_a_skeleton_without_thickness_or_of_another_unit_is_refused(tmp_path):
                             scale * thick * truth.radius).write_swc(path)
         with pytest.raises(InputError, match=complaint):
             reconstruct(tmp_path / "cloud.ply", tmp_path / "a.branch", skeleton_path=path)
-
-
-def test_edges_take_a_quarter_pixel_from_measured_radii():
-    """A radius from elsewhere stays; none is more than halved."""
-    truth = generate_branch(81, length=0.6, fork_count=1).skeleton
-    state = np.where(truth.branch == 0, MEASURED, INTERPOLATED).astype(np.int8)
-    truth = replace(truth, radius_state=state)
-    view = View(np.array([1.0, 0.0, 0.3]), 0.002)
-    less = without_edges(truth, view)
-    pixel = 0.002 * np.linalg.norm(truth.nodes - view.eye, axis=1)
-    measured = state == MEASURED
-    assert less.radius[measured] == pytest.approx((truth.radius - 0.25 * pixel)[measured])
-    assert (less.radius == truth.radius)[~measured].all()
-    coarse = without_edges(truth, View(view.eye, 1.0))
-    assert (coarse.radius[measured] == truth.radius[measured] / 2).all()

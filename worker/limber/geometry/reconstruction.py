@@ -41,8 +41,6 @@ from limber.geometry.skeleton.plausibility import (
 )
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.radii.silhouette import (
-    within_silhouette,
-    without_edges,
     without_hidden_twigs,
 )
 from limber.geometry.skeleton.search_result import SkeletonResult, result_of_skeleton
@@ -323,8 +321,6 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared) -> tuple[SkeletonRe
         prepared: The cloud, and the view from which it was seen.
     """
     skeleton, dropped = without_hidden_twigs(found.skeleton, prepared.view, _SILHOUETTE_REACH)
-    skeleton = without_edges(skeleton, prepared.view)
-    skeleton, _ = within_silhouette(skeleton, prepared.cloud.points, prepared.view)
     node, residual = nearest_cylinders(skeleton, prepared.cloud.points)
     text = ""
     if dropped:
@@ -355,7 +351,7 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     scale = UNIT_METRES[settings.unit]
     root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin
     return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),
-                       camera=prepared.view is not None, progress=progress,
+                       view=prepared.view, progress=progress,
                        where=lambda place: (place + prepared.origin) / scale)
 
 

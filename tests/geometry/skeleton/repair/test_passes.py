@@ -9,7 +9,7 @@ import pytest
 from limber.geometry.skeleton.radii.axis_fit import AxisFit
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
 from limber.geometry.skeleton.repair.passes import PASSES, Pass, Repaired
-from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, UNRESOLVED, Skeleton
+from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
 from limber.geometry.skeleton.uncertain_parts import KINK, start_angle, turns
 
 Z, RADIUS, NOISE = 0.005 * np.arange(81), 0.008, 0.0005
@@ -112,11 +112,7 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
         "settle": lambda: (_before(_aside(), strands=1), _centred),
         "draw ends back": lambda: (_before(_branch(np.vstack([
             [0, 0, -0.012], ALONG[1:-1], [0, 0, 0.412]]))), _ends(0.0, 0.4)),
-        "fill in blank radii": lambda: (_before(blank, gap), _thick),
-        "taper radii": lambda: (_before(_hair(slice(60, 81), 0.02)), lambda now: bool(
-            (now.skeleton.radius_state[60:] == LIMITED).all())),
-        "weigh unresolved radii": lambda: (_before(_branch(radius=2e-4)), lambda now: bool(
-            (now.skeleton.radius_state == UNRESOLVED).any())),
+        "find the likeliest radii": lambda: (_before(blank, gap), _thick),
         "mend kinks": lambda: (_before(_branch(folded, radius=0.005)), lambda now: bool(
             turns(now.skeleton, now.skeleton.runs()[0]).max() <= KINK)),
     }

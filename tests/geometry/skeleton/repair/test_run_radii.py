@@ -8,13 +8,12 @@ import pytest
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.repair.run_radii import (
-    filled_in,
     point_counts,
     steadied,
     tapered,
     unpinched,
 )
-from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
+from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
 RADIUS = 0.006
@@ -45,9 +44,6 @@ def test_a_hair_where_points_are_missing_gets_its_neighbours_radius() -> None:
     z = np.linspace(0, 0.4, 81)
     taper = replace(_stem(slice(0)), radius=0.006 - 0.005 * z)
     np.testing.assert_allclose(steadied(taper, points).radius, taper.radius, rtol=0.03, atol=3e-4)
-    told = replace(_stem(slice(21, 40)), radius_state=np.where(
-        np.isin(np.arange(81), range(21, 40)), INTERPOLATED, 0).astype(np.int8))
-    np.testing.assert_allclose(filled_in(told, points).radius, RADIUS)
 
 
 def test_few_points_at_a_foot_do_not_thin_the_run() -> None:

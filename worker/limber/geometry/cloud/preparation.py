@@ -171,7 +171,7 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
         sight = find_sight(cloud.points * scale, scanner)
     if sight is None:
         return cloud, None
-    view = View(scanner, sight.pitch, sight.fill)
+    view = View(scanner, sight.pitch)
     flying = flying_pixels(sight, _FLYING_ANGLE, _FLYING_SPECK)
     counts["flying"] = int(flying.sum())
     rest = cloud.subset(~flying)

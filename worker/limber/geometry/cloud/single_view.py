@@ -30,12 +30,10 @@ class View:
     Attributes:
         eye: The camera's position [m], shape [3].
         pitch: Width of a pixel at distance 1.
-        fill: Fraction of the pixels on the seen surface that are in the cloud.
     """
 
     eye: np.ndarray
     pitch: float
-    fill: float = 1.0
 
 
 @dataclass(frozen=True)

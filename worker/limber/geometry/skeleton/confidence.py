@@ -5,14 +5,20 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.radii.likeliest_radii import (
+    SPACINGS,
+    RadiusEvidence,
+    likeliest_radii,
+    point_spacing,
+)
 from limber.geometry.skeleton.radii.shared_errors import shared_error
-from limber.geometry.skeleton.radii.unresolved_radii import SPACINGS, point_spacing, weighed
-from limber.geometry.skeleton.skeleton import BRIDGED, STATES, UNRESOLVED, Skeleton
+from limber.geometry.skeleton.repair.run_radii import tapered
+from limber.geometry.skeleton.skeleton import BRIDGED, LIMITED, STATES, UNRESOLVED, Skeleton
 from limber.geometry.skeleton.sweep import stretches
 
 _GAP = 4.0  # radii without a point that make a gap
-_BRIDGED_SIGMA = 0.15  # fraction of a radius in a gap
 # Logistic models: a constant, then a slope for each column of the evidence. A twig exists where its
 # fork is true, a node where it lies inside the true wood. Both were fitted by maximum likelihood
 # (benchmarks.scan_probabilities) to 769 side branches of 62 generated scans: the project's own
@@ -24,26 +30,32 @@ _POINTS_MOST = 3.0  # ln(1 + points / 10) above which more points are no more ev
 _NOISE_MOST = 2.0  # noise in radii above which it no longer matters
 
 
-def assessed(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
-    """Return the skeleton with honest radii, intervals, states and probabilities.
+def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool = False,
+             one_sided: bool = False, view: View | None = None) -> Skeleton:
+    """Return the skeleton with the likeliest radii, their intervals, states and probabilities.
 
     Args:
         skeleton: Fitted to the points.
         points: The scan [m], shape [m, 3].
         noise: Standard deviation of the points [m].
+        rays: One sensor's rays made the points, whose noise widens no branch.
+        one_sided: The points show one side of the branches.
+        view: The depth camera's view, if there was one.
     """
     spacing, count = _shown(skeleton, points, noise)
     # A quarter of a circle is off together; the four average.
     shared = shared_error(skeleton, points, noise) / 2
-    assessed_skeleton = weighed(replace(skeleton,
-                                        radius_sigma=np.hypot(skeleton.radius_sigma, shared)),
-                                spacing, noise)
-    gap = _gaps(assessed_skeleton, count, spacing)
-    sigma = np.where(gap > 0,
-                     np.maximum(assessed_skeleton.radius_sigma,
-                                _BRIDGED_SIGMA * assessed_skeleton.radius),
-                     assessed_skeleton.radius_sigma)
-    return _with_probability(replace(assessed_skeleton, radius_sigma=sigma), count, gap, noise)
+    pixel = None if view is None else view.pitch * np.linalg.norm(skeleton.nodes - view.eye, axis=1)
+    shown = RadiusEvidence(spacing, 0.0 if rays else noise, shared, rays or one_sided, pixel)
+    likeliest = likeliest_radii(skeleton, shown)
+    # Wood hardly thickens outwards. What does so nevertheless, beyond its interval, is a bunch of
+    # twigs or two limbs in one: it counts for nothing.
+    swollen = tapered(replace(likeliest, radius_state=skeleton.radius_state),
+                      count).radius_state == LIMITED
+    if swollen.any():
+        likeliest = likeliest_radii(replace(skeleton, radius_state=np.where(
+            swollen, LIMITED, skeleton.radius_state).astype(np.int8)), shown)
+    return _with_probability(likeliest, count, _gaps(likeliest, count, spacing), noise)
 
 
 def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.canonical_frame import OwnFrame
+from limber.geometry.cloud.single_view import View
 from limber.geometry.cloud.thinning import thinned
 from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.confidence import likely
@@ -37,7 +38,7 @@ _GAP_FACTOR = 3.0  # the paper's gamma: a step of more than this many median ste
 
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                 root: np.ndarray | None = None, up: np.ndarray | None = None,
-                camera: bool = False, where: Where | None = None,
+                view: View | None = None, where: Where | None = None,
                 progress: Progress = SILENT) -> SkeletonResult:
     """Find the rooted skeleton of a cloud.
 
@@ -46,7 +47,8 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
         settings: Settings to use.
         root: A point [m] near the root, shape [3]; None: the thick end of the plant.
         up: The up direction, shape [3]; None: z.
-        camera: The points are a depth camera's, and scatter only along its sight.
+        view: The depth camera's view of the points, if they are one's: they scatter only along its
+            sight.
         where: Transforms positions of the cloud to its file's coordinates, for errors; None: the
             same.
         progress: Called during the work.
@@ -59,7 +61,8 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     own = OwnFrame.of(points)
     up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
     found = _of_ordered(own, settings or SkeletonSettings(),
-                        None if root is None else own.inside(root), up @ own.axes, camera,
+                        None if root is None else own.inside(root), up @ own.axes,
+                        None if view is None else replace(view, eye=own.inside(view.eye)),
                         where or (lambda original_order: original_order), progress)
     original_order, drawn = np.argsort(own.order), found.contraction
     return replace(found.moved(own.outside), contraction=replace(
@@ -127,7 +130,8 @@ class _Search:
 
 
 def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | None,
-                up: np.ndarray, camera: bool, where: Where, progress: Progress) -> SkeletonResult:
+                up: np.ndarray, view: View | None, where: Where, progress: Progress,
+                ) -> SkeletonResult:
     """The skeleton of points in the cloud's own frame, as are ``root`` and ``up``."""
     points = own.coordinates
     search = _Search(points, settings, up, float(np.linalg.norm(np.ptp(points, axis=0))))
@@ -145,7 +149,7 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
         graph.loops = loops
     first, pruned = search.pruned(graph, start)
     some = search.to_fit(graph, thin)
-    fitted = repaired(first, some, search.diagonal, camera, progress.part(0.65, 0.95))
+    fitted = repaired(first, some, search.diagonal, view, progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     check_round(fitted.skeleton, points, segment, residual)
     skeleton, more = fitted.skeleton, fitted.pruned

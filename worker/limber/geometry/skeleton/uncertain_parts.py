@@ -1,11 +1,11 @@
-"""Parts of a skeleton that its user should check: unlikely, vague, bridged, kinked."""
+"""Parts of a skeleton that its user should check: unlikely, vague, swollen, bridged, kinked."""
 
 from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
 
-from limber.geometry.skeleton.skeleton import BRIDGED, UNRESOLVED, Skeleton
+from limber.geometry.skeleton.skeleton import BRIDGED, LIMITED, UNRESOLVED, Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths, stretches
 
 _LIKELY = 0.8  # probability above which a branch is not listed
@@ -19,6 +19,7 @@ class DoubtfulKind(StrEnum):
 
     unlikely = "unlikely branch"
     unresolved = "unresolved radius"
+    limited = "limited radius"
     bridged = "bridged gap"
     kink = "kink"
     backwards = "starts backwards"
@@ -37,7 +38,7 @@ class DoubtfulPart:
         length: Length of the part [m]; 0 for a single node.
         radius: Median radius there [m].
         value: Probability of an unlikely branch, an attachment or a root; standard deviation over
-            radius of an unresolved one; angle [rad] of a kink; NaN for a gap.
+            radius of an unresolved or limited one; angle [rad] of a kink; NaN for a gap.
     """
 
     kind: DoubtfulKind
@@ -57,10 +58,11 @@ def doubtful_parts(skeleton: Skeleton) -> list[DoubtfulPart]:
         if probability < _LIKELY:
             found.append(_part(skeleton, DoubtfulKind.unlikely, run, own, probability))
         share = skeleton.radius_sigma / np.maximum(skeleton.radius, 1e-300)
-        for part in _stretches(own, skeleton.radius_state[own] == UNRESOLVED):
-            found.append(
-                _part(skeleton, DoubtfulKind.unresolved, run, part, float(share[part].max()))
-            )
+        # Limited: points show more than wood has there, as a bunch of twigs or two limbs in one.
+        for state, kind in ((UNRESOLVED, DoubtfulKind.unresolved),
+                            (LIMITED, DoubtfulKind.limited)):
+            found += [_part(skeleton, kind, run, part, float(share[part].max()))
+                      for part in _stretches(own, skeleton.radius_state[own] == state)]
         for part in _stretches(own, skeleton.radius_state[own] == BRIDGED):
             found.append(_part(skeleton, DoubtfulKind.bridged, run, part, float("nan")))
         turn = turns(skeleton, members)

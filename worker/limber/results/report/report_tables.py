@@ -259,6 +259,7 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     value_formats = {"unlikely branch": "probability {:.2f}",
                      "attachment": "probability {:.2f}", "root": "probability {:.2f}",
                      "unresolved radius": "sigma {:.0%} of the radius",
+                     "limited radius": "sigma {:.0%} of the radius",
                      "kink": "{:.0f} degrees", "starts backwards": "{:.0f} degrees"}
     rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "uncertainty"]]
     for part in doubtful:

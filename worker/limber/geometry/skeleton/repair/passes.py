@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from limber.core.progress import SILENT, Progress
+from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.confidence import assessed
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
-from limber.geometry.skeleton.radii.cylinders import point_counts
 from limber.geometry.skeleton.radii.ray_fit import fit_of_rays
 from limber.geometry.skeleton.repair.attachment import attached
 from limber.geometry.skeleton.repair.backward_twigs import without_backward_starts
@@ -18,10 +18,8 @@ from limber.geometry.skeleton.repair.kinks import without_kinks
 from limber.geometry.skeleton.repair.resampling import resampled
 from limber.geometry.skeleton.repair.run_ends import ends_within, with_full_tips, without_bare_ends
 from limber.geometry.skeleton.repair.run_radii import (
-    filled_in,
     limited,
     steadied,
-    tapered,
     unpinched,
 )
 from limber.geometry.skeleton.repair.spurs import SPUR_REACH, prune_spurs
@@ -44,7 +42,7 @@ class Repaired:
         skeleton: Its current state.
         points: The scan, thinned [m], shape [m, 3].
         radius_limits: Least and largest radius [m].
-        camera: The points are a depth camera's.
+        view: The depth camera's view of the points, if they are one's.
         rays: The points are one sensor's, evenly spaced across its sight and scattered along it.
         fit: The last fit.
         pinched: Start of the first fit, where only one side of wood was seen: it may make a stem
@@ -57,7 +55,7 @@ class Repaired:
     skeleton: Skeleton
     points: np.ndarray
     radius_limits: tuple[float, float]
-    camera: bool = False
+    view: View | None = None
     rays: bool = False
     fit: AxisFit | None = None
     pinched: Skeleton | None = None
@@ -71,7 +69,8 @@ class Repaired:
 
     def fitted(self, first: Skeleton, **how: Any) -> "Repaired":
         """The same after a fit that starts from ``first``."""
-        fit = fit_axes(first, self.points, along_sight=self.camera, progress=self.progress, **how)
+        fit = fit_axes(first, self.points, along_sight=self.view is not None,
+                       progress=self.progress, **how)
         if self.rays:
             fit = fit_of_rays(fit, self.points, certain=True) or fit
         return replace(self, fit=fit, skeleton=fit.skeleton)
@@ -113,7 +112,7 @@ class Pass:
 
 def _fit_coarsely(now: Repaired) -> Repaired:
     after = now.fitted(resampled(now.skeleton, _COARSE), uncertainty=False)
-    by_rays = fit_of_rays(after.last_fit, now.points, certain=now.camera)
+    by_rays = fit_of_rays(after.last_fit, now.points, certain=now.view is not None)
     if by_rays is not None:
         return replace(after, rays=True, fit=by_rays, skeleton=by_rays.skeleton)
     # For leaves too, unpinched radii would make thick stems that seem to have no leaves.
@@ -145,12 +144,6 @@ def _settle(now: Repaired) -> Repaired:
     rounds = _ROUNDS_NOISY if noisy else _ROUNDS_LATE if now.strands else 0
     return now.fitted(now.skeleton, rounds=rounds, settled=noisy and not now.strands,
                       seen=now.last_fit.seen)
-
-
-def _fill_in(now: Repaired) -> Repaired:
-    # Where leaves thicken or thin the axes, the nodes beside a gap give no information on it
-    # either.
-    return now.of(filled_in(now.skeleton, now.points)) if now.beside <= LEAF_SHARE else now
 
 
 STEADY = Pass("steady radii", "Where points are missing, a first radius is far too small.",
@@ -192,22 +185,20 @@ PASSES = (
     DROP_BARE_ENDS,
     Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
          lambda now: now.of(ends_within(now.skeleton, now.points))),
-    Pass("fill in blank radii", "No point determines a radius, but adjacent radii are known.",
-         _fill_in),
     LIMIT,
-    Pass("taper radii",
-         "A bunch of twigs that the scan does not resolve appears as a thick cylinder.",
-         lambda now: now.of(tapered(now.skeleton, point_counts(now.skeleton, now.points)))),
-    Pass("weigh unresolved radii",
-         "A radius smaller than the spacing or the noise is treated as measured.",
-         lambda now: now.of(assessed(now.skeleton, now.points, now.noise))),
+    Pass("find the likeliest radii",
+         "A radius that few points, the spacing or the noise determine, or that no wood has, is "
+         "treated as measured.",
+         lambda now: now.of(assessed(
+             now.skeleton, now.points, now.noise, rays=now.rays,
+             one_sided=now.last_fit.seen.one_sided, view=now.view))),
     Pass("mend kinks", "A branch turns more sharply than wood does.",
          lambda now: now.of(without_kinks(now.skeleton)[0])),
 )
 """In the order in which they run; some run again after a fit."""
 
 
-def repaired(skeleton: Skeleton, points: np.ndarray, diagonal: float, camera: bool,
+def repaired(skeleton: Skeleton, points: np.ndarray, diagonal: float, view: View | None,
              progress: Progress = SILENT) -> Repaired:
     """Run all passes on the skeleton of the contracted points.
 
@@ -215,10 +206,10 @@ def repaired(skeleton: Skeleton, points: np.ndarray, diagonal: float, camera: bo
         skeleton: With first radii.
         points: The scan, thinned [m], shape [m, 3].
         diagonal: Size of the cloud [m].
-        camera: The points are a depth camera's.
+        view: The depth camera's view of the points, if they are one's.
         progress: Called during fits.
     """
-    now = Repaired(skeleton, points, (_LEAST_RADIUS * diagonal, _MOST_RADIUS * diagonal), camera)
+    now = Repaired(skeleton, points, (_LEAST_RADIUS * diagonal, _MOST_RADIUS * diagonal), view)
     done = 0.0
     for each in PASSES:
         until = done if each.until is None else each.until

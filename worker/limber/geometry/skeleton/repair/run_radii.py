@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from limber.geometry.skeleton.radii.cylinders import point_counts
-from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
+from limber.geometry.skeleton.skeleton import LIMITED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths
 
 _RAG = 0.25  # fraction of a run's median radius (by length) below which a part is ignored
@@ -13,15 +13,6 @@ _STEADY = 40  # points that make a reliable radius
 _SURE = 1.96  # standard deviations
 _GROWTH = 1.25  # largest growth of a radius along a run, over the median measured so far
 _SPEAK = 1 / 8  # fraction of a run's nodes, and of its points, that decide for what follows
-
-
-def filled_in(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
-    """Return the skeleton, with radii that no point supports taken from their neighbours."""
-    blank = skeleton.radius_state == INTERPOLATED
-    if not blank.any():
-        return skeleton
-    return replace(skeleton, radius=np.where(blank, steadied(skeleton, points).radius,
-                                             skeleton.radius))
 
 
 def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:

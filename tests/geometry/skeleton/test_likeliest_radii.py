@@ -1,0 +1,107 @@
+"""Radii of all branches together: measured ones as measured, others as wood grows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.geometry.skeleton.confidence import assessed
+from limber.geometry.skeleton.radii.likeliest_radii import RadiusEvidence, likeliest_radii
+from limber.geometry.skeleton.skeleton import (
+    INTERPOLATED,
+    LIMITED,
+    MEASURED,
+    UNRESOLVED,
+    Skeleton,
+)
+
+_STEM, _TWIG = 81, 40
+
+
+def _plant(stem: np.ndarray | float = 0.008, twig: np.ndarray | float = 0.003,
+           sigma: float = 0.02) -> Skeleton:
+    """A stem of 0.4 m along z and a twig of 0.12 m from its middle, all measured."""
+    z, x = np.linspace(0, 0.4, _STEM), np.linspace(0, 0.12, _TWIG + 1)[1:]
+    nodes = np.vstack([np.stack([0 * z, 0 * z, z], axis=1),
+                       np.stack([x, 0 * x, 0 * x + 0.2], axis=1)])
+    parent = np.r_[np.arange(_STEM) - 1, 40, _STEM + np.arange(_TWIG - 1)]
+    radius = np.r_[np.broadcast_to(stem, _STEM), np.broadcast_to(twig, _TWIG)]
+    return Skeleton.from_edges(nodes, parent, radius, radius_sigma=sigma * radius,
+                               radius_state=np.full(len(radius), MEASURED, np.int8))
+
+
+def _seen(spacing: float = 0.001, noise: float = 0.0005, **more: object) -> RadiusEvidence:
+    return RadiusEvidence(np.full(_STEM + _TWIG, spacing), noise, **more)
+
+
+def test_well_measured_radii_stay() -> None:
+    """Also a twig far thinner than most are against their carrier."""
+    for twig in (0.006, 0.003, 0.001):
+        told = likeliest_radii(_plant(twig=twig), _seen(0.0003, 0.0001))
+        np.testing.assert_allclose(told.radius, _plant(twig=twig).radius, rtol=0.05)
+        assert (told.radius_state == MEASURED).all()
+        assert (told.radius_sigma > 0.005 * told.radius).all()
+
+
+def test_a_gap_gets_the_radius_between_and_a_wider_interval() -> None:
+    """The middle of a gap is less sure than its ends."""
+    stem = np.linspace(0.009, 0.006, _STEM)
+    plant = _plant(np.where(np.isin(np.arange(_STEM), range(20, 50)), 4e-4, stem))
+    state = np.where(plant.radius < 5e-4, INTERPOLATED, MEASURED).astype(np.int8)
+    told = likeliest_radii(replace(plant, radius_state=state), _seen())
+    np.testing.assert_allclose(told.radius[:_STEM], stem, rtol=0.08)
+    sigma = told.radius_sigma / told.radius
+    assert sigma[35] > 1.5 * sigma[10] and (told.radius_state[20:50] == INTERPOLATED).all()
+
+
+@pytest.mark.parametrize("fitted", [0.0004, 0.0015])
+def test_an_unresolved_twig_follows_its_carrier(fitted: float) -> None:
+    """Fits of a few points far apart come out anywhere: carrier and interval decide."""
+    plant = _plant(twig=fitted, sigma=0.3)
+    told = likeliest_radii(plant, _seen(0.008, 0.0005))
+    twig = told.branch == 1
+    assert (told.radius_state[twig] == UNRESOLVED).all()
+    low, high = (told.radius[twig] * np.exp(way * 1.96 * (told.radius_sigma / told.radius)[twig])
+                 for way in (-1, 1))
+    assert (low < 0.001).all() and (high > 0.004).all()
+    assert np.median(told.radius[twig]) < 0.006
+
+
+def test_one_fit_that_failed_among_good_ones_moves_little() -> None:
+    """A knot of 30 mm between radii of 8 mm does not thicken its neighbours."""
+    radius = np.full(_STEM, 0.008)
+    radius[40:43] = 0.03
+    told = likeliest_radii(_plant(radius), _seen())
+    np.testing.assert_allclose(told.radius[:36], 0.008, rtol=0.06)
+    assert told.radius[41] < 0.02
+
+
+def test_a_bunch_at_the_end_of_a_stem_is_stated_and_not_believed() -> None:
+    """Points of a bunch three times as wide as the stem; the stem's radius goes on."""
+    rng = np.random.default_rng(0)
+    z, angle = rng.uniform(0, 0.4, 6000), rng.uniform(0, 2 * np.pi, 6000)
+    wide = np.where(z > 0.3, 0.024, 0.008)
+    points = np.stack([wide * np.cos(angle), wide * np.sin(angle), z], axis=1)
+    plant = _plant(np.where(np.linspace(0, 0.4, _STEM) > 0.3, 0.024, 0.008)).subset(
+        np.arange(_STEM + _TWIG) < _STEM)
+    told = assessed(plant, points, 0.0003)
+    assert (told.radius_state[62:] == LIMITED).all() and told.radius[62:].max() < 0.012
+
+
+def test_an_image_widens_its_branches_by_a_fraction_of_a_pixel() -> None:
+    """A quarter of a pixel is taken off, and the interval holds no pixel and half a one."""
+    pixel = np.full(_STEM + _TWIG, 0.002)
+    told = likeliest_radii(_plant(), _seen(0.0002, 0.0, pixel=pixel, one_sided=True))
+    np.testing.assert_allclose(told.radius[:_STEM], 0.0075, rtol=0.02)
+    assert (1.96 * told.radius_sigma[:_STEM] > 0.0005).all()
+    coarse = likeliest_radii(_plant(), _seen(0.0002, 0.0, pixel=50 * pixel, one_sided=True))
+    assert (coarse.radius > 0).all() and np.isfinite(coarse.radius_sigma).all()
+
+
+def test_errors_that_all_fits_share_widen_all_intervals() -> None:
+    """Of a coarser scan, of registration, and of sections that one side shows."""
+    plain = likeliest_radii(_plant(), _seen(0.0005, 0.0))
+    for more, factor in ((_seen(0.005, 0.0), 1.5), (_seen(0.0005, 0.0, shared=0.0008), 1.5),
+                         (_seen(0.0005, 0.0, one_sided=True), 1.15)):
+        told = likeliest_radii(_plant(), more)
+        assert (told.radius_sigma > factor * plain.radius_sigma)[5:_STEM - 5].all()
