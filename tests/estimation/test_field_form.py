@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 
+from benchmarks.paper_branches import Bench, PaperBranch
+from limber.core.errors import InputError
 from limber.estimation.interpolation_prior import YoungField, open_field
-from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
+from limber.mechanics.materials.layered_section import LayeredSection
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)
@@ -49,6 +52,51 @@ def test_one_modulus_is_uniform_and_the_papers_field_is_its_weights(small_bench)
     assert one.names == ()
     plain = YoungField(small_bench.weights)
     assert plain.young(Values(TRUTH, 0.35, 900.0)) == pytest.approx(small_bench.weights @ TRUTH)
+
+
+FORKED = PaperBranch("forked", (3e7,) * 4, 0.35, 0.4, (0.010, 0.008), 0.3, (0.5, 0.12))
+
+
+@pytest.fixture(scope="module")
+def forked():
+    return Bench(FORKED)
+
+
+def test_side_branches_of_each_order_have_a_ratio_of_their_own(forked):
+    """Only where it is asked for, and with a wide prior; the interval is that of the fit."""
+    field = open_field(forked.mesh, FORKED.skeleton, forked.weights, FRACTIONS, by_order=True)
+    assert field.names[-1] == "form of side branches of order 1"
+    values = Values(TRUTH, 0.35, 900.0, form=(0.0,) * (len(field.names) - 1) + (-1.0,))
+    plain = replace(values, form=(0.0,) * len(field.names))
+    ratio = np.log(field.young(values) / field.young(plain))
+    aside = forked.mesh.centroids[:, 0] < forked.mesh.centroids[:, 0].min() + 0.04
+    assert ratio[aside] == pytest.approx(-LINK_DEVIATION) and 0.5 < np.mean(ratio == 0) < 1
+    found, = field.order_moduli(values, {field.names[-1]: 0.5})
+    assert found["order"] == 1 and found["factor"] == pytest.approx(np.exp(-LINK_DEVIATION))
+    assert np.log(found["interval"]) == pytest.approx(-LINK_DEVIATION * np.array([1.98, 0.02]))
+
+
+def test_layers_are_in_every_form_of_the_field(small_bench):
+    """A hollow branch of one modulus: the equivalent one of thin sections is the lower."""
+    section = LayeredSection(pith_radius=5e-3)
+    factor = section.on(small_bench.mesh, small_bench.branch.skeleton)
+    assert factor.min() == pytest.approx(1 - (5 / 8)**4, abs=0.02)
+    assert factor.max() == pytest.approx(1 - (5 / 10)**4, abs=0.02)
+    field = open_field(small_bench.mesh, small_bench.branch.skeleton,
+                       factor[:, None] * small_bench.weights, FRACTIONS,
+                       log_factor=np.log(factor))
+    one = Values(np.full(4, 2e7), 0.35, 900.0, form=(-0.7,) + (0.0,) * (len(field.names) - 1))
+    assert field.young(one) == pytest.approx(2e7 * factor)
+    with pytest.raises(InputError, match="No wood is left"):
+        LayeredSection(pith_radius=8e-3).on(small_bench.mesh, small_bench.branch.skeleton)
+
+
+@pytest.mark.parametrize(("section", "factor"), [
+    (LayeredSection(), 1.0), (LayeredSection(pith_radius=5e-3), 1 - 0.5**4),
+    (LayeredSection(bark_thickness=1e-3, bark_modulus=1.0), 1.0),
+    (LayeredSection(bark_thickness=1e-3, bark_modulus=0.1), 0.9**4 + 0.1 * (1 - 0.9**4))])
+def test_a_layered_section_bends_as_its_layers(section, factor):
+    assert section.bending_factor(np.array([0.01])) == pytest.approx(factor)
 
 
 def test_a_prior_is_a_row_of_its_own():

@@ -12,7 +12,7 @@ from limber.estimation.fitting.objective import Objective
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull
-from limber.estimation.uncertainty.grip_error import grip_error
+from limber.estimation.uncertainty.shape_sensitivity import grip_error
 from limber.geometry.skeleton.control_points import control_points
 from limber.recordings.cell_errors import EXACT
 

@@ -10,6 +10,7 @@ from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError
 from limber.core.progress import Progress
 from limber.estimation.fitting import reduced_fit
+from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.simulated_pull import VirtualPullSettings
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -18,6 +19,7 @@ from limber.results.report.estimate_figures import report_figures
 from limber.stages.moduli.estimate import EVALUATIONS, estimate, follow
 from limber.stages.pulls.virtual_pull import virtual_pull
 from limber.store import Branch
+from limber.store.loading import load_estimated_subject
 
 QUICK = EstimateSettings(key_frames=6)
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
@@ -179,3 +181,23 @@ def test_following_a_pull(branch_folder):
     batch = np.array(estimate(branch_folder, settings)["young_pa"])
     assert np.all(np.abs(np.log(np.array(result["young_pa"]) / batch)) < half)
     assert np.all(np.abs(np.log(np.array(result["young_pa"]) / TRUTH)) < 2 * half + 0.03)
+
+
+@pytest.mark.slow
+def test_a_hollow_branch_has_stiffer_wood_and_the_same_bending_stiffness(branch_folder):
+    """The mesh gets the modulus of solid sections; what is computed on it stays the same."""
+    quick = QUICK.model_copy(update={"mesh_check": False, "shapes": 0})
+    solid = estimate(branch_folder, quick)
+    mesh = TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"]
+    hollow = estimate(branch_folder, quick.model_copy(update={"pith_radius": 6e-3}))
+    wood = np.array(hollow["young_pa"]) / np.array(solid["young_pa"])
+    # The radius falls from 10 to 8 mm.
+    assert np.all(wood > 1 / (1 - 0.6**4) - 0.02) and np.all(wood < 1 / (1 - 0.75**4) + 0.02)
+    assert hollow["bending_stiffness_nm2"] == pytest.approx(solid["bending_stiffness_nm2"],
+                                                            rel=0.03)
+    again = TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"]
+    assert again == pytest.approx(mesh, rel=0.12)
+    known = json.loads((branch_folder / "estimate.json").read_text())
+    subject = load_estimated_subject(Branch.read(branch_folder), known, gravity=True)
+    assert subject.young(Values(np.array(known["young_mesh_pa"]), 0.36, 900.0,
+                                form=tuple(known["field_form"]))) == pytest.approx(again)

@@ -64,6 +64,18 @@ class _Drift(_Told):
     interval: tuple[float, float]
 
 
+class _Creep(_Told):
+    share: float
+    interval: tuple[float, float]
+    time_s: _Positive
+
+
+class _OrderModulus(_Told):
+    order: int
+    factor: _Positive
+    interval: tuple[_Maybe, _Maybe]
+
+
 class _Evaluation(_Told):
     parameters: list[_Maybe] = []
     loss_m2: _Maybe = None
@@ -119,6 +131,10 @@ class _Estimate(_Told):
     recording_spread: float = 0.0
     field_form: list[float] | None = None
     field_form_deviations: list[_Positive] | None = None
+    creep: _Creep | None = None
+    orders: bool = False
+    section: dict[str, float] = {}
+    order_moduli: list[_OrderModulus] = []
     causes: list[_Cause] | None = None
     next_actions: list[_Action] | None = None
     held_out: dict[str, _Score] | None = None

@@ -35,6 +35,7 @@ def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
         "forward_count": found.objective.forward_count, "converged": found.fit.converged,
         "stopped": found.stopped, "is_weightless": found.is_weightless, "held_out": found.held_out,
         "variance_factor": sure.variance_factor, "warnings": found.warnings,
+        "creep": found.creep, "orders": settings.orders, "section": settings.section,
         "forward": settings.forward} | _bending(found) | _reduced_error(found) | _by_pull(found)
 
 
@@ -75,6 +76,9 @@ def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, A
     content: dict[str, Any] = {
         "control_points_m": subject.control_points,
         "fractions": _fractions(subject), "parameters": objective.space.names,
+        "order_moduli": [] if subject.field is None else subject.field.order_moduli(
+            found.values, dict(zip(objective.space.names, np.sqrt(np.diag(
+                found.uncertainty.covariance)), strict=True))),
         "field_form_deviations": ([] if subject.field is None
                                   else subject.field.deviations(found.values)),
         "groups": objective.space.groups, "links": objective.space.links,

@@ -15,6 +15,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.loads.loaded_branch import is_stable
+from limber.mechanics.materials.layered_section import LayeredSection
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.materials.young_field import young_weights
 from limber.mechanics.model import BranchModel
@@ -29,7 +30,8 @@ class Subject:
         mesh: Its tetrahedra.
         skeleton: Its axes.
         control_points: [m], shape [K, 3].
-        weights: Map Young's modulus from the control points to the tetrahedra, [tet_count, K].
+        weights: Map Young's modulus from the control points to the tetrahedra, [tet_count, K]; of
+            a layered section that of the wood to the equivalent one.
         model: The model with the initial values.
         start: The initial values.
         field: Interpolation prior between the control points. None: the weights interpolate.
@@ -87,11 +89,13 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     model = model.as_scanned() if settings.gravity else model
     start = Values(np.full(len(points), young), poisson, density,
                    (damping.mass, damping.stiffness))
-    weights = young_weights(mesh, points)
+    factor = LayeredSection(**settings.section).on(mesh, skeleton) if settings.section else 1.0
+    weights = np.reshape(factor, (-1, 1)) * young_weights(mesh, points)
     field = None
     if settings.field == "open" and settings.forward == "full" and (
             settings.method == "gauss-newton"):
-        field = open_field(mesh, skeleton, weights, settings.fractions)
+        field = open_field(mesh, skeleton, weights, settings.fractions, log_factor=np.log(factor),
+                           by_order=settings.orders)
     return Subject(mesh, skeleton, points, weights, model, start, field)
 
 

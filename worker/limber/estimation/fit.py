@@ -43,6 +43,7 @@ from limber.estimation.forward.forward_model import Forward, under_its_weight
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import uncertainty
+from limber.estimation.uncertainty.creep import with_creep
 from limber.estimation.uncertainty.identifiability import (
     identifiability,
     link_unresolved,
@@ -203,10 +204,12 @@ def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
 
 def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
               progress: Progress = SILENT, *, cache: Path | None = None, digest: str = "",
-              near: Values | None = None, far: FarPoints | None = None) -> Estimate:
+              near: Values | None = None, far: FarPoints | None = None, quick: bool = False,
+              ) -> Estimate:
     """Check what the data determine, fit the moduli, and compute their uncertainty.
 
     Args:
+        quick: Leave Gauss' approximation of the intervals as it is.
         near: Values near the solution, to start from if they have an equilibrium.
         far: Ends the fit if it finds points far from where they were simulated.
         cache, digest: Folder of the reduced bases, and digest of their dependencies; see
@@ -236,12 +239,13 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
         far.look(fit.evaluation, objective)
     if settings.method == "gauss-newton" and not stopped:
         fit, objective = _linked_at_the_end(fit, objective, settings, progress)
+        fit, objective = with_creep(fit, objective)
         fit = averaged(fit, objective)
     elif not stopped:
         for message in link_unresolved(fit.evaluation, objective.space)[1]:
             progress.warn(message)
     sure = uncertainty(fit.evaluation, objective)
-    if not stopped:
+    if not stopped and not quick:
         sure = profiled(sure, fit.evaluation, objective, progress)
     found = Estimate(fit, objective, sure, judged)
     judge_fit(found, progress)

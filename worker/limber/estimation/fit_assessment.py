@@ -10,7 +10,7 @@ from limber.core.errors import WorkError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit_preparation import forwards_of
-from limber.estimation.fitting.nuisances import in_words, nuisance_records, unlikely
+from limber.estimation.fitting.nuisances import CREEP, in_words, nuisance_records, unlikely
 from limber.estimation.fitting.objective import Objective, held_out, without
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton
 from limber.estimation.forward.forward_model import Forward
@@ -18,7 +18,6 @@ from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.bending_stiffness import SectionMean
 from limber.estimation.uncertainty.covariance import Uncertainty, outliers
-from limber.estimation.uncertainty.grip_error import grip_error
 from limber.estimation.uncertainty.identifiability import (
     SCALE_DEVIATION,
     Identifiability,
@@ -34,7 +33,9 @@ from limber.estimation.uncertainty.model_error import (
 from limber.estimation.uncertainty.next_actions import Prospects
 from limber.estimation.uncertainty.path_error import path_error, path_prescribed
 from limber.estimation.uncertainty.shape_error import hung_error, shape_error
+from limber.estimation.uncertainty.shape_sensitivity import grip_error
 from limber.estimation.uncertainty.variance_parts import largest, variance_parts
+from limber.mechanics.materials.layered_section import LayeredSection
 from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry, Pull
 
@@ -116,6 +117,17 @@ class Estimate:
                                                           self.uncertainty.covariance)
 
     @property
+    def creep(self) -> dict[str, Any] | None:
+        """Creep of the branch: ``share`` by which a lasting load lowers the moduli, its 95 %
+        ``interval``, and ``time_s``, the time constant [s]; None: the record does not show it.
+        """
+        record = next((each for each in self.cell_errors if each["name"] == CREEP), None)
+        if record is None:
+            return None
+        seconds = next(each.creep_time for each in self.objective.forwards if each.creep_time)
+        return {"share": record["value"], "interval": record["interval"], "time_s": seconds}
+
+    @property
     def causes(self) -> dict[str, np.ndarray]:
         """Variance of log E at the control points by cause, each of shape [K]."""
         sure = self.uncertainty
@@ -191,6 +203,13 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
             "intervals are widened by this factor.")
     for sentence in in_words(found.cell_errors):
         progress.warn(sentence)
+    if (creep := found.creep) is not None:
+        low, high = (100 * end for end in creep["interval"])
+        progress.warn(
+            f"The branch creeps: under a lasting bend its force falls by {100 * creep['share']:.2g}"
+            f" % ({low:.2g} to {high:.2g} %) with a time constant of about {creep['time_s']:.2g} "
+            "s. The moduli are those under a quick load. Under a lasting load they are lower by "
+            "this share.")
     named = outliers(found.fit.evaluation, found.objective)
     if named:
         worst = "; ".join(f"{entry['pull']} {entry['what']} at {entry['time_s']:.2f} s "
@@ -260,7 +279,8 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
     """
     subject = subject.without_weight() if found.is_weightless else subject
     found.second_moment = np.exp(SectionMean.of(
-        subject.skeleton, subject.mesh, subject.weights).log_second_moment(subject.skeleton.radius))
+        subject.skeleton, subject.mesh, subject.weights).log_second_moment(
+            subject.skeleton.radius, LayeredSection(**settings.section)))
     error = _geometry_error(subject, found, settings, axes, cloud, progress)
     if settings.mesh_check:
         progress(1.0, "measuring the excess stiffness of the mesh")

@@ -9,13 +9,15 @@ the moduli: the pull determines them, or they widen the intervals. Bumps are lar
 neighbouring moduli differ.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.core.not_none import present
-from limber.estimation.parameters import Values
+from limber.estimation.parameters import LINK_DEVIATION, Values
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 
@@ -33,6 +35,7 @@ slopes at both. Slopes of 0 to 3 times the straight one's keep it monotone (Frit
 points it may stop at once or continue for the length of a step: the uniform deviation, sqrt(1/12) =
 0.29.
 """
+_ORDER = "form of side branches of order "
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,7 @@ class YoungField:
         widths: Deviations of these changes if all moduli are the same, shape [B].
         steps: Increase of them by a change of log E at the control points, shape [B, K].
         names: Names of the mixture and the bumps, B + 1; empty without ``straight``.
+        log_factor: Log of the factor of a layered section in ``weights``, shape [tet_count].
     """
 
     weights: np.ndarray
@@ -55,6 +59,7 @@ class YoungField:
     widths: np.ndarray | None = None
     steps: np.ndarray | None = None
     names: tuple[str, ...] = ()
+    log_factor: np.ndarray | float = 0.0
 
     def young(self, values: Values) -> np.ndarray:
         """Young's modulus of all tetrahedra [Pa], shape [tet_count]."""
@@ -64,7 +69,7 @@ class YoungField:
         form = self._form(values)
         part = self._part(form)
         sizes, _ = self._sizes(values)
-        return np.exp((1 - part) * np.log(plain) + part * (self.straight @ np.log(values.young))
+        return np.exp(np.log(plain) + part * self._deviation(values)
                       + self.bumps @ (sizes * form[1:]))
 
     def shares(self, values: Values, extra: tuple[str, ...]) -> np.ndarray:
@@ -82,7 +87,7 @@ class YoungField:
                   + (self.bumps @ (form[1:, None] * by_young)).T)
         if self.names[0] not in extra:
             return shares
-        deviation = self.straight @ np.log(values.young) - np.log(plain)
+        deviation = self._deviation(values)
         return np.vstack([shares, MIXTURE[1] * deviation, (self.bumps * sizes).T])
 
     def deviations(self, values: Values) -> np.ndarray:
@@ -94,7 +99,7 @@ class YoungField:
         control points, shape [B + 1, K].
         """
         plain = self.weights @ values.young
-        deviation = self.straight @ np.log(values.young) - np.log(plain)
+        deviation = self._deviation(values)
         by_young = self.straight - self.weights * values.young / plain[:, None]
         sizes, sizes_by_young = self._sizes(values)
         # For a uniform branch both fields of the mixture are the same.
@@ -104,6 +109,33 @@ class YoungField:
     def same_at_any_step(self) -> "YoungField":
         """Return the field with the bumps of a uniform branch, as in older estimates."""
         return self if self.straight is None else replace(self, steps=np.zeros_like(self.steps))
+
+    def order_moduli(self, values: Values, deviation: Mapping[str, float],
+                     ) -> list[dict[str, Any]]:
+        """Modulus of the side branches of each order over that of the main path.
+
+        Args:
+            deviation: Name of a free parameter to its standard deviation.
+
+        Returns:
+            Of each order ``order``, ``factor`` and its 95 % ``interval``.
+        """
+        found = []
+        sizes = self.deviations(values)
+        for number, name in enumerate(self.names[1:]):
+            if name.startswith(_ORDER) and name in deviation:
+                middle = sizes[number] * values.form[1 + number]
+                width = 1.96 * sizes[number] * deviation[name]
+                found.append({"order": int(name.removeprefix(_ORDER)),
+                              "factor": float(np.exp(middle)),
+                              "interval": np.exp([middle - width, middle + width]).tolist()})
+        return found
+
+    def _deviation(self, values: Values) -> np.ndarray:
+        """Log-linear field less the paper's, of the tetrahedra, shape [tet_count]."""
+        straight = present(self.straight, "log-linear field")
+        return straight @ np.log(values.young) + self.log_factor - np.log(
+            self.weights @ values.young)
 
     def _sizes(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
         """Deviations of the bumps [B], and their derivative to log E at the control points [B, K].
@@ -120,20 +152,25 @@ class YoungField:
 
 
 def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
-               fractions: tuple[float, ...]) -> YoungField:
+               fractions: tuple[float, ...], *, log_factor: np.ndarray | float = 0.0,
+               by_order: bool = False) -> YoungField:
     """Return the field with an unknown interpolation; for a single modulus, the uniform one.
 
     Args:
         fractions: Positions of the control points on the main path, ascending, shape [K].
+        log_factor: Log of the factor of a layered section that is in the weights, [tet_count].
+        by_order: Whether side branches of each order have a modulus of their own.
     """
     positions = np.asarray(fractions, float)
-    if len(positions) < 2 or np.any(np.diff(positions) <= 0):
+    is_uniform = len(positions) < 2 or bool(np.any(np.diff(positions) <= 0))
+    along, order = _element_positions(mesh, skeleton)
+    if is_uniform and not (by_order and order.any()):
         return YoungField(weights)
-    along, is_side = _element_positions(mesh, skeleton)
     straight = _hats(along, positions)
     halfway = (positions[1:] + positions[:-1]) / 2
-    stations = np.sort(np.r_[positions, halfway, *([0.0] if positions[0] > 0 else []),
-                             *([1.0] if positions[-1] < 1 else [])])
+    stations = positions if is_uniform else np.sort(
+        np.r_[positions, halfway, *([0.0] if positions[0] > 0 else []),
+              *([1.0] if positions[-1] < 1 else [])])
     hats = _hats(along, stations)
     names, bumps, widths, steps = ["form"], [], [], []
     for number, station in enumerate(stations):
@@ -146,17 +183,17 @@ def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
         beside = int(np.clip(np.searchsorted(positions, station), 1, len(positions) - 1))
         steps.append((STEP_BETWEEN if inside else STEP_BEYOND) * (
             np.eye(len(positions))[beside] - np.eye(len(positions))[beside - 1]))
-    if is_side.any():
-        names.append("form of side branches")
-        bumps.append(is_side.astype(float))
-        widths.append(BUMP_OF_ORDER)
+    for number in np.unique(order[order > 0]) if by_order else [0] if order.any() else []:
+        names.append(f"{_ORDER}{number}" if by_order else "form of side branches")
+        bumps.append((order == number if by_order else order > 0).astype(float))
+        widths.append(LINK_DEVIATION if by_order else BUMP_OF_ORDER)
         steps.append(np.zeros(len(positions)))
     return YoungField(weights, straight, np.column_stack(bumps), np.array(widths),
-                      np.array(steps), tuple(names))
+                      np.array(steps), tuple(names), log_factor)
 
 
 def _element_positions(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
-    """Position of each tetrahedron on the main path (0 to 1), and whether it is on a side branch.
+    """Position of each tetrahedron on the main path (0 to 1), and its branching order (0: main).
     """
     path = np.asarray(skeleton.main_path())
     on_path = np.zeros(len(skeleton.nodes), bool)
@@ -175,7 +212,8 @@ def _element_positions(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, n
     for share in (0.25, 0.5, 0.75):
         middles.append((1 - share) * skeleton.nodes[parent] + share * skeleton.nodes[child])
         positions.append((1 - share) * positions[0][parent] + share * positions[0][child])
-    side = np.concatenate([~on_path, *3 * [~on_path[child]]])
+    orders = np.where(on_path, 0, np.maximum(skeleton.order, 1))
+    side = np.concatenate([orders, *3 * [orders[child]]])
     nearest = cKDTree(np.vstack(middles)).query(mesh.centroids)[1]
     return np.clip(np.concatenate(positions)[nearest], 0.0, 1.0), side[nearest]
 

@@ -23,9 +23,10 @@ class EstimateSettings(Settings):
     """Options for estimating Young's modulus from pulls."""
 
     groups: ClassVar[Groups] = {
-        "input": ("pull", "drive", "motion", "fractions", "free_frame"),
+        "input": ("pull", "drive", "motion", "fractions", "control_points",
+                  "free_frame"),
         "material": ("young", "poisson", "density", "gravity", "fit_poisson", "fit_density",
-                     "fit_damping"),
+                     "fit_damping", "orders", "pith_radius", "bark_thickness", "bark_modulus"),
         "solver": ("method", "forward", "key_frames"),
         "uncertainty": ("field", "poisson_sigma", "density_sigma", "hung_sigma", "hold_out",
                         "mesh_check", "shapes"),
@@ -49,6 +50,9 @@ class EstimateSettings(Settings):
     fractions: tuple[float, ...] = Field(
         (0.2, 0.4, 0.6, 0.8), description="Positions of the control points as fractions of the "
             "main path.")
+    control_points: Literal["fractions", "evidence"] = Field(
+        "fractions", description="fractions: control points at --fractions. evidence: 1 to 6 at "
+        "equal distances, as many as the pulls support.")
     free_frame: bool = Field(
         False, description="Fit the frame of the observed points freely, to 10 cm and 17 degrees, "
         "instead of within the pull's calibration. The result states what that costs.")
@@ -71,6 +75,16 @@ class EstimateSettings(Settings):
     fit_poisson: bool = Field(False, description="Estimate Poisson's ratio too.")
     fit_density: bool = Field(False, description="Estimate the density too.")
     fit_damping: bool = Field(False, description="Estimate Rayleigh damping too (dynamic only).")
+    orders: bool = Field(
+        False, description="Estimate the modulus of side branches over that of the main path, one "
+        "ratio for each branching order. Pull or observe side branches: otherwise the pulls do not "
+        "determine it.")
+    pith_radius: float = Field(
+        0.0, ge=0, description="Radius of a hollow or of pith that carries nothing [m]. The "
+        "modulus is then that of the wood, and the mesh has an equivalent one for bending.")
+    bark_thickness: float = Field(0.0, ge=0, description="Thickness of the bark [m].")
+    bark_modulus: float = Field(
+        0.0, ge=0, description="Young's modulus of the bark over that of the wood.")
     key_frames: int = Field(
         12, ge=3, description="Number of simulated frames. A spline interpolates the others. The "
         "number is doubled if that changes the result.")
@@ -91,6 +105,15 @@ class EstimateSettings(Settings):
 
     _young = field_validator("young")(possible_young)
     _density = field_validator("density")(possible_density)
+
+    @property
+    def section(self) -> dict[str, float]:
+        """Layers of the cross-section, as :class:`limber.mechanics.materials.layered_section` takes
+        them; empty for a solid one.
+        """
+        layers = {"pith_radius": self.pith_radius, "bark_thickness": self.bark_thickness,
+                  "bark_modulus": self.bark_modulus}
+        return layers if self.pith_radius or self.bark_thickness else {}
 
 
 class SwingSettings(Settings):

@@ -279,7 +279,8 @@ def load_estimated_subject(branch: Branch, known: dict[str, Any], *, gravity: bo
     """
     subject = load_subject(branch, EstimateSettings(
         fractions=tuple(known["fractions"]), gravity=gravity and not known.get("is_weightless"),
-        field="open" if known.get("field_form") else "inverse_distance"))
+        field="open" if known.get("field_form") else "inverse_distance",
+        orders=known.get("orders", False), **known.get("section", {})))
     if subject.field is not None and known.get("field_form_deviations") is None:
         return replace(subject, field=subject.field.same_at_any_step())
     return subject

@@ -34,6 +34,12 @@ UNLIKELY = 10.0
 off, with moduli five times too high and narrow intervals.
 """
 
+CREEP = "creep of the branch"
+CREEP_SIGMA = 0.1
+"""Prior deviation of the share by which the force under a lasting bend falls: of green wood within
+minutes some percent.
+"""
+
 
 @dataclass(frozen=True)
 class Nuisance:
@@ -233,6 +239,10 @@ def _sources(forward: Forward, known: CalibrationEntry) -> list[_Source]:
             False, _along)
         if len(forward.frames) > 3:
             add(["camera clock"], "s", known.clock_sigma_s, False, _late)
+    seconds = forward.creep_time
+    if seconds is not None and forward.uses_force and not forward.force_is_stated:
+        add([CREEP], "", CREEP_SIGMA, True, lambda pull: {
+            "forces": -relaxed(pull.frames.times, pull.forces, seconds)[..., None]})
     if forward.uses_force and not forward.force_is_stated:
         add(["force gain"], "", known.force_gain_sigma, True,
             lambda pull: {"forces": pull.forces[..., None]})
@@ -291,6 +301,28 @@ def _late(pull: _Pull) -> dict[str, np.ndarray]:
     return {"points": np.gradient(pull.positions, times, axis=0)[..., None]}
 
 
+def relaxed(times: np.ndarray, forces: np.ndarray, seconds: float) -> np.ndarray:
+    """Part of a force that a standard linear solid relaxes, per share of the relaxation, [f, 3].
+
+    The integral of (1 - exp(-(t - s) / seconds)) dF(s), exact for forces that are linear between
+    the frames; the force of the first frame has acted for long.
+
+    Args:
+        times: [s], shape [f].
+        forces: Of the elastic branch [N], shape [f, 3].
+        seconds: Time constant [s].
+    """
+    found = np.zeros_like(forces)
+    waiting = np.zeros(forces.shape[1])
+    for frame in range(1, len(times)):
+        step = (times[frame] - times[frame - 1]) / seconds
+        kept = np.exp(-step)
+        new = (1 - kept) / step if step > 0 else 1.0
+        waiting = kept * waiting + new * (forces[frame] - forces[frame - 1])
+        found[frame] = forces[frame] - forces[0] - waiting
+    return found
+
+
 def nuisance_records(nuisances: Sequence[Nuisance], found: Eliminated,
                      free: np.ndarray) -> list[dict]:
     """Return each error with its value, 95 % interval and prior deviation, in its own unit.
@@ -314,7 +346,8 @@ def nuisance_records(nuisances: Sequence[Nuisance], found: Eliminated,
 
 def in_words(listed: Sequence[dict]) -> list[str]:
     """Return a sentence for each error without which the fit would be poor, largest first."""
-    named = sorted((each for each in listed if each["explains_misfit"]),
+    named = sorted((each for each in listed
+                    if each["explains_misfit"] and each["name"] != CREEP),
                    key=lambda each: -abs(each["value"] / each["prior_sigma"]))
     return [_sentence(each) for each in named]
 

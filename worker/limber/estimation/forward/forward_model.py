@@ -88,6 +88,9 @@ class Forward(ABC):
     shape [m].
     """
 
+    creep_time: float | None = None
+    """Time constant of the branch's creep [s], if its share is an unknown of the fit."""
+
     def __init__(self, name: str, entry: PullEntry, frames: Frames, rest_points: np.ndarray):
         self.name, self.entry, self.frames = name, entry, frames
         self.rest_points = np.asarray(rest_points, float)

@@ -11,6 +11,7 @@ import numpy as np
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.materials.layered_section import LayeredSection
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,14 @@ class SectionMean:
         share = (weights * (np.abs(mesh.volumes) / radius**2)[:, None]).T
         return cls(low, high, fraction, share / share.sum(axis=1, keepdims=True))
 
-    def log_second_moment(self, radius: np.ndarray) -> np.ndarray:
+    def log_second_moment(self, radius: np.ndarray, section: LayeredSection | None = None,
+                          ) -> np.ndarray:
         """Return the mean log of the second moment of area [log m^4], shape [K].
 
         Args:
             radius: At the skeleton's nodes [m], shape [node_count].
+            section: Its layers; their moment is that of as much wood.
         """
         between = (1 - self.fraction) * radius[self.low] + self.fraction * radius[self.high]
-        return self.weights @ np.log(np.pi / 4 * between**4)
+        carrying = 1.0 if section is None else section.bending_factor(between)
+        return self.weights @ np.log(np.pi / 4 * between**4 * carrying)

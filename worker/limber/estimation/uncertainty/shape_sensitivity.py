@@ -21,6 +21,7 @@ from limber.estimation.fitting.nuisances import ErrorSlopes
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import Values
+from limber.estimation.uncertainty.path_error import WIDEST
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.model import BranchModel
@@ -184,3 +185,26 @@ def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndar
     found = tangent.solve_all(rights, np.column_stack(pins))
     return [(imposed + free, out + STEP * here.model.tangent_times(state, imposed + free))
             for imposed, free, out in zip(moved, found, after, strict=True)]
+
+
+def grip_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | None:
+    """Relative standard deviation of E from the length in a clamping gripper, shape [K].
+
+    Because of soft pads and the position where the branch leaves the jaws, that length is never
+    known to a millimetre (``held_length_sigma_m`` of the calibration). Its error is the same in all
+    pulls.
+
+    Args:
+        evaluation: At the end of the fit.
+        objective: The minimised objective.
+
+    Returns:
+        None if no gripper clamps or its length is known, or as for
+        :func:`limber.estimation.uncertainty.shape_sensitivity.taken_up`.
+    """
+    if not any(forward.entry.grasp.mode == "clamped"
+               and calibration_of(forward.entry).held_length_sigma_m > 0
+               for forward in objective.forwards):
+        return None
+    steps = taken_up(evaluation, objective, grip_slopes)
+    return None if steps is None else np.minimum(np.abs(steps[:, 0]), WIDEST)

@@ -38,6 +38,7 @@ ADVICE = {
                                 "reconstruct)",
     "length in the gripper": "measure it, and state it under [grasp] (radius_m: half of it) and "
                              "[calibration] (held_length_sigma_m) in pull.toml",
+    "creep of the branch": "hold the branch at the end of the pull, or pull there and back",
     "mesh": "use a finer mesh (--mesh-spacing of reconstruct)",
     "clamp": "scan farther down, so that the clamped position is known",
 }
@@ -49,6 +50,7 @@ _GROUPS = (("camera clock", "clock"), ("camera", "camera frame"), ("gripper", "g
            ("force gain", "force gain"), ("force", "zero of the force sensor"),
            ("curvature of the force", "zero of the force sensor"),
            ("torque", "zero of the force sensor"),
+           ("creep", "creep of the branch"),
            ("form", "modulus between the control points"),
            ("poisson", "Poisson's ratio"), ("density", "density"))
 

@@ -35,6 +35,7 @@ from limber.results.report.report_tables import (
     is_assumed,
     modulus_rows,
     pull_rows,
+    rigidity_rows,
 )
 from limber.results.report.ringing_section import vibration_rows
 from limber.results.report.section import Section, inline_png, read_png
@@ -195,6 +196,7 @@ def _estimate(branch: Branch) -> Section:
         if estimate.get("truth"):
             estimate["truth"]["assumed"] = True
     for title, rows in [
+            ("Flexural rigidity (I: mean of the control point's part)", rigidity_rows(estimate)),
             ("Sources of uncertainty: standard deviations", deviation_rows(estimate)),
             ("Modulus by pull", pull_rows(estimate)),
             ("Pulls predicted by a fit without them: RMS errors",

@@ -17,6 +17,8 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
             these are of a scan without a real pull), or None.
     """
     truth = (pull or {}).get("young_true_pa")
+    if truth and len(truth) != len(estimate["young_pa"]):
+        truth = None  # at other control points
     header = ["control point", "E [MPa]", "95 % interval [MPa]"]
     titles = ["assumed E [MPa]", "difference"] if is_assumed(pull) else ["true E [MPa]", "error"]
     rows = [[*header, *titles, "in the interval"] if truth else header]
@@ -26,6 +28,19 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
             row += [_mpa(truth[number]), f"{100 * (young / truth[number] - 1):+.1f} %",
                     "yes" if _holds(estimate, number, truth[number]) else "NO"]
         rows.append(row)
+    return rows
+
+
+def rigidity_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
+    """Return flexural rigidity E I per control point; none if the shape was not judged."""
+    if not estimate.get("bending_stiffness_nm2"):
+        return []
+    rows = [["control point", "E I [N m^2]", "E I [N mm^2]", "95 % interval [N m^2]"]]
+    for number, (value, (low, high)) in enumerate(zip(
+            estimate["bending_stiffness_nm2"], estimate["bending_stiffness_interval_nm2"],
+            strict=True)):
+        rows.append([str(number + 1), f"{value:.4g}", f"{1e6 * value:.4g}",
+                     f"{low:.4g} to {high:.4g}"])
     return rows
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -23,6 +24,7 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from limber.estimation.estimated_branch import Subject
     from limber.estimation.fit_assessment import Estimate
+    from limber.recordings.recording import Pull
 
 
 EVALUATIONS = ".estimate-evaluations.jsonl"
@@ -101,6 +103,11 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
     warnings: list[str] = []
     heard = progress.keeping(warnings)
     pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
+    asked, evidence = settings, None
+    if settings.control_points == "evidence":
+        settings, evidence = _with_supported_points(branch, pulls, subject, settings, heard)
+        subject = load_subject(branch, settings)
+        pulls = _placed(pulls, load_subject(branch, asked))
     log_path = branch.folder / EVALUATIONS
     if force or not resume:
         log_path.unlink(missing_ok=True)
@@ -116,13 +123,14 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
                     cloud=_cloud(branch), progress=heard.part(0.9, 0.98))
         if settings.hold_out:
             _foretell_others(branch, names, subject, found, settings, heard)
-    result = summary(found, settings)
+    result = summary(found, settings) | ({} if evidence is None else {
+        "control_point_evidence": evidence, "fractions": settings.fractions})
     earlier = branch.manifest.stages.get("estimate")
     if found.stopped and earlier is not None and not earlier.result.get("stopped"):
         raise Cancelled("The estimate was stopped.",
                         "The finished estimate of an earlier run is kept.",
                         "Run it again when there is time for it.")
-    with branch.stage("estimate", settings, digests=digests) as stage:
+    with branch.stage("estimate", asked, digests=digests) as stage:
         full = result | details(found, subject, pulls)
         stage.path("estimate.json").write_text(
             json.dumps(plain(full), indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -140,6 +148,28 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
                         "Run it again with --resume to start from there.")
     log.forget()
     return stage.result
+
+
+def _with_supported_points(branch: Branch, pulls: list[Pull], subject: Subject,
+                           settings: EstimateSettings, progress: Progress,
+                           ) -> tuple[EstimateSettings, dict[int, float]]:
+    """The settings with as many control points as the pulls support, and their evidence."""
+    from limber.estimation.uncertainty.control_point_count import supported_fractions
+    from limber.store.loading import load_subject
+
+    fractions, known = supported_fractions(
+        _placed(pulls, subject), lambda chosen: load_subject(
+            branch, settings.model_copy(update={"fractions": chosen})), settings,
+        progress.part(0.2, 0.5))
+    return settings.model_copy(update={"fractions": fractions}), known
+
+
+def _placed(pulls: list[Pull], subject: Subject) -> list[Pull]:
+    """Pulls that state where their points are; points without a position are at its control points.
+    """
+    rest = tuple(map(tuple, subject.control_points.tolist()))
+    return [pull if pull.entry.rest_points_m is not None else replace(
+        pull, entry=pull.entry.model_copy(update={"rest_points_m": rest})) for pull in pulls]
 
 
 def _bases(folder: Path) -> dict[str, str]:
@@ -263,9 +293,12 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
         held_out_rows,
         modulus_rows,
         pull_rows,
+        rigidity_rows,
     )
 
     tables = [("Young's modulus", modulus_rows(result, None))]
+    if rigidity := rigidity_rows(result):
+        tables.append(("Flexural rigidity (I: mean of the control point's part)", rigidity))
     if causes := cause_rows(result):
         tables.append(("Sources of uncertainty, largest first", causes))
     if actions := action_rows(result):

@@ -1,0 +1,99 @@
+"""Creep of the branch, by a standard linear solid, where the record shows it.
+
+Under a sudden pull the force of a viscoelastic branch falls by a share g of itself, with a time
+constant. With the same course in all of the branch, the force is that of an elastic branch less g
+times its relaxed part; the shape under prescribed motion is the elastic one. The share is one more
+unknown of the fit beside the errors of the cell. It is added only if the residuals make it likely:
+a pull one way at constant speed hardly shows it.
+"""
+
+import numpy as np
+
+from limber.estimation.fitting.nuisances import CREEP_SIGMA, ErrorSlopes, relaxed
+from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.fitting.optimise import Fit, gauss_newton
+from limber.estimation.forward.forward_model import Forward
+from limber.estimation.uncertainty.covariance import repeated
+
+TIME_SHARES = (0.03, 0.1, 0.3, 1.0)
+"""Tested time constants over the duration of the longest pull."""
+LIKELIER = 3.0
+"""Log of the ratio of evidences above which creep is added."""
+FEWEST = 12
+"""Fewest frames of a pull that can show it."""
+
+
+def with_creep(fit: Fit, objective: Objective) -> tuple[Fit, Objective]:
+    """Fit again with the branch's creep as an unknown, if the residuals show it."""
+    seconds = shown_creep(fit.evaluation, objective)
+    if seconds is None:
+        return fit, objective
+    for forward in objective.forwards:
+        forward.creep_time = seconds
+    objective = objective.with_space(objective.space)
+    return gauss_newton(objective, fit.evaluation.free, is_near=True), objective
+
+
+def shown_creep(evaluation: Evaluation, objective: Objective) -> float | None:
+    """Return the time constant of the creep that the residuals show [s]; None if they do not.
+
+    Linear in the share: its evidence is that of one more direction of the residuals, with a normal
+    prior, divided among the tested time constants.
+
+    Args:
+        evaluation: At the end of a fit, with derivatives.
+        objective: The minimised objective.
+    """
+    lasting = [float(np.ptp(each.frames.times)) for each in objective.forwards if _may_show(each)]
+    if not lasting:
+        return None
+    basis = np.linalg.qr(evaluation.slopes)[0]
+    kinds = [np.array(each.kinds) for each in objective.raw_slopes(evaluation)]
+    found = []
+    for seconds in max(lasting) * np.array(TIME_SHARES):
+        changes = [_change(pull.forces, forward, float(seconds))
+                   for pull, forward in zip(evaluation.pulls, objective.forwards, strict=True)]
+        column = objective.residual_slopes(evaluation, changes)[:, 0]
+        column = column - basis @ (basis.T @ column)
+        square, along = float(column @ column), -float(column @ evaluation.residual)
+        share = along / (square + 1)
+        scale = _noise(evaluation.residual + share * column, kinds, objective)
+        square, along = square / scale, along / scale
+        likelier = 0.5 * along**2 / (square + 1) - 0.5 * np.log1p(square)
+        if share > 0:
+            found.append((likelier - np.log(len(TIME_SHARES)), float(seconds)))
+    best, seconds = max(found, default=(-np.inf, 0.0))
+    return seconds if best > LIKELIER else None
+
+
+def _noise(residual: np.ndarray, kinds: list[np.ndarray], objective: Objective) -> float:
+    """Variance of the forces' residuals over the stated one, times that of correlated ones.
+
+    Args:
+        residual: Of all measurements and priors, shape [r].
+        kinds: Of each pull, the measured quantity of each of its residuals.
+    """
+    start, series, fitted = 0, [], 0
+    for each, forward in zip(kinds, objective.forwards, strict=True):
+        forces = residual[start:start + len(each)][each == "noise of the force"]
+        series.append(forces.reshape(-1, 3))
+        fitted += 0 if forward.response is None else forward.response.wrenches.shape[-1]
+        start += len(each)
+    count = sum(each.size for each in series)
+    variance = sum(float(np.sum(each**2)) for each in series) / max(count - fitted, 1)
+    return variance * repeated([(np.zeros((len(each), 0, 3)), each) for each in series])
+
+
+def _may_show(forward: Forward) -> bool:
+    return (forward.uses_force and not forward.force_is_stated and not forward.is_dynamic
+            and len(forward.frames) >= FEWEST)
+
+
+def _change(forces: np.ndarray, forward: Forward, seconds: float) -> ErrorSlopes:
+    """Change of a pull's measurements by one prior deviation of the share."""
+    count, points = len(forces), forward.frames.positions.shape[1]
+    slope = np.zeros((count, 3, 1))
+    if _may_show(forward):
+        slope[..., 0] = -CREEP_SIGMA * relaxed(forward.frames.times, forces, seconds)
+    none = np.zeros((count, 3, 1))
+    return ErrorSlopes(np.zeros((count, points, 3, 1)), slope, none, none)
