@@ -14,7 +14,13 @@ from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
-from limber.estimation.fit_assessment import MISFIT_FACTOR, Estimate, hold_out, judge_fit
+from limber.estimation.fit_assessment import (
+    MISFIT_FACTOR,
+    Estimate,
+    hold_out,
+    judge_fit,
+    require_one_explanation,
+)
 from limber.estimation.fit_preparation import (
     forwards_of,
     parameter_space,
@@ -55,11 +61,6 @@ from limber.recordings.cell_errors import calibration_of
 from limber.recordings.recording import Pull
 from limber.recordings.sensor_checks import force_unit_suspicion
 
-AS_LIKELY = 8.0
-"""Difference of the objectives below which two fits explain the pulls as well: one is then 3,000
-times as likely as the other, about as much as priors that are stated roughly may be wrong.
-"""
-
 
 class _ForceLeadsNowhereError(WorkError):
     """No equilibrium under a pull's measured force; there may be one along its path."""
@@ -92,20 +93,23 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
             other = in_frame(pulls, branch, as_stated, EvaluationLog(None, ""))
         except (WorkError, InputError):
             return found
-        _require_one_explanation(found, other)
+        require_one_explanation(found, other)
         return found
 
     def in_frame(pulls: list[Pull], branch: Subject, chosen: EstimateSettings,
                  log: EvaluationLog) -> Estimate:
         shifts: dict[str, np.ndarray] = {}
         near: Values | None = None
+        earlier: FarPointsError | None = None
         for rounds_left in reversed(range(ROUNDS)):
             forwards = forwards_of(pulls, branch, chosen, progress, shifts)
+            if earlier is not None:
+                earlier.begin(forwards)
             try:
                 return of_forwards(forwards, branch, chosen, log, near,
                                    FarPoints(shifts) if rounds_left else None)
             except FarPointsError as far:
-                shifts, near, log = far.shifts, far.values, EvaluationLog(None, "")
+                shifts, near, earlier, log = far.shifts, far.values, far, EvaluationLog(None, "")
         raise AssertionError("the last round looks for no far points")
 
     def of_forwards(forwards: list[Forward], branch: Subject, chosen: EstimateSettings,
@@ -145,31 +149,6 @@ def _in_free_frame(pulls: list[Pull], fitted: Callable[[list[Pull]], Estimate]) 
         seen = [put_right(pull, shift, turn) for pull in seen]
         found = fitted(seen)
     return found
-
-
-def _require_one_explanation(free: Estimate, as_stated: Estimate) -> None:
-    """Refuse a free frame where points that are off along the branch explain the pulls as well.
-
-    Raises:
-        WorkError: with the frame as stated the fit is as good, with moduli outside the intervals.
-    """
-    loss, other = (each.fit.evaluation.objective for each in (free, as_stated))
-    if free.stopped or as_stated.is_bad is not None or other - loss > AS_LIKELY:
-        return
-    low, high = free.uncertainty.young_interval.T
-    young = as_stated.values.young
-    if np.any((young < low) | (young > high)):
-        raise WorkError(
-            "The pulls do not tell a shift of the frame from a shift of the points.",
-            f"With a free frame they give {_listed(free.values.young)} MPa, with the frame as "
-            f"stated and points off along the branch {_listed(young)} MPa. Both fit as well.",
-            "Register the camera (camera_sigma_m) and omit --free-frame. Or mark the points on "
-            "the branch, give their positions (--nominal of import-pull), and state that under "
-            "[calibration] (point_sigma_m).")
-
-
-def _listed(young: np.ndarray) -> str:
-    return ", ".join(f"{value / 1e6:.4g}" for value in young)
 
 
 def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
@@ -231,7 +210,8 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     space, _ = link_unresolved(first, objective.space)
     objective = objective.with_space(space)
     try:
-        fit, objective = _fitted(objective, space.pack(start), settings, progress, reduction)
+        fit, objective = _fitted(objective, space.pack(start), settings, progress, reduction,
+                                 far, is_near=near is not None and start is near)
     except Stopped:
         fit = best_so_far(objective)
     stopped = fit.status is FitStatus.stopped
@@ -308,8 +288,8 @@ def _without_equilibrium(objective: Objective) -> WorkError:
 
 
 def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
-            progress: Progress, reduction: Reduction | None,
-            ) -> tuple[Fit, Objective]:
+            progress: Progress, reduction: Reduction | None, far: FarPoints | None, *,
+            is_near: bool) -> tuple[Fit, Objective]:
     def optimise(chosen: Objective, free: np.ndarray, is_near: bool = False) -> Fit:
         if settings.method == "nelder-mead":
             return nelder_mead(chosen, free, evaluation_limit=EVALUATION_LIMIT)
@@ -317,13 +297,19 @@ def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
 
     if settings.method == "gauss-newton":
         start = _resumed(objective, start)
+        if far is not None and reduction is None and not is_near:
+            # A rough fit tells whether points are far off. The full one then begins from there.
+            start, is_near = _rough(objective, start).evaluation.free, True
+            if (rough := objective.evaluate(start, jacobian=True)) is not None:
+                far.look(rough, objective)
     if reduction is not None:
         return fit_reduced(objective, start, optimise, _rough, reduction, progress)
-    return _refined(optimise(objective, start), objective, settings, progress), objective
+    return _refined(optimise(objective, start, is_near), objective, settings, progress), objective
 
 
 def _rough(objective: Objective, free: np.ndarray) -> Fit:
-    return gauss_newton(objective, free, evaluation_limit=8, tolerance=1e-2)
+    return gauss_newton(objective, free, evaluation_limit=8, tolerance=1e-2, robust=False,
+                        force_rounds=0)
 
 
 def _resumed(objective: Objective, start: np.ndarray) -> np.ndarray:

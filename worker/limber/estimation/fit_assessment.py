@@ -51,6 +51,10 @@ UNLIKE = 0.2
 is no result: the simulated branch moves otherwise. Below it the stated noise may just be too small.
 Chosen.
 """
+AS_LIKELY = 8.0
+"""Difference of the objectives below which two fits explain the pulls as well: one is then 3,000
+times as likely as the other, about as much as priors that are stated roughly may be wrong.
+"""
 WIDE = 0.15
 """Standard deviation of a log E above which advice on narrowing it is given."""
 
@@ -266,6 +270,31 @@ def require_result(found: Estimate) -> None:
         raise WorkError("The pulls give no estimate.", reason,
                         f"The fit ended at {young} MPa. Nothing was written. Check the warnings "
                         "about the recording, or use more pulls.")
+
+
+def require_one_explanation(free: Estimate, as_stated: Estimate) -> None:
+    """Refuse a free frame where points that are off along the branch explain the pulls as well.
+
+    Raises:
+        WorkError: with the frame as stated the fit is as good, with moduli outside the intervals.
+    """
+    loss, other = (each.fit.evaluation.objective for each in (free, as_stated))
+    if free.stopped or as_stated.is_bad is not None or other - loss > AS_LIKELY:
+        return
+    low, high = free.uncertainty.young_interval.T
+    young = as_stated.values.young
+    if np.any((young < low) | (young > high)):
+        raise WorkError(
+            "The pulls do not tell a shift of the frame from a shift of the points.",
+            f"With a free frame they give {_listed(free.values.young)} MPa, with the frame as "
+            f"stated and points off along the branch {_listed(young)} MPa. Both fit as well.",
+            "Register the camera (camera_sigma_m) and omit --free-frame. Or mark the points on "
+            "the branch, give their positions (--nominal of import-pull), and state that under "
+            "[calibration] (point_sigma_m).")
+
+
+def _listed(young: np.ndarray) -> str:
+    return ", ".join(f"{value / 1e6:.4g}" for value in young)
 
 
 def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: EstimateSettings,

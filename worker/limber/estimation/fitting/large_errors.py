@@ -13,6 +13,8 @@ from limber.core.not_none import present
 from limber.core.numerics.rigid import rotated
 from limber.estimation.fitting.nuisances import nuisance_records
 from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.forward.forward_model import Forward
+from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import Values
 from limber.recordings.recording import Pull
 
@@ -66,9 +68,15 @@ def put_right(pull: Pull, shift: np.ndarray, turn: np.ndarray) -> Pull:
 class FarPointsError(Exception):
     """Points are far from where they were simulated: the pulls are fitted again there."""
 
-    def __init__(self, shifts: dict[str, np.ndarray], values: Values):
+    def __init__(self, shifts: dict[str, np.ndarray], values: Values, forwards: list[Forward]):
         super().__init__()
-        self.shifts, self.values = shifts, values
+        self.shifts, self.values, self.forwards = shifts, values, forwards
+
+    def begin(self, forwards: list[Forward]) -> None:
+        """Let simulations of the same pulls start from the states found so far."""
+        for forward, known in zip(forwards, self.forwards, strict=True):
+            if isinstance(forward, QuasiStaticForward) and isinstance(known, QuasiStaticForward):
+                forward.begin_at(known)
 
 
 @dataclass(frozen=True)
@@ -86,4 +94,5 @@ class FarPoints:
                                   np.zeros((size, size)))
         far = far_points(listed, self.shifts)
         if far is not None:
-            raise FarPointsError(far, objective.space.unpack(evaluation.free))
+            raise FarPointsError(far, objective.space.unpack(evaluation.free),
+                                 objective.forwards)
