@@ -1,7 +1,7 @@
-"""The energy field of a branch: a grid of points with the worker's energies and colours, hidden.
+"""The energy field of a branch: points of a grid with the worker's energies and colours, hidden.
 
 The view shows a slice of it (:mod:`overlays.energy_slice`); its attributes ``energy_j`` and
-``color`` are there for geometry nodes.
+``color`` are there for geometry nodes. Points where the field is not trusted are left out.
 """
 
 import json
@@ -16,6 +16,8 @@ from .scene_data import SceneData
 
 _GRID_KEY = "limber_grid"
 """Points along the three edges of the grid, the last one fastest."""
+_PLACE = "grid_place"
+"""Attribute of a point: its number in the grid."""
 _BOX_KEY = "limber_grid_box_m"
 """Its lower and upper corner, in the branch's frame [m]."""
 held: list[Vector] = []
@@ -31,9 +33,12 @@ def add(shown: ShownBranch, data: SceneData) -> None:
     axes = [np.linspace(*ends) for ends in zip(about["low_m"], about["high_m"], energies.shape,
                                                strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    mesh = meshes.new_mesh("Energy field", points)
-    meshes.set_scalars(mesh, "energy_j", energies.ravel())
-    meshes.set_colors(mesh, "color", data.arrays["energy_grid_color"].reshape(-1, 4))
+    colours = data.arrays["energy_grid_color"].reshape(-1, 4)
+    trusted = np.flatnonzero(colours[:, 3] > 0)
+    mesh = meshes.new_mesh("Energy field", points[trusted])
+    meshes.set_integers(mesh, _PLACE, trusted)
+    meshes.set_scalars(mesh, "energy_j", energies.ravel()[trusted])
+    meshes.set_colors(mesh, "color", colours[trusted])
     thing = add_object(shown.collection, "Energy field", mesh)
     thing[_GRID_KEY] = list(energies.shape)
     thing[_BOX_KEY] = [*about["low_m"], *about["high_m"]]
@@ -63,8 +68,8 @@ def colours_at(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
     Between the grid's points they are mixed; outside it they are transparent.
     """
     counts, (low, high) = np.array(thing[_GRID_KEY]), box(thing)
-    colours = np.empty(4 * len(thing.data.vertices), np.float32)
-    thing.data.attributes["color"].data.foreach_get("color", colours)
+    colours = np.zeros((np.prod(counts), 4), np.float32)
+    colours[meshes.integers(thing.data, _PLACE)] = meshes.colors(thing.data, "color")
     colours = colours.reshape(*counts, 4)
     place = (points - low) / (high - low) * (counts - 1)
     is_inside = ((place >= 0) & (place <= counts - 1)).all(axis=1)

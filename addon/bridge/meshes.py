@@ -103,6 +103,20 @@ def set_integers(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
     mesh.update_tag()
 
 
+def integers(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
+    """Return INT attribute ``name``, shape [v]; KeyError if there is none."""
+    values = np.empty(len(mesh.vertices), np.int32)
+    mesh.attributes[name].data.foreach_get("value", values)
+    return values
+
+
+def colors(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
+    """Return the linear colours of attribute ``name``, shape [v, 4]; KeyError if there is none."""
+    values = np.empty(4 * len(mesh.vertices), np.float32)
+    mesh.attributes[name].data.foreach_get("color", values)
+    return values.reshape(-1, 4)
+
+
 def set_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
     """Write a linear RGBA colour per vertex and make it the one that Solid mode shows; [v, 4]."""
     values = _checked(values, 4, name)

@@ -111,13 +111,14 @@ def test_the_zip_is_for_the_blenders_with_its_python(build):
     plain = (ROOT / "addon" / "blender_manifest.toml").read_text()
     wheel = Path("a-1.0-py3-none-any.whl")
     made = {python: tomllib.loads(build.with_wheels(plain, [wheel], "linux-x64", python))
-            for python in ("3.11", "3.13")}
+            for python in ("3.11", "3.13", "3.14")}
     assert [(each["blender_version_min"], each.get("blender_version_max"))
-            for each in made.values()] == [("4.2.0", "5.1.0"), ("4.3.0", None)]
+            for each in made.values()] == [
+                ("4.2.0", "5.1.0"), ("4.3.0", None), ("5.2.0", None)]
     assert made["3.11"]["wheels"] == [f"./wheels/{wheel.name}"]
     assert made["3.11"]["permissions"] == tomllib.loads(plain)["permissions"]
-    with pytest.raises(SystemExit, match=r"no Blender has Python 3\.14.*3\.11, 3\.13"):
-        build.blender_versions("3.14")
+    with pytest.raises(SystemExit, match=r"no Blender has Python 3\.15.*3\.11, 3\.13, 3\.14"):
+        build.blender_versions("3.15")
 
 
 def test_a_worker_that_does_not_load_says_what_to_do(tmp_path):
@@ -169,6 +170,8 @@ def _copy_scripts(root):
     (root / "scripts").mkdir()
     for name in ("scripts/build_extension", "scripts/check_dependencies", "requirements.lock"):
         shutil.copy(ROOT / name, root / name)
+    for name in ("worker/docs", "blend_files/manual"):
+        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
 
 
 def _check(path):
@@ -178,7 +181,7 @@ def _check(path):
     assert path.name == f"limber-{manifest['version']}.zip"
     sources = {file.relative_to(ROOT / "addon").as_posix()
                for file in (ROOT / "addon").rglob("*.py")}
-    assert sources | {"sbom.cdx.json"} <= names
+    assert sources | {"sbom.cdx.json", "guide/howto/scan.html"} <= names
     assert not [name for name in names if "__pycache__" in name or name.endswith(".pyc")]
 
 
@@ -195,6 +198,7 @@ def test_by_the_bpy_package(tmp_path, bpy):
             archive.namelist())
 
 
+@pytest.mark.slow
 def test_without_any_blender(tmp_path):
     """With neither, the zip is made all the same, and what was not checked is said."""
     shutil.copytree(ROOT / "addon", tmp_path / "addon")
@@ -204,6 +208,7 @@ def test_without_any_blender(tmp_path):
     _check(path)
 
 
+@pytest.mark.slow
 def test_an_invalid_manifest_is_refused(tmp_path, bpy):
     """A tagline that Blender does not take ends the build with an error."""
     if not list((ROOT / ".venv").glob("lib/python3*/site-packages/bpy")):
@@ -236,3 +241,14 @@ def test_provisioning_waits_for_apts_lock(tmp_path, refusals, says):
     waits = (tmp_path / "slept").read_text().split()
     assert waits == ["5"] * min(refusals, 60)
     assert ("Could not get lock" in done.stderr) == (refusals > 60)
+
+
+def test_packages_without_a_wheel(build, monkeypatch):
+    """What has none for a Python is left out; that the network fails is no reason for it."""
+    said = [(0, ""), (1, "ERROR: No matching distribution found for ompl"),
+            (1, "ERROR: ResolutionImpossible: for help"), (1, "Network is unreachable")]
+    monkeypatch.setattr(build.subprocess, "run", lambda *_, **__: subprocess.CompletedProcess(
+        [], *said[0][:1], "", said.pop(0)[1]))
+    assert [build.has_wheel(["pip"], "ompl") for _ in range(3)] == [True, False, False]
+    with pytest.raises(SystemExit, match="unreachable"):
+        build.has_wheel(["pip"], "ompl")
