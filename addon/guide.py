@@ -5,7 +5,7 @@ from pathlib import Path
 import bpy
 
 _PAGES = {"start": "tutorials/blender", "job": "howto/troubleshooting",
-          "result": "reference/glossary", "play": "tutorials/blender"}
+          "result": "tutorials/blender", "play": "tutorials/blender"}
 """Page of each panel that is no step; those of the steps are in :mod:`steps`."""
 
 

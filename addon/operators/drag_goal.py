@@ -46,18 +46,22 @@ class LIMBER_OT_drag_goal(NeedsBranchInObjectMode, bpy.types.Operator):
             energy_field.held[:] = [self._from + Vector(self.move)]
             self._apply()
         elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
-            self.cancel(context)
+            self._end(context)
             if not Vector(self.move).length:
                 return {"CANCELLED"}
             goal_ball.follow(context.scene)
             return {"FINISHED"}
         elif event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
             self._before.put_back(context.scene, self._branch)
-            self.cancel(context)
+            self._end(context)
             return {"CANCELLED"}
         return {"RUNNING_MODAL"}
 
     def cancel(self, context):
+        """Blender closes or loads another file."""
+        energy_field.held.clear()
+
+    def _end(self, context) -> None:
         """Hide again what is drawn while something is dragged."""
         energy_field.held.clear()
         for thing, was_hidden in self._reach:

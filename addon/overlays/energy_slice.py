@@ -46,7 +46,8 @@ def net(thing: bpy.types.Object, surface: bpy.types.Object, place: Vector, acros
 def _draw() -> None:
     context = bpy.context
     surface = branches.find_surface(context.scene)
-    if surface is None or not energy_field.is_sliced(context.scene):
+    if surface is None or not energy_field.is_sliced(context.scene) or (
+            not context.space_data.overlay.show_overlays):
         return
     thing = energy_field.of(branches.branch_of(surface))
     if thing is None:
