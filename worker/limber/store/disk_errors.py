@@ -1,8 +1,8 @@
 """Messages for stages that meet a full disk or a lost folder."""
 
 import gc
-import os
 import shutil
+import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -80,7 +80,7 @@ def require_short(folder: Path, room: int) -> None:
 
 def limits_paths() -> bool:
     """Whether this is a Windows on which long paths are not switched on."""
-    if os.name != "nt":
+    if sys.platform != "win32":
         return False
     import ctypes
 
