@@ -32,6 +32,18 @@ def add_rods(shown: ShownBranch, data: SceneData) -> None:
         shown.objects[f"rods:{key}"] = [thing]
 
 
+def add_cell(shown: ShownBranch, data: SceneData) -> None:
+    """Add what the robot's cell file states: arm at its home, camera's view, obstacles."""
+    for key, about in (data.info.get("cell") or {}).items():
+        title, color = about["title"], tuple(about["color"])
+        mesh = meshes.new_mesh(title, data.arrays[f"solid:{key}"],
+                               data.arrays[f"solid_faces:{key}"])
+        meshes.set_one_color(mesh, color)
+        shown.objects[f"cell:{key}"] = [add_object(
+            shown.collection, title, mesh,
+            materials.plain_material(title, color, alpha=about["alpha"]))]
+
+
 def add_hemisphere(shown: ShownBranch, data: SceneData) -> None:
     """Add the hemisphere of possible grasps, as lines."""
     about = data.info.get("hemisphere")

@@ -69,6 +69,7 @@ def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = No
     _add_goal(shown, data)
     _add_base(shown, data)
     annotations.add_rods(shown, data)
+    annotations.add_cell(shown, data)
     annotations.add_hemisphere(shown, data)
     energy_field.add(shown, data)
     _add_motion(scene, shown, data)

@@ -42,6 +42,7 @@ _SHAPES = {
     "observation_motion": "sm3 r", "observation_seen": "sm b",
     "rods": "u3 r", "rod_faces": "x3 i", "rod_color": "u4 r",
     "energy_grid": "hjz r", "energy_grid_color": "hjz4 r",
+    "solid": "u3 r", "solid_faces": "x3 i",
     "robot_starts": "sl3 r", "robot_ends": "sl3 r", "robot_radii": "l r",
     "view_points": "w3 r", "view_direction": "3 r"}
 _NEEDED = ("vertices", "faces", "view_points", "view_direction")
@@ -171,8 +172,10 @@ def _arrays_trouble(arrays: dict[str, np.ndarray]) -> str:
             return f"{name} has the invalid type {array.dtype}"
         if number == "r" and not np.isfinite(array).all():
             return f"{name} contains values that are not finite"
-    surfaces = [("faces", "vertices")] + [(name, name.replace("rod_faces", "rods", 1))
-                                          for name in arrays if name.startswith("rod_faces:")]
+    surfaces = [("faces", "vertices")] + [
+        (name, name.replace(faces, vertices, 1)) for name in arrays
+        for faces, vertices in (("rod_faces:", "rods:"), ("solid_faces:", "solid:"))
+        if name.startswith(faces)]
     for name, vertices in surfaces:
         faces, count = arrays[name], len(arrays.get(vertices, ()))
         if len(faces) and (faces.min() < 0 or faces.max() >= count):
@@ -195,6 +198,8 @@ def _pairs_trouble(arrays: dict[str, np.ndarray], info: dict[str, Any]) -> str:
     wanted += ["energy_grid", "energy_grid_color"] * bool(info.get("energy_grid"))
     wanted += [f"{kind}:{name}" for name in info.get("rods") or {}
                for kind in ("rods", "rod_faces", "rod_color")]
+    wanted += [f"{kind}:{name}" for name in info.get("cell") or {}
+               for kind in ("solid", "solid_faces")]
     if len(arrays.get("targets", ())) != len(info.get("targets") or ()):
         return "the number of targets does not match the number of their names"
     for name in ("grasp", "control_points", "targets"):

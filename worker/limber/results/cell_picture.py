@@ -63,7 +63,7 @@ def _draw(axes: Axes, seen: list[int], cell: Cell, joints: np.ndarray,
               f"second arm ({other.name}) at its home")
     _rods(axes, seen, arm_rods(cell.arm, base, joints), _ARM, f"arm ({cell.arm.name})")
     flange = base @ cell.arm.forward(joints)
-    _rods(axes, seen, list(_gripper(cell, flange)), _TOOL, "gripper")
+    _rods(axes, seen, list(gripper_rods(cell, flange)), _TOOL, "gripper")
     if skeleton is not None:
         _branch(axes, seen, skeleton)
     if cell.camera is not None:
@@ -88,8 +88,8 @@ def arm_rods(arm: Any, base: np.ndarray, joints: np.ndarray) -> list[Rod]:
     return [foot, *zip(starts, ends, map(float, rods.radii), strict=True)]
 
 
-def _gripper(cell: Cell, flange: np.ndarray) -> Iterator[Rod]:
-    """The stated shape of the gripper, or a line from the flange to the grasp."""
+def gripper_rods(cell: Cell, flange: np.ndarray) -> Iterator[Rod]:
+    """Yield the stated shape of the gripper, or a line from the flange to the grasp."""
     for part in cell.tool.parts:
         ends = np.array([part.start_m, part.end_m]) @ flange[:3, :3].T + flange[:3, 3]
         yield ends[0], ends[1], part.radius_m
@@ -146,8 +146,12 @@ def _branch(axes: Axes, seen: list[int], skeleton: Skeleton) -> None:
     axes.autoscale_view()
 
 
-def _camera(axes: Axes, seen: list[int], cell: Cell, flange: np.ndarray) -> None:
-    """The edges of what the camera sees, up to a metre away."""
+def camera_edges(cell: Cell, flange: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return both ends of the edges of what the camera sees, up to a metre away [m], branch frame.
+
+    Args:
+        flange: Its frame in the branch's frame, for a camera on it, shape [4, 4].
+    """
     camera = cell.camera
     assert camera is not None
     frame = matrices(np.array(camera.pose))
@@ -159,9 +163,11 @@ def _camera(axes: Axes, seen: list[int], cell: Cell, flange: np.ndarray) -> None
                         for x, y in ((0, 0), (camera.width, 0), (camera.width, camera.height),
                                      (0, camera.height))])
     ends = far * corners @ frame[:3, :3].T + frame[:3, 3]
-    lines = [(frame[:3, 3], end) for end in ends]
-    lines += list(pairwise([*ends, ends[0]]))
-    for number, line in enumerate(lines):
+    return [*((frame[:3, 3], end) for end in ends), *pairwise([*ends, ends[0]])]
+
+
+def _camera(axes: Axes, seen: list[int], cell: Cell, flange: np.ndarray) -> None:
+    for number, line in enumerate(camera_edges(cell, flange)):
         axes.plot(*np.array(line)[:, seen].T, color=_CAMERA, linewidth=0.9,
                   label="camera's view" if number == 0 else None)
 

@@ -47,6 +47,8 @@ grasp_times`` [g]
 ``robot_starts``, ``robot_ends`` [frames, n,    rods with round ends: the arm of the plan's dry
 3], ``robot_radii`` [n]                         run from foot to wrist, then the gripper, of which
                                                 ``info["robot"]`` says the name and the last rods
+``solid:KEY`` [u, 3], ``solid_faces:KEY``       surfaces of a cell, of which ``info["cell"]``
+[x, 3]                                          says title, colour and opacity
 ``frame_bounds`` [2, 3], ``view_points``,       what the camera must see, and its direction
 ``view_direction`` [3]
 ==============================================  ====================================================

@@ -24,10 +24,15 @@ _TURN_SECONDS = 6.0
 
 
 class SceneInputs(BranchInputs):
-    """A branch folder, and the output files."""
+    """A branch folder, the robot's cell and the output files."""
 
-    groups: ClassVar[Groups] = {"output": ("output", "render", "turntable", "data")}
+    groups: ClassVar[Groups] = {"input": ("cell",),
+                                "output": ("output", "render", "turntable", "data")}
     common = ("output", "render")
+
+    cell: Path | None = Field(
+        None, description="The robot's cell file. Its arm, gripper, camera, obstacles and "
+        "workspace are shown as well.")
 
     output: Path | None = Field(None, description="The .blend to write.",
                                 json_schema_extra={"short": "-o"})
@@ -70,7 +75,10 @@ def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = 
         InputError: not exactly one of output and data is given, or there is nothing to show.
         WorkError: Blender failed.
     """
+    from limber.results.scene.cell_objects import add_cell
     from limber.results.scene.contents import scene_data
+    from limber.robot.cell.cell import read_cell
+    from limber.stages.paths.plan_cell import cell_obstacles
     from limber.store.loading import load_targets
 
     if (inputs.output is None) == (inputs.data is None):
@@ -80,6 +88,9 @@ def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = 
     branch = Branch.read(inputs.branch_folder)
     data = scene_data(branch, settings.plan, settings.motion, load_targets(branch),
                       settings.strength)
+    if inputs.cell is not None:
+        cell = read_cell(inputs.cell)
+        add_cell(data, cell, cell_obstacles(cell, inputs.cell.parent))
     if settings.color not in data.info["scalars"]:
         raise InputError(f"The branch has no {settings.color} to show.",
                          f"It has: {', '.join(data.info['scalars'])}.",
