@@ -2,6 +2,7 @@
 
 import json
 import sys
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,7 @@ from limber.cli.commands.robot import command
 from limber.core.numerics.rigid import matrices
 from limber.geometry.io.clouds import read_cloud
 from limber.robot.cell.cell import Cell, write_cell
-from limber.robot.realsense import RealSense, seen_points
+from limber.robot.realsense import RealSense, camera_differences, seen_points
 
 WIDTH, HEIGHT, SCALE = 12, 8, 0.001
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.5, 0.1, 0, 0, 0, 1.2)},
@@ -24,15 +25,19 @@ class Library:
     Attributes:
         frames: Image of each frame, in turn.
         fails: Raised where the pipeline starts or waits.
+        age: Of a frame when it comes [s]; by the clock named by ``domain``.
     """
 
     stream = SimpleNamespace(depth="depth")
+    timestamp_domain = SimpleNamespace(global_time="global", system_time="system",
+                                       hardware_clock="hardware")
 
     def __init__(self):
         row = np.full((HEIGHT, WIDTH), 500, np.uint16)
         row[0, 0], row[0, 1] = 0, 1500
         self.frames, self.count, self.stopped = [row], 0, False
         self.fails = {}
+        self.age, self.domain = 0.03, "global"
 
     def config(self):
         return SimpleNamespace(enable_stream=lambda kind: None)
@@ -55,7 +60,9 @@ class Library:
             raise RuntimeError(self.fails["wait"])
         self.count += 1
         image = self.frames[self.count % len(self.frames)]
-        return SimpleNamespace(get_depth_frame=lambda: SimpleNamespace(get_data=lambda: image))
+        return SimpleNamespace(get_depth_frame=lambda: SimpleNamespace(
+            get_data=lambda: image, get_timestamp=lambda: 1e3 * (time.time() - self.age),
+            get_frame_timestamp_domain=lambda: self.domain))
 
     def stop(self):
         self.stopped = True
@@ -118,3 +125,24 @@ def test_the_command_writes_a_cloud_and_names_what_is_missing(library, tmp_path,
     assert code != 0 and "pip install pyrealsense2" in told["error"]
     code, told = run(["-o", str(out)], capfd)
     assert code == 2 and "Neither --middle nor --realsense" in told["error"]
+
+
+@pytest.mark.parametrize("domain, age", [("global", 0.03), ("hardware", 0.0)])
+def test_a_frame_tells_when_it_was_taken(library, domain, age):
+    """By its own stamp where that is this computer's clock; else by its arrival."""
+    library.domain = domain
+    with RealSense() as camera:
+        depth, taken = camera.frame()
+    assert depth[0, 1] == 1.5 and np.isnan(depth[0, 0])
+    assert time.monotonic() - taken == pytest.approx(age, abs=0.01)
+
+
+def test_a_cells_camera_is_compared_with_the_connected_one(library):
+    """Goals in its view are planned with the cell's intrinsics."""
+    right = CELL.model_copy(update={"camera": CELL.camera.model_copy(update={
+        "width": WIDTH, "height": HEIGHT, "focal_px": (10.05, 10.0), "centre_px": (6.5, 4.0)})})
+    with RealSense() as camera:
+        assert camera_differences(right, camera.camera) == []
+        size, focal, centre = camera_differences(CELL, camera.camera)
+    assert "(12, 8) pixels in the connected camera, (640, 480) in the cell file" in size
+    assert "camera.focal_px" in focal and "camera.centre_px" in centre

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,10 +20,13 @@ from limber.cli.main import command_of
 from limber.core.errors import BranchFolderError, InputError, NoPathError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import SILENT
+from limber.geometry.cloud.camera import D455
+from limber.perception.observe import observe
 from limber.recordings.recording import read_pull
-from limber.robot.cell.cell import Cell
+from limber.robot.cell.cell import CameraEntry, Cell
 from limber.robot.known_arms import arm_named
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
+from limber.robot.virtual.depth_camera import VirtualCamera
 from limber.stages.pulls.record import RecordOptions, RecordSettings, record
 from limber.stages.pulls.record_path import arc_path, suggested_pull, there_and_back, waypoint_path
 from limber.stages.registry import stage_description
@@ -398,3 +402,84 @@ def test_its_schema_is_plain(capsys):
     from limber.stages.registry import stage_schema
 
     assert json.dumps(stage_schema("record"))
+
+
+class VirtualRealSense:
+    """pyrealsense2 as :class:`.RealSense` uses it, with images of the virtual robot's branch."""
+
+    stream = SimpleNamespace(depth="depth")
+    timestamp_domain = SimpleNamespace(global_time="global", system_time="system")
+
+    def __init__(self, address: str, pose: np.ndarray):
+        self._eye = VirtualCamera(address)
+        self._camera = D455.model_copy(update={"pose": tuple(map(float, pose))})
+
+    def config(self):
+        return SimpleNamespace(enable_stream=lambda kind: None)
+
+    def pipeline(self):
+        return self
+
+    def start(self, config):
+        seen = SimpleNamespace(width=D455.width, height=D455.height, fx=D455.fx, fy=D455.fy,
+                               ppx=D455.cx, ppy=D455.cy)
+        video = SimpleNamespace(get_intrinsics=lambda: seen)
+        sensor = SimpleNamespace(get_depth_scale=lambda: 1e-4)
+        return SimpleNamespace(
+            get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
+            get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video))
+
+    def wait_for_frames(self, milliseconds):
+        stamp = 1e3 * time.time()
+        steps = np.round(1e4 * self._eye.depth(self._camera)).astype(np.uint16)
+        return SimpleNamespace(get_depth_frame=lambda: SimpleNamespace(
+            get_data=lambda: steps, get_timestamp=lambda: stamp,
+            get_frame_timestamp_domain=lambda: "global"))
+
+    def stop(self):
+        self._eye.__exit__()
+
+
+@pytest.mark.slow
+def test_a_realsense_records_what_the_tracker_follows(branch_folder, tmp_path, robot, monkeypatch):
+    """Slow: a pull and its tracking. The control points move as the markers of the same pull."""
+    skeleton = load_skeleton(Branch.open(branch_folder))
+    middle, out = skeleton.nodes.mean(axis=0), sideways(Branch.open(branch_folder))
+    side = np.cross(out, skeleton.point_at(0.9) - skeleton.point_at(0.1))
+    placed = D455.looking(eye=middle + 0.5 * side / np.linalg.norm(side), target=middle)
+    cell = cell_at(branch_folder, robot.address).model_copy(update={
+        "camera": CameraEntry(pose=placed.pose, mount="branch")})
+    path = cell_file(cell, tmp_path)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", VirtualRealSense(robot.address, placed.pose))
+    result = record(branch_folder, path, "seen", sideways_pull(branch_folder, distance=0.03),
+                    RecordOptions(confirm="seen", realsense=True))
+    assert result["ended"] == "reached" and result["depth_images"] > 5
+    folder = branch_folder / "pulls" / "seen"
+    pull = read_pull(folder)
+    assert pull.entry.observation == "depth"
+    seen, warnings = observe(folder, pull, skeleton, (0.5, 0.92))
+    assert not any("pose has an error" in text for text in warnings), warnings
+    # At the grasp the branch is where the gripper is; below, it follows on the same side.
+    start = np.array(pull.entry.grasp.point_m)
+    held = np.array([np.interp(seen.times, pull.times, pull.poses[:, k]) for k in range(3)]).T
+    assert np.nanmax(np.linalg.norm(seen.positions[:, 1] - held, axis=1)) < 4e-3
+    gone = (seen.positions[:, 0] - skeleton.point_at(0.5)) @ out
+    way = (held - start) @ out
+    assert way.max() > 0.025
+    farthest = int(way.argmax())
+    assert 0.2 * way[farthest] < gone[farthest] < 0.8 * way[farthest]
+    assert abs(gone[0]) < 2e-3
+
+
+def test_a_camera_on_the_flange_cannot_watch_a_pull(branch_folder, tmp_path, robot, monkeypatch):
+    cell = cell_at(branch_folder, robot.address).model_copy(update={
+        "camera": CameraEntry(pose=(0, 0, 0.1, 0, 0, 0), mount="flange")})
+    monkeypatch.setitem(sys.modules, "pyrealsense2", VirtualRealSense(
+        robot.address, np.zeros(6)))
+    with pytest.raises(InputError, match="mount = \"branch\""):
+        record(branch_folder, cell_file(cell, tmp_path), "seen", sideways_pull(branch_folder),
+               RecordOptions(confirm="seen", realsense=True))
+    with pytest.raises(InputError, match="Both --markers and --realsense"):
+        record(branch_folder, cell_file(cell, tmp_path), "seen", sideways_pull(branch_folder),
+               RecordOptions(confirm="seen", realsense=True, markers=MARKERS))
+    assert Branch.open(branch_folder).streams() == []

@@ -3,6 +3,7 @@
 The package is large and not needed by anything else, so it belongs to no extra of Limber.
 """
 
+import time
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ _FRAMES = 15
 """Frames of one image: their median has less noise, and half of them may miss a pixel."""
 _SETTLE_FRAMES = 15  # until the exposure is steady
 _WAIT_MS = 2000
+_SAME_FOCAL, _SAME_PX = 0.01, 2.0  # fraction of the focal length; pixels of the centre
+_OLDEST_SECONDS = 0.5  # of a frame; more is another clock
 
 
 class RealSense:
@@ -38,14 +41,20 @@ class RealSense:
         except RuntimeError as error:
             raise WorkError(f"No RealSense camera answers ({error}).", "",
                             "Check its USB cable, and that no other program uses it.") from error
+        clocks = library.timestamp_domain
+        self._host_clocks = (clocks.global_time, clocks.system_time)
         self._scale = float(profile.get_device().first_depth_sensor().get_depth_scale())
         seen = profile.get_stream(library.stream.depth).as_video_stream_profile().get_intrinsics()
         self.camera = Camera(width=seen.width, height=seen.height, fx=seen.fx, fy=seen.fy,
                              cx=seen.ppx, cy=seen.ppy)
 
     def __enter__(self) -> "RealSense":
-        for _ in range(_SETTLE_FRAMES):
-            self._frame()
+        try:
+            for _ in range(_SETTLE_FRAMES):
+                self._frame()
+        except WorkError:
+            self._pipeline.stop()
+            raise
         return self
 
     def __exit__(self, *_exception: object) -> None:
@@ -62,13 +71,29 @@ class RealSense:
         median = np.ma.median(np.ma.masked_equal(frames, 0), axis=0).filled(0)
         return np.where(is_seen, self._scale * median, np.nan)
 
+    def frame(self) -> tuple[np.ndarray, float]:
+        """Return the next image [m], NaN without a reading, and when it was taken [s, monotonic].
+
+        Raises:
+            WorkError: it sends no frames.
+        """
+        frame = self._next()
+        age = 0.0
+        if frame.get_frame_timestamp_domain() in self._host_clocks:
+            age = min(max(time.time() - 1e-3 * frame.get_timestamp(), 0.0), _OLDEST_SECONDS)
+        taken = time.monotonic() - age
+        steps = np.asanyarray(frame.get_data())
+        return np.where(steps > 0, self._scale * steps, np.nan), taken
+
     def _frame(self) -> np.ndarray:
+        return np.asanyarray(self._next().get_data()).copy()
+
+    def _next(self) -> Any:
         try:
-            frame = self._pipeline.wait_for_frames(_WAIT_MS).get_depth_frame()
+            return self._pipeline.wait_for_frames(_WAIT_MS).get_depth_frame()
         except RuntimeError as error:
             raise WorkError(f"The RealSense camera sends no image ({error}).", "",
                             "Check its USB cable: depth needs USB 3.") from error
-        return np.asanyarray(frame.get_data()).copy()
 
 
 def seen_points(cell: Cell, camera: RealSense, flange: np.ndarray | None) -> np.ndarray:
@@ -87,6 +112,26 @@ def seen_points(cell: Cell, camera: RealSense, flange: np.ndarray | None) -> np.
     near, far = entry.range_m
     placed = camera.camera.model_copy(update={"pose": tuple(map(float, pose_vectors(frame)))})
     return depth_to_cloud(placed, depth, (depth >= near) & (depth <= far)).points
+
+
+def camera_differences(cell: Cell, camera: Camera) -> list[str]:
+    """Return in words how the intrinsics of the cell's [camera] differ from the connected camera's.
+
+    Goals in the camera's view (``limber plan --in-view``) are planned with the cell's.
+    """
+    entry = cell.camera
+    if entry is None:
+        return ["A camera is connected, but the cell file has no [camera]"]
+    found = []
+    for what, seen, wanted, within in (
+            ("camera's size", (camera.width, camera.height), (entry.width, entry.height), 0.0),
+            ("camera.focal_px", (camera.fx, camera.fy), entry.focal_px,
+             _SAME_FOCAL * camera.fx),
+            ("camera.centre_px", (camera.cx, camera.cy), entry.centre_px, _SAME_PX)):
+        if np.abs(np.subtract(seen, wanted)).max() > within:
+            found.append(f"{what}: ({seen[0]:g}, {seen[1]:g}) pixels in the connected camera, "
+                         f"({wanted[0]:g}, {wanted[1]:g}) in the cell file")
+    return found
 
 
 def _library() -> Any:

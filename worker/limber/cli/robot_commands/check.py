@@ -18,18 +18,101 @@ _SECONDS = 1.0
 
 @stage_command("check")
 @click.argument("cell_file", type=click.Path(path_type=Path))
-def check(run: Run, cell_file: Path) -> dict[str, Any]:
+@click.option("--offline", is_flag=True, help="Read files only: no robot is needed.")
+@click.option("--branch", "folder", type=click.Path(path_type=Path), help="Branch folder that the "
+              "cell must belong to; with --offline.")
+@click.option("--plan", help="Plan of the branch folder whose motion the arm must be able to "
+              "follow; with --offline.")
+@click.option("--realsense", is_flag=True, help="Compare [camera] with the connected RealSense "
+              "camera too: goals in its view are planned with [camera].")
+def check(run: Run, cell_file: Path, offline: bool, folder: Path | None, plan: str | None,
+          realsense: bool) -> dict[str, Any]:
     """Read model, version, settings, mode and force, and compare them with the cell.
 
     The robot does not move, and nothing is written to the controller. Each difference is stated
     with both values. `limber record` and `limber execute` set tool and payload themselves after
-    showing them, and restore them.
+    showing them, and restore them. With --offline only the cell file, its calibration and a plan
+    are checked.
     """
+    from limber.core.errors import InputError
     from limber.robot.cell.cell import read_cell
+
+    if ((folder or plan) and not offline) or (plan and folder is None):
+        raise InputError("--branch and --plan are checked from files.", "A plan belongs to a "
+                         "branch.", "Give --offline --branch FOLDER, and --plan NAME if you want.")
+    cell = read_cell(cell_file)
+    camera = _camera(run, cell) if realsense else {}
+    if offline:
+        return camera | _from_files(run, cell, cell_file, folder, plan)
+    return camera | _from_robot(run, cell)
+
+
+def _from_files(run: Run, cell: Cell, cell_file: Path, folder: Path | None, plan: str | None,
+                ) -> dict[str, Any]:
+    """Check a cell, its calibration and a plan without a robot."""
+    from limber.robot.cell.compatibility import check_branch
+    from limber.stages.paths.execute import ExecuteSettings, planned_motion
+    from limber.stages.paths.plan_cell import cell_obstacles
+    from limber.store import Branch
+
+    obstacles = cell_obstacles(cell, cell_file.parent)
+    for text in _not_stated(cell):
+        run.progress.warn(text)
+    result: dict[str, Any] = {
+        "arm": cell.arm.name, "obstacles": len(obstacles),
+        "base_position_sigma_m": cell.base.position_sigma_m,
+        "base_rotation_sigma_rad": cell.base.rotation_sigma_rad,
+        "calibration_residual_m": cell.base.residual_m}
+    if plan is None and folder is not None and (
+            warning := check_branch(cell, Branch.read(folder).uuid, folder)):
+        run.progress.warn(warning)
+    if plan is not None and folder is not None:
+        *_, motion = planned_motion(folder, plan, cell_file, ExecuteSettings(),
+                                    progress=run.progress, is_to_move=True)
+        result |= {"plan": plan, "motion": motion}
+    run.close(f"{cell_file} describes a {cell.arm.name}; its base is known to "
+              f"{1000 * cell.base.position_sigma_m:.1f} mm"
+              f"{f', and the arm can follow {plan}' if plan else ''}. No robot was asked.")
+    return result
+
+
+def _not_stated(cell: Cell) -> list[str]:
+    """What a cell file leaves open, and what that means."""
+    found = []
+    if cell.base.residual_m is None:
+        found.append("base.pose was not calibrated by Limber. It is believed within "
+                     f"{1000 * cell.base.position_sigma_m:.1f} mm (limber robot calibrate).")
+    if cell.branch is None:
+        found.append("The cell names no branch, so it is taken for each one.")
+    if cell.tool.mass_kg is None:
+        found.append("tool.mass_kg is not stated. No motion starts without it.")
+    if not cell.tool.parts:
+        found.append("tool.parts is empty, so the gripper itself is not checked against obstacles.")
+    if not cell.obstacles:
+        found.append("No obstacle is stated: nothing but the branch is avoided.")
+    return found
+
+
+def _camera(run: Run, cell: Cell) -> dict[str, Any]:
+    """Compare the connected camera with the cell's."""
+    from limber.robot.realsense import RealSense, camera_differences
+
+    with RealSense() as camera:
+        differences = camera_differences(cell, camera.camera)
+    for each in differences:
+        run.progress.warn(f"{each}.")
+    return {"camera_differences": differences}
+
+
+def _from_robot(run: Run, cell: Cell) -> dict[str, Any]:
+    from limber.core.errors import WorkError
     from limber.robot.robot_state import observe
 
-    cell = read_cell(cell_file)
-    seen = observe(cell, _SECONDS)
+    try:
+        seen = observe(cell, _SECONDS)
+    except WorkError as error:
+        raise WorkError(error.seen, error.why, f"{error.fix} With --offline the files are checked "
+                        "without a robot.") from error
     version = seen.facts.get("version")
     if cell.robot.version and version and cell.robot.version != version:
         run.progress.warn(f"The cell was calibrated with controller version {cell.robot.version}; "

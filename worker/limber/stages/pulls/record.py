@@ -26,10 +26,12 @@ if TYPE_CHECKING:
     from limber.robot.motion.execution import Blocked
     from limber.robot.motion.trajectory import Trajectory
     from limber.robot.pull_plausibility import PullPlausibility
-    from limber.robot.recorder import MarkerStream, PullRecorder
+    from limber.robot.recorder import PullRecorder
+    from limber.stages.pulls.record_observers import Observers
     from limber.store import Stream
 
 _TARE_SECONDS = 1.0
+_FEWEST_IMAGES = 2  # of a pull that is observed
 _SETTLE_SECONDS = 0.5  # until the branch rests in the closed gripper
 
 
@@ -77,7 +79,8 @@ class RecordSettings(Settings):
 class RecordOptions(Settings):
     """Options of a recording's run."""
 
-    groups: ClassVar[Groups] = {"running": ("confirm", "markers", "after_stop", "recover")}
+    groups: ClassVar[Groups] = {"running": (
+        "confirm", "markers", "realsense", "after_stop", "recover")}
     common = ("confirm",)
 
     confirm: str | None = Field(
@@ -86,6 +89,10 @@ class RecordOptions(Settings):
     markers: int | None = Field(
         None, ge=1, le=65535, description="Port at the robot's address where a tracker sends "
         "observed points as JSON lines (the virtual robot's is 63400).")
+    realsense: bool = Field(
+        False, description="Record depth images with the connected RealSense camera, which stands "
+        "still at the pose of [camera] in the cell file. `limber estimate` tracks the control "
+        "points in them.", json_schema_extra={"switch": True})
     after_stop: AfterStop = Field(
         "ask", description="What to do after a stop. ask: ask at the terminal, or hold without "
                            "one.",
@@ -150,15 +157,15 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
     from limber.robot.driver.link import RobotLink
     from limber.robot.driver.live_force import LiveForce
     from limber.robot.pull_plausibility import off_axis
-    from limber.robot.recorder import MarkerStream, PullRecorder
+    from limber.robot.recorder import PullRecorder
     from limber.stages.pulls.record_nudge import nudge_and_checks
+    from limber.stages.pulls.record_observers import Observers
     from limber.stages.pulls.record_path import grasp_point
 
-    tracker = (MarkerStream(cell.robot.address, options.markers, cell.base.pose)
-               if options.markers else None)
     stream = branch.stream(f"pulls/{name}/robot.csv")
     entry_lines = branch.stream(f"pulls/{name}/pull.toml")
-    marker_lines = branch.stream(f"pulls/{name}/markers.csv") if options.markers else None
+    observers = Observers(branch, cell, name, stream.path.parent, options.markers,
+                          options.realsense)
     recorders: list[PullRecorder] = []
     try:
         progress(0.02, "connecting")
@@ -167,12 +174,13 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
         doubts: list[PullPlausibility] = []
 
         def take(rows: np.ndarray) -> None:
+            observers.heard(rows)
             if recorders:
                 recorders[0].take(rows)
             live.take(rows)
             if doubts and doubts[-1].reason is None and doubts[-1].take(rows):
                 link.stop()
-        with live, RobotLink(cell, take) as link:
+        with observers, live, RobotLink(cell, take) as link:
             sample = link.wait_for_samples()
             point, off = grasp_point(branch, sample[1:4])
             if warning := off_axis(cell, sample[1:4], off):
@@ -195,26 +203,26 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                 if event["event"] != "reached":
                     return {"ended": _how_it_ended(event, doubts), "after_stop": retreat_if_chosen(
                         cell, link, options.after_stop, progress), "sample_count": 0}
-            _write_entry(entry_lines, cell, point, tared, trajectory.duration, tracker,
-                         marker_lines)
+            _write_entry(entry_lines, cell, point, tared, trajectory.duration, observers)
             recorder.close_gripper()
             live.at("pulling")
             doubts += predicted[:1]
             link.start(trajectory)
-            event = _watched(link, tracker, marker_lines, recorder, trajectory, progress)
+            event = _watched(link, observers, recorder, trajectory, progress)
             ended = {"ended": _how_it_ended(event, doubts)}
             if event["event"] == "reached":
                 # The last observations arrive a little later.
                 time.sleep(0.5)
-                _write_markers(tracker, marker_lines, recorder)
+                observers.end(recorder, progress)
                 _warn_of_what_is_left(doubts, recorder, progress)
                 grip(cell, link, close=False, progress=progress)
             else:
+                observers.end(recorder, progress)
                 ended["after_stop"] = retreat_if_chosen(cell, link, options.after_stop, progress)
         return ended | {"peak_force_n": recorder.peak_force, "sample_count": recorder.count,
                         "warnings": list(link.warnings)}
     finally:
-        _close_lines([stream, entry_lines, marker_lines], recorders, tracker)
+        _close_lines([stream, entry_lines, observers.lines], recorders)
 
 
 def _nudged(link: RobotLink, live: LiveForce, recorder: PullRecorder, across: Trajectory,
@@ -223,21 +231,18 @@ def _nudged(link: RobotLink, live: LiveForce, recorder: PullRecorder, across: Tr
     progress(0.13, "nudging the branch across the pull")
     live.at("nudging")
     link.start(across)
-    event = _watched(link, None, None, recorder, across, progress.part(0.13, 0.15))
+    event = _watched(link, None, recorder, across, progress.part(0.13, 0.15))
     time.sleep(_SETTLE_SECONDS)
     return event
 
 
-def _close_lines(streams: list[Stream | None], recorders: list[PullRecorder],
-                 tracker: MarkerStream | None) -> None:
+def _close_lines(streams: list[Stream | None], recorders: list[PullRecorder]) -> None:
     for lines in streams:
         if lines is not None:
             lines.close()
             if not (recorders and recorders[0].count):
                 # No sample came: there is nothing to import, and the name stays free.
                 lines.path.unlink(missing_ok=True)
-    if tracker is not None:
-        tracker.close()
 
 
 def _how_it_ended(event: dict[str, Any], doubts: list[PullPlausibility]) -> str:
@@ -256,10 +261,9 @@ def _warn_of_what_is_left(doubts: list[PullPlausibility], recorder: PullRecorder
         progress.warn(f"{warning}.")
 
 
-def _watched(link: RobotLink, tracker: MarkerStream | None, lines: Stream | None,
-             recorder: PullRecorder, trajectory: Trajectory, progress: Progress,
-             ) -> dict[str, Any]:
-    """Wait for the end of the motion; markers are written as they arrive."""
+def _watched(link: RobotLink, observers: Observers | None, recorder: PullRecorder,
+             trajectory: Trajectory, progress: Progress) -> dict[str, Any]:
+    """Wait for the end of the motion; observations are written as they arrive."""
     begin = time.monotonic()
     while True:
         try:
@@ -272,19 +276,10 @@ def _watched(link: RobotLink, tracker: MarkerStream | None, lines: Stream | None
             # Ctrl-C stops the arm before anything else.
             link.stop()
             raise
-        _write_markers(tracker, lines, recorder)
+        if observers is not None:
+            observers.write(recorder)
         progress(0.15 + 0.8 * min((time.monotonic() - begin) / trajectory.duration, 1.0),
                  "pulling", force_n=recorder.peak_force)
-
-
-def _write_markers(tracker: MarkerStream | None, lines: Stream | None,
-                   recorder: PullRecorder) -> None:
-    if tracker is None or lines is None:
-        return
-    for clock, points in tracker.read():
-        if recorder.first is not None and clock >= recorder.first:
-            lines.append(",".join([f"{clock - recorder.first:.6f}",
-                                   *(f"{value:.6g}" for value in points.ravel())]))
 
 
 def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
@@ -322,21 +317,15 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
 
 
 def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, Any],
-                 seconds: float, tracker: MarkerStream | None, marker_lines: Stream | None,
-                 ) -> None:
+                 seconds: float, observers: Observers) -> None:
     """Write ``pull.toml`` first, so that the files left by a kill can be read."""
     from limber.recordings.recording import GraspEntry, PullEntry, entry_text
     from limber.robot.recorder import known_errors, known_noise
     from limber.stages.pulls.record_path import GRASP_RADIUS_M
 
-    rest = noise = None
-    if tracker is not None and marker_lines is not None:
-        points, noise = tracker.at_rest()
-        rest = tuple(tuple(map(float, point)) for point in points)
-        names = (f"m{k}_{axis}_m" for k in range(len(rest)) for axis in "xyz")
-        marker_lines.append(",".join(("t_s", *names)))
+    rest, noise = observers.at_rest()
     entry = PullEntry(
-        observation="markers" if rest else "none", grasp=GraspEntry(
+        observation=observers.kind, grasp=GraspEntry(
             point_m=tuple(map(float, point)), radius_m=GRASP_RADIUS_M),
         sensor=known_noise(cell, noise),
         calibration=known_errors(cell, seconds, tare_sigma=tared["sigma"]),
@@ -366,8 +355,14 @@ def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str
         markers = 0
         if f"{prefix}markers.csv" in left:
             markers = len(read_stream(stage.path(f"{prefix}markers.csv")))
+        images = sum(file.startswith(f"{prefix}depth/") for file in left)
+        if images < _FEWEST_IMAGES:
+            entry = stage.path(f"{prefix}pull.toml")
+            entry.write_text(entry.read_text(encoding="utf-8").replace(
+                'observation = "depth"', 'observation = "none"'), encoding="utf-8")
         stage.result.update(
             {"pull": name, "sample_count": len(samples), "marker_frames": markers,
+             "depth_images": images or None,
              "seconds": float(samples.times[-1]), "peak_force_n": float(force.max())} | ended)
     return stage.result
 
@@ -377,6 +372,7 @@ STAGE = StageDescription(
     RecordSettings, RecordOptions, key="record:{name}", reads=("skeleton.swc",),
     writes=("pulls/{name}/",),
     found=("Pull {pull}: {sample_count:count} samples in {seconds:s}, {marker_frames} marker "
-           "frames, peak force {peak_force_n:N}; ended: {ended}.",),
+           "frames, peak force {peak_force_n:N}; ended: {ended}.",
+           "{depth_images} depth images."),
     then="limber estimate {branch_folder}", step="pulls", label="Record a Pull",
     moves_robot="always")
