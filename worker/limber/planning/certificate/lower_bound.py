@@ -141,7 +141,8 @@ def certify_all(problems: Sequence[GentleProblem], improve: Sequence[Improve], *
 def _next_grid(searches: "list[_Search]", grid: Grid, cell: np.ndarray, *, is_first: bool,
                ) -> tuple[Grid, np.ndarray] | None:
     """Bound on a grid; return the next one, None if a finer grid is not worth its time."""
-    keep, near, ratios = np.zeros(grid.open_cells.shape, bool), grid.about_goal, np.ones(3)
+    keep, near = np.zeros(grid.open_cells.shape, bool), grid.about_goal
+    common, ratios = COARSEST, np.ones(3)
     try:
         land = _land(searches[0].problem, grid, cell)
         for one in searches:
@@ -149,6 +150,7 @@ def _next_grid(searches: "list[_Search]", grid: Grid, cell: np.ndarray, *, is_fi
             one.take(found, grid, is_first=is_first)
             if not one.is_done:
                 own, near = found.keep(one.upper), found.about_goal
+                common = min(common, one.ratio())
                 ratios = np.minimum(ratios, _ratios(found.ground, own, one.ratio()))
                 keep |= own
             del found
@@ -166,10 +168,11 @@ def _next_grid(searches: "list[_Search]", grid: Grid, cell: np.ndarray, *, is_fi
         return None
     if not keep.any():
         return None
-    # No more cells than are allowed.
-    ratios = np.minimum(1.0, ratios * max(
-        np.cbrt(keep.sum() / ratios.prod() / _MOST_CELLS), 1.0))
-    return None if ratios.prod() > COARSEST**3 else refined(grid, keep, near, cell, ratios)
+    # No more cells than are allowed; cells that are hardly finer are not worth their time.
+    coarser = max(float(np.cbrt(keep.sum() / ratios.prod() / _MOST_CELLS)), 1.0)
+    if coarser > 1.0 and coarser * common > COARSEST:
+        return None
+    return refined(grid, keep, near, cell, np.minimum(1.0, coarser * ratios))
 
 
 @dataclass
