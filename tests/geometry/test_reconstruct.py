@@ -115,7 +115,7 @@ def test_left_out_twigs_become_masses(generated, tmp_path):
     """
     folder, _, full = generated
     place = tmp_path / "t.branch"
-    result = reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_radius=0.0035))
+    result = reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_radius=0.0055))
     masses = json.loads((place / "point_masses.json").read_text())
     assert len(masses) == result["left_out_twigs"] == 2
     whole = 900 * full["mesh_volume_m3"]

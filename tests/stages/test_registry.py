@@ -31,7 +31,7 @@ OTHERS = {
                  {"move": (-0.1, 0.0, 1e-3), "gravity": False, "kind": "static",
                   "load_at": ((0.0, 0.0, 0.1, 1.0, -2.0, 0.5), (0.0, 0.0, 0.2, 0.0, 0.0, -1.0))}),
     "estimate": ({"branch_folder": "-odd.branch"},
-                 {"pull": ("one", "two"), "fractions": (0.25, 0.75), "robust": False}),
+                 {"pull": ("one", "two"), "fractions": (0.25, 0.75), "hold_out": False}),
 }
 
 
