@@ -139,6 +139,16 @@ def test_help_shows_what_most_users_choose(capsys):
     assert "--damping-mass" in capsys.readouterr().out
 
 
+def test_an_old_command_line_may_state_a_constant(capsys):
+    """An option that became a constant takes its value, refuses another, and no help shows it."""
+    assert parsed("reconstruct", ["a.ply", "-o", "a.branch", "--prune", "2.5"])[1] == (
+        parsed("reconstruct", ["a.ply", "-o", "a.branch"])[1])
+    assert main.call(["reconstruct", "a.ply", "-o", "a.branch", "--prune", "3"]) == 2
+    assert "--prune 3.0 cannot be set any more: it is always 2.5" in capsys.readouterr().err
+    assert main.call(["reconstruct", "--help-all"]) == 0
+    assert "--prune" not in capsys.readouterr().out
+
+
 def test_help_shows_about_a_fifth():
     """Of all options and inputs, and of none more than ten."""
     shown = {name: [field for part in ("inputs", "settings", "options")

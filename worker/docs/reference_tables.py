@@ -71,7 +71,8 @@ def _command(name: str, command: click.Command | None) -> list[str]:
             lines = _command(f"{name} {child}", command.get_command(context, child))
             parts += [f"#{line}" if line.startswith("## ") else line for line in lines]
         return parts
-    rows = [_option_row(option) for option in command.params]
+    rows = [_option_row(option) for option in command.params
+            if not getattr(option, "hidden", False)]
     if rows:
         parts += ["| option | meaning | default |", "|---|---|---|", *rows, ""]
     return parts

@@ -153,12 +153,13 @@ class Settings(BaseModel):
     @classmethod
     def without_retired(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return values by name, without former fields that have the constant's value."""
-        former = cls._former()
+        former = cls.former()
         return {name: value for name, value in values.items()
                 if name not in former or value != former[name]}
 
     @classmethod
-    def _former(cls) -> dict[str, Any]:
+    def former(cls) -> dict[str, Any]:
+        """Return the retired fields of the model and its bases, each with its value."""
         return {name: value for base in cls.__mro__
                 for name, value in vars(base).get("retired", {}).items()}
 
@@ -167,10 +168,10 @@ class Settings(BaseModel):
     def _drop_retired(cls, values: Any) -> Any:
         if not isinstance(values, Mapping):
             return values
-        remaining, former = cls.without_retired(values), cls._former()
+        remaining, former = cls.without_retired(values), cls.former()
         for name in remaining.keys() & former:
-            raise ValueError(f"{_flag(name)} {remaining[name]!r} cannot be set any more: it is "
-                             f"always {former[name]!r}")
+            now = "is not used" if former[name] is None else f"is always {former[name]!r}"
+            raise ValueError(f"{_flag(name)} {remaining[name]!r} cannot be set any more: it {now}")
         return remaining
 
     @classmethod
@@ -197,7 +198,7 @@ class Settings(BaseModel):
             content["expert"] = cls.is_expert(name)
             if unit := _UNIT.search(content.get("description", "")):
                 content["unit"] = unit.group(1)
-        return schema | ({"retired": sorted(former)} if (former := cls._former()) else {})
+        return schema | ({"retired": sorted(former)} if (former := cls.former()) else {})
 
 
 def nearest(name: str, known: Sequence[str]) -> str:

@@ -85,7 +85,8 @@ def _show_all(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None
 
 def options_of(command: click.Command) -> frozenset[str]:
     """Return the options of a command, as they are typed."""
-    return frozenset(flag for param in command.params if isinstance(param, click.Option)
+    return frozenset(flag for param in command.params
+                     if isinstance(param, click.Option) and not param.hidden
                      for flag in (*param.opts, *param.secondary_opts))
 
 
@@ -139,11 +140,20 @@ def stage_options(stage: StageDescription) -> Callable[[Callable], Callable]:
 def _with_options(function: Callable, fields: Mapping[str, type[BaseModel]],
                   prefix: str) -> Callable:
     """Add an option per field of a model; the function gets ``values``, those that were given."""
+    former = {name: value for model in fields.values() if issubclass(model, Settings)
+              for name, value in model.former().items() if name not in fields}
+
     @functools.wraps(function)
     def body(*args: Any, **options: Any) -> Any:
-        chosen = {field: options.pop(f"{prefix}__{field}") for field in fields}
+        chosen = {field: options.pop(f"{prefix}__{field}") for field in (*fields, *former)}
         values = {field: value for field, value in chosen.items() if value is not None}
         return function(*args, values=values, **options)
+    for name, value in former.items():
+        # Old command lines may state the constant; the model refuses any other value.
+        flag, kind = "--" + name.replace("_", "-"), str if value is None else type(value)
+        declared = f"{flag}/--no-{flag[2:]}" if isinstance(value, bool) else flag
+        body = click.option(declared, f"{prefix}__{name}", hidden=True, default=None,
+                            type=kind)(body)
     for name, model in reversed(fields.items()):
         body = _parameter(model, name, model.model_fields[name], f"{prefix}__{name}")(body)
     return body

@@ -79,12 +79,14 @@ class StageDescription:
 
         kinds = (self.inputs, self.settings, self.options)
         known = [name for kind in kinds for name in kind.model_fields]
+        former = {name for kind in kinds for name in kind.former()}
         for name in values:
-            if name not in known:
+            if name not in known and name not in former:
                 raise InputError(f"{self.name} has no {name!r}.", nearest(name, known))
         inputs, settings, options = (
             checked_settings(kind, {name: value for name, value in values.items()
-                                    if name in kind.model_fields}) for kind in kinds)
+                                    if name in kind.model_fields or name in kind.former()})
+            for kind in kinds)
         return inputs, settings, options
 
     def entry(self, inputs: "Settings", settings: "Settings") -> str:
