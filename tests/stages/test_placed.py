@@ -93,6 +93,8 @@ def test_tables_in_frames_of_their_own(tmp_path):
         frame_pose=(1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2)))
     found = read_pull(folder / "pulls" / "own")
     np.testing.assert_allclose(found.observations.positions, seen.positions, atol=1e-6)
+    # They need not be the control points: they rest where the first frame shows them.
+    np.testing.assert_allclose(found.entry.rest_points_m, seen.positions[0], atol=1e-6)
     np.testing.assert_allclose(found.poses, pull.poses, atol=1e-6)
     np.testing.assert_allclose(found.wrenches, pull.wrenches, atol=1e-6)
 

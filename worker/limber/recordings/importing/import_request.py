@@ -31,12 +31,14 @@ class BranchFrame:
         nodes: Nodes of its mesh [m], shape [n, 3]; needed for a steady load. None: there is no mesh
             yet to compare with.
         path: Nodes of its main path from base to tip [m], shape [m, 3].
+        control_points: Number of the mesh's control points; None as for ``nodes``.
     """
 
     alignment: Alignment = field(default_factory=Alignment)
     gravity: tuple[float, float, float] = GRAVITY
     nodes: np.ndarray | None = None
     path: np.ndarray | None = None
+    control_points: int | None = None
 
     def at(self, distance: float) -> np.ndarray:
         """Return the point at a distance from the base along the main path [m], shape [3].
@@ -122,6 +124,11 @@ class ImportRequest:
                              "Give --marker-frame if the pose of their frame was measured; else "
                              "--nominal.")
         return points @ rotation_matrix(np.array(pose[3:])).T + pose[:3]
+
+    def own_markers(self, seen: np.ndarray) -> bool:
+        """Whether markers [f, m, 3] cannot be the branch's control points."""
+        known = self.branch.control_points
+        return self.settings.marker_frame is not None or known not in (None, seen.shape[1])
 
     def grasp_or(self, otherwise: Callable[[], np.ndarray]) -> tuple[float, float, float]:
         """Return the grasp point in the branch's frame [m]; if none was given, the alternative."""

@@ -179,6 +179,21 @@ def _gripper(request: ImportRequest) -> Stream:
     return read_robot(Path(request.settings.robot), request)
 
 
+def _at_rest_first(seen: Observations, labels: list[str], stream: Stream, name: str,
+                   ) -> tuple[Observations, np.ndarray, list[str]]:
+    """The markers that the first frame shows, when the branch is at rest; those positions [m]."""
+    there = seen.visible[0]
+    if not there.any():
+        raise InputError(f"{name}: no marker is visible in the first frame.",
+                         "The markers' positions at rest are not known.",
+                         "Start the recording before the pull, or give --nominal.")
+    unseen = [label for label, here in zip(labels, there, strict=True) if not here]
+    messages = [f"{name}: {label} is not visible in the first frame, where the branch is at rest, "
+                "and was discarded." for label in unseen]
+    used = seen.positions[:, there]
+    return replace(seen, positions=used), used[0], [*stream.warnings, *messages]
+
+
 def _seen(read: tuple[Stream, list[str]], request: ImportRequest,
           ) -> tuple[Observations, np.ndarray | None, list[str]]:
     """Markers [m], their nominal rest positions if given, and warnings."""
@@ -188,7 +203,9 @@ def _seen(read: tuple[Stream, list[str]], request: ImportRequest,
     if placed is None:
         if request.branch.nodes is not None:
             require_near(seen.positions[0], request.name, request.branch.nodes)
-        return seen, None, list(stream.warnings)
+        if not request.own_markers(seen.positions):
+            return seen, None, list(stream.warnings)
+        return _at_rest_first(seen, labels, stream, request.name)
     moved = placed.apply(seen.positions[:, placed.used])
     return (replace(seen, positions=moved), moved[0],
             [*stream.warnings, *placed.warnings])

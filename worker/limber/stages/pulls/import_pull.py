@@ -134,8 +134,12 @@ def _frame(branch: Branch, settings: ImportSettings) -> BranchFrame:
     if branch.has("skeleton.swc"):
         skeleton = load_skeleton(branch)
         path = skeleton.nodes[skeleton.main_path()]
-    return BranchFrame(branch.manifest.alignment, branch.gravity,
-                       load_mesh(branch).nodes if loaded or branch.has("mesh.vtu") else None, path)
+    if not (loaded or branch.has("mesh.vtu")):
+        return BranchFrame(branch.manifest.alignment, branch.gravity, path=path)
+    mesh = load_mesh(branch)
+    marks = mesh.point_data.get("control_point")
+    return BranchFrame(branch.manifest.alignment, branch.gravity, mesh.nodes, path,
+                       None if marks is None else int(marks.max()) + 1)
 
 
 def _digest(path: Path) -> str:
