@@ -305,30 +305,6 @@ class QuasiStaticForward(Forward):
         made.begin_at(self)
         return made
 
-    def with_torque(self, values: Values, sigma: float) -> "QuasiStaticForward":
-        """Return a pose-driven pull of a clamped grasp as if its torque had been recorded.
-
-        Args:
-            values: Values under which the readings of the torque are simulated.
-            sigma: Standard deviation of one reading [N m].
-
-        Raises:
-            ValueError: the pull has no equilibrium under the values.
-        """
-        asked = copy.copy(self)
-        asked.uses_torque = True
-        simulated = present(asked.simulate(values, (), False), "equilibrium of the pull")
-        wrenches = self.frames.wrenches.copy()
-        wrenches[:, 3:] = present(simulated.torques, "torque of the pull")
-        entry = self.entry.model_copy(update={"sensor": self.entry.sensor.model_copy(
-            update={"torque_sigma_nm": sigma})})
-        made = type(self)(self.name, self._model, self.weights, entry,
-                          replace(self.frames, wrenches=wrenches), self.rest_points,
-                          key_count=self.key_count, field=self.field)
-        made.point_shifts = self.point_shifts
-        made.begin_at(self)
-        return made
-
     def begin_at(self, other: "QuasiStaticForward") -> None:
         """Start from states and force of another simulation of this pull with as many nodes."""
         if self.has_force_unknowns:

@@ -7,15 +7,17 @@ does, with the errors of shape and mesh in both. An action helps only where its 
 the causes of the variance alone do not show: two causes that hide each other must both be mended.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypedDict
 
 import numpy as np
 
+from limber.core.not_none import present
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.parameters import YOUNG_BOUNDS_PA
+from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
 from limber.estimation.uncertainty.covariance import Uncertainty, inverse_information, scaled_rows
 from limber.estimation.uncertainty.model_error import ModelError, total_interval
 from limber.estimation.uncertainty.path_error import path_slopes
@@ -181,7 +183,7 @@ class Prospects:
             full = forward.full
             if (isinstance(full, QuasiStaticForward) and full.drive == "pose"
                     and full.entry.grasp.mode == "clamped" and not full.uses_torque):
-                full, is_new = full.with_torque(values, TORQUE_SIGMA_NM), True
+                full, is_new = _torque_recorded(full, values), True
             forwards.append(full)
         if not is_new:
             return None
@@ -230,3 +232,24 @@ class Prospects:
             forward.response.points.shape[-1]) for forward in objective.forwards]
         start = first + sum(counts[:number])
         return np.array([*errors, *range(start, start + counts[number])], int)
+
+
+def _torque_recorded(pull: QuasiStaticForward, values: Values) -> QuasiStaticForward:
+    """A pose-driven pull of a clamped grasp as if its torque had been recorded.
+
+    Raises:
+        ValueError: the pull has no equilibrium under the values.
+    """
+    asked = copy.copy(pull)
+    asked.uses_torque = True
+    simulated = present(asked.simulate(values, (), False), "equilibrium of the pull")
+    wrenches = pull.frames.wrenches.copy()
+    wrenches[:, 3:] = present(simulated.torques, "torque of the pull")
+    entry = pull.entry.model_copy(update={"sensor": pull.entry.sensor.model_copy(
+        update={"torque_sigma_nm": TORQUE_SIGMA_NM})})
+    made = type(pull)(pull.name, pull.model, pull.weights, entry,
+                      replace(pull.frames, wrenches=wrenches), pull.rest_points,
+                      key_count=pull.key_count, field=pull.field)
+    made.point_shifts = pull.point_shifts
+    made.begin_at(pull)
+    return made

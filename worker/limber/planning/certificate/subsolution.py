@@ -36,8 +36,7 @@ from limber.core.numerics.compiled import compiled
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, turns
 from limber.planning.certificate.fast_marching import march, neighbours
 
-RIM = 2
-"""Closed cells around the open ones that have coefficients as well."""
+RIM = 2  # closed cells around the open ones that have coefficients as well
 _ROUNDS, _CLOSE = 8, 1.0005  # local reweighting; ends when nothing exceeds by more than _CLOSE
 _IDLE, _WORTH = 2, 1.004  # rounds without gain that end it; the factor that counts as a gain
 _LARGE = 100_000  # a single round for so many cells: it takes a third of a second
