@@ -9,9 +9,9 @@ import pytest
 from benchmarks.paper_branches import Bench, PaperBranch, exact_pull, measured
 from limber.cli.main import call
 from limber.core.errors import InputError
+from limber.estimation.control_point_count import equal_fractions, supported_fractions
 from limber.estimation.estimated_branch import subject_of
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.uncertainty.control_point_count import equal_fractions, supported_fractions
 from limber.recordings.cell_errors import EXACT
 
 QUICK = EstimateSettings(key_frames=6, hold_out=False, mesh_check=False, gravity=False,

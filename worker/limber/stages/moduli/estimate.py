@@ -154,7 +154,7 @@ def _with_supported_points(branch: Branch, pulls: list[Pull], subject: Subject,
                            settings: EstimateSettings, progress: Progress,
                            ) -> tuple[EstimateSettings, dict[int, float]]:
     """The settings with as many control points as the pulls support, and their evidence."""
-    from limber.estimation.uncertainty.control_point_count import supported_fractions
+    from limber.estimation.control_point_count import supported_fractions
     from limber.store.loading import load_subject
 
     fractions, known = supported_fractions(
