@@ -144,7 +144,7 @@ def test_an_old_command_line_may_state_a_constant(capsys):
     assert parsed("reconstruct", ["a.ply", "-o", "a.branch", "--prune", "2.5"])[1] == (
         parsed("reconstruct", ["a.ply", "-o", "a.branch"])[1])
     assert main.call(["reconstruct", "a.ply", "-o", "a.branch", "--prune", "3"]) == 2
-    assert "--prune 3.0 cannot be set any more: it is always 2.5" in capsys.readouterr().err
+    assert "--prune 3.0: it cannot be set any more and is always 2.5" in capsys.readouterr().err
     assert main.call(["reconstruct", "--help-all"]) == 0
     assert "--prune" not in capsys.readouterr().out
 

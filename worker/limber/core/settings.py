@@ -170,8 +170,7 @@ class Settings(BaseModel):
             return values
         remaining, former = cls.without_retired(values), cls.former()
         for name in remaining.keys() & former:
-            now = "is not used" if former[name] is None else f"is always {former[name]!r}"
-            raise ValueError(f"{_flag(name)} {remaining[name]!r} cannot be set any more: it {now}")
+            raise ValueError(f"{_flag(name)} {remaining[name]!r}: {why_constant(former[name])}")
         return remaining
 
     @classmethod
@@ -199,6 +198,12 @@ class Settings(BaseModel):
             if unit := _UNIT.search(content.get("description", "")):
                 content["unit"] = unit.group(1)
         return schema | ({"retired": sorted(former)} if (former := cls.former()) else {})
+
+
+def why_constant(value: Any) -> str:
+    """Return why a retired setting cannot have another value than its constant."""
+    now = "is not used" if value is None else f"is always {value!r}"
+    return f"it cannot be set any more and {now}"
 
 
 def nearest(name: str, known: Sequence[str]) -> str:

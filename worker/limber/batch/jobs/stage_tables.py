@@ -13,7 +13,7 @@ from limber.batch.jobs.branch_jobs import StageTask
 from limber.batch.jobs.job_paths import JobPaths
 from limber.batch.jobs.problems import Problems
 from limber.batch.jobs.toml_positions import KeyPath
-from limber.core.settings import nearest
+from limber.core.settings import Settings, nearest, why_constant
 from limber.core.units import in_unit
 from limber.stages.registry import (
     StageDescription,
@@ -97,11 +97,16 @@ class _StageValues:
 
     def tasks(self) -> list[StageTask]:
         own = self._own_inputs()
+        former = {name: value for model in self._models() for name, value in model.former().items()}
         values: dict[str, Any] = {}
         for key, value in self._values.items():
             if key in own:
                 self._problems.add(self._key_paths[key],
                                    f"The batch sets {key!r} itself. Remove it.")
+            elif key in former:
+                if value != former[key]:
+                    self._problems.add(self._key_paths[key], f"{self._stage.name} {key}: "
+                                       f"{why_constant(former[key])}.")
             elif key not in self._fields:
                 self._problems.add(self._key_paths[key], f"{self._stage.name} has no {key!r}. "
                                    f"{nearest(key, list(self._fields))}")
@@ -109,6 +114,9 @@ class _StageValues:
                 values[key] = self._value(key, value)
         return [task for each in self._runs(values)
                 if (task := self._checked(own | each)) is not None]
+
+    def _models(self) -> tuple[type[Settings], ...]:
+        return self._stage.inputs, self._stage.settings, self._stage.options
 
     def _own_inputs(self) -> dict[str, Any]:
         """Return the inputs that follow from the branch."""
@@ -168,7 +176,7 @@ class _StageValues:
 
     def _checked(self, values: dict[str, Any]) -> StageTask | None:
         made = []
-        for model in (self._stage.inputs, self._stage.settings, self._stage.options):
+        for model in self._models():
             own = {key: value for key, value in values.items() if key in model.model_fields}
             try:
                 made.append(model(**own))
