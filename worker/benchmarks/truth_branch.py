@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from benchmarks.paper_branches import PaperBranch
-from limber.estimation.gripper_path import MotionWanted, moved
+from limber.estimation.forward.gripper_path import MotionWanted, moved
 from limber.estimation.next_pull import PullChoice
 from limber.estimation.virtual_cell import CellErrors, marked_points
 from limber.geometry.skeleton.control_points import control_points

@@ -21,7 +21,7 @@ from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit_preparation import forwards_of, parameter_space
 from limber.estimation.fitting.objective import Objective
-from limber.estimation.gripper_path import MotionWanted, moved
+from limber.estimation.forward.gripper_path import MotionWanted, moved
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
 from limber.mechanics.model import BranchModel

@@ -16,7 +16,7 @@ from limber.core.constants import GRAVITY
 from limber.core.errors import InputError, WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
-from limber.estimation.gripper_path import MotionWanted, moved
+from limber.estimation.forward.gripper_path import MotionWanted, moved
 from limber.estimation.settings import VirtualPullSettings
 from limber.estimation.uncertainty.model_error import refined
 from limber.estimation.virtual_cell import CellErrors, marked_points

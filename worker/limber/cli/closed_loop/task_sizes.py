@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.estimation.gripper_path import force_for_travel
+from limber.estimation.forward.gripper_path import force_for_travel
 from limber.mechanics import solve_static
 from limber.robot.cell.cell import Cell, LimitsEntry
 from limber.store import Branch

@@ -10,6 +10,7 @@ from limber.core.errors import InputError
 from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.estimation.forward.forward_model import Forward, Simulated, under_its_weight
+from limber.estimation.forward.gripper_path import measured_over_simulated
 from limber.estimation.forward.gripper_torque import require_torque, torque_slopes, uses_torque
 from limber.estimation.forward.input_force import (
     Course,
@@ -21,7 +22,6 @@ from limber.estimation.forward.input_force import (
     wrench_sigma,
 )
 from limber.estimation.forward.key_frames import key_frames, travel
-from limber.estimation.gripper_path import measured_over_simulated
 from limber.estimation.interpolation_prior import YoungField
 from limber.estimation.parameters import Values, equal_values, mechanics_names
 from limber.geometry.tets.tet_mesh import TetMesh

@@ -85,7 +85,7 @@ def arc_path(branch: Branch, point: np.ndarray, direction: np.ndarray, distance:
     Raises:
         WorkError: no such force moves it so far.
     """
-    from limber.estimation.gripper_path import force_for_travel
+    from limber.estimation.forward.gripper_path import force_for_travel
     from limber.mechanics import Grasp, solve_static
     from limber.store.loading import load_branch
 
