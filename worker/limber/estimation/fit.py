@@ -39,6 +39,7 @@ from limber.estimation.fitting.large_errors import (
 from limber.estimation.fitting.objective import Evaluation, Objective, Stopped
 from limber.estimation.fitting.optimise import (
     EVALUATION_LIMIT,
+    ROUGH_ENDING,
     Fit,
     FitStatus,
     gauss_newton,
@@ -299,17 +300,17 @@ def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
         start = _resumed(objective, start)
         if far is not None and reduction is None and not is_near:
             # A rough fit tells whether points are far off. The full one then begins from there.
-            start, is_near = _rough(objective, start).evaluation.free, True
-            if (rough := objective.evaluate(start, jacobian=True)) is not None:
-                far.look(rough, objective)
+            rough = gauss_newton(objective, start, robust=False, tolerance=ROUGH_ENDING,
+                                 force_rounds=0, evaluation_limit=EVALUATION_LIMIT).evaluation
+            start, is_near = rough.free, True
+            far.look(rough, objective)
     if reduction is not None:
         return fit_reduced(objective, start, optimise, _rough, reduction, progress)
     return _refined(optimise(objective, start, is_near), objective, settings, progress), objective
 
 
 def _rough(objective: Objective, free: np.ndarray) -> Fit:
-    return gauss_newton(objective, free, evaluation_limit=8, tolerance=1e-2, robust=False,
-                        force_rounds=0)
+    return gauss_newton(objective, free, evaluation_limit=8, tolerance=1e-2)
 
 
 def _resumed(objective: Objective, start: np.ndarray) -> np.ndarray:

@@ -111,7 +111,8 @@ def estimate_offset(pull: Pull, *, limit_s: float = 1.0) -> tuple[float, float]:
 
     quanta = _quanta(pull.poses)
     smooth = np.column_stack([
-        _unrounded(pull.times, each) if quantum > 0 else each
+        # A rotation vector jumps where the angle passes half a turn.
+        _unrounded(pull.times, each) if quantum > 0 and np.ptp(np.diff(each)) < 1.0 else each
         for each, quantum in zip(pull.poses.T, quanta, strict=True)])
 
     def at(offset: float, poses: np.ndarray = smooth) -> np.ndarray:

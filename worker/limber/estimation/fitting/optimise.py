@@ -34,6 +34,8 @@ FIRST_SIMPLEX = 0.5
 """Step of Nelder-Mead's first simplex in log E: a factor of 1.6. With 1 it finds the paper's young
 branch as fast.
 """
+ROUGH_ENDING = 0.02
+"""Relative change of the cost at which the first phase of a robust fit ends."""
 FORCE_ROUNDS = 6
 """Most linearisations of a measured input force."""
 FORCE_SETTLED = 0.1
@@ -93,8 +95,10 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
         WorkError: the start has no equilibrium.
     """
     # Far from the solution all residuals are large, and a robust loss would only slow convergence.
-    phases = [("linear", 0.02), ("soft_l1", tolerance)] if robust else [("linear", tolerance)]
-    if robust and is_near:
+    phases = [("linear", ROUGH_ENDING), ("soft_l1", tolerance)]
+    if not robust:
+        phases = [("linear", tolerance)]
+    elif is_near:
         phases = phases[1:]
     search = _Search(objective, start, evaluation_limit)
     moved = search.begin
