@@ -44,13 +44,14 @@ def test_clock_offset_is_found(plain_pull, offset):
     assert abs(found - offset) < 4 * sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantum", [2e-4, 1e-3, 5e-3])
 def test_the_offsets_error_includes_the_rounding_of_the_poses(plain_pull, quantum):
     """A pull one way with rounded poses: the offset is off by far more than noise explains."""
     seen = np.linspace(0.2, 3.8, 120)
     way = np.interp(seen, plain_pull.times, plain_pull.poses[:, 0])
     off = []
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         positions = np.zeros((120, 2, 3))
         positions[:, 0, 0], positions[:, 1, 0], positions[:, 1, 2] = 0.3 * way, 0.7 * way, -way**2

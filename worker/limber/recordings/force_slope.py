@@ -22,7 +22,7 @@ from limber.recordings.time_series import saturated
 NOISE_FLOOR_N = 20 * FORCE_UNITS_N["gf"]
 """Force above the unloaded reading that counts as contact [N]; a drop of twice as much is a slip.
 """
-_DISTANCE = r"distance|along|from.?(the.?)?base"
+_DISTANCE = r"along|from.?(the.?)?base"
 """Title of the column that states where the branch was loaded."""
 OBSTACLE = 2.0
 """Growth factor of the slope at a bend above which there is an obstacle behind the branch."""

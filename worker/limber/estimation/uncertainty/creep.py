@@ -19,6 +19,8 @@ TIME_SHARES = (0.03, 0.1, 0.3, 1.0)
 """Tested time constants over the duration of the longest pull."""
 LIKELIER = 3.0
 """Log of the ratio of evidences above which creep is added."""
+LEAST_NOISE = 0.05
+"""Smallest variance of the residuals over the stated one: below it errors of the model count."""
 FEWEST = 12
 """Fewest frames of a pull that can show it."""
 
@@ -81,7 +83,8 @@ def _noise(residual: np.ndarray, kinds: list[np.ndarray], objective: Objective) 
         start += len(each)
     count = sum(each.size for each in series)
     variance = sum(float(np.sum(each**2)) for each in series) / max(count - fitted, 1)
-    return variance * repeated([(np.zeros((len(each), 0, 3)), each) for each in series])
+    return max(variance, LEAST_NOISE) * repeated(
+        [(np.zeros((len(each), 0, 3)), each) for each in series])
 
 
 def _may_show(forward: Forward) -> bool:

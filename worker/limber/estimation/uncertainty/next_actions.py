@@ -183,6 +183,8 @@ class Prospects:
             full = forward.full
             if (isinstance(full, QuasiStaticForward) and full.drive == "pose"
                     and full.entry.grasp.mode == "clamped" and not full.uses_torque):
+                if full.simulate(values, (), False) is None:
+                    return None
                 full, is_new = _torque_recorded(full, values), True
             forwards.append(full)
         if not is_new:

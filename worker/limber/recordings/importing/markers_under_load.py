@@ -156,12 +156,9 @@ def import_gauge(table: ForceTable, request: ImportRequest) -> dict[str, Any]:
     point where the gauge held it. A row without force, if there is one, is the ruler's zero.
 
     Raises:
-        InputError: there is no mesh, the grasp is not on the branch, or the force is always zero.
+        InputError: the grasp is not on the branch, or the force is always zero.
     """
-    settings, nodes = request.settings, request.branch.nodes
-    if nodes is None:
-        raise InputError("The branch has no mesh yet.", "The position of the load is on it.",
-                         "Reconstruct the branch first.")
+    settings, nodes = request.settings, _nodes(request)
     peak = float(np.abs(table.force).max())
     if peak == 0.0:
         raise InputError(f"{request.source.name} has no force.", "Nothing pulled the branch.",

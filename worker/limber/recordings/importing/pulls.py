@@ -48,8 +48,8 @@ def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
 
     Returns:
         ``frame_count``, ``point_count``, ``time_offset_s``; for a steady load ``displacement_m``,
-        ``settled_s`` and ``registration_rms_m``; for a force table without the position of
-        the load ``slope_n_per_m``, ``slope_interval_n_per_m`` and ``why_no_modulus``.
+        ``settled_s`` and ``registration_rms_m``; for a force table without a mesh or the
+        position of the load ``slope_n_per_m``, ``slope_interval_n_per_m`` and ``why_no_modulus``.
 
     Raises:
         InputError: the recording cannot be read as its stated kind.
@@ -61,7 +61,8 @@ def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
         if table.distance is not None and not request.stated & {"grasp_point", "grasp_distance"}:
             request = replace(request, settings=settings.model_copy(
                 update={"grasp_distance": table.distance}))
-        is_placed = request.stated & {"grasp_point", "grasp_distance"}
+        is_placed = request.branch.nodes is not None and (
+            request.stated & {"grasp_point", "grasp_distance"})
         return (import_gauge if is_placed else _import_force)(table, request)
     if settings.weight is not None or settings.load is not None:
         require_loadable(chosen, request)
