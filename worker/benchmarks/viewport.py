@@ -58,6 +58,7 @@ def _measured(place: Path, setting: Setting, part: str) -> dict[str, Any]:
         "addon": str(_ROOT / "addon"), "branch": str(branch), "cloud": str(place / "scan.ply"),
         "large_cloud": str(place / "million.ply"), "quick": setting.quick, "seed": setting.seed,
         "part": part, "seconds": setting.budget.remaining,
+        "learn_seconds": 20.0 if setting.quick else 200.0,
         "grab_seconds": 5.0 if setting.quick else 20.0}))
     environment = {"LIMBER_PYTHON": sys.executable} | os.environ
     with _screen(part) as display:
