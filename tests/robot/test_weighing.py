@@ -5,11 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from limber.cli.robot_commands.moves import log_move
 from limber.cli.robot_commands.weigh import weighed, weightless
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.cell.cell import Cell
-from limber.robot.weighing import tilted_joints, weigh
+from limber.robot.weighing import never_weighed, tilted_joints, weigh, weighed_as
 from limber.stages.paths.arm_moves import to_joints
 from limber.stages.paths.arm_surroundings import ArmSurroundings
 
@@ -107,3 +108,17 @@ def test_an_arm_weighs_its_gripper_by_small_tilts(sensor, told, monkeypatch):
     found = weighed(cell, link, ways, rows)
     assert (told is None and not found.faults) or told in found.faults[0]
     assert told is not None or found.mass == pytest.approx(MASS, abs=0.05)
+
+
+def test_a_sensor_that_was_never_weighed_is_a_warning_before_a_motion(monkeypatch, tmp_path):
+    """Until the same gripper was weighed without a fault; another mass is untested again."""
+    monkeypatch.setenv("LIMBER_STATE", str(tmp_path))
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, tool={"mass_kg": MASS})
+    other = cell.model_copy(update={"tool": cell.tool.model_copy(update={"mass_kg": 0.3})})
+    assert "not tested by the gripper's weight" in never_weighed(cell)
+    assert never_weighed(weightless(cell)) is None
+    path = tmp_path / "cell.toml"
+    log_move(path, "weigh", {"armed": True, "faults": ["the sensor's sign"]} | weighed_as(cell))
+    assert never_weighed(cell) is not None
+    log_move(path, "weigh", {"armed": True, "faults": []} | weighed_as(cell))
+    assert never_weighed(cell) is None and never_weighed(other) is not None

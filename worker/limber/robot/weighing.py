@@ -5,10 +5,14 @@ mass; a sensor with another sign, unit or other axes shows another change.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.json_lines import json_objects
+from limber.robot.cell.cell import Cell
+from limber.robot.motion.way_file import log_path
 
 GRAVITY = 9.81
 _LEAST_TILT = 0.03  # sine of the angle of gravity's change
@@ -34,6 +38,29 @@ class Weighing:
     mass: float
     sigma: float
     faults: tuple[str, ...]
+
+
+def weighed_as(cell: Cell) -> dict[str, Any]:
+    """Return what a weighing depends on, as its line of the log of motions states it."""
+    return {"address": cell.robot.address, "stated_kg": cell.tool.mass_kg,
+            "sensor": cell.sensor.kind, "sensor_pose": list(cell.sensor.pose)}
+
+
+def never_weighed(cell: Cell) -> str | None:
+    """Return a warning if the log of motions has no good weighing of this sensor and gripper."""
+    if not cell.tool.mass_kg:
+        return None
+    wanted, path = weighed_as(cell), log_path()
+    lines: list[dict[str, Any]] = []
+    if path.is_file():
+        with open(path, encoding="utf-8") as stream:
+            lines = [line for line in json_objects(stream) if line.get("command") == "weigh"
+                     and all(line.get(key) == value for key, value in wanted.items())]
+    if lines and lines[-1].get("faults") == []:
+        return None
+    return ("The force sensor was not tested by the gripper's weight with these values of [sensor] "
+            "and tool.mass_kg: a wrong mass or unit may show only in the branch's estimate "
+            "(limber robot weigh).")
 
 
 def tilted_joints(joints: np.ndarray, mass: float) -> np.ndarray:

@@ -33,7 +33,7 @@ def weigh(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[s
     from limber.robot.cell.cell import read_cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.operator_decisions import require_confirmation
-    from limber.robot.weighing import require_tilts, tilted_joints
+    from limber.robot.weighing import require_tilts, tilted_joints, weighed_as
     from limber.stages.paths.arm_moves import to_joints
     from limber.stages.paths.arm_surroundings import ArmSurroundings
     from limber.stages.paths.plan_cell import cell_obstacles
@@ -54,7 +54,7 @@ def weigh(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[s
     with RobotLink(weightless(cell), rows.append) as link:
         found = weighed(cell, link, moves, rows)
     result |= {"mass_kg": found.mass, "mass_sigma_kg": found.sigma, "faults": list(found.faults)}
-    log_move(cell_file, "weigh", result)
+    log_move(cell_file, "weigh", result | weighed_as(cell))
     if found.faults:
         raise SafetyStop(f"{'; '.join(found.faults)}.", "The guard would feel another force than "
                          "the branch's.", "Correct [sensor] or tool.mass_kg in the cell file.",
