@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,6 +30,7 @@ from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
 from limber.robot.virtual.depth_camera import VirtualCamera
 from limber.stages.pulls.record import RecordOptions, RecordSettings, record
 from limber.stages.pulls.record_path import arc_path, suggested_pull, there_and_back, waypoint_path
+from limber.stages.pulls.record_prediction import PullModel
 from limber.stages.registry import stage_description
 from limber.store import Branch
 from limber.store.loading import load_skeleton
@@ -145,6 +147,28 @@ def after_a_way(robot, way: float, action: str, **values):
     finally:
         over.set()
         watching.join()
+
+
+def test_a_sensor_that_a_nudge_finds_wrong_stops_before_the_pull(branch_folder, tmp_path, robot,
+                                                                monkeypatch):
+    """The prediction is turned round instead of the sensor: nothing is recorded, the name is free.
+    """
+    predicted, motions = PullModel.predicted, []
+
+    def turned_round(model: PullModel, trajectory):
+        found = predicted(model, trajectory)
+        motions.append(trajectory)
+        return found if len(motions) == 1 else replace(found, forces=-found.forces)
+    monkeypatch.setattr(PullModel, "predicted", turned_round)
+    begin = flange_of(robot)
+    with pytest.raises(SafetyStop, match="implausible: the force points against") as stop:
+        record(branch_folder, cell_file(cell_at(branch_folder, robot.address), tmp_path), "turned",
+               sideways_pull(branch_folder), RecordOptions(confirm="turned"))
+    assert stop.value.result["sample_count"] == 0
+    assert np.linalg.norm(flange_of(robot) - begin) < 0.005
+    assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
+    branch = Branch.open(branch_folder)
+    assert branch.streams() == [] and not branch.has("pulls/turned/pull.toml")
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import time
 import numpy as np
 
 STEP = 0.008
+_LARGEST_BYTES = 10_000_000  # rosbridge_server's own limit (parameter max_message_size)
 _NAMES = [f"{name}_joint" for name in (
     "elbow", "shoulder_lift", "shoulder_pan", "wrist_1", "wrist_2", "wrist_3")]
 _ORDER = [2, 1, 0, 3, 4, 5]  # of the arm's joints in those names
@@ -44,7 +45,7 @@ class RosBridge:
         from websockets.sync.server import serve
 
         self._server = serve(self._serve, "127.0.0.1", 0, compression=None,
-                             close_timeout=0.2)
+                             close_timeout=0.2, max_size=_LARGEST_BYTES)
         self.url = f"ws://127.0.0.1:{self._server.socket.getsockname()[1]}"
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
         return self

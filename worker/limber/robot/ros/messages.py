@@ -127,7 +127,9 @@ def goal_of(trajectory: Trajectory, names: list[str]) -> dict[str, Any]:
     points = []
     for time, joints, speed in zip(trajectory.times, trajectory.joints, speeds, strict=True):
         nanoseconds = round(1e9 * float(time))
-        points.append({"positions": joints.tolist(), "velocities": speed.tolist(),
+        # Rounded to a tenth of a micrometre: rosbridge takes messages up to 10 MB.
+        points.append({"positions": np.round(joints, 7).tolist(),
+                       "velocities": np.round(speed, 6).tolist(),
                        "time_from_start": {"sec": nanoseconds // 10**9,
                                            "nanosec": nanoseconds % 10**9}})
     return {"trajectory": {"joint_names": names, "points": points}}

@@ -199,10 +199,11 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             time.sleep(_SETTLE_SECONDS)
             if across is not None:
                 doubts.append(predicted[1])
-                event = _nudged(link, live, recorder, across, progress)
+                event = _nudged(link, live, recorder, across, predicted[1], progress)
                 if event["event"] != "reached":
                     return {"ended": _how_it_ended(event, doubts), "after_stop": retreat_if_chosen(
-                        cell, link, options.after_stop, progress), "sample_count": 0}
+                        cell, link, options.after_stop, progress), "peak_force_n": 0.0,
+                        "sample_count": 0, "warnings": list(link.warnings)}
             _write_entry(entry_lines, cell, point, tared, trajectory.duration, observers)
             recorder.close_gripper()
             live.at("pulling")
@@ -226,14 +227,15 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
 
 
 def _nudged(link: RobotLink, live: LiveForce, recorder: PullRecorder, across: Trajectory,
-            progress: Progress) -> dict[str, Any]:
+            doubt: PullPlausibility, progress: Progress) -> dict[str, Any]:
     """Nudge the branch across the pull and back, which is not recorded; return how it ended."""
     progress(0.13, "nudging the branch across the pull")
     live.at("nudging")
     link.start(across)
     event = _watched(link, None, recorder, across, progress.part(0.13, 0.15))
     time.sleep(_SETTLE_SECONDS)
-    return event
+    # Its last samples may have come after its end.
+    return event if doubt.reason is None else {"event": "stopped", "reason": doubt.reason}
 
 
 def _close_lines(streams: list[Stream | None], recorders: list[PullRecorder]) -> None:
