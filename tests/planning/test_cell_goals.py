@@ -130,20 +130,26 @@ def test_the_sight_is_refined_on_the_branch_model(field, small_model):
 def test_a_plan_ends_deeper_in_a_region_than_the_field_is_wrong(field):
     """Poses of the goal less the margin are inside by the stated error; where that leaves none, a
     fraction of it, and a bound is for all of the goal."""
-    middle = tuple(field.tip(field.region.draw(1, np.random.default_rng(2)))[0])
-    goal = TargetGoal(Ball(middle, 0.05))
-    inner = goal.with_margin(field, field.limited())
+    tips = field.tip(field.region.draw(4000, np.random.default_rng(3)))
+    rest = field.tip(field.rest[None])[0]
+    away = np.linalg.norm(tips - rest, axis=1)
+    goal = TargetGoal(Ball(tuple(tips[np.argmin(np.abs(away - 0.08))]), 0.03))
+    assert goal.distance(field, field.rest[None])[0] > goal.tolerance
+    start = field.rest
+    inner = goal.with_margin(field, field.limited(), start)
     points = goal_points(inner, field, field.limited())
     depth = -goal.region.distance(field.tip(points))
     stated = field.place_errors(None, points, 0.95)
     assert inner.margin == 1.0 and stated.min() > 0.0
-    assert (depth >= np.minimum(stated, 0.4 * 0.05) - 1e-9).all()
+    assert (depth >= np.minimum(stated, 0.4 * 0.03) - 1e-9).all()
     assert (inner.uncertainty(field, points) > goal.uncertainty(field, points)).all()
     # A ball that the tip only touches: nothing is left of it with the whole margin.
-    tips = field.tip(field.region.draw(4000, np.random.default_rng(3)))
     far = tips[np.argmax(tips[:, 0])]
     touched = TargetGoal(Ball(tuple(far + [0.2998, 0.0, 0.0]), 0.3))
-    assert touched.with_margin(field, field.limited()).margin < 1.0
+    assert touched.with_margin(field, field.limited(), start).margin < 1.0
+    # A start that is in the goal stays where it is.
+    around = TargetGoal(Ball(tuple(rest), 0.03))
+    assert around.with_margin(field, field.limited(), start) is around
 
 
 

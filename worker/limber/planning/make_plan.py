@@ -99,7 +99,9 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     start, limits = start_of(field, goal, settings), limits or own
     if limits.constraints:
         field = _knowing(field, grasp_model, limits, workers, progress)
-    aim = goal.with_margin(field, limits.on(field)) if isinstance(goal, TargetGoal) else goal
+    aim = goal
+    if isinstance(goal, TargetGoal):
+        aim = goal.with_margin(field, limits.on(field), start)
     rounds = _Rounds(grasp_model, settings, limits, goal, start, uncertainty, workers, field, aim,
                      limits, pace or Pace(settings.speed, settings.acceleration), progress)
     count = _REPLANS + 1

@@ -70,10 +70,13 @@ class TargetGoal:
         stated = np.where(np.isfinite(stated), stated, 0.0)  # not known: the full model decides
         return self.inset + self.margin * np.minimum(stated, _MOST * self.tolerance)
 
-    def with_margin(self, field: EnergyField, limits: FieldArrays) -> Self:
+    def with_margin(self, field: EnergyField, limits: FieldArrays, start: np.ndarray) -> Self:
         """Return the goal less the field's error in the target's position, or the largest of a few
-        fractions of it with which a drawn pose keeps ``limits``.
+        fractions of it with which a drawn pose keeps ``limits``; all of it if the ``start`` [3] is
+        in it.
         """
+        if self.distance(field, start[None])[0] <= self.tolerance:
+            return self
         for share in _SHARES:
             part = replace(self, margin=share)
             points = part.guess(field, _DRAWN, np.random.default_rng(0))
