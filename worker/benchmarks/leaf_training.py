@@ -1,0 +1,135 @@
+"""Trains the classifier of leaf points, and measures it on each source that it was not trained on.
+
+``python -m benchmarks.leaf_training --first SEED --count N --out DIR`` makes N scans of each kind,
+in leaf and bare, keeps their features in DIR (a stopped run continues), writes the trees of
+:mod:`limber.geometry.cloud.leaf_trees`, trained on all sources but those left out, and prints which
+leaves are found in these. It needs scikit-learn, which Limber itself does not.
+"""
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from benchmarks.scan_probabilities import OWN
+from benchmarks.scan_runs import KINDS
+from benchmarks.worlds.sources import BARE_VIEWS, SOURCES, WORLDS
+from limber.geometry.cloud.canonical_frame import OwnFrame
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.leaf_trees import TREES, surroundings
+from limber.geometry.cloud.leaves import find_leaves, point_spacing
+from limber.geometry.cloud.preparation import prepare
+from limber.geometry.cloud.thinning import thinned
+from limber.geometry.leaf_removal import leaf_mask
+from limber.geometry.settings import ReconstructSettings
+from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT
+
+_KINDS = (*(f"{source}:leafy" for source in SOURCES), "leafy",
+          *(f"{source}:{view}" for view in BARE_VIEWS for source in SOURCES), "crowns", "2-mm")
+_TREES, _LEAVES, _RATE, _LEAST = 50, 20, 0.2, 50  # number, ends, learning rate, points of an end
+_MOST = 1500  # points of a scan that are learnt from
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A prepared scan: points [m], shape [n, 3], features [n, f], and which are on leaves [n]."""
+
+    kind: str
+    points: np.ndarray
+    features: np.ndarray
+    leaf: np.ndarray
+
+    @property
+    def source(self) -> str:
+        return self.kind.split(":")[0] if ":" in self.kind else OWN
+
+
+def labelled(kind: str, seed: int, out: Path) -> Labelled:
+    """A scan of a kind, from ``out`` if it is there."""
+    file = out / f"{kind.replace(':', '_')}_{seed}.npz"
+    if not file.is_file():
+        case = (KINDS | WORLDS)[kind](seed)
+        settings = ReconstructSettings(**case.settings)
+        prepared = prepare(Cloud(case.points), 1.0, settings, up=np.array(settings.up, float))
+        points = prepared.cloud.points
+        points = points[thinned(points, FIT_POINT_LIMIT)]
+        own = OwnFrame.of(points)
+        points = points[own.order]
+        truth = np.zeros(len(case.points), bool) if case.leaf is None else case.leaf
+        leaf = truth[cKDTree(case.points).query(points + prepared.origin)[1]]
+        np.savez_compressed(file, points=points, leaf=leaf, features=surroundings(
+            own.coordinates, point_spacing(own.coordinates)))
+    with np.load(file) as kept:
+        return Labelled(kind, kept["points"], kept["features"], kept["leaf"])
+
+
+def trained(scans: list[Labelled]) -> Any:
+    """A gradient-boosted classifier of the points of scans; each scan weighs the same."""
+    from sklearn.ensemble import HistGradientBoostingClassifier
+
+    rng = np.random.default_rng(0)
+    chosen = [rng.choice(len(scan.leaf), min(_MOST, len(scan.leaf)), replace=False)
+              for scan in scans]
+    weight = np.concatenate([np.full(len(rows), _MOST / len(rows)) for rows in chosen])
+    model = HistGradientBoostingClassifier(
+        max_iter=_TREES, learning_rate=_RATE, max_leaf_nodes=_LEAVES, min_samples_leaf=_LEAST,
+        l2_regularization=1.0, early_stopping=False)
+    return model.fit(
+        np.vstack([scan.features[rows] for scan, rows in zip(scans, chosen, strict=True)]),
+        np.concatenate([scan.leaf[rows] for scan, rows in zip(scans, chosen, strict=True)]), weight)
+
+
+def exported(model: Any) -> dict[str, np.ndarray]:
+    """The trees as arrays, which :mod:`limber.geometry.cloud.leaf_trees` reads."""
+    columns: dict[str, list] = {name: [] for name in ("feature", "threshold", "low", "high",
+                                                      "value")}
+    first, depth, begin = [], [], 0
+    for stage in model._predictors:
+        nodes = stage[0].nodes
+        own, end = np.arange(len(nodes)), nodes["is_leaf"].astype(bool)
+        columns["feature"].append(np.where(end, 0, nodes["feature_idx"]).astype(np.int16))
+        columns["threshold"].append(nodes["num_threshold"].astype(np.float32))
+        columns["low"].append(np.where(end, own, nodes["left"]).astype(np.int16))
+        columns["high"].append(np.where(end, own, nodes["right"]).astype(np.int16))
+        columns["value"].append(nodes["value"].astype(np.float32))
+        first.append(begin)
+        depth.append(int(nodes["depth"].max()))
+        begin += len(nodes)
+    return {name: np.concatenate(parts) for name, parts in columns.items()} | {
+        "first": np.array(first), "depth": np.array(depth),
+        "start": np.float64(np.ravel(model._baseline_prediction)[0])}
+
+
+def tell(scan: Labelled) -> None:
+    """Print the shares of leaf points missed and of wood taken."""
+    found = leaf_mask(find_leaves(scan.points), len(scan.points))
+    missed = 1 - found[scan.leaf].mean() if scan.leaf.any() else 0.0
+    print(f"{scan.kind}: {missed:.1%} of the leaves' points missed, "
+          f"{found[~scan.leaf].mean():.1%} of the wood's taken", flush=True)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make scans, train, write the trees, and measure them on the sources left out."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--first", type=int, required=True, help="first seed of each kind")
+    parser.add_argument("--count", type=int, default=3, help="seeds of each kind")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the features")
+    parser.add_argument("--left-out", nargs="+", default=["weber-penn", "dichotomous"])
+    options = parser.parse_args(arguments)
+    options.out.mkdir(parents=True, exist_ok=True)
+    scans = [labelled(kind, seed, options.out) for kind in _KINDS
+             for seed in range(options.first, options.first + options.count)]
+    model = trained([scan for scan in scans if scan.source not in options.left_out])
+    np.savez_compressed(TREES, **exported(model))
+    for scan in scans:
+        if scan.source in options.left_out:
+            tell(scan)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,79 @@
+"""Evidence that a point is on a leaf: boosted trees on the shape of its surroundings.
+
+Around a point of a leaf the scan is a sheet: wide in two directions, thin in the third. On a stem
+this holds only within a fraction of the stem's radius; beyond it the stem is round, and farther out
+a line. The trees are trained by ``benchmarks.leaf_training`` on scans with known leaves.
+"""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from limber.geometry.cloud.preparation import voxel_thinned
+
+_CELL = 0.25  # cell size, as a fraction of the scale
+_FINEST, _STEP, _SCALES = 4.0, 1.5, 11  # first scale in point spacings, ratio, number
+TREES = Path(__file__).with_name("leaf_trees.npz")
+
+
+def surroundings(points: np.ndarray, spacing: float) -> np.ndarray:
+    """The shape of each point's surroundings at several scales, shape [n, 44].
+
+    Ratios of the second to the largest and of the smallest to the second standard deviation, the
+    smallest over the scale, and the logarithm of the number of filled cells: all without unit.
+
+    Args:
+        points: Positions [m], shape [n, 3].
+        spacing: Of the points [m].
+    """
+    columns: list[np.ndarray] = []
+    for step in range(_SCALES):
+        scale = _FINEST * spacing * _STEP**step
+        chosen = voxel_thinned(points, _CELL * scale)
+        variances, count = _variances(points[chosen], scale)
+        small, middle, large = np.sqrt(variances).T / scale
+        shape = np.column_stack([middle / np.maximum(large, 1e-9), small / np.maximum(middle, 1e-9),
+                                 small, np.log(count)])
+        columns.append(shape[cKDTree(points[chosen]).query(points)[1]])
+    return np.stack(columns, axis=2).reshape(len(points), -1).astype(np.float32)
+
+
+def _variances(points: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Variances of each point's neighbourhood [m^2], smallest first, [n, 3]; and its size [n]."""
+    pairs = cKDTree(points).query_pairs(scale, output_type="ndarray")
+    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    total = len(points)
+    count = 1 + np.bincount(one, minlength=total)
+    offset = points[other] - points[one]
+    first = np.stack([np.bincount(one, offset[:, k], total) for k in range(3)], axis=1)
+    # Without a single pair, bincount returns integers, so there is no division in place.
+    first = first / count[:, None]
+    second = np.empty((total, 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            moment = np.bincount(one, offset[:, i] * offset[:, j], total) / count
+            second[:, i, j] = second[:, j, i] = moment - first[:, i] * first[:, j]
+    return np.maximum(np.linalg.eigvalsh(second), 0.0), count
+
+
+def leaf_log_odds(features: np.ndarray) -> np.ndarray:
+    """Logarithm of the odds that each point is on a leaf, shape [n], from its surroundings."""
+    trees = _trees()
+    total = np.full(len(features), float(trees["start"]))
+    rows = np.arange(len(features))
+    for first, depth in zip(trees["first"], trees["depth"], strict=True):
+        node = np.full(len(features), first)
+        for _ in range(depth):
+            # An end of the tree leads to itself.
+            low = features[rows, trees["feature"][node]] <= trees["threshold"][node]
+            node = first + np.where(low, trees["low"][node], trees["high"][node])
+        total += trees["value"][node]
+    return total
+
+
+@cache
+def _trees() -> dict[str, np.ndarray]:
+    with np.load(TREES, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
