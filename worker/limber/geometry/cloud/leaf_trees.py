@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.core.files.reading import read_arrays
 from limber.geometry.cloud.preparation import voxel_thinned
 
 _CELL = 0.25  # cell size, as a fraction of the scale
@@ -75,5 +76,4 @@ def leaf_log_odds(features: np.ndarray) -> np.ndarray:
 
 @cache
 def _trees() -> dict[str, np.ndarray]:
-    with np.load(TREES, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+    return read_arrays(TREES, "the classifier of leaves, a part of Limber")
