@@ -14,7 +14,7 @@ from limber.geometry.cloud.leaves import Leaf, find_leaves
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_cloud
-from limber.geometry.leaf_removal import check_agreed, without_leaves
+from limber.geometry.leaf_removal import _on_round_axes, check_agreed, without_leaves
 from limber.geometry.point_classes import COLOURS, shown_if_refused
 from limber.geometry.reconstruction import _MOSTLY, reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings
@@ -212,9 +212,9 @@ def test_a_stem_seen_from_one_side_is_no_leaf() -> None:
                       _tube([0, 0, 1.8], [0.3, 0.2, 2.0], 0.01, 0.01, rng, view)])
     stem += rng.normal(0, 3e-3, stem.shape)
     prepared = prepare(Cloud(stem), 1.0, ReconstructSettings(), up=np.array([0.0, 0.0, 1.0]))
-    assert len(without_leaves(prepared)[1]) > 0
+    assert without_leaves(prepared)[1] == []
     found = skeletonise(prepared.cloud.points)
-    assert without_leaves(prepared, found=found)[1] == []
+    assert _on_round_axes(found, prepared.cloud.points).mean() > 0.5
 
 
 @pytest.mark.parametrize("count", [1, 3, 39, 40, 60, 100, 250])
