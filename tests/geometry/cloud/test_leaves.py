@@ -12,6 +12,7 @@ from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf, find_leaves
 from limber.geometry.cloud.preparation import prepare
+from limber.geometry.cloud.supports import Support
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_cloud
 from limber.geometry.leaf_removal import _on_round_axes, check_agreed, without_leaves
@@ -142,16 +143,18 @@ def test_few_leaves_need_no_consent() -> None:
 
 
 def test_a_refusal_shows_its_points_by_class(tmp_path, monkeypatch) -> None:
-    """Wood brown, leaves green, the rest red, in the file's coordinates; none after success."""
+    """Wood brown, leaves green, a stake blue, the rest red, in the file's coordinates; after
+    success none."""
     cloud = Cloud(np.random.default_rng(0).random((60, 3)) + 100.0)
     prepared = prepare(cloud, 1.0, ReconstructSettings(keep_sheets=True))
     seen: list[Cloud] = []
-    with shown_if_refused(seen.append, prepared, []):
+    with shown_if_refused(seen.append, prepared, [], []):
         pass
     off = np.arange(len(prepared.cloud) - 10) < 5
 
     def refuse(raw: Cloud, settings: ReconstructSettings, *, show, **_: object) -> None:
-        with shown_if_refused(show, prepared, [Leaf(np.arange(10), 1e-3)], off):
+        with shown_if_refused(show, prepared, [Leaf(np.arange(10), 1e-3)],
+                              [Support("stake", np.array([59]), np.zeros(3))], off):
             raise InputError("leaves")
     monkeypatch.setattr("limber.geometry.reconstruction.reconstruct_cloud", refuse)
     cloud.write_ply(tmp_path / "scan.ply")
@@ -162,7 +165,8 @@ def test_a_refusal_shows_its_points_by_class(tmp_path, monkeypatch) -> None:
     assert any(str(tmp_path / "a_points.ply") in text for text in told)
     shown = read_cloud(tmp_path / "a_points.ply")
     assert not seen and np.allclose(shown.points, prepared.cloud.points + prepared.origin)
-    assert shown.attributes["class"].tolist() == [1] * 10 + [2] * 5 + [0] * (len(shown) - 15)
+    assert shown.attributes["class"].tolist() == (
+        [1] * 10 + [2] * 5 + [0] * (len(shown) - 16) + [list(COLOURS).index("stake")])
     assert shown.attributes["color"][0].tolist() == list(COLOURS["leaf"])
     assert not (tmp_path / "a.branch").exists()
 

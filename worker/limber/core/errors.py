@@ -20,6 +20,12 @@ class LimberError(Exception):
         self.seen, self.why, self.fix = seen, why, fix
         super().__init__(" ".join(part for part in (seen, why, fix) if part))
 
+    def adding(self, text: str) -> Self:
+        """Add a sentence to what was seen; returns the error itself."""
+        self.seen = f"{self.seen} {text}"
+        self.args = (" ".join(part for part in (self.seen, self.why, self.fix) if part),)
+        return self
+
     def at(self, position: Iterable[float]) -> Self:
         """Set the position; returns the error itself."""
         self.place = tuple(float(value) for value in position)

@@ -9,9 +9,11 @@ from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.cloud.preparation import Prepared
+from limber.geometry.cloud.supports import Support
 from limber.geometry.leaf_removal import leaf_mask
 
-COLOURS = {"wood": (139, 90, 43), "leaf": (60, 170, 60), "on no round axis": (220, 40, 40)}
+COLOURS = {"wood": (139, 90, 43), "leaf": (60, 170, 60), "on no round axis": (220, 40, 40),
+           "pot": (150, 150, 150), "stake": (60, 110, 230), "post": (30, 50, 140)}
 """Red, green and blue of each class; its place is the value of the column ``class``."""
 
 Show = Callable[[Cloud], None]
@@ -20,27 +22,32 @@ Show = Callable[[Cloud], None]
 
 @contextmanager
 def shown_if_refused(show: Show | None, prepared: Prepared, leaves: list[Leaf],
-                     off_axes: np.ndarray | None = None) -> Iterator[None]:
+                     supports: list[Support], off_axes: np.ndarray | None = None,
+                     ) -> Iterator[None]:
     """Show the points by class if what is done meanwhile refuses the scan.
 
     Args:
         show: Receives the cloud; None: nobody looks.
         prepared: The whole scan.
         leaves: Its leaves.
+        supports: Its pots, stakes and posts.
         off_axes: Which of the other points are on no round axis, shape [rest]; None: not known.
     """
     try:
         yield
     except InputError:
         if show is not None:
-            show(classified(prepared, leaves, off_axes))
+            show(classified(prepared, leaves, supports, off_axes))
         raise
 
 
-def classified(prepared: Prepared, leaves: list[Leaf], off_axes: np.ndarray | None) -> Cloud:
+def classified(prepared: Prepared, leaves: list[Leaf], supports: list[Support],
+               off_axes: np.ndarray | None) -> Cloud:
     """Return the points with columns ``class`` and ``color``, see :func:`shown_if_refused`."""
     kind = leaf_mask(leaves, len(prepared.cloud)).astype(np.uint8)
     if off_axes is not None:
         kind[np.flatnonzero(kind == 0)[off_axes]] = 2
+    for support in supports:
+        kind[support.points] = list(COLOURS).index(support.kind)
     colour = np.array(list(COLOURS.values()), np.uint8)
     return Cloud(prepared.cloud.points + prepared.origin, {"color": colour[kind], "class": kind})

@@ -13,6 +13,12 @@ from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.cloud.preparation import Prepared, prepare
+from limber.geometry.cloud.supports import (
+    Support,
+    find_supports,
+    named_if_refused,
+    supports_text,
+)
 from limber.geometry.leaf_removal import (
     check_agreed,
     cut_off,
@@ -133,13 +139,19 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
                        up=np.array(settings.up, float))
     for text in prepared.warnings:
         progress.warn(text)
+    supports = [] if own is not None else find_supports(prepared.cloud.points,
+                                                        np.array(settings.up, float))
     if known is not None and not known.fits(len(prepared.cloud)):
         progress.warn("The skeleton that an earlier run stored belongs to another number of "
                       "points. It is searched for again.")
         known = None
-    found, wood, leaves = (
-        _searched(prepared, settings, own, show, progress.part(0.02, 0.55)) if known is None
-        else _found_before(prepared, known, progress))
+    named = "" if not supports else supports_text(
+        supports, len(prepared.cloud),
+        lambda place: (place + prepared.origin) / UNIT_METRES[settings.unit])
+    with named_if_refused(named):
+        found, wood, leaves = (
+            _searched(prepared, settings, own, supports, show, progress.part(0.02, 0.55))
+            if known is None else _found_before(prepared, known, progress))
     whole = found
     if wood.view is not None and own is None:
         found, text = seen_skeleton(found, wood)
@@ -150,11 +162,15 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         keep(alignment, found.skeleton, FoundSkeleton(whole, leaves))
     if own is None:
         scale = UNIT_METRES[settings.unit]
-        with shown_if_refused(show, prepared, leaves, off_axes(whole)):
+        with named_if_refused(named), shown_if_refused(show, prepared, leaves, supports,
+                                                       off_axes(whole)):
             check_explained(whole, settings.unexplained, wood.cloud.points,
                             lambda place: (place + wood.origin) / scale)
     # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.
     warnings = list(prepared.warnings)
+    if named:
+        warnings.append(named)
+        progress.warn(named)
     for text in found.warnings_at(alignment.undo):
         warnings.append(text)
         progress.warn(text)
@@ -181,7 +197,8 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
 
 
 def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton | None,
-              show: Show | None, progress: Progress) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
+              supports: list[Support], show: Show | None, progress: Progress,
+              ) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
     """The skeleton, the part of the scan in which it was found, and the leaves removed from it."""
     found = _skeleton(prepared, settings, own, progress)
     if own is not None or settings.leaves == "keep":
@@ -195,7 +212,7 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     else:
         return found, prepared, []
     if settings.leaves == "ask":
-        with shown_if_refused(show, prepared, leaves):
+        with shown_if_refused(show, prepared, leaves, supports):
             check_agreed(prepared, leaves, settings.unit)
     return (_skeleton(wood, settings, own, progress.part(0.55, 1.0)), wood, leaves) if leaves else (
         found, prepared, [])

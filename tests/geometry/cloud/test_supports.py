@@ -1,0 +1,68 @@
+"""Pots, stakes and posts are found by their shape, and named; no plant is one."""
+
+import numpy as np
+import pytest
+
+from benchmarks.worlds.sources import bare_case, potted_case
+from limber.core.errors import InputError
+from limber.geometry.cloud.supports import find_supports, named_if_refused, supports_text
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def _rod(radius: float, top: float, tip: float | None = None, bend: float = 0.0,
+         at: tuple[float, float] = (0.0, 0.0), count: int = 4000) -> np.ndarray:
+    """Points of a rod from the ground, which thins to ``tip`` and bends by ``bend`` [m]."""
+    rng = np.random.default_rng(0)
+    angle, z = rng.uniform(0, 2 * np.pi, count), rng.uniform(0, top, count)
+    thick = radius + ((radius if tip is None else tip) - radius) * z / top
+    points = np.stack([at[0] + thick * np.cos(angle) + bend * (z / top)**2,
+                       at[1] + thick * np.sin(angle), z], axis=1)
+    return points + 0.0003 * rng.standard_normal(points.shape)
+
+
+@pytest.mark.parametrize("source", ["monopodial", "opposite"])
+def test_pot_and_stake_of_a_potted_plant_are_named(source: str) -> None:
+    """With nearly all of their points and few of the plant's; the plant without them has none."""
+    case = potted_case(7100, source)
+    found = find_supports(case.points, np.array(case.settings["up"]))
+    assert {each.kind for each in found} == {"pot", "stake"}
+    named = np.concatenate([each.points for each in found])
+    assert case.leaf[named].mean() > 0.9 and np.isin(np.flatnonzero(case.leaf), named).mean() > 0.9
+    bare = bare_case(7100, source, "round")
+    assert find_supports(bare.points, np.array(bare.settings["up"])) == []
+
+
+def test_a_stake_is_straight_and_even_and_a_stem_is_not() -> None:
+    """A rod beside a stem is a stake, one of 30 mm radius a post; a tapered or bent rod is wood."""
+    stem = _rod(0.01, 1.0, tip=0.004, bend=0.1)
+    for thick, kind in ((0.006, "stake"), (0.03, "post")):
+        scan = np.vstack([stem, _rod(thick, 0.8, at=(0.0, 0.15))])
+        found = find_supports(scan, UP)
+        assert [each.kind for each in found] == [kind]
+        assert (found[0].points >= len(stem)).mean() > 0.95
+    for wood in (_rod(0.006, 0.8, tip=0.003, at=(0.0, 0.15)),
+                 _rod(0.006, 0.8, bend=0.15, at=(0.0, 0.15))):
+        assert find_supports(np.vstack([stem, wood]), UP) == []
+
+
+def test_supports_of_a_dense_scan_have_all_of_their_points() -> None:
+    """More points than are looked at: the others follow the nearest of these."""
+    scan = np.vstack([_rod(0.01, 1.0, tip=0.004, bend=0.1, count=160_000),
+                      _rod(0.006, 0.8, at=(0.0, 0.15), count=60_000)])
+    found = find_supports(scan, UP)
+    assert [each.kind for each in found] == ["stake"]
+    assert len(found[0].points) == pytest.approx(60_000, rel=0.02)
+
+
+def test_a_refusal_names_the_supports() -> None:
+    """Kind, share and place; other refusals stay as they are."""
+    found = find_supports(np.vstack([_rod(0.01, 1.0, tip=0.004, bend=0.1),
+                                     _rod(0.006, 0.8, at=(0.0, 0.15))]), UP)
+    text = supports_text(found, 8000, lambda place: 1000 * place)
+    assert "a stake (50 % of the points) at (" in text and "--crop-low" in text
+    for added in (text, ""):
+        with pytest.raises(InputError) as caught, named_if_refused(added):
+            raise InputError("Too flat.", "Wood is round.", "Crop it.")
+        assert str(caught.value) == " ".join(
+            part for part in ("Too flat.", added, "Wood is round.", "Crop it.") if part)

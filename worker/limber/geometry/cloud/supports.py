@@ -1,0 +1,205 @@
+"""Pots, stakes and posts in a scan of a plant, found by their shape; they are named, never removed.
+
+A pot is a body turned about an upright axis at the foot of the scan, which ends where the stem
+leaves it. A stake is straight to a fraction of its radius and as thick above as below, for far
+longer than wood is.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from limber.core.errors import InputError
+
+_ENOUGH = 100_000  # points that show supports
+_SLICES = 40  # over the height of the scan
+_LEAST = 8  # points of a slice's circle
+_ROUND = 0.08  # fraction of the radius by which the points of a circle scatter
+_ON_CIRCLE = 0.6  # fraction of a slice's points that must be on its circle
+# Slices of a pot at least; the fraction of the next slice's points that go on with it, and its
+# height over its radius, at most.
+_POT_SLICES, _GOES_ON, _TALL = 3, 0.2, 4.0
+_STEADY = 0.25  # largest change of a pot's radius from slice to slice
+_LONG = 14  # slices that a stake crosses at least
+# A stake: scatter of its middles over its radius, and of the logarithms of its radii; fall of these
+# over its length; slope against the upright.
+_STRAIGHT, _EVEN, _FALL, _SLOPE = 0.15, 0.12, 0.08, 0.27
+_STAKES_MOST = 3
+_WIDE = (0.5, 2.0)  # thicknesses of a slice around its first middle in which a stake is looked for
+_THICK_POST = 0.02  # radius of a post [m]; thinner ones are stakes
+
+
+@dataclass(frozen=True)
+class Support:
+    """A thing beside the plant.
+
+    Attributes:
+        kind: ``pot``, ``stake`` or ``post``.
+        points: Indices of its points in the scan.
+        at: One of its points, in its middle [m], shape [3].
+    """
+
+    kind: str
+    points: np.ndarray
+    at: np.ndarray
+
+
+def find_supports(points: np.ndarray, up: np.ndarray) -> list[Support]:
+    """Return the pot, the stakes and the posts that a scan shows.
+
+    Args:
+        points: The scan [m], shape [n, 3].
+        up: The up direction, shape [3].
+    """
+    some = np.arange(0, len(points), len(points) // _ENOUGH + 1)
+    found = _in_sample(points[some], up / np.linalg.norm(up))
+    if len(some) < len(points) and found:
+        near = cKDTree(points[some]).query(points)[1]
+        found = [replace(each, points=np.flatnonzero(np.isin(near, each.points)))
+                 for each in found]
+    return found
+
+
+def supports_text(supports: list[Support], count: int, where: Callable[[np.ndarray], np.ndarray],
+                  ) -> str:
+    """Return a sentence that names the supports of a scan.
+
+    Args:
+        supports: At least one.
+        count: Number of points of the scan.
+        where: Transforms a position to the user's coordinates.
+    """
+    named = [f"a {each.kind} ({100 * len(each.points) / count:.0f} % of the points) at ("
+             + ", ".join(f"{value:.3f}" for value in where(each.at)) + ")" for each in supports]
+    return (f"The scan shows {' and '.join(named)}: remove such points from the scan "
+            "(--crop-low, --crop-high, or in another program), or they count as the plant's.")
+
+
+@contextmanager
+def named_if_refused(text: str) -> Iterator[None]:
+    """Add a sentence about a scan's supports, if there is one, to a refusal of the scan."""
+    try:
+        yield
+    except InputError as error:
+        if text:
+            error.adding(text)
+        raise
+
+
+def _in_sample(points: np.ndarray, up: np.ndarray) -> list[Support]:
+    """The supports among points [m], shape [n, 3]; ``up`` is a unit vector."""
+    across = np.linalg.svd(up[None])[2][1:]
+    height, flat = points @ up, points @ across.T
+    thick = max(float(np.ptp(height)) / _SLICES, 1e-12)
+    layer = np.minimum(((height - height.min()) / thick).astype(np.int64), _SLICES - 1)
+    pot = _pot(flat, layer, thick)
+    found = [] if pot is None else [("pot", pot)]
+    rest = np.ones(len(points), bool)
+    if pot is not None:
+        rest[pot] = False
+    for _ in range(_STAKES_MOST):
+        stake = _stake(flat, layer, height, np.flatnonzero(rest), thick)
+        if stake is None:
+            break
+        own, radius = stake
+        rest[own] = False
+        found.append(("post" if radius > _THICK_POST else "stake", own))
+    return [Support(kind, own, points[own][np.argmin(np.linalg.norm(
+        points[own] - np.median(points[own], axis=0), axis=1))]) for kind, own in found]
+
+
+def _circle(flat: np.ndarray) -> tuple[np.ndarray, float, float] | None:
+    """Middle [m], radius [m] and fraction of points on the circle that fits most of them."""
+    if len(flat) < _LEAST:
+        return None
+    weight = np.ones(len(flat))
+    for _ in range(8):
+        matrix = np.column_stack([2 * flat, np.ones(len(flat))]) * weight[:, None]
+        (x, y, c), *_ = np.linalg.lstsq(matrix, (flat**2).sum(axis=1) * weight, rcond=None)
+        radius = float(np.sqrt(max(c + x**2 + y**2, 1e-18)))
+        off = np.abs(np.hypot(flat[:, 0] - x, flat[:, 1] - y) - radius)
+        weight = 1 / (1 + (off / max(float(np.median(off)), 0.02 * radius))**2)
+    return np.array([x, y]), radius, float(np.mean(off < 3 * _ROUND * radius))
+
+
+def _pot(flat: np.ndarray, layer: np.ndarray, thick: float) -> np.ndarray | None:
+    """Indices of the points of a pot at the foot of the scan; None if there is none."""
+    circles: list[tuple[np.ndarray, float]] = []
+    for number in range(_SLICES // 2):
+        own = flat[layer == number]
+        told = _circle(own)
+        # Its soil fills the last slice; the scan's first slice may be a part of one.
+        if told is None or told[2] < _ON_CIRCLE or (circles and (
+                abs(told[1] / circles[-1][1] - 1) > _STEADY
+                or np.linalg.norm(told[0] - circles[-1][0]) > _STEADY * told[1])):
+            if circles or number > 1:
+                break
+            continue
+        circles.append(told[:2])
+    if len(circles) < _POT_SLICES:
+        return None
+    top = number - 1
+    middle, radius = circles[-1]
+    distance = np.linalg.norm(flat - middle, axis=1)
+    above = distance[layer == top + 1]
+    goes_on = np.mean(np.abs(above - radius) < 3 * _ROUND * radius) if len(above) else 1.0
+    if goes_on > _GOES_ON or len(circles) * thick > _TALL * radius:
+        return None
+    return np.flatnonzero((layer <= top) & (distance < 1.2 * radius))
+
+
+def _stake(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, rest: np.ndarray,
+           thick: float) -> tuple[np.ndarray, float] | None:
+    """Indices of the points of the longest stake among ``rest``, and its radius [m]."""
+    cell, of = np.unique(np.floor(flat[rest] / thick).astype(np.int64), axis=0,
+                         return_inverse=True)
+    pairs = np.unique(np.column_stack([of.ravel(), layer[rest]]), axis=0)
+    crossed = np.bincount(pairs[:, 0], minlength=len(cell))
+    for start in np.argsort(-crossed, kind="stable")[:2 * _STAKES_MOST]:
+        if crossed[start] < _LONG:
+            return None
+        middle = np.median(flat[rest[of.ravel() == start]], axis=0)
+        for wide in _WIDE:
+            told = _rod(flat, layer, height, rest, middle, wide * thick)
+            if told is not None:
+                return told
+    return None
+
+
+def _rod(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, rest: np.ndarray,
+         start: np.ndarray, reach: float) -> tuple[np.ndarray, float] | None:
+    """The stake through ``start`` [m], shape [2]: its points and radius; None if there is none."""
+    line = np.array([[start[0], 0.0], [start[1], 0.0]])
+    for _ in range(4):
+        aside = np.linalg.norm(flat[rest] - line[:, 0] - height[rest, None] * line[:, 1], axis=1)
+        near = rest[aside < reach]
+        rows = []
+        for number in np.unique(layer[near]):
+            own = near[layer[near] == number]
+            told = _circle(flat[own])
+            if told is not None and told[2] > _ON_CIRCLE and told[1] < reach:
+                rows.append((float(height[own].mean()), *told[0], told[1]))
+        if len(rows) < _LONG:
+            return None
+        level, x, y, radius = np.array(rows).T
+        line = np.array([_line(level, x), _line(level, y)])
+        reach = 1.5 * float(np.median(radius))
+    size = float(np.median(radius))
+    off = np.hypot(x - line[0, 0] - line[0, 1] * level, y - line[1, 0] - line[1, 1] * level)
+    scatter = np.abs(np.log(radius / size))
+    fall = abs(_line(level, np.log(radius))[1]) * float(np.ptp(level))
+    if (np.median(off) > _STRAIGHT * size or np.median(scatter) > _EVEN or fall > _FALL
+            or np.linalg.norm(line[:, 1]) > _SLOPE):
+        return None
+    return near, size
+
+
+def _line(level: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Value at level 0 and slope of the line through most values (Theil and Sen)."""
+    one, other = np.triu_indices(len(level), 1)
+    apart = level[other] - level[one]
+    slope = float(np.median((values[other] - values[one])[apart > 0] / apart[apart > 0]))
+    return np.array([np.median(values - slope * level), slope])
