@@ -87,13 +87,14 @@ def test_a_foot_does_not_reach_out_of_the_points():
 
 @pytest.mark.slow
 def test_radius_uncertainty_is_about_the_error(forked_branch, of_forked):
-    """The stated standard deviation is of the size of the true error."""
+    """The stated standard deviation is of the size of the true error, and includes what other
+    sensors smooth or widen at the scale of their points."""
     from scipy.spatial import cKDTree
 
     found, truth = of_forked.skeleton, forked_branch.skeleton
     _, near = cKDTree(truth.nodes).query(found.nodes)
     error = np.abs(found.radius - truth.radius[near])
-    assert 0.2 < np.median(error) / np.median(found.radius_sigma) < 5
+    assert 0.1 < np.median(error) / np.median(found.radius_sigma) < 2
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.core.json_lines import json_objects
 from limber.robot.cell.cell import Cell
-from limber.robot.motion.way_file import log_path
+from limber.robot.motion.followed_path import log_path
 
 GRAVITY = 9.81
 _LEAST_TILT = 0.03  # sine of the angle of gravity's change

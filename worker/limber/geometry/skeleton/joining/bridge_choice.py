@@ -41,6 +41,9 @@ def mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, rul
     made = _Made(state)
     decisive: set[tuple[int, int]] = set()
     allowed = _Allowed(found, state, ends, weight, rules, alone)
+    key = pairs[0].astype(np.int64) * len(weight) + pairs[1]
+    by_key = np.argsort(key, kind="stable")
+    sorted_key = key[by_key]
 
     def decide(index: int) -> None:
         one, other = sorted(state.piece[[found.one[index], found.other[index]]].tolist())
@@ -52,7 +55,8 @@ def mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, rul
         decide(index)
         fresh = [piece for piece in (a, b) if piece not in best]
         if len(fresh) == 2 or (made.has(a, b) and made.is_clear(found, index, fresh[0])):
-            same = np.flatnonzero((pairs[0] == a) & (pairs[1] == b) & allowed.likely)
+            same = by_key[slice(*np.searchsorted(sorted_key, [key[index], key[index] + 1]))]
+            same = same[allowed.likely[same]]
             index = next(other for other in same[np.argsort(own_price[same], kind="stable")]
                          if allowed.holds(other))
             decide(index)
@@ -69,6 +73,9 @@ class _Made:
     def __init__(self, state: Joined) -> None:
         self.indices: list[int] = []
         self._state = state
+        self._by_label = np.argsort(state.label, kind="stable")
+        self._start = np.searchsorted(state.label[self._by_label],
+                                      np.arange(state.label.max() + 2))
         self._joined: set[int] = set()
         self._middles: list[np.ndarray] = []
         self._halves: list[float] = []
@@ -90,7 +97,7 @@ class _Made:
 
         No path to their added nodes is cheaper then. Blind paths are compared with blind ones.
         """
-        own = self._state.nodes[self._state.label == piece]
+        own = self._state.nodes[self._by_label[self._start[piece]:self._start[piece + 1]]]
         gap = np.linalg.norm(own[:, None] - np.array(self._middles), axis=2).min(axis=0)
         blind = found.turn[index] == np.pi
         cost = found.length[index] if blind else found.price[index]

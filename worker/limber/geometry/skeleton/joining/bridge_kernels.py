@@ -13,6 +13,9 @@ _RATIO = 0.7  # price of a radius ratio of e
 _FARTHER = 2.0  # an end may reach this many limits if it points at its target
 _POINTS_AT = math.radians(25.0)
 _LEAST = 1e-12
+# Paths of an end that are kept: the cheapest ones, and of these so many to each piece. A round
+# takes an end's cheapest allowed path; those to all nodes of thousands of pieces fill the memory.
+_KEPT, _KEPT_OF_PIECE = 256, 32
 
 
 @njit(cache=True)
@@ -29,7 +32,7 @@ def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: n
            label: np.ndarray, end_node: np.ndarray, end_direction: np.ndarray,
            end_radius: np.ndarray, end_of: np.ndarray, limit: float,
            ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Price the paths from all ends with a direction to the nodes of other pieces.
+    """Price the paths from all ends with a direction to other pieces; keep the cheapest of each.
 
     Args:
         nodes: Positions [m], shape [n, 3].
@@ -51,7 +54,9 @@ def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: n
                            [0.0 for _ in range(0)])
     meets = [0 for _ in range(0)]
     vector = np.empty(3)
+    of_piece = np.zeros(label.max() + 1, np.int64)
     for k in range(len(end_node)):
+        begin = len(one)
         own, out, radius = end_node[k], end_direction[k], end_radius[k]
         if out[0] == 0 and out[1] == 0 and out[2] == 0:
             continue
@@ -89,8 +94,40 @@ def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: n
             price.append(far * (1 + (turned / _TURN)**2 + min(side, comes)))
             turn.append(turned)
             meets.append(1 if comes < side else 0)
+        if len(one) - begin <= _KEPT_OF_PIECE:
+            continue
+        kept = _cheapest(np.array(price[begin:]), label[np.array(other[begin:])], of_piece)
+        for place, which in enumerate(kept):
+            there, here = begin + place, begin + which
+            other[there], length[there], price[there] = other[here], length[here], price[here]
+            turn[there], meets[there] = turn[here], meets[here]
+        for _ in range(len(one) - begin - len(kept)):
+            one.pop()
+            other.pop()
+            length.pop()
+            price.pop()
+            turn.pop()
+            meets.pop()
     return (np.array(one), np.array(other), np.array(length), np.array(price), np.array(turn),
             np.array(meets))
+
+
+@njit(cache=True)
+def _cheapest(price: np.ndarray, label: np.ndarray, of_piece: np.ndarray) -> np.ndarray:
+    """Indices of an end's paths to keep, ascending; ``of_piece`` is a counter of zeros."""
+    order = np.argsort(price, kind="mergesort")
+    kept = np.zeros(len(price), np.bool_)
+    count = 0
+    for index in order:
+        if of_piece[label[index]] < _KEPT_OF_PIECE:
+            of_piece[label[index]] += 1
+            kept[index] = True
+            count += 1
+            if count == _KEPT:
+                break
+    for index in order:
+        of_piece[label[index]] = 0
+    return np.flatnonzero(kept)
 
 
 @njit(cache=True)

@@ -13,7 +13,8 @@ from limber.geometry.skeleton.joining.rivals import rivals
 _ODD = 1.9  # price of a bridge over its length above which its neighbours are tried without it
 _AROUND = 2.0  # neighbourhood, in lengths of that bridge
 _CLEARLY = 0.98  # fraction of the price of all bridges below which others are better
-_MOST_PATHS = 150_000_000  # paths between ends and nodes in all trials: some seconds
+# Work of all trials, in paths between ends and nodes: some seconds; and what a node costs besides.
+_MOST_WORK, _NODE_WORK = 150_000_000, 1500
 
 
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
@@ -67,7 +68,7 @@ def _joined(first: Joined, rules: Rules, refused: frozenset[tuple[int, int]] = f
                            state.piece, refused)
         chosen, decisive = mutual(found, state, ends, weight, rules, alone)
         state.rounds.append(Round(state.copy([]), alone, decisive,
-                                  len(ends.node) * len(state.nodes)))
+                                  (len(ends.node) + _NODE_WORK) * len(state.nodes)))
         if not chosen and alone:
             alone = False
             continue
@@ -105,15 +106,15 @@ def _reconsidered(state: Joined, rules: Rules) -> Joined:
     """
     refused: frozenset[tuple[int, int]] = frozenset()
     vain: set[tuple[int, int]] = set()
-    gone_through = 0
+    done = 0
     while True:
         best, without = state, refused
         for pair in _doubted(state, rules.gap):
             # As many as there were with that bridge.
-            path_count = sum(past.path_count for past in state.rounds[_start(state, pair):])
-            if pair in vain or gone_through + path_count > _MOST_PATHS:
+            work = sum(past.work for past in state.rounds[_start(state, pair):])
+            if pair in vain or done + work > _MOST_WORK:
                 continue
-            gone_through += path_count
+            done += work
             dearest = _CLEARLY * best.cost()
             other = _without(state, pair, rules, refused, dearest)
             parts = other.label.max() > state.label.max()

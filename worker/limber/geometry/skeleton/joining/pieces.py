@@ -100,13 +100,13 @@ class Round:
         alone: Whether pieces without a direction had to wait.
         decisive: The pairs of given pieces between which a hypothesis mattered. Without the
             hypotheses of any other pair, the round is the same.
-        path_count: Paths between ends and nodes that could have been hypotheses.
+        work: Its work, in paths between ends and nodes: these, and what each node costs besides.
     """
 
     before: Joined
     alone: bool
     decisive: set[tuple[int, int]]
-    path_count: int
+    work: int
 
 
 @dataclass(frozen=True)
