@@ -67,8 +67,8 @@ class PlacedInputs(BranchInputs):
     groups: ClassVar[Groups] = {"input": ("coordinates",)}
 
     coordinates: Literal["branch", "scan"] = Field(
-        "branch", description="Coordinates of the given positions: the branch folder's, or those "
-        "of the scan's file in metres.", json_schema_extra=NOT_KEPT)
+        "branch", description="Coordinates of all given positions but boxes: the branch folder's, "
+        "or those of the scan's file in metres.", json_schema_extra=NOT_KEPT)
 
     def in_branch(self, settings: Settings) -> Settings:
         """Return the settings with all positions in the branch's frame.

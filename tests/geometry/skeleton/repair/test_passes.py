@@ -42,7 +42,7 @@ def _before(skeleton: Skeleton, points: np.ndarray | None = None, **found: objec
     nothing = np.empty((0, 3))
     seen = seen_sides(nothing, nothing, *[np.ones(1)] * 2, np.ones(1), np.zeros(1))
     fit = AxisFit(skeleton, np.zeros(len(points), int), np.zeros(len(points)), NOISE, seen)
-    return replace(Repaired(skeleton, points, (1e-4, 0.05), 2.5, fit=fit), **found)
+    return replace(Repaired(skeleton, points, (1e-4, 0.05), fit=fit), **found)
 
 
 def _hair(part: slice, thin: float = 4e-4) -> Skeleton:
