@@ -355,6 +355,38 @@ def test_the_robots_links_go_with_the_frames(bpy, addon, beam, tmp_path):
             assert top == pytest.approx(half + 0.03, abs=1e-5)
 
 
+def test_a_cell_is_shown_where_its_file_says(bpy, addon, beam, tmp_path):
+    """Arm, gripper and an obstacle that lets one see through; shown again they are not doubled."""
+    from limber.planning.constraints.obstacles import Box
+    from limber.results.scene.cell_objects import add_cell
+    from limber.results.scene.contents import scene_data as data_of
+    from limber.robot.cell.cell import Cell
+    from limber.store import Branch
+
+    cell_data = data_of(Branch.open(beam.folder))
+    table = Box("table", np.array([0.4, 0.3, 0.02]), np.array([0.1, 0.0, -0.05]), np.eye(3))
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.6, 0, 0, 0, 0, 0)})
+    add_cell(cell_data, cell, [table])
+    cell_data.write(tmp_path / "data.npz")
+    scenes = importlib.import_module("limber_addon.scene")
+    reader = importlib.import_module("limber_addon.scene_data")
+    for _ in range(2):
+        shown = scenes.show_branch(bpy.context.scene,
+                                   reader.read_scene_data(tmp_path / "data.npz"))
+    kinds = {kind for kind in shown.objects if kind.startswith("cell:")}
+    assert kinds == {"cell:arm", "cell:tool", "cell:obstacle1"}
+    [thing] = shown.objects["cell:obstacle1"]
+    assert thing.name == "Obstacle table"
+    places = np.array([vertex.co for vertex in thing.data.vertices])
+    np.testing.assert_allclose(np.abs(places - table.centre), np.tile(table.half, (8, 1)),
+                               atol=1e-6)
+    assert thing.active_material.diffuse_color[3] < 1.0
+    cell_data.arrays["solid_faces:arm"][-1, 0] = 10**6
+    cell_data.write(tmp_path / "bad.npz")
+    with pytest.raises(reader.SceneDataError, match="solid_faces:arm contains indices"):
+        reader.read_scene_data(tmp_path / "bad.npz")
+
+
 def test_a_long_legend_keeps_to_its_margin_and_height(bpy, addon, beam, tmp_path):
     """Lines break where the margin ends; all is smaller where it would leave the picture below."""
     from mathutils import Vector
