@@ -28,7 +28,12 @@ from limber.robot.cell.cell import CameraEntry, Cell
 from limber.robot.known_arms import arm_named
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
 from limber.robot.virtual.depth_camera import VirtualCamera
-from limber.stages.pulls.record import RecordOptions, RecordSettings, record
+from limber.stages.pulls.record import (
+    RecordOptions,
+    RecordSettings,
+    _remove_empty,
+    record,
+)
 from limber.stages.pulls.record_path import arc_path, suggested_pull, there_and_back, waypoint_path
 from limber.stages.pulls.record_prediction import PullModel
 from limber.stages.registry import stage_description
@@ -240,6 +245,21 @@ def test_a_killed_recording_is_taken_over(branch_folder, tmp_path, robot):
     assert result["seconds"] > killed - begin - 1.0
     pull = read_pull(branch_folder / "pulls" / "cut")
     assert np.all(np.diff(pull.times) > 0) and np.isfinite(pull.poses).all()
+
+
+def test_a_recording_killed_before_its_pull_leaves_its_name_free(branch_folder, tmp_path):
+    """Its title line alone is no recording: it cannot be recovered, and blocks nothing."""
+    branch = Branch.open(branch_folder)
+    path = cell_file(standing_at(branch, "127.0.0.98"), tmp_path)
+    with branch.stream("pulls/cut/robot.csv") as lines:
+        lines.append("t_s,x_m")
+    with pytest.raises(InputError, match="before its pull began"):
+        record(branch_folder, path, "cut", RecordSettings(), RecordOptions(recover=True))
+    # No robot answers there: it got as far as that.
+    with pytest.raises(WorkError, match="No robot answers"):
+        record(branch_folder, path, "cut", RecordSettings(), RecordOptions(confirm="cut"))
+    _remove_empty(branch, "cut")
+    assert branch.streams() == []
 
 
 def test_the_piece_moves_with_the_gripper_as_one_body():

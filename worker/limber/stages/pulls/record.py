@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from limber.store import Stream
 
 _TARE_SECONDS = 1.0
+_FEWEST_ROWS = 2  # of a pull, after the title line
 _FEWEST_IMAGES = 2  # of a pull that is observed
 _SETTLE_SECONDS = 0.5  # until the branch rests in the closed gripper
 
@@ -130,17 +131,21 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
     if warning := check_branch(cell, branch.uuid, folder):
         progress.warn(warning)
     if options.recover:
+        if branch.growing(f"pulls/{name}") and not _left_samples(branch, name):
+            raise InputError(f"The recording {name} was interrupted before its pull began.",
+                             "There is nothing to recover.", "Record it again; its name is free.")
         return _finish(branch, name, settings, {"ended": "recovered after an interruption"})
     if branch.has(f"pulls/{name}/pull.toml"):
         raise InputError(f"{folder} already has a recording {name}.",
                          "A recording is never overwritten.", "Give another --name.")
-    if f"pulls/{name}/robot.csv" in branch.streams():
+    if _left_samples(branch, name):
         raise InputError(f"A recording {name} was interrupted.", "It would be lost.",
                          "Recover it with --recover, or give another --name.")
     require_payload(cell)
     blocked = blocked_by(cell, cell_obstacles(cell, cell_file.parent))
     require_confirmation(name, options.confirm, cell, progress)
     with branch.writing(f"the recording {name}"):
+        _remove_empty(branch, name)
         ended = _recorded(branch, cell, name, settings, options, blocked, progress)
         # Nothing is recorded of a stop before the pull: the name stays free.
         result = _finish(branch, name, settings, ended) if ended["sample_count"] else ended
@@ -150,6 +155,21 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
                          f"in pulls/{name}.",
                          "Check the branch and the robot before anything moves.", result=result)
     return result
+
+
+def _left_samples(branch: Branch, name: str) -> bool:
+    """Whether an interrupted recording has samples."""
+    folder = branch.growing(f"pulls/{name}")
+    rows = None if folder is None else folder / "robot.csv"
+    return rows is not None and rows.is_file() and rows.read_bytes().count(b"\n") > _FEWEST_ROWS
+
+
+def _remove_empty(branch: Branch, name: str) -> None:
+    """Remove what a recording left that was interrupted before its pull began."""
+    folder = branch.growing(f"pulls/{name}")
+    for file in () if folder is None else [*folder.iterdir()]:
+        if file.is_file():
+            file.unlink()
 
 
 def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
@@ -170,7 +190,6 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
     try:
         progress(0.02, "connecting")
         live = LiveForce(branch.folder, f"Recording {name}", cell.limits.soft_force_n)
-
         doubts: list[PullPlausibility] = []
 
         def take(rows: np.ndarray) -> None:
