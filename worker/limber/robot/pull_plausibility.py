@@ -16,7 +16,7 @@ from limber.robot.cell.cell import Cell
 
 LOOKED_M = 0.01
 """Travel by which a wrong sensor has been detected."""
-NUDGE_M, NUDGE_M_S, NUDGE_SECONDS = 0.004, 0.01, 0.5
+NUDGE_M, NUDGE_M_S, NUDGE_SECONDS = 0.004, 0.01, 1.0
 """Way, speed and rest at its end of a nudge: a branch of 50 N/m is judged by it with certainty."""
 
 _NOISES = 4.0  # times the noise of a smoothed force; less is not significant
