@@ -284,7 +284,7 @@ PARTS = {
     "path": Part(_watched(_path), 20, (_PATH,)),
     "faults": Part(_watched(_faults), 150, _faults_asked(_faults_told(tuple(EVERY))),
                    grows=True),
-    "wrong-states": Part(wrong_states, 30, (STATES_ROW,)),
+    "wrong-states": Part(wrong_states, 30, (STATES_ROW,), grows=True),
     "retreats": Part(retreats, 60, (RETREAT_ROW,), grows=True),
     "ros": Part(_watched(ros_door), LEAST_ROS_S, ROS_ROWS, grows=True),
     "branches": Part(_watched(partial(followed_paths, address=_ADDRESS)), 60, FOLLOWED_ROWS,
