@@ -87,9 +87,9 @@ class CapsuleEntry(_Entry):
 class ToolEntry(_Entry):
     """The gripper: its grasp pose, weight and shape."""
 
-    grasp_pose: Pose = Field((0.0,) * 6, description="Frame of the grasp in the flange's frame: its "
-                            "origin is between the fingers, its z the direction of approach, its "
-                            "y lies along the branch.")
+    grasp_pose: Pose = Field((0.0,) * 6, description="Frame of the grasp in the flange's frame: "
+                             "its origin is between the fingers, its z the direction of approach, "
+                             "its y lies along the branch.")
     mass_kg: float | None = Field(
         None, ge=0, le=20, description="Payload [kg]: all that the flange carries, with the "
                                        "sensor; 0 for a bare flange. The robot does not move "
