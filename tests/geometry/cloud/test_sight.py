@@ -93,6 +93,8 @@ def test_flying_pixels_are_counted() -> None:
     prepared = prepare(Cloud(points), 1.0)
     assert prepared.counts["flying"] > 0.03 * len(points)
     assert any("flying" in text for text in prepared.warnings)
+    kept = prepare(Cloud(points), 1.0, PreparationSettings(keep_flying=True))
+    assert "flying" not in kept.counts and len(kept.cloud.points) > len(prepared.cloud.points)
     moved = PreparationSettings(camera_at=(500.0, 100.0, 20.0))
     away = prepare(Cloud(1000 * points + np.array(moved.camera_at)), 1e-3, moved)
     assert away.counts["flying"] == prepared.counts["flying"]

@@ -145,12 +145,12 @@ class VirtualPullSettings(Settings):
         "motion": ("motion", "drive", "weight", "frames", "duration", "grasp_fraction", "mode",
             "reach", "phase"),
         "noise": ("position_noise", "force_noise", "torque_noise", "camera", "outliers", "seed"),
-        "errors of the cell": ("cell_errors", "force_bias_sigma", "force_drift_sigma"),
+        "errors of the cell": ("cell_errors", "pose_sigma", "pose_turn_sigma", "force_gain_sigma",
+            "force_bias_sigma", "force_drift_sigma", "torque_bias_sigma", "camera_sigma",
+            "camera_turn_sigma", "point_sigma", "clock_sigma"),
     }
     common = ("cell_errors", "seed")
-    retired: ClassVar[dict[str, Any]] = {"turn": 2.0} | dict.fromkeys((
-        "pose_sigma", "pose_turn_sigma", "force_gain_sigma", "torque_bias_sigma", "camera_sigma",
-        "camera_turn_sigma", "point_sigma", "clock_sigma"))
+    retired: ClassVar[dict[str, Any]] = {"turn": 2.0}
 
     young: tuple[float, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]. Default: that of a "
@@ -208,11 +208,28 @@ class VirtualPullSettings(Settings):
         "none", description="Errors of the cell that stay during the recording, drawn from the "
         "seed. realistic: those of a cell that was set up with care and not measured since "
         "(gripper 1 mm and 1 degree, force gain 2 %, zero and drift 1 N, camera 1 mm, points 5 mm "
-        "along the branch). The pull states their standard deviations as its calibration.")
+        "along the branch). The pull "
+        "states their standard deviations as its calibration. Each can be set by its own option.")
+    pose_sigma: float | None = Field(
+        None, ge=0, description="Error of the position of the gripper's frame, each axis [m].")
+    pose_turn_sigma: float | None = Field(
+        None, ge=0, description="Error of the rotation of the gripper's frame, each axis [rad].")
+    force_gain_sigma: float | None = Field(None, ge=0, description="Relative error of the force.")
     force_bias_sigma: float | None = Field(
         None, ge=0, description="Zero offset of the force, each axis [N].")
     force_drift_sigma: float | None = Field(
         None, ge=0, description="Drift of the force's zero over the recording, each axis [N].")
+    torque_bias_sigma: float | None = Field(
+        None, ge=0, description="Zero offset of the torque, each axis [N m].")
+    camera_sigma: float | None = Field(
+        None, ge=0, description="Error of the position of the observer's frame, each axis [m].")
+    camera_turn_sigma: float | None = Field(
+        None, ge=0, description="Error of the rotation of the observer's frame, each axis [rad].")
+    point_sigma: float | None = Field(
+        None, ge=0, description="Distance of each observed point along the branch from its control "
+        "point [m].")
+    clock_sigma: float | None = Field(
+        None, ge=0, description="Offset of the observer's clock from the robot's [s].")
     seed: int = Field(0, ge=0, description="Seed of all random numbers.")
 
     @property
@@ -221,8 +238,13 @@ class VirtualPullSettings(Settings):
         from limber.recordings.cell_errors import EXACT, CalibrationEntry
 
         begun = CalibrationEntry() if self.cell_errors == "realistic" else EXACT
-        sigmas = {"force_bias_sigma_n": self.force_bias_sigma,
-                  "force_drift_sigma_n": self.force_drift_sigma}
+        sigmas = {"pose_sigma_m": self.pose_sigma, "pose_sigma_rad": self.pose_turn_sigma,
+                  "force_gain_sigma": self.force_gain_sigma,
+                  "force_bias_sigma_n": self.force_bias_sigma,
+                  "force_drift_sigma_n": self.force_drift_sigma,
+                  "torque_bias_sigma_nm": self.torque_bias_sigma,
+                  "camera_sigma_m": self.camera_sigma, "camera_sigma_rad": self.camera_turn_sigma,
+                  "point_sigma_m": self.point_sigma, "clock_sigma_s": self.clock_sigma}
         return begun.model_copy(update={
             name: value for name, value in sigmas.items() if value is not None})
 

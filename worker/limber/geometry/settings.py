@@ -15,7 +15,7 @@ class PreparationSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("crop_low", "crop_high", "camera_at"),
-        "shape": ("keep_sheets",),
+        "shape": ("keep_sheets", "keep_flying"),
     }
     retired: ClassVar[dict[str, Any]] = {
         "flying_speck": 20, "silhouette_reach": 1.5, "flying_angle": 78.0, "outlier_neighbours": 8,
@@ -30,6 +30,9 @@ class PreparationSettings(Settings):
         "origin, if the cloud is an image seen from there.")
     keep_sheets: bool = Field(
         False, description="Keep walls and ground. Default: wide flat sheets are removed.")
+    keep_flying: bool = Field(
+        False, description="Keep points that look like flying pixels of a depth camera. Default: "
+        "they are removed from a cloud that one camera saw.")
 
 
 class SkeletonSettings(Settings):

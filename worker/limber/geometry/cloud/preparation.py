@@ -172,10 +172,13 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
     if sight is None:
         return cloud, None
     view = View(scanner, sight.pitch)
+    if settings.keep_flying:
+        return cloud, view
     flying = flying_pixels(sight, _FLYING_ANGLE, _FLYING_SPECK)
     counts["flying"] = int(flying.sum())
     rest = cloud.subset(~flying)
-    _enough(rest, "Without flying pixels, the depth camera's cloud")
+    _enough(rest, "Without flying pixels (--keep-flying keeps them), the depth camera's "
+                  "cloud")
     return rest, view
 
 
@@ -282,7 +285,7 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
     flying = counts.get("flying", 0)
     if flying > 0.02 * counts["read"]:
         texts.append(f"{flying} of {counts['read']} points were discarded as flying pixels of a "
-                     "depth camera.")
+                     "depth camera (--keep-flying keeps them).")
     lost = counts.get("outliers", 0)
     if lost > 0.1 * len(points):
         texts.append(f"{lost} points were discarded as outliers.")
