@@ -18,7 +18,7 @@ takes. The command ``limber`` does the same in a terminal, and the Blender add-o
 from typing import TYPE_CHECKING
 
 from limber.core.lazy import exports as _exports
-from limber.core.threads import one_thread as _one_thread
+from limber.core.threads import same_digits as _same_digits
 from limber.version import VERSION as __version__
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from limber.api.verbs import reconstruct as reconstruct
 
 # Before any module of Limber loads a library, in each process: no result may depend on threads.
-_one_thread()
+_same_digits()
 
 _PLACES = {
     "Branch": "api.branch",
