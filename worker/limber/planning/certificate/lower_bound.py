@@ -143,29 +143,20 @@ def _next_grid(searches: "list[_Search]", grid: Grid, cell: np.ndarray, *, is_fi
     """Bound on a grid; return the next one, None if a finer grid is not worth its time."""
     keep, near = np.zeros(grid.open_cells.shape, bool), grid.about_goal
     common, ratios = COARSEST, np.ones(3)
-    try:
-        land = _land(searches[0].problem, grid, cell)
-        for one in searches:
+    land: _Land | None = None
+    for one in searches:
+        try:
+            land = land or _land(searches[0].problem, grid, cell)
             found = _bound(one.problem, land, grid, cell)
-            one.take(found, grid, is_first=is_first)
-            if not one.is_done:
-                own, near = found.keep(one.upper), found.about_goal
-                common = min(common, one.ratio())
-                ratios = np.minimum(ratios, _ratios(found.ground, own, one.ratio()))
-                keep |= own
-            del found
-    except NoPathError:
-        if is_first:
-            # Corners this far apart do not resolve a narrow valley.
-            for one in searches:
-                one.upper = one.improve(None)
-            return refined(grid, grid.open_cells, grid.about_goal, cell)
-        if not all(one.upper < np.inf for one in searches):
-            raise
-        # A path that keeps the limits is the stronger proof.
-        for one in searches:
-            one.note(grid, 0)
-        return None
+        except NoPathError as separated:
+            return _unbounded(searches, grid, cell, separated, is_first=is_first)
+        one.take(found, grid, is_first=is_first)
+        if not one.is_done:
+            own, near = found.keep(one.upper), found.about_goal
+            common = min(common, one.ratio())
+            ratios = np.minimum(ratios, _ratios(found.ground, own, one.ratio()))
+            keep |= own
+        del found
     if not keep.any():
         return None
     # No more cells than are allowed; cells that are hardly finer are not worth their time.
@@ -173,6 +164,22 @@ def _next_grid(searches: "list[_Search]", grid: Grid, cell: np.ndarray, *, is_fi
     if coarser > 1.0 and coarser * common > COARSEST:
         return None
     return refined(grid, keep, near, cell, np.minimum(1.0, coarser * ratios))
+
+
+def _unbounded(searches: "list[_Search]", grid: Grid, cell: np.ndarray, separated: NoPathError, *,
+               is_first: bool) -> tuple[Grid, np.ndarray] | None:
+    """Go on, or end, after a grid whose closed cells separate the start from the goal."""
+    if is_first:
+        # Corners this far apart do not resolve a narrow valley.
+        for one in searches:
+            one.upper = one.improve(None)
+        return refined(grid, grid.open_cells, grid.about_goal, cell)
+    if not all(one.upper < np.inf for one in searches):
+        raise separated
+    # A path that keeps the limits is the stronger proof.
+    for one in searches:
+        one.note(grid, 0)
+    return None
 
 
 @dataclass
