@@ -24,7 +24,7 @@ from limber.stages.pulls.record_path import there_and_back
 from limber.stages.pulls.record_prediction import PullModel
 from limber.store import Branch
 
-_SHARE = 0.5  # of the pull's own way, if that is short
+_SHARE = 0.5  # of the pull's own travel, and of the force at which a motion pauses
 
 
 def nudge_and_checks(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
@@ -67,9 +67,12 @@ def nudge(cell: Cell, stiffness: np.ndarray, sample: np.ndarray, pull: Trajector
     first = int(np.argmax(away >= min(LOOKED_M, farthest)))
     way = matrices(np.array(cell.base.pose))[:3, :3] @ (pull.poses[first] - pull.poses[0])[:3]
     side = nudge_direction(way, stiffness)
+    # A stiff branch is nudged less far, so that the nudge itself stays below the limits.
+    gentle = cell.limits.soft_force_n / float(np.linalg.norm(stiffness @ side))
+    travel = min(NUDGE_M, _SHARE * farthest, _SHARE * gentle)
     frames = np.array([matrices(sample[1:7])] * 2)
     for sign in (1.0, -1.0):
-        frames[1, :3, 3] = frames[0, :3, 3] + sign * min(NUDGE_M, _SHARE * farthest) * side
+        frames[1, :3, 3] = frames[0, :3, 3] + sign * travel * side
         try:
             return there_and_back(cell, frames, speed=min(NUDGE_M_S, cell.limits.speed_m_s),
                                   cycles=1, pause=NUDGE_SECONDS, start=sample[19:25],
