@@ -11,6 +11,8 @@ _BESIDE, _ICON = 58, 21
 """Width of the tabs, the scroll bar and the margins beside a text, and of an icon before it, at a
 scale of 1 [pixels]."""
 _LABEL_SHARE = 0.4
+_USUAL_LETTER = 0.5
+"""Width of a letter of the interface's font over its size."""
 _GAP = 8
 """Width between a text and what stands beside it [pixels]."""
 
@@ -73,9 +75,10 @@ def wrapped(text: str, space: float) -> tuple[str, ...]:
 
 def width(text: str) -> float:
     """Return the width of a text as a panel draws it [pixels]."""
-    style = bpy.context.preferences.ui_styles[0].widget
-    blf.size(0, style.points * _scale(bpy.context))
-    return blf.dimensions(0, text)[0]
+    size = bpy.context.preferences.ui_styles[0].widget.points * _scale(bpy.context)
+    blf.size(0, size)
+    # A Blender without a window may have no font loaded: it measures 0.
+    return blf.dimensions(0, text)[0] or _USUAL_LETTER * size * len(text)
 
 
 def _scale(context: bpy.types.Context) -> float:
