@@ -89,8 +89,11 @@ class Run(Directive):
 
 
 def _tried(command: list[str], folder: Path) -> subprocess.CompletedProcess:
-    """Run a command; once more where a robot was stopped."""
+    """Run a command; once more, from the same files, where a robot was stopped."""
+    before = set(folder.iterdir())
     for _ in range(2):
+        for made in set(folder.iterdir()) - before:
+            shutil.rmtree(made) if made.is_dir() else made.unlink()
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False,
                               timeout=SECONDS,
                               env={**os.environ, "COLUMNS": "96", "NO_COLOR": "1"})
