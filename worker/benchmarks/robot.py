@@ -140,7 +140,7 @@ def _stop_rows(rate: int, stops: list[_Stop], late: list[_Stop]) -> list[Row]:
     again = "" if not late else (f"; {len(late)} done again, the machine stood still: to "
                                  f"{1000 * max(stop.latency for stop in late):.1f} ms")
     time_asked, way_asked = _stop_asked(rate)
-    way = Row(*way_asked, f"{1000 * max(stop.travel for stop in stops + late):.1f} mm", None,
+    way = Row(*way_asked, f"{1000 * max(stop.way for stop in stops + late):.1f} mm", None,
               len(stops + late))
     if not stops:
         return [Row(*time_asked, f"none that the machine let be measured{again}", None, 0), way]
