@@ -35,6 +35,10 @@ class Alignment(BaseModel):
         """Transform input coordinates, shape [n, 3], to branch coordinates [m]."""
         return (np.asarray(points) * self.scale - self.origin) @ np.array(self.rotation).T
 
+    def apply_metres(self, points: np.ndarray) -> np.ndarray:
+        """Transform input coordinates in metres, shape [..., 3], to branch coordinates [m]."""
+        return self.apply(np.asarray(points) / self.scale)
+
     def undo(self, points: np.ndarray) -> np.ndarray:
         """Transform branch coordinates [m], shape [n, 3], back to those of the input file."""
         return (np.asarray(points) @ np.array(self.rotation) + self.origin) / self.scale

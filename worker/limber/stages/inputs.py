@@ -78,8 +78,6 @@ class PlacedInputs(BranchInputs):
         """
         if self.coordinates == "branch":
             return settings
-        import numpy as np
-
         from limber.store import Branch
 
         alignment = Branch.read(self.branch_folder).manifest.alignment
@@ -92,7 +90,7 @@ class PlacedInputs(BranchInputs):
                                  "Its box has the axes of the branch's frame, which are others.",
                                  "Give all positions with --coordinates branch.")
             if kind == "branch" and value is not None:
-                moved[name] = tuple(alignment.apply(np.array(value) / alignment.scale).tolist())
+                moved[name] = tuple(alignment.apply_metres(value).tolist())
         return settings.model_copy(update=moved)
 
 

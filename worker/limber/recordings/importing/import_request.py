@@ -104,10 +104,9 @@ class ImportRequest:
 
     def in_branch(self, points: np.ndarray) -> np.ndarray:
         """Transform points [m] from the user's frame to the branch's, shape [n, 3]."""
-        alignment = self.branch.alignment
         if self.settings.coordinates == "branch":
             return points
-        return alignment.apply(points / alignment.scale)
+        return self.branch.alignment.apply_metres(points)
 
     def markers_in_branch(self, points: np.ndarray) -> np.ndarray:
         """Transform markers [m] from their stated frame, if any; shape [..., 3].

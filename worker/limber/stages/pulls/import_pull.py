@@ -93,7 +93,7 @@ def _poses_in_branch(given: ImportSettings, branch: Branch) -> dict[str, tuple[f
 
     alignment = branch.manifest.alignment
     turn = rotation_vector(np.array(alignment.rotation))
-    return {name: (*alignment.apply(pose[:3] / alignment.scale).tolist(),
+    return {name: (*alignment.apply_metres(pose[:3]).tolist(),
                    *composed(turn, pose[3:]).tolist()) for name, pose in poses.items()}
 
 
