@@ -23,7 +23,7 @@ from limber.robot.ros import guarded_robot
 from limber.robot.ros.bridge import Bridge
 from limber.robot.ros.cloud_topic import CloudTopic
 from limber.robot.ros.guarded_robot import RosRobot, Topics
-from limber.robot.ros.messages import JointStates, cloud_of, goal_of
+from limber.robot.ros.messages import JointStates, cloud_of, goal_of, spline
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
             tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})
@@ -184,6 +184,29 @@ def test_a_goal_carries_times_and_ends_at_rest():
     assert points[-1]["positions"] == pytest.approx(path.joints[-1])
     end = points[-1]["time_from_start"]
     assert end["sec"] + 1e-9 * end["nanosec"] == pytest.approx(path.duration)
+
+
+def test_a_long_path_is_a_small_goal_that_the_controllers_spline_stays_on():
+    """There and back five times with rests: a tenth of the points, none of them off the path."""
+    out = line(0.1, 0.03)
+    legs = [out, out.backwards()] * 5
+    times = np.concatenate([k * (out.duration + 0.5) + leg.times for k, leg in enumerate(legs)])
+    path = Trajectory(times, np.concatenate([leg.poses for leg in legs]), None,
+                      np.concatenate([leg.joints for leg in legs]))
+    points = goal_of(path, ["a"] * 6)["trajectory"]["points"]
+    assert len(points) < 0.2 * len(times)
+    at, joints, speeds = (np.array(column) for column in zip(*((
+        point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"],
+        point["positions"], point["velocities"]) for point in points), strict=True))
+    wanted = np.linspace(0.0, path.duration, 5000)
+    rows = np.clip(np.searchsorted(at, wanted, side="right") - 1, 0, len(at) - 2)
+    passed = np.array([spline(time, at[k:k + 2], joints[k:k + 2], speeds[k:k + 2])
+                       for time, k in zip(wanted, rows, strict=True)])
+    planned = np.array([path.angles(time) for time in wanted])
+    assert np.abs(passed - planned).max() < 3e-4
+    rests = np.abs(passed[(wanted > out.duration) & (wanted < out.duration + 0.5)] - path.angles(
+        out.duration))
+    assert rests.max() < 1e-6
 
 
 def test_the_example_node_stops_on_a_word_and_on_silence(monkeypatch):

@@ -7,6 +7,8 @@ import time
 
 import numpy as np
 
+from limber.robot.ros.messages import spline
+
 STEP = 0.008
 _LARGEST_BYTES = 10_000_000  # rosbridge_server's own limit (parameter max_message_size)
 _NAMES = [f"{name}_joint" for name in (
@@ -92,11 +94,13 @@ class RosBridge:
         before = self.joints.copy()
         self.joints = self.joints + STEP * self.drift
         if self._goal is not None:
-            goal, times, ways, at = self._goal
+            goal, times, ways, speeds, at = self._goal
             at = min(at + STEP, times[-1])
-            self.joints = np.array([np.interp(at, times, ways[:, k]) for k in range(6)])
+            first = min(int(np.searchsorted(times, at, side="right")) - 1, len(times) - 2)
+            ends = slice(first, first + 2)
+            self.joints = spline(at, times[ends], ways[ends], speeds[ends])
             self.followed.append(self.joints.copy())
-            self._goal = (goal, times, ways, at)
+            self._goal = (goal, times, ways, speeds, at)
             if at >= times[-1]:
                 self._goal = None
                 socket.send(json.dumps({"op": "action_result", "id": goal["id"], "status": 4,
@@ -129,10 +133,11 @@ class RosBridge:
         elif order["op"] == "send_action_goal":
             points = order["args"]["trajectory"]["points"]
             order_of = [order["args"]["trajectory"]["joint_names"].index(name) for name in _NAMES]
-            ways = np.array([point["positions"] for point in points])[:, order_of][:, _ORDER]
+            ways, speeds = (np.array([point[kind] for point in points])[:, order_of][:, _ORDER]
+                            for kind in ("positions", "velocities"))
             self._goal = (order, np.array([
                 point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"]
-                for point in points]), ways, 0.0)
+                for point in points]), ways, speeds, 0.0)
         elif order["op"] == "cancel_action_goal":
             self._goal, self.stood_at = None, time.monotonic()
 

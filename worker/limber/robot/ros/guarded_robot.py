@@ -195,15 +195,17 @@ class RosRobot:
         Raises:
             SafetyStop: the arm is not at its start, or the guard refuses.
         """
-        sample = self.last
-        assert sample is not None and self._states is not None and trajectory.joints is not None
+        assert self._states is not None and trajectory.joints is not None
+        # It takes a while for a long path; what arrives meanwhile is read before it is sent.
+        goal = goal_of(trajectory, self._states.ordered)
+        sample = self._newest()
         require_start(sample.pose, sample.joints, trajectory.poses[0], trajectory.joints[0],
                       self._cell.arm.joint_names)
         if np.abs(sample.joint_speeds).max() > _STANDS_RAD_S:
             raise _moves_already()
         self.guard.begin()
         self._way.begin(sample, trajectory, goes_on=goes_on)
-        return self._watched_goal(trajectory)
+        return self._watched_goal(trajectory, goal)
 
     def retreat(self) -> dict[str, Any]:
         """Go back along the path that was followed, while the force falls; a person has chosen it.
@@ -221,8 +223,10 @@ class RosRobot:
         if not np.abs(sample.joints - before).max() <= _STILL_RAD:
             raise _moves_already()
         back = self._way.from_here(sample, self._cell.limits.acceleration_m_s2)
+        assert self._states is not None
+        goal = goal_of(back, self._states.ordered)
         self.guard.begin_retreat(self.smooth)
-        event = self._watched_goal(back)
+        event = self._watched_goal(back, goal)
         self._settled()
         return event | {"force_n": float(np.linalg.norm(self.smooth[:3]))}
 
@@ -241,14 +245,19 @@ class RosRobot:
         self._kept.close()
         self._bridge.close()
 
-    def _watched_goal(self, trajectory: Trajectory) -> dict[str, Any]:
-        """Send a trajectory as a goal and watch it to its end."""
-        assert self._states is not None and trajectory.joints is not None
+    def _newest(self) -> Sample:
+        """Read what has arrived; returns the last sample."""
+        while (message := self._bridge.receive(0.0)) is not None:
+            self._take(message)
+        assert self.last is not None
+        return self.last
+
+    def _watched_goal(self, trajectory: Trajectory, content: dict[str, Any]) -> dict[str, Any]:
+        """Send a trajectory as the goal ``content`` and watch it to its end."""
         self._goals += 1
         goal = f"limber-{self._goals}"
         self._bridge.send(op="send_action_goal", id=goal, action=self._topics.trajectory,
-                          action_type=FOLLOW, feedback=False,
-                          args=goal_of(trajectory, self._states.ordered))
+                          action_type=FOLLOW, feedback=False, args=content)
         place, beat = 0, 0.0
         self._hold_ups.set_off()
         while True:

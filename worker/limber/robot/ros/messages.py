@@ -17,6 +17,7 @@ STOP = "std_msgs/msg/Bool"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 FOLLOW = "control_msgs/action/FollowJointTrajectory"
 _AXES = ("x", "y", "z")
+_SPLINE_RAD = 5e-5  # from a trajectory between two points of its goal; .05 mm at a reach of 1 m
 _FLOATS = {7: "f4", 8: "f8"}  # sensor_msgs/msg/PointField
 
 
@@ -117,19 +118,62 @@ def cloud_of(message: dict[str, Any]) -> np.ndarray:
 def goal_of(trajectory: Trajectory, names: list[str]) -> dict[str, Any]:
     """Return the goal of FollowJointTrajectory for a trajectory with joints.
 
+    It has only the points that the controller's own interpolation needs, so that a long path is a
+    small message: while a bridge reads a large one it sends no samples.
+
     Args:
         names: Names of the joints in ROS, in the arm's order.
     """
     if trajectory.joints is None:
         raise InputError("The motion has no joint angles.", "ROS follows joint angles.", "")
-    speeds = np.gradient(trajectory.joints, trajectory.times, axis=0)
-    speeds[0] = speeds[-1] = 0.0
+    times, joints = trajectory.times, trajectory.joints
+    speeds = np.gradient(joints, times, axis=0)
+    stands = (np.diff(joints, axis=0) == 0.0).all(axis=1)
+    speeds[np.r_[True, stands] | np.r_[stands, True]] = 0.0
     points = []
-    for time, joints, speed in zip(trajectory.times, trajectory.joints, speeds, strict=True):
-        nanoseconds = round(1e9 * float(time))
-        # Rounded to a tenth of a micrometre: rosbridge takes messages up to 10 MB.
-        points.append({"positions": np.round(joints, 7).tolist(),
-                       "velocities": np.round(speed, 6).tolist(),
+    for row in _knots(times, joints, speeds):
+        nanoseconds = round(1e9 * float(times[row]))
+        points.append({"positions": np.round(joints[row], 7).tolist(),
+                       "velocities": np.round(speeds[row], 6).tolist(),
                        "time_from_start": {"sec": nanoseconds // 10**9,
                                            "nanosec": nanoseconds % 10**9}})
     return {"trajectory": {"joint_names": names, "points": points}}
+
+
+def spline(time: float | np.ndarray, times: np.ndarray, joints: np.ndarray, speeds: np.ndarray,
+           ) -> np.ndarray:
+    """Return the joint angles at times [s] between two points, shape [..., joints].
+
+    A cubic spline, as ROS' joint_trajectory_controller makes it of positions and velocities
+    (ros2_controllers, "Trajectory Representation").
+
+    Args:
+        times, joints, speeds: Of the two points, shapes [2], [2, joints] and [2, joints].
+    """
+    length = times[1] - times[0]
+    part = (np.asarray(time, float)[..., None] - times[0]) / length
+    rest = 1.0 - part
+    return (rest**2 * ((1.0 + 2.0 * part) * joints[0] + part * length * speeds[0])
+            + part**2 * ((1.0 + 2.0 * rest) * joints[1] - rest * length * speeds[1]))
+
+
+def _knots(times: np.ndarray, joints: np.ndarray, speeds: np.ndarray) -> list[int]:
+    """Return rows of a trajectory such that splines between them stay on it."""
+    def fits(first: int, end: int) -> bool:
+        ends, rows = [first, end], slice(first, end + 1)
+        passed = spline(times[rows], times[ends], joints[ends], speeds[ends])
+        return bool(np.abs(passed - joints[rows]).max() <= _SPLINE_RAD)
+
+    last, rows = len(times) - 1, [0]
+    while (first := rows[-1]) < last:
+        # Twice as far each time, then by halving; neighbours always fit.
+        good, bad = first + 1, last + 1
+        while good < last and fits(first, further := min(2 * good - first, last)):
+            good = further
+        if good < last:
+            bad = min(2 * good - first, last)
+        while bad - good > 1:
+            middle = (good + bad) // 2
+            good, bad = (middle, bad) if fits(first, middle) else (good, middle)
+        rows.append(good)
+    return rows
