@@ -7,12 +7,12 @@ import pytest
 
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import Progress
-from limber.planning.baseline_and_plan import plan_pair
+from limber.planning.baseline_and_plan import plan_pair, with_bound
 from limber.planning.certificate import lower_bound
 from limber.planning.certificate.grid import first_grid, refined
 from limber.planning.certificate.lower_bound import certify
 from limber.planning.constraints.limits import Limits
-from limber.planning.cost import CostWeights, resample
+from limber.planning.cost import CostWeights, arc_lengths, resample
 from limber.planning.field.energy_field import knowing
 from limber.planning.field.interpolation.valid_region import TrustRegion
 from limber.planning.goals.grasp_goal import GraspGoal
@@ -339,6 +339,34 @@ def test_a_bound_is_for_all_of_the_goal_where_paths_end_deeper_in_it(well_field,
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
+def test_a_plan_is_bounded_closely_once_it_holds(ridge_field):
+    """Before, any bound will do; afterwards the same path has one as close as if asked at once."""
+    settings = PlanSettings(iterations=300, engine="own")
+    at_once = plan_pair(ridge_field, START, GOAL, settings)
+    before = plan_pair(ridge_field, START, GOAL, settings, is_bounded=False)
+    after = with_bound(before)
+    assert len(before.certificate.levels) == 1 < len(after.certificate.levels)
+    assert before.certificate.lower < after.certificate.lower
+    assert after.certificate.lower == pytest.approx(at_once.certificate.lower, rel=0.02)
+    assert np.array_equal(before.plan.points, after.plan.points)
+    assert with_bound(after) is after
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("coarse_bound")
+def test_a_detour_may_count_from_the_tree(ridge_field):
+    """As in the paper's table: the path of RRT* as its tree has it is longer than the shortest."""
+    settings = PlanSettings(iterations=300, engine="own", max_detour=2.0)
+    shortest, tree = (plan_pair(ridge_field, START, GOAL, settings, detour_from_tree=from_tree)
+                      for from_tree in (False, True))
+    raw = arc_lengths(resample(tree.compared["RRT*, not smoothed"], 0.005))[-1]
+    assert tree.detour.longest == pytest.approx(1.02 * raw)
+    assert tree.detour.longest > 1.01 * shortest.detour.longest
+    assert tree.detour.energy_integral < shortest.detour.energy_integral
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("coarse_bound")
 def test_costs_of_two_seeds_compare(ridge_field):
     """Scales and the plan's cost do not depend on the seed; D-RRT* is never below the bound."""
     found = [plan_pair(ridge_field, START, GOAL, PlanSettings(
@@ -405,7 +433,7 @@ def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
     shortest, _ = refine(np.linspace(START, GOAL.position, 40), replace(
         problem, weights=problem.weights._replace(energy=0.0)))
     free = plan_gentle(problem)
-    held = plan_detour(problem, shortest, 0.03, [free.points])
+    held = plan_detour(problem, shortest, 1.03 * arc_lengths(shortest)[-1], [free.points])
     length = np.linalg.norm(np.diff(held.found.points, axis=0), axis=1).sum()
     assert length <= 1.03 * held.shortest * (1 + 1e-9)
     assert length > 1.01 * held.shortest, "the detour that is allowed is of use here"

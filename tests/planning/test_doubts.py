@@ -89,6 +89,7 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
 
     uncertainty = limits.doubts(rough_field)["strain"]
     monkeypatch.setattr(baseline_and_plan, "plan_pair", plan_pair)
+    monkeypatch.setattr(baseline_and_plan, "_closed_by_field", lambda *_: None)
     arguments = rough_field, START, GOAL, settings, limits
     progress = Progress(on_warning=told.append)
     if UNPROVEN in seen:
@@ -99,6 +100,22 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
         with pytest.raises(BlockedError, match="No path exists"):
             baseline_and_plan.plan_within(*arguments, progress=progress)
         assert max(tried) <= 2.4 and len(tried) == 1, "without margins it is proven as well"
+
+
+def test_where_cells_close_the_way_by_the_field_only_its_error_is_tried(rough_field, monkeypatch):
+    """Neither margins nor the limits themselves can be kept on the field then; no close bound is
+    computed before the full model has decided."""
+    limits, tried = Limits(strain=2.4), []
+
+    def plan_pair(_field, _start, _goal, _settings, tried_limits, *, is_bounded=True, **_options):
+        tried.append((float(tried_limits.max_loads[0]), is_bounded))
+        raise BlockedError(f"None was found, {UNPROVEN}.", "On a grid.", "Raise the limit.")
+
+    monkeypatch.setattr(baseline_and_plan, "plan_pair", plan_pair)
+    with pytest.raises(BlockedError, match=UNPROVEN):
+        baseline_and_plan.plan_within(rough_field, START, GOAL, PlanSettings(), limits)
+    uncertainty = limits.doubts(rough_field)["strain"]
+    assert tried == [(pytest.approx(2.4 + uncertainty), False)]
 
 
 def test_a_target_may_be_nearer_than_the_field_has_it(rough_field):

@@ -11,6 +11,7 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import fit_field
 from limber.planning.goals.allowed_poses import goal_points
 from limber.planning.goals.camera_view import View
+from limber.planning.goals.chosen_pose import default_goal, second_arm_goal
 from limber.planning.goals.goal import GoalRequest
 from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.goals.regions import Ball, BoxRegion
@@ -103,11 +104,23 @@ def test_an_empty_workspace_names_its_axis():
 
 
 def test_a_random_start_lies_outside_a_large_goal(ridge_field):
-    """Also where the goal is deeper than a start is far from rest."""
+    """By half the largest deflection, also where the goal is deeper than that."""
     goal = TargetGoal(Ball((0.0, 0.9, 0.3), 0.8))
+    away = np.linalg.norm(ridge_field.samples.positions - ridge_field.rest, axis=1)
     for seed in range(4):
         start = random_start(ridge_field, goal, PlanSettings(), seed)
-        assert goal.distance(ridge_field, start[None])[0] > goal.tolerance
+        outside = goal.distance(ridge_field, start[None])[0] - goal.tolerance
+        assert outside >= 0.5 * away.max()
+
+
+def test_a_second_arm_reaches_a_part_of_the_poses_and_not_rest(ridge_field):
+    """The paper's goal: a ball of that arm's reach, into which the tip must be moved."""
+    goal = second_arm_goal(ridge_field)
+    points = ridge_field.region.draw(2000, np.random.default_rng(0))
+    assert 0.02 < (goal.distance(ridge_field, points) <= goal.tolerance).mean() < 0.5
+    assert goal.distance(ridge_field, ridge_field.rest[None])[0] > goal.tolerance + 0.01
+    far = default_goal(ridge_field, 0.01).centre(ridge_field)
+    assert goal.distance(ridge_field, far[None])[0] < goal.tolerance
 
 
 @pytest.mark.parametrize(("settings", "words"), [

@@ -25,6 +25,7 @@ from benchmarks.planning_detours import DETOUR_ROWS, Detour, detour_rows, run_de
 from benchmarks.planning_goals import GOAL_ROWS, RegionGoal, goal_rows, run_region_goal
 from benchmarks.planning_limits import (
     COVERED_ROW,
+    LIMITED,
     NEAR_ROWS,
     NearLimit,
     coverage,
@@ -50,6 +51,7 @@ from limber.reduced.model_cache import ReducedCache
 _ERRORS = (("energy", "energy", 100, (1, 5), "%"), ("force", "force", 100, (2, 8), "%"),
            ("tip", "target position", 1e3, (1, 4), "mm"))
 """Errors of a field at fresh poses: name, description, scale, required median and 95 %, unit."""
+_SEEDS_APART = 101  # of a branch's starts
 _TIMED_STARTS = 3  # of each branch, where only times are asked
 _Start = tuple[str, int, int]
 """Branch, number, seed."""
@@ -264,7 +266,9 @@ def _near_limits(setting: Setting) -> list[Row]:
 def _near_limit_of(task: tuple[_Start, GraspModel, EnergyField, GraspGoal], source: str,
                    ) -> NearLimit:
     (name, number, own), model, known, _ = task
-    return run_near_limit(model, known, number, own, branch=name, source=source)
+    # One goal for each of the limited quantities, on which the numbers take turns.
+    goal_seed = own - _SEEDS_APART * (number % len(LIMITED))
+    return run_near_limit(model, known, number, own, goal_seed, branch=name, source=source)
 
 
 def _region_goals(setting: Setting) -> list[Row]:
@@ -319,7 +323,7 @@ def _sure_of(task: tuple[Subject, EnergyField, GraspGoal], draws: int, seed: int
 
 def _own_seed(seed: int, branch: int, number: int) -> int:
     """The seed of a start follows from the base seed, the branch and the start's number."""
-    return (seed + 1009 * branch + 101 * number) % (1 << 31)
+    return (seed + 1009 * branch + _SEEDS_APART * number) % (1 << 31)
 
 
 def _saved_rows(trials: dict[str, list[Trial]]) -> list[Row]:

@@ -29,7 +29,8 @@ from limber.planning.path_problem import BlockedError
 from limber.planning.path_start import random_start
 from limber.planning.settings import PlanSettings
 
-_NAMES = ("force", "strain", "energy", "axial_force")
+LIMITED = ("force", "strain", "energy", "axial_force")
+"""Limited quantities, by their names in settings."""
 _SLACK = 1e-3  # of a limit, that the path at other poses may be over it
 _HOPELESS = 0.5  # of what the goal itself takes at least
 _IN_GOAL = 4000  # poses in it that are looked at
@@ -66,21 +67,33 @@ class NearLimit:
     trouble: str = ""
 
 
-def run_near_limit(model: GraspModel, known: EnergyField, number: int, seed: int, **whose: str,
-                   ) -> NearLimit:
-    """Draw start, goal and a limit, and plan."""
-    found = NearLimit(number, seed=seed, **whose)
-    generator = np.random.default_rng([seed, number])
+_free_paths: dict[tuple[str, int], tuple[PlanSettings, dict[str, float]]] = {}
+
+
+def _free_path(model: GraspModel, known: EnergyField, branch: str, seed: int,
+               ) -> tuple[PlanSettings, dict[str, float]]:
+    """Return settings with a random goal, and the peaks of the gentlest path to it, planned once
+    for all limits."""
+    if (branch, seed) in _free_paths:
+        return _free_paths[branch, seed]
     free = PlanSettings(seed=seed, inertia=False, iterations=500, goal_tolerance=0.01)
+    goal = random_start(known, near(known.rest, 0.01), free, seed)
+    asked = free.model_copy(update={"goal": tuple(map(float, goal))})
+    peaks = _peaks(plan_motion(known, model, asked, workers=1).plan.ahead)
+    return _free_paths.setdefault((branch, seed), (asked, peaks))
+
+
+def run_near_limit(model: GraspModel, known: EnergyField, number: int, seed: int, goal_seed: int,
+                   **whose: str) -> NearLimit:
+    """Plan with a limit near the peak of a free path to a random goal, each quantity in turn."""
+    found = NearLimit(number, seed=seed, name=LIMITED[number % len(LIMITED)], **whose)
+    generator = np.random.default_rng([seed, number])
     try:
-        goal = random_start(known, near(known.rest, 0.01), free, seed)
-        asked = free.model_copy(update={"goal": tuple(map(float, goal))})
-        motion = plan_motion(known, model, asked, workers=1)
-        peaks = _peaks(motion.plan.ahead)
-        found.name = str(generator.choice([name for name in _NAMES if peaks[name] > 0.0]))
+        asked, peaks = _free_path(model, known, found.branch, goal_seed)
         found.share = float(generator.uniform(0.95, 1.05))
         _with_limit(found, model, known, asked, found.share * peaks[found.name])
-        _hopeless(found, model, known, asked)
+        if found.name == LIMITED[0]:
+            _hopeless(found, model, known, asked)
     except LimberError as error:
         found.trouble = f"{type(error).__name__}: {error}"
     return found
@@ -165,7 +178,7 @@ def coverage(model: GraspModel, known: EnergyField, count: int, seed: int,
         good, _ = solve_branch(solvers, places, progress=SILENT)
     fresh = samples_of(good[1:], np.empty((0, 3)))
     chart, inner = known.region.chart.plain, ~known.region.is_face()
-    values, limits = sampled_sizes(fresh), Limits(**dict.fromkeys(_NAMES, 1e9))
+    values, limits = sampled_sizes(fresh), Limits(**dict.fromkeys(LIMITED, 1e9))
     above, found = limits.above(known), {}
     for one in limited(known, limits.on(known)):
         error = LocalError.of(chart.map(known.samples.positions)[inner], above[one.name][inner],

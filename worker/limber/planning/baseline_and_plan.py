@@ -9,9 +9,9 @@ import numpy as np
 from limber.core.errors import InputError, NoPathError
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import judge
-from limber.planning.certificate.lower_bound import Certificate
+from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
 from limber.planning.constraints.limits import Limits
-from limber.planning.cost import STEP, CostWeights, EdgeWeights
+from limber.planning.cost import STEP, CostWeights, EdgeWeights, arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.interpolation.local_error import LocalError
 from limber.planning.field.limited_quantities import UNITS
@@ -23,7 +23,7 @@ from limber.planning.goals.allowed_poses import (
 )
 from limber.planning.goals.goal import Goal
 from limber.planning.goals.grasp_goal import near
-from limber.planning.path_problem import UNPROVEN, BlockedError, GentleProblem
+from limber.planning.path_problem import UNPROVEN, BlockedError, GentleProblem, not_found
 from limber.planning.path_start import check_start
 from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.eikonal import GentlePath, plan_gentle, separated
@@ -49,7 +49,8 @@ class PathPair:
     plan's gap to the best possible path on the field; ``compared`` has the polylines [n, 3] of all
     found paths, by name. ``margins`` is by how much the limits were tighter than requested;
     ``detour`` the effect of a limit on the length. ``trees`` has the results of the planners that
-    grow a tree, by the planner's name.
+    grow a tree, by the planner's name. ``unbounded`` is the problem of a plan that the full model
+    probably refuses, of which no close bound was computed (:func:`with_bound`).
     """
 
     baseline: FoundPath
@@ -61,6 +62,7 @@ class PathPair:
     margins: dict[str, float] = field(default_factory=dict)
     detour: DetourPath | None = None
     trees: dict[str, FoundPath] = field(default_factory=dict)
+    unbounded: GentleProblem | None = None
 
     @property
     def stays(self) -> bool:
@@ -88,10 +90,14 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     """
     margins = limits.margins(field)
     check_start(field, start, limits.on(field))
-    _check_any_path(field, start, goal, limits, asked or limits)
+    closed = _closed_by_field(field, start, goal, limits, asked or limits)
     none = dict.fromkeys(margins, 0.0)
     surely = (asked or limits).beyond(field)
     errors = (asked or limits).errors(field)
+    options = {"errors": errors, "asked_goal": asked_goal, "before": before}
+    if closed is not None:
+        return replace(_in_doubt(closed, field, start, goal, settings, limits, surely, **options,
+                                 progress=progress), margins=none)
     # A start near its limit leaves room for only a part of the margins.
     shares = [share for share in _SHARES if any(margins.values())
               and allowed_points(start[None], limits.within(field, share))[0]]
@@ -99,8 +105,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
         part = {name: shares[0] * value for name, value in margins.items()}
         try:
             found = plan_pair(field, start, goal, settings, limits.within(field, shares[0]),
-                              beyond=surely, errors=errors, asked_goal=asked_goal,
-                              before=before, progress=progress.part(0.0, 0.5))
+                              beyond=surely, **options, progress=progress.part(0.0, 0.5))
             return replace(found, margins=part)
         except NoPathError as error:
             if isinstance(error, BlockedError) and error.is_proven:
@@ -110,24 +115,29 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
                           "model decides whether it is allowed.")
     try:
         found = plan_pair(field, start, goal, settings, limits.on(field), beyond=surely,
-                          errors=errors, asked_goal=asked_goal, before=before,
-                          progress=progress.part(0.5, 1.0))
+                          **options, progress=progress.part(0.5, 1.0))
     except BlockedError as error:
-        found = _in_doubt(error, field, start, goal, settings, limits, surely, errors=errors,
-                          asked_goal=asked_goal, before=before, progress=progress.part(0.5, 1.0))
+        found = _in_doubt(error, field, start, goal, settings, limits, surely, **options,
+                          progress=progress.part(0.5, 1.0))
     return replace(found, margins=none)
 
 
-def _check_any_path(field: EnergyField, start: np.ndarray, goal: Goal, limits: Limits,
-                    asked: Limits) -> None:
-    """Raise BlockedError if cells prove, before any search, that no path keeps the limits."""
+def _closed_by_field(field: EnergyField, start: np.ndarray, goal: Goal, limits: Limits,
+                     asked: Limits) -> BlockedError | None:
+    """Return the error if cells show, before any search, that no path keeps the limits by the field
+    without its error; None if they do not.
+
+    Raises:
+        BlockedError: they prove it with the field's error as well.
+    """
     if not limits.asked():
-        return
+        return None
     problem = GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
                             beyond=asked.beyond(field), errors=asked.errors(field))
     verdict = judge(problem, _FEW_CELLS)
     if not verdict.proven:
-        return
+        return not_found(problem, "By the energy field there is none, but its error leaves the "
+                         "question open.") if verdict.closed_by_field else None
     none = separated(problem, verdict)
     try:
         goal_points(goal, field, problem.limits)
@@ -140,7 +150,7 @@ def _check_any_path(field: EnergyField, start: np.ndarray, goal: Goal, limits: L
 def _in_doubt(none: BlockedError, field: EnergyField, start: np.ndarray, goal: Goal,
               settings: PlanSettings, limits: Limits, surely: FieldArrays,
               **options: Any) -> PathPair:
-    """Return the plan with limits relaxed by the field's possible error.
+    """Return the plan with limits relaxed by the field's possible error, without a close bound.
 
     Raises:
         BlockedError: ``none``, if it is proven, the field has no error, or relaxing does not help.
@@ -154,7 +164,7 @@ def _in_doubt(none: BlockedError, field: EnergyField, start: np.ndarray, goal: G
         "decides whether it is allowed.")
     try:
         return plan_pair(field, start, goal, settings, limits.beyond(field), beyond=surely,
-                         **options)
+                         is_bounded=False, **options)
     except NoPathError:
         raise none from None
 
@@ -168,11 +178,14 @@ def _margin_text(margins: dict[str, float]) -> str:
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
               limits: FieldArrays | None = None, *, beyond: FieldArrays | None = None,
               errors: Mapping[str, LocalError] | None = None, asked_goal: Goal | None = None,
-              before: PathPair | None = None, progress: Progress = SILENT) -> PathPair:
+              before: PathPair | None = None, detour_from_tree: bool = False,
+              is_bounded: bool = True, progress: Progress = SILENT) -> PathPair:
     """Plan both paths under the same limits, and bound the cost of any path from below.
 
     ``limits`` are those of the settings if not given; ``beyond``, ``errors`` and ``asked_goal`` are
-    used by the bound (:class:`~.path_problem.GentleProblem`).
+    used by the bound (:class:`~.path_problem.GentleProblem`). With ``detour_from_tree``, the
+    settings' largest detour counts from the path of RRT* as its tree has it, as in the paper;
+    otherwise from the shortest path known. Without ``is_bounded`` any bound will do.
 
     Raises:
         InputError: the start is not allowed.
@@ -196,9 +209,9 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
                             errors=errors or {}, asked_goal=asked_goal)
     trees = _trees(problem, goals, settings, weighed, {} if before is None else before.trees,
                    progress.part(0.0, 0.5)) if nobody is None else {}
-    known = [path.points for path in trees.values()]
     try:
-        gentle, detour = _gentle(problem, known, settings, progress.part(0.5, 1.0))
+        gentle, detour = _gentle(problem, trees, settings, detour_from_tree,
+                                 ENOUGH if is_bounded else _ANY, progress.part(0.5, 1.0))
     except BlockedError as error:
         if nobody is None or UNPROVEN in error.seen:
             raise
@@ -214,7 +227,17 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     for name, path in trees.items():
         compared |= {name: path.points, f"{name}, not smoothed": path.raw}
     return PathPair(baseline, plan, _approach(problem, settings), weighed, certificate, compared,
-                    detour=detour, trees=trees)
+                    detour=detour, trees=trees,
+                    unbounded=None if is_bounded or detour is not None else problem)
+
+
+def with_bound(pair: PathPair, progress: Progress = SILENT) -> PathPair:
+    """Return the pair, its plan as it is, with a close bound."""
+    if pair.unbounded is None:
+        return pair
+    cost = pair.unbounded.cost(pair.plan.points)
+    return replace(pair, unbounded=None, certificate=certify(
+        pair.unbounded, lambda _rough: cost, progress=progress))
 
 
 def _chosen(problem: GentleProblem, gentle: GentlePath, trees: dict[str, FoundPath],
@@ -249,18 +272,23 @@ def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSe
                     {"straight line": path.points, "eikonal": path.points})
 
 
-def _gentle(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,
-            progress: Progress) -> tuple[GentlePath, DetourPath | None]:
+def _gentle(problem: GentleProblem, trees: Mapping[str, FoundPath], settings: PlanSettings,
+            detour_from_tree: bool, enough: float, progress: Progress,
+            ) -> tuple[GentlePath, DetourPath | None]:
     """Return the gentlest path, and the effect of a limit on its length."""
+    known = [path.points for path in trees.values()]
     if settings.max_detour is None:
-        return plan_gentle(problem, known, progress=progress), None
-    detour = _detour(problem, known, settings, progress)
+        return plan_gentle(problem, known, enough=enough, progress=progress), None
+    tree = trees["RRT*"].raw if detour_from_tree and "RRT*" in trees else None
+    detour = _detour(problem, known, tree, settings, progress)
     return detour.found, detour
 
 
-def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,
-            progress: Progress) -> DetourPath:
-    """Return the gentlest path within the length that the settings allow."""
+def _detour(problem: GentleProblem, known: list[np.ndarray], tree: np.ndarray | None,
+            settings: PlanSettings, progress: Progress) -> DetourPath:
+    """Return the gentlest path within the length that the settings allow over the ``tree``'s path
+    [n, 3], or the shortest one if it has none.
+    """
     if settings.planner != "eikonal":
         raise InputError("--max-detour is given with --planner d-rrt-star.",
                          "D-RRT* cannot limit the length of its path.",
@@ -269,7 +297,10 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSetti
     paths = [_shortest(problem, path) for path in rough]
     shortest = min((path for path in paths if np.isfinite(path.cost)),
                    key=lambda path: path.cost).points
-    return plan_detour(problem, shortest, settings.max_detour / 100.0, rough,
+    length = float(arc_lengths(shortest)[-1])
+    if tree is not None:  # as long as it is reported
+        length = max(length, float(arc_lengths(resample(tree, STEP))[-1]))
+    return plan_detour(problem, shortest, (1.0 + settings.max_detour / 100.0) * length, rough,
                        progress=progress.part(0.3, 1.0))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
-from limber.planning.baseline_and_plan import PathPair, plan_within
+from limber.planning.baseline_and_plan import PathPair, plan_within, with_bound
 from limber.planning.closed_passages import checked_wall, confirmed, not_confirmed
 from limber.planning.constraints.chance import Risk, YoungUncertainty
 from limber.planning.constraints.full_model_check import broken_on_full_model, field_error, learnt
@@ -121,7 +121,8 @@ class _Rounds:
         field: Field including the states learnt so far.
         aim, planned_limits: Goal and limits for planning, tightened by the amounts that earlier
             plans missed them by.
-        pair: The last paths on the field; ``plan`` and ``baseline`` on the full model.
+        pair: The last paths on the field; ``plan`` and ``baseline`` on the full model, the latter
+            of ``baseline_points``.
         risks, moving: Of the plans so far: their risks, and the last one's motion in time.
         round_records: One row per round.
     """
@@ -141,6 +142,7 @@ class _Rounds:
     pair: PathPair | None = None
     plan: ResolvedPath | None = None
     baseline: ResolvedPath | None = None
+    baseline_points: np.ndarray | None = None
     risks: list[Risk] = fresh(default_factory=list)
     passages: list[Passages] = fresh(default_factory=list)
     moving: MotionCheck | None = None
@@ -148,7 +150,7 @@ class _Rounds:
 
     def plan_once(self, ahead: Progress, is_last: bool) -> bool:
         """Plan and check; return whether the plan may be passed on. If not, samples were added."""
-        began, before = perf_counter(), self.pair
+        began = perf_counter()
         pair = self._planned(ahead, is_last)
         if pair is None:
             return False
@@ -156,7 +158,7 @@ class _Rounds:
         stopped = pair.certificate.stopped
         if stopped:  # the best path so far is checked too: otherwise it could not be kept
             ahead, self.progress = ahead.to_the_end(), self.progress.to_the_end()
-        plan = self.plan = self._solved(before, pair, ahead)
+        plan = self.plan = self._solved(pair, ahead)
         is_last = is_last or stopped
         off = field_error(self.field, plan.solved)
         is_near = is_last or pair.stays or off <= self.settings.field_error / 100.0
@@ -166,6 +168,7 @@ class _Rounds:
             "margins": pair.margins, "field_energy_error": off,
             "plan_seconds": planned - began, "check_seconds": perf_counter() - planned})
         if not broken and is_near:
+            self._completed(pair, ahead.part(0.95, 1.0))
             return True
         if stopped:
             raise Cancelled("The search was stopped.",
@@ -244,18 +247,37 @@ class _Rounds:
             none = with_added_poses(none, len(self.passages), self.passages[-1].summary)
         raise none
 
-    def _solved(self, before: PathPair | None, pair: PathPair, ahead: Progress) -> ResolvedPath:
-        """Return the plan on the full model, and keep the baseline there."""
+    def _solved(self, pair: PathPair, ahead: Progress) -> ResolvedPath:
+        """Return the plan on the full model, and keep the baseline there unless the plan is
+        probably refused.
+        """
         ahead(0.3, "both paths on the full model")
-        # The shortest path rarely changes with new samples: it is solved once.
-        same = before is not None and np.array_equal(before.baseline.points, pair.baseline.points)
-        paths = [pair.plan.points] + [pair.baseline.points] * (not same)
-        # A refined path has points closer together, so that its chords follow the shell.
-        plan, *other = resolve_side_by_side(
-            self.grasp_model, [resample(points, STEP) for points in paths], pair.approach,
-            self.workers, ahead.part(0.3, 0.95))
-        self.baseline = other[0] if other else self.baseline
+        points = [pair.plan.points]
+        if pair.unbounded is None and self._lacks_baseline(pair):
+            points.append(pair.baseline.points)
+        plan, *other = self._on_full_model(points, pair, ahead.part(0.3, 0.95))
+        if other:
+            self.baseline, self.baseline_points = other[0], points[1]
         return plan
+
+    def _lacks_baseline(self, pair: PathPair) -> bool:
+        # The shortest path rarely changes with new samples: it is solved once.
+        return not (self.baseline_points is not None
+                    and np.array_equal(self.baseline_points, pair.baseline.points))
+
+    def _on_full_model(self, paths: list[np.ndarray], pair: PathPair, ahead: Progress,
+                       ) -> list[ResolvedPath]:
+        # A refined path has points closer together, so that its chords follow the shell.
+        return resolve_side_by_side(
+            self.grasp_model, [resample(points, STEP) for points in paths], pair.approach,
+            self.workers, ahead)
+
+    def _completed(self, pair: PathPair, ahead: Progress) -> None:
+        """Add to a plan that holds what it lacks: a close bound, the baseline on the full model."""
+        self.pair = with_bound(pair, ahead)
+        if self._lacks_baseline(pair):
+            self.baseline, = self._on_full_model([pair.baseline.points], pair, ahead)
+            self.baseline_points = pair.baseline.points
 
     def _broken(self, plan: ResolvedPath, is_near: bool, ahead: Progress) -> list[str]:
         """Return the limits that a plan breaks, at standstill, with other moduli, or in motion; the

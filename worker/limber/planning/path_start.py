@@ -41,7 +41,7 @@ def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: i
     half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())
     fit = np.linalg.norm(points - field.rest, axis=1) >= half
     away = goal.distance(field, points)
-    fit &= (away >= half) & (away > goal.tolerance)
+    fit &= away >= half + goal.tolerance
     fit &= allowed_points(points, Limits.of(settings).on(field))
     if not fit.any():
         raise NoPathError("No allowed deformed start is far from rest and far from the goal.",

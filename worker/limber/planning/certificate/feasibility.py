@@ -134,14 +134,16 @@ class _Cells:
 @dataclass(frozen=True)
 class Verdict:
     """``edges`` [m] along and off the shell, shape [3], of the last cells; whether they prove that
-    there is no path; a ``path`` [k, 3] through cells that keep all limits at their corners, if any;
-    the ``wall`` [k, 3], middles of the cells that block the path, those least over a limit first;
-    and, where the field does not know the target's position exactly, ``nearest`` [k, 3]: middles of
-    reached cells, those that come nearest to the goal first.
+    there is no path, or that there is none by the field without its error; a ``path`` [k, 3]
+    through cells that keep all limits at their corners, if any; the ``wall`` [k, 3], middles of the
+    cells that block the path, those least over a limit first; and, where the field does not know
+    the target's position exactly, ``nearest`` [k, 3]: middles of reached cells, those that come
+    nearest to the goal first.
     """
 
     edges: np.ndarray
     proven: bool = False
+    closed_by_field: bool = False
     path: np.ndarray | None = None
     wall: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     nearest: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
@@ -156,7 +158,7 @@ def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
     on_field = _judged(exact, most, is_exact=True)
     if not on_field.proven:
         return on_field
-    return _judged(problem, most)
+    return replace(_judged(problem, most), closed_by_field=True)
 
 
 def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> Verdict:

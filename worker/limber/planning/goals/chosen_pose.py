@@ -1,4 +1,6 @@
-"""A chosen grasp pose: drawn from the paper's hemisphere (``--goal-seed``), or a distant one."""
+"""A chosen goal: a pose drawn from the paper's hemisphere (``--goal-seed``), a distant one, or the
+reach of a second arm.
+"""
 
 import numpy as np
 
@@ -7,7 +9,11 @@ from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.goals.goal import GoalKind, GoalRequest
 from limber.planning.goals.grasp_goal import GraspGoal, near
-from limber.planning.goals.regions import ball
+from limber.planning.goals.regions import Ball, ball
+from limber.planning.goals.target_goal import TargetGoal
+
+_REACH = 0.85  # [m] of a UR5, which stands for the second arm
+_BEGINS = 0.6  # fraction of the tip's way to the default goal at which that reach begins
 
 
 def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
@@ -36,6 +42,21 @@ def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
     raise NoPathError("No distant pose lies well inside the sampled region.",
                       f"Too few of the {len(away)} accepted samples are far from the rest pose.",
                       "Sample more poses with `limber energy --samples`, or give a --goal.")
+
+
+def second_arm_goal(field: EnergyField) -> TargetGoal:
+    """Return the paper's goal: the branch's tip, with its flower, within reach of a second arm.
+
+    The arm stands on the side to which the branch bends with the least energy. Its reach is a ball.
+
+    Raises:
+        NoPathError: there is no far pose.
+    """
+    far = default_goal(field, 0.01).centre(field)
+    rest, there = field.tip(np.stack([field.rest, far]))
+    way = there - rest
+    x, y, z = map(float, rest + (_BEGINS + _REACH / np.linalg.norm(way)) * way)
+    return TargetGoal(Ball((x, y, z), _REACH))
 
 
 def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits: FieldArrays,

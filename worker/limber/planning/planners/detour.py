@@ -87,15 +87,15 @@ class DetourPath:
                 "curve": [vars(point) for point in self.curve]}
 
 
-def plan_detour(problem: GentleProblem, shortest: np.ndarray, max_detour: float,
+def plan_detour(problem: GentleProblem, shortest: np.ndarray, longest: float,
                 others: list[np.ndarray], *, progress: Progress = SILENT) -> DetourPath:
-    """Return the gentlest path at most ``max_detour`` (a fraction) longer than ``shortest`` [n, 3].
+    """Return the gentlest path of at most ``longest`` [m]; ``shortest`` [n, 3] is one such path.
 
     Raises:
         NoPathError: there is no path at all; states whether that is proven.
     """
     least = float(arc_lengths(shortest)[-1])
-    search = _Search(problem, shortest, (1.0 + max_detour) * least)
+    search = _Search(problem, shortest, longest)
     progress(0.0, "refining paths of the allowed length")
     search.begin(others)
     weights = search.first_weights()

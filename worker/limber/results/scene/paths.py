@@ -46,7 +46,8 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
     _add_trees(data, branch, plan)
     _add_energy_scale(data)
     data.info["plan"] = plan
-    data.info["goal"] = _goal(summary.get("goal") or {}, data.arrays.get("path:plan"))
+    data.info["goal"] = _goal(summary, data.arrays.get("path:plan"),
+                              float(np.ptp(data.arrays["vertices"], axis=0).max()))
     saved, added = summary.get("energy_saved_percent"), summary.get("length_added_percent")
     if saved is not None and added is not None:
         data.info["notes"].append(
@@ -113,12 +114,17 @@ def _path_note(summary: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _goal(goal: dict[str, Any], path: np.ndarray | None) -> dict[str, Any] | None:
-    """Return what must reach the goal region, its centre [m], and its radius [m] or None."""
-    centre = goal.get("position_m")
+def _goal(summary: dict[str, Any], path: np.ndarray | None, size: float) -> dict[str, Any] | None:
+    """Return what must reach the goal region, its centre [m], and its radius [m] or None; of a
+    region larger than the branch's ``size`` [m], where the path ends in it.
+    """
+    goal = summary.get("goal") or {}
+    centre, radius = goal.get("position_m"), goal.get("tolerance_m")
+    if summary.get("target_end_m") is not None and (radius or 0.0) > size:
+        centre, radius = summary["target_end_m"], None
     if centre is None:
         if path is None:
             return None
         centre = path[-1]
-    return {"kind": goal.get("kind", "grasp"), "radius_m": goal.get("tolerance_m"),
+    return {"kind": goal.get("kind", "grasp"), "radius_m": radius,
             "centre_m": [float(value) for value in centre[:3]]}

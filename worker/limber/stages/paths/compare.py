@@ -46,11 +46,13 @@ class CompareSettings(Settings):
     trials: int = Field(10, ge=1, le=1000, description=(
         "Number of random deformed start configurations."))
     goal: tuple[float, float, float] | None = Field(None, description=(
-        "Goal position of the grasp, in the branch's frame [m]. Default: a distant pose."),
+        "Goal position of the grasp, in the branch's frame [m]. Default: the branch's tip within "
+        "reach of a second arm, as in the paper."),
         json_schema_extra=POSITION)
     seed: int = Field(0, ge=0, description="Seed of the starts and the planners.")
-    max_detour: float | None = Field(None, ge=0, le=1000, description=(
-        "Largest extra length of the gentle path over the shortest path [%]."))
+    max_detour: float | None = Field(8.1, ge=0, le=1000, description=(
+        "Largest extra length of the gentle path over that of RRT* [%]. Default: the paper's "
+        "mean."))
     iterations: int = Field(3000, ge=100, le=200_000, description=(
         "Number of samples of RRT* and D-RRT*."))
     engine: Literal["auto", "ompl", "own"] = Field("auto", description=(
@@ -70,7 +72,7 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
     """
     from limber.planning.experiments.compared_planners import run_trials, summarised
     from limber.planning.field.energy_field import EnergyField
-    from limber.planning.goals.chosen_pose import default_goal
+    from limber.planning.goals.chosen_pose import second_arm_goal
     from limber.planning.goals.grasp_goal import near
     from limber.results.report.planner_figure import planner_figure
 
@@ -85,7 +87,7 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
         return branch.manifest.stages[key].result
     asked = PlanSettings(**{each: getattr(settings, each) for each in (
         "seed", "max_detour", "iterations", "engine")})
-    goal = (default_goal(field, asked.goal_tolerance) if settings.goal is None
+    goal = (second_arm_goal(field) if settings.goal is None
             else near(np.array(settings.goal), asked.goal_tolerance))
     with branch.stage(key, settings, reads=reads) as stage:
         trials = run_trials(field, goal, asked, settings.trials, workers=workers,
