@@ -46,6 +46,8 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool
     # A quarter of a circle is off together; the four average.
     shared = shared_error(skeleton, points, noise) / 2
     pixel = None if view is None else view.pitch * np.linalg.norm(skeleton.nodes - view.eye, axis=1)
+    if rays and view is None:
+        pixel = spacing
     shown = RadiusEvidence(spacing, 0.0 if rays else noise, shared, rays or one_sided, pixel)
     likeliest = likeliest_radii(skeleton, shown)
     # Wood hardly thickens outwards. What does so nevertheless, beyond its interval, is a bunch of

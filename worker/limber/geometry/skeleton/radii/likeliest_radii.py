@@ -28,12 +28,13 @@ _TAPER, _WANDER, _FORK, _ROOT = -0.5, 5e-3, 0.3, 3.0
 _APART = 8.0  # radii along a run from which fits are independent
 # Fraction of the radius by which fits scatter about the steady radius of wood: least, most, first.
 _LOCAL = (0.01, 0.1, 0.05)
+# Pixels by which a sensor may widen each side of all branches: half a one where any part of a pixel
+# on the branch gives a reading, less than none where mixed ones are dropped. The scan does not show
+# it: a front widened so is that of a thicker branch, to a tenth of a pixel.
+_EDGE = 0.25
 # Fraction of the points' spacing by which a sensor may widen or thin all branches of a scan; and by
 # which the radius of a run may be off besides.
 _RESOLUTION, _COARSE = 0.1, 0.05
-# Pixels by which an image widens a branch to each side: half a one where it assigns a pixel to the
-# branch if any part of it is on the branch, none where its middle decides.
-_EDGE, _EDGE_SIGMA = 0.25, 0.2
 # Fraction of the radius, over (noise / radius)^2: the noise itself is known to 4 %, and the radius
 # of one side changes by 3.7 times that (of half a circle, the scatter is twice the square of the
 # noise and 0.54 of the radius's).
@@ -55,7 +56,8 @@ class RadiusEvidence:
         noise: Standard deviation of the points across the branches [m].
         shared: Standard deviation of what all points around a branch are off together [m].
         one_sided: Whether one side was seen.
-        pixel: Width of a depth camera's pixel at each node [m], shape [n]; None: no camera's scan.
+        pixel: Distance of neighbouring rays at each node [m], shape [n], if the edges of branches
+            determine the radii, as in one sensor's scan; None: they do not.
     """
 
     spacing: np.ndarray
@@ -63,12 +65,6 @@ class RadiusEvidence:
     shared: float = 0.0
     one_sided: bool = False
     pixel: np.ndarray | None = None
-
-    def widened(self) -> tuple[np.ndarray, np.ndarray]:
-        """What all radii of the scan are wider than the branches, and its deviation [m]."""
-        if self.pixel is None:
-            return np.zeros_like(self.spacing), _RESOLUTION * self.spacing
-        return _EDGE * self.pixel, _EDGE_SIGMA * self.pixel
 
 
 def likeliest_radii(skeleton: Skeleton, evidence: RadiusEvidence) -> Skeleton:
@@ -78,9 +74,10 @@ def likeliest_radii(skeleton: Skeleton, evidence: RadiusEvidence) -> Skeleton:
         skeleton: Fitted. Radii whose state is not measured count for nothing.
         evidence: Its nodes' evidence.
     """
-    added, added_sigma = evidence.widened()
-    radius = np.maximum(skeleton.radius - added, 0.5 * skeleton.radius)
-    first, fitted = radius, np.log(radius)
+    first = radius = skeleton.radius
+    fitted = np.log(radius)
+    resolution = _RESOLUTION * evidence.spacing if evidence.pixel is None else (
+        _EDGE * evidence.pixel)
     independent = np.minimum(skeleton.steps / (_APART * skeleton.radius), 1.0)
     independent *= skeleton.radius_state == MEASURED
     trust, local = np.ones(len(radius)), _LOCAL[2]
@@ -98,7 +95,7 @@ def likeliest_radii(skeleton: Skeleton, evidence: RadiusEvidence) -> Skeleton:
     # A fit that collapsed resolves nothing; one that does not count is no evidence of thin wood.
     thick = np.where(skeleton.radius_state == MEASURED, first, radius)
     coarse = (2 * thick < SPACINGS * evidence.spacing) | (thick < _NOISES * evidence.noise)
-    scan = np.minimum(added_sigma / thin, 1.0)
+    scan = np.minimum(resolution / thin, 1.0)
     sigma = np.hypot(posterior.deviations(), posterior.moved_by(scan))
     return replace(skeleton, radius=radius, radius_sigma=radius * sigma,
                    radius_state=np.where(coarse, UNRESOLVED, skeleton.radius_state))
@@ -155,12 +152,24 @@ def _of_runs(skeleton: Skeleton, evidence: RadiusEvidence, radius: np.ndarray,
 
     Each has a standard deviation of 1.
     """
+    # Their sum must not depend on single fits, or it would level their scatter.
+    radius = _typical(skeleton, radius)
     oval = _OVAL_SIDE if evidence.one_sided else _OVAL
     noise = _BIAS * np.minimum(evidence.noise / radius, 1.0)**2
     coarse = np.minimum(_COARSE * evidence.spacing / radius, 1.0)
     off = np.sqrt(oval**2 + noise**2 + coarse**2 + (evidence.shared / radius)**2)
     return sparse.coo_matrix((off, (np.arange(len(off)), skeleton.branch)),
                              (len(off), skeleton.branch_count)).tocsr()
+
+
+def _typical(skeleton: Skeleton, radius: np.ndarray) -> np.ndarray:
+    """Radii [m] that change by one rate along each run, shape [n]."""
+    typical = np.log(radius)
+    for own in skeleton.own_runs():
+        along = skeleton.arc_length[own] - skeleton.arc_length[own].mean()
+        rate = float(along @ typical[own]) / max(float(along @ along), 1e-300)
+        typical[own] = typical[own].mean() + rate * along
+    return np.exp(typical)
 
 
 @dataclass(frozen=True)

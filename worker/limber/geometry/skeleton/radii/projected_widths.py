@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths, tangents
@@ -50,11 +51,15 @@ class SightField:
         return direction / np.maximum(np.linalg.norm(direction, axis=1), 1e-300)[:, None]
 
 
-def sight_field(skeleton: Skeleton, points: np.ndarray) -> SightField:
-    """Where one sensor stood, from the sides of the branches that have points.
+def sight_field(skeleton: Skeleton, points: np.ndarray, view: View | None = None) -> SightField:
+    """Where one sensor stood: its ``view``, or from the sides of the branches that have points.
 
     Across each axis, the mean normal of its points points to the sensor.
     """
+    if view is not None:
+        middle = points.mean(axis=0)
+        far = float(np.linalg.norm(view.eye - middle))
+        return SightField((view.eye - middle) / far, 1 / far, middle)
     _, high, _, offset = on_cylinders(skeleton, points)
     axis = _axes(skeleton)
     size = np.linalg.norm(offset, axis=1)
@@ -80,17 +85,19 @@ def sight_field(skeleton: Skeleton, points: np.ndarray) -> SightField:
     return SightField(found[:3] / size, float(max(found[3], 0.0)) / size, middle)
 
 
-def by_projected_widths(skeleton: Skeleton, points: np.ndarray) -> tuple[Skeleton, SightField]:
+def by_projected_widths(skeleton: Skeleton, points: np.ndarray, view: View | None = None,
+                        ) -> tuple[Skeleton, SightField]:
     """Return the skeleton with axes and radii by the width of its points, and the sight.
 
     Args:
         skeleton: Fitted by the distances of the points.
         points: The scan [m], shape [m, 3].
+        view: The sensor's view, if it is known.
     """
-    field, start = sight_field(skeleton, points), skeleton
+    field, start = sight_field(skeleton, points, view), skeleton
     for _ in range(_ROUNDS):
         skeleton = _near(start, _moved(skeleton, points, field))
-        field = sight_field(skeleton, points)
+        field = sight_field(skeleton, points, view)
     return skeleton, field
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.radii.axis_fit import AxisFit
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.radii.projected_widths import by_projected_widths
@@ -14,7 +15,8 @@ from limber.geometry.skeleton.radii.visible_sides import PLACES, SeenSides
 _LIKELIER = 3.0  # logarithm: twenty times
 
 
-def fit_of_rays(fit: AxisFit, points: np.ndarray, certain: bool) -> AxisFit | None:
+def fit_of_rays(fit: AxisFit, points: np.ndarray, certain: bool, view: View | None = None,
+                ) -> AxisFit | None:
     """Return the fit by the branches' widths across one sensor's sight.
 
     Args:
@@ -22,8 +24,9 @@ def fit_of_rays(fit: AxisFit, points: np.ndarray, certain: bool) -> AxisFit | No
         points: The scan [m], shape [m, 3].
         certain: Whether one sensor's rays are known to have made the points; otherwise None is
             returned where the points do not support it.
+        view: The sensor's view, if it is known.
     """
-    skeleton, field = by_projected_widths(fit.skeleton, points)
+    skeleton, field = by_projected_widths(fit.skeleton, points, view)
     if not certain and rays_over_skin(fit, skeleton, field, points) < _LIKELIER:
         return None
     segment, residual = nearest_cylinders(skeleton, points)

@@ -72,7 +72,7 @@ class Repaired:
         fit = fit_axes(first, self.points, along_sight=self.view is not None,
                        progress=self.progress, **how)
         if self.rays:
-            fit = fit_of_rays(fit, self.points, certain=True) or fit
+            fit = fit_of_rays(fit, self.points, certain=True, view=self.view) or fit
         return replace(self, fit=fit, skeleton=fit.skeleton)
 
     @property
@@ -112,7 +112,7 @@ class Pass:
 
 def _fit_coarsely(now: Repaired) -> Repaired:
     after = now.fitted(resampled(now.skeleton, _COARSE), uncertainty=False)
-    by_rays = fit_of_rays(after.last_fit, now.points, certain=now.view is not None)
+    by_rays = fit_of_rays(after.last_fit, now.points, now.view is not None, now.view)
     if by_rays is not None:
         return replace(after, rays=True, fit=by_rays, skeleton=by_rays.skeleton)
     # For leaves too, unpinched radii would make thick stems that seem to have no leaves.
