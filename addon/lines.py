@@ -11,8 +11,6 @@ _BESIDE, _ICON = 58, 21
 """Width of the tabs, the scroll bar and the margins beside a text, and of an icon before it, at a
 scale of 1 [pixels]."""
 _LABEL_SHARE = 0.4
-_USUAL_LETTER = 0.5
-"""Width of a letter of the interface's font over its size."""
 _GAP = 8
 """Width between a text and what stands beside it [pixels]."""
 
@@ -55,7 +53,6 @@ def room(context: bpy.types.Context) -> float:
     return max(width, 2 * _BESIDE * scale) - _BESIDE * scale
 
 
-@lru_cache(maxsize=512)
 def wrapped(text: str, space: float) -> tuple[str, ...]:
     """Return the lines of a text, none wider than ``space`` [pixels]: words stay whole if they fit.
     """
@@ -75,10 +72,14 @@ def wrapped(text: str, space: float) -> tuple[str, ...]:
 
 def width(text: str) -> float:
     """Return the width of a text as a panel draws it [pixels]."""
-    size = bpy.context.preferences.ui_styles[0].widget.points * _scale(bpy.context)
+    return _measured(text, bpy.context.preferences.ui_styles[0].widget.points * _scale(bpy.context))
+
+
+@lru_cache(maxsize=4096)
+def _measured(text: str, size: float) -> float:
+    # The user may change the interface's scale and font size while Blender runs.
     blf.size(0, size)
-    # A Blender without a window may have no font loaded: it measures 0.
-    return blf.dimensions(0, text)[0] or _USUAL_LETTER * size * len(text)
+    return blf.dimensions(0, text)[0]
 
 
 def _scale(context: bpy.types.Context) -> float:

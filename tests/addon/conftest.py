@@ -161,8 +161,11 @@ def registered(addon, monkeypatch, worker_python):
 
 
 @pytest.fixture()
-def whole_texts(addon, monkeypatch):
-    """Panels draw each text as one line, however wide: for tests of what they say."""
+def whole_texts(registered, monkeypatch):
+    """Panels draw each text as one line, however wide: for tests of what they say.
+
+    Every module is loaded before: one that took the replaced function would keep it.
+    """
     lines = importlib.import_module("limber_addon.lines")
     monkeypatch.setattr(lines, "wrapped", lambda text, _space: (text,) if text else ())
 

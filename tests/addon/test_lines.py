@@ -32,6 +32,16 @@ def test_a_narrow_sidebar_makes_more_lines(bpy, lines):
         lines.wrapped(text, lines.room(bpy.context)))
 
 
+def test_a_changed_font_size_changes_the_lines(bpy, lines):
+    """The user makes the interface's font larger while Blender runs."""
+    text = "A text of some length that has to be put into several lines"
+    before = lines.wrapped(text, 200.0)
+    bpy.context.preferences.ui_styles[0].widget.points *= 2
+    after = lines.wrapped(text, 200.0)
+    assert len(after) > len(before)
+    assert all(lines.width(line) <= 200.0 for line in after)
+
+
 def test_what_does_not_fit_beside_stands_above(bpy, lines):
     """A title too wide, or a text too wide for its field, leaves the field its own line."""
     assert lines.has_room_beside(bpy.context, "Poisson", "")
