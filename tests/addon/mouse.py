@@ -9,6 +9,8 @@ import bpy
 from driving import draw, seen, started, view, waited
 
 STEP_PIXELS = 9
+TAB_DOWN = 180 if bpy.app.version < (5, 0, 0) else 244
+"""How far down the sidebar our tab is [pixels]: newer Blenders have the tab Animation above it."""
 seen["clicks"] = 0
 at = {}
 
@@ -48,7 +50,7 @@ def click():
 def point_at_tab():
     """Our tab is the last one: at the sidebar's right edge, at the lower end of the tabs."""
     sidebar = view("UI")[2]
-    at.update(x=sidebar.x + sidebar.width - 9, y=sidebar.y + sidebar.height - 180)
+    at.update(x=sidebar.x + sidebar.width - 9, y=sidebar.y + sidebar.height - TAB_DOWN)
     event("MOUSEMOVE")
     return True
 
