@@ -10,9 +10,12 @@ import pytest
 
 from limber.cli.commands.robot import command
 from limber.core.numerics.rigid import matrices
+from limber.core.progress import Progress
 from limber.geometry.io.clouds import read_cloud
 from limber.robot.cell.cell import Cell, write_cell
+from limber.robot.live_view import look
 from limber.robot.realsense import RealSense, camera_differences, seen_points
+from limber.stages.paths.plan_cell import cell_positions
 
 WIDTH, HEIGHT, SCALE = 12, 8, 0.001
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.5, 0.1, 0, 0, 0, 1.2)},
@@ -146,3 +149,29 @@ def test_a_cells_camera_is_compared_with_the_connected_one(library):
         size, focal, centre = camera_differences(CELL, camera.camera)
     assert "(12, 8) pixels in the connected camera, (640, 480) in the cell file" in size
     assert "camera.focal_px" in focal and "camera.centre_px" in centre
+
+
+def test_what_stands_before_the_camera_hides_a_goal(library):
+    """A wall at .5 m fills the image; the part of it that is the branch hides nothing."""
+    told = []
+    progress = Progress(on_warning=told.append)
+    camera = matrices(np.array(CELL.camera.pose))
+
+    def at(column: float, row: float, depth: float) -> np.ndarray:
+        return (camera @ [depth * (column - 6) / 10, depth * (row - 4) / 10, depth, 1.0])[:3]
+    branch = np.array([at(8.0, 5.0, 0.5)])
+    seen = look(CELL, branch, progress)
+    assert "something 0.50 m before the camera" in seen.hiding(at(3.0, 2.0, 0.7))
+    assert seen.hiding(at(3.0, 2.0, 0.45)) == seen.hiding(at(3.0, 2.0, -0.5)) == ""
+    assert seen.hiding(at(40.0, 2.0, 0.7)) == ""
+    assert np.isnan(seen.depth[5, 8]) and seen.depth[2, 3] == 0.5
+    # Its own intrinsics are the view, and the cell's are named.
+    assert sum("The connected camera's own view is taken" in text for text in told) == 3
+    place = cell_positions(CELL, (), seen)["in_view"]
+    assert place.blocked(at(3.0, 2.0, 0.7), None) == seen.hiding(at(3.0, 2.0, 0.7))
+    assert place.region.distance(at(3.0, 2.0, 0.7)[None])[0] <= 0.0
+    assert place.region.distance(at(13.0, 2.0, 0.7)[None])[0] > 0.0
+    told.clear()
+    library.fails = {"start": "no device"}
+    assert look(CELL, branch, progress) is None
+    assert "No connected camera was asked" in told[0] and "no device" in told[0]

@@ -103,6 +103,17 @@ def seen_points(cell: Cell, camera: RealSense, flange: np.ndarray | None) -> np.
         cell: Its [camera] states pose and mount.
         flange: The flange's frame in the robot's base, for a camera on it, shape [4, 4].
     """
+    return placed_image(cell, camera, flange)[2]
+
+
+def placed_image(cell: Cell, camera: RealSense, flange: np.ndarray | None,
+                 ) -> tuple[Camera, np.ndarray, np.ndarray]:
+    """Return the camera at its pose in the branch's frame; a depth image [m], shape [height,
+    width], NaN outside the range; and its points by rows [m], branch frame, shape [n, 3].
+
+    Args:
+        cell, flange: As :func:`seen_points` takes them.
+    """
     entry = cell.camera
     assert entry is not None
     frame = matrices(np.array(entry.pose))
@@ -111,13 +122,12 @@ def seen_points(cell: Cell, camera: RealSense, flange: np.ndarray | None) -> np.
     depth = camera.depth()
     near, far = entry.range_m
     placed = camera.camera.model_copy(update={"pose": tuple(map(float, pose_vectors(frame)))})
-    return depth_to_cloud(placed, depth, (depth >= near) & (depth <= far)).points
+    depth = np.where((depth >= near) & (depth <= far), depth, np.nan)
+    return placed, depth, depth_to_cloud(placed, depth).points
 
 
 def camera_differences(cell: Cell, camera: Camera) -> list[str]:
     """Return in words how the intrinsics of the cell's [camera] differ from the connected camera's.
-
-    Goals in the camera's view (``limber plan --in-view``) are planned with the cell's.
     """
     entry = cell.camera
     if entry is None:

@@ -198,21 +198,24 @@ class _InCell:
     @classmethod
     def of(cls, branch: Branch, path: Path, limits: Limits, progress: Progress,
            settings: PlanSettings, grasp_model: GraspModel) -> _InCell:
+        from limber.robot.live_view import look
         from limber.stages.paths.plan_cell import (
             cell_for,
             cell_obstacles,
             cell_positions,
             clearance_in,
+            is_fixed,
             limits_in,
         )
 
         cell = cell_for(branch, path, progress)
         obstacles = cell_obstacles(cell, path.parent)
-        clearance = clearance_in(
-            cell, settings.clearance, obstacles, grasp_model.rest_position,
-            grasp_model.mesh.nodes + grasp_model.rest.displacement)
+        nodes = grasp_model.mesh.nodes + grasp_model.rest.displacement
+        clearance = clearance_in(cell, settings.clearance, obstacles, grasp_model.rest_position,
+                                 nodes)
+        live = look(cell, nodes, progress) if settings.in_view and is_fixed(cell.camera) else None
         return cls(cell, obstacles, limits_in(cell, limits, obstacles, clearance),
-                   cell_positions(cell, obstacles), clearance)
+                   cell_positions(cell, obstacles, live), clearance)
 
     def taken(self, motion: PlanPath, grasp_model: GraspModel, found: PlannedMotion,
               settings: PlanSettings, progress: Progress) -> dict[str, Any]:

@@ -21,10 +21,11 @@ from limber.planning.goals.camera_view import View
 from limber.planning.goals.goal import CellPlace
 from limber.planning.goals.regions import Ball, position_text
 from limber.planning.plan_file import PlanPath
-from limber.robot.cell.cell import BoxEntry, Cell, SecondArmEntry, read_cell
+from limber.robot.cell.cell import BoxEntry, CameraEntry, Cell, SecondArmEntry, read_cell
 from limber.robot.cell.compatibility import check_branch
 from limber.robot.interface import Arm
 from limber.robot.known_arms import arm_named
+from limber.robot.live_view import LiveView
 from limber.robot.motion.execution import Blocked, RobotMotion
 from limber.robot.motion.expected_wrench import Predicted
 from limber.stages.paths.plan_legs import surface_points
@@ -79,12 +80,17 @@ def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
     return tuple(found)
 
 
-def cell_positions(cell: Cell, obstacles: tuple[Obstacle, ...] = ()) -> dict[str, CellPlace]:
-    """Return the cell's constraints on goals: its camera's view and its second arm's reach."""
+def cell_positions(cell: Cell, obstacles: tuple[Obstacle, ...] = (),
+                   live: LiveView | None = None) -> dict[str, CellPlace]:
+    """Return the cell's constraints on goals: its camera's view and its second arm's reach.
+
+    Args:
+        live: What the connected camera sees now; its own intrinsics are the view then.
+    """
     found = {}
-    if (view := _view_of(cell)) is not None:
+    if (view := _view_of(cell, live)) is not None:
         found["in_view"] = CellPlace(
-            view, partial(hiding, view, obstacles), True, view.words,
+            view, partial(hiding, view, obstacles, live=live), True, view.words,
             "The camera does not see {what}",
             "Move the camera in the cell file to a side without branch or obstacles")
     if cell.second_arm is not None:
@@ -112,16 +118,18 @@ def _outer_reach(arm: Arm, entry: SecondArmEntry) -> float:
 
 
 def hiding(view: View, obstacles: tuple[Obstacle, ...], point: np.ndarray,
-           surface: np.ndarray | None) -> str:
-    """Return in words that the branch's surface or an obstacle hides a target at ``point`` [3] from
-    the camera; empty if nothing does.
+           surface: np.ndarray | None, live: LiveView | None = None) -> str:
+    """Return in words that the branch's surface, an obstacle or what the camera sees now hides a
+    target at ``point`` [3]; empty if nothing does.
     """
     if surface is not None and view.hidden_by(surface, point, _OWN_SURFACE):
         return "the branch hides it"
     eye = view.frame[:3, 3]
     count = int(np.ceil(np.linalg.norm(point - eye) / _SIGHT_SPACING)) + 1
     hit = closest(obstacles, eye + np.linspace(0.0, 1.0, count)[:, None] * (point - eye))
-    return f"{hit[0]} hides it" if hit else ""
+    if hit:
+        return f"{hit[0]} hides it"
+    return "" if live is None else live.hiding(point)
 
 
 def _untaken(entry: SecondArmEntry, place: np.ndarray, _surface: object) -> str:
@@ -139,15 +147,22 @@ def _untaken(entry: SecondArmEntry, place: np.ndarray, _surface: object) -> str:
     return ""
 
 
-def _view_of(cell: Cell) -> View | None:
+def is_fixed(camera: CameraEntry | None) -> bool:
+    """Whether there is a camera that does not move with the arm."""
+    return camera is not None and camera.mount == "branch"
+
+
+def _view_of(cell: Cell, live: LiveView | None) -> View | None:
     """Return the view of the cell's camera; None without a static one."""
     camera = cell.camera
-    if camera is None or camera.mount != "branch":
+    if camera is None or not is_fixed(camera):
         return None
-    (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
+    (fx, fy), (cx, cy), (width, height) = (
+        (camera.focal_px, camera.centre_px, (camera.width, camera.height)) if live is None else
+        ((live.camera.fx, live.camera.fy), (live.camera.cx, live.camera.cy),
+         (live.camera.width, live.camera.height)))
     return View(matrices(np.array(camera.pose)),
-                (-cx / fx, (camera.width - cx) / fx, -cy / fy, (camera.height - cy) / fy),
-                camera.range_m)
+                (-cx / fx, (width - cx) / fx, -cy / fy, (height - cy) / fy), camera.range_m)
 
 
 def clearance_in(cell: Cell, asked: float | None, obstacles: tuple[Obstacle, ...],
