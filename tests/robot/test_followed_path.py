@@ -42,6 +42,9 @@ def test_another_program_goes_the_same_way_back():
     found = read_followed_path(CELL)
     assert found.bias == pytest.approx([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
     assert found.gripper_closed is None
+    # As after `limber robot weigh`, which tares without the gripper's weight.
+    lighter = CELL.model_copy(update={"tool": CELL.tool.model_copy(update={"mass_kg": 0.5})})
+    assert read_followed_path(lighter).bias is None
     back = RetreatPath(ARM.joint_names, found).from_here(sample_at(end), 0.3)
     assert back.poses[-1] == pytest.approx(POSE) and back.greatest_speeds[0] <= 0.015 * (1 + 1e-6)
     # A new way forgets the old one, but not tare and gripper.

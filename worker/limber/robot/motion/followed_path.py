@@ -35,7 +35,8 @@ class FollowedPath:
         poses: Poses of the tool's centre, base frame [m, rad], in order, shape [n, 6].
         joints: [rad], shape [n, joints].
         speeds: Greatest speeds on it [m/s], [rad/s], shape [2].
-        bias: Bias of the force sensor by its last tare, flange frame [N, N m], shape [6]; or None.
+        bias: Bias of the force sensor by its last tare, flange frame [N, N m], shape [6]; None if
+            it is not known with the cell's payload (`limber robot weigh` tares with another).
         gripper_closed: Whether the gripper was last closed; None: it was not moved.
         at: Start time of the path, seconds since 1970.
     """
@@ -74,6 +75,8 @@ def read_followed_path(cell: Cell) -> FollowedPath | None:
     try:
         pose_lines = [line for line in lines if "pose" in line]
         last = {name: line[name] for line in lines[1:] for name in line}
+        if last.get("bias_with") != plain(_payload(cell)):
+            last["bias"] = None
         followed = FollowedPath(
             _rows([line["pose"] for line in pose_lines], 6),
             _rows([line["joints"] for line in pose_lines], len(cell.arm.joint_names)),
@@ -111,6 +114,7 @@ class FollowedPathFile:
     def __init__(self, cell: Cell):
         self._lasting: dict[str, Any] = {}
         self._path, self._head = followed_path_file(cell), _head(cell)
+        self._payload = _payload(cell)
         self._lines: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="way", daemon=True)
         self._thread.start()
@@ -122,8 +126,8 @@ class FollowedPathFile:
 
     def tared(self, bias: np.ndarray) -> None:
         """The force sensor's bias [6] is known; it holds for later paths."""
-        self._lasting["bias"] = bias.copy()
-        self.add(bias=self._lasting["bias"])
+        self._lasting |= {"bias": bias.copy(), "bias_with": self._payload}
+        self.add(**self._lasting)
 
     def gripped(self, closed: bool) -> None:
         """The gripper was closed or opened; it stays so for later paths."""
@@ -160,6 +164,11 @@ def _rows(values: list[Any], count: int) -> np.ndarray:
     if rows.ndim != 2 or rows.shape[1] != count:
         raise ValueError(f"rows of shape {rows.shape}")
     return rows
+
+
+def _payload(cell: Cell) -> dict[str, Any]:
+    """What the controller subtracts from the force, and so what a tare is relative to."""
+    return {"mass_kg": cell.tool.mass_kg, "centre_of_mass_m": cell.tool.centre_of_mass_m}
 
 
 def _head(cell: Cell) -> dict[str, Any]:
