@@ -170,7 +170,7 @@ def _to(run: Run, cell_file: Path, cell: Cell, folder: Path | None, goal: np.nda
     """Plan the path of the empty arm to joint angles ``goal`` [n], and follow it if ``armed``."""
     from limber.robot.driver.link import RobotLink
     from limber.robot.operator_decisions import require_confirmation
-    from limber.stages.paths.arm_moves import to_joints
+    from limber.stages.paths.arm_moves import is_at, to_joints
     from limber.stages.paths.arm_surroundings import ArmSurroundings
     from limber.stages.paths.plan_cell import cell_obstacles
     from limber.store import Branch
@@ -183,6 +183,9 @@ def _to(run: Run, cell_file: Path, cell: Cell, folder: Path | None, goal: np.nda
                           "alone (--branch).")
     around = ArmSurroundings(cell, cell_obstacles(cell, cell_file.parent), skeleton)
     sample, _ = stands(cell)
+    if is_at(sample.joints, goal):
+        run.close("The arm is there already. Nothing was moved.")
+        return {"armed": armed, "duration_s": 0.0}
     motion = to_joints(cell, sample.joints, goal, around)
     assert motion.joints is not None
     result = _motion_summary(motion) | {"armed": armed, "clearance_m": float(

@@ -17,7 +17,13 @@ from limber.stages.paths.arm_surroundings import ArmSurroundings
 
 _NEAR_M = 0.15  # m from the branch: nearer, the arm is slower
 _SLOWEST = 0.25
+_AT_GOAL_RAD = 1e-3
 _JOINT_SPEED = 0.4  # rad/s: an elbow is as fast as a gripper, and nobody watches it
+
+
+def is_at(joints: np.ndarray, goal: np.ndarray) -> bool:
+    """Whether joint angles [rad, n] are those of a goal."""
+    return bool(np.abs(joints - goal).max() < _AT_GOAL_RAD)
 
 
 def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurroundings,
@@ -31,7 +37,7 @@ def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurrou
         workspace.
     """
     _require_limits(cell, goal)
-    if np.abs(goal - start).max() < 1e-3:
+    if is_at(start, goal):
         raise NoPathError("The arm is there already.", "", "")
     joints = joint_space_path(start, goal, cell.joint_limits, around.free)
     poses = pose_vectors(cell.arm.forward(joints) @ matrices(np.array(cell.tool.grasp_pose)))
