@@ -10,7 +10,13 @@ from limber.cli.robot_commands.weigh import weighed, weightless
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.cell.cell import Cell
-from limber.robot.weighing import never_weighed, tilted_joints, weigh, weighed_as
+from limber.robot.weighing import (
+    require_weighed,
+    tilted_joints,
+    unweighed,
+    weigh,
+    weighed_as,
+)
 from limber.stages.paths.arm_moves import to_joints
 from limber.stages.paths.arm_surroundings import ArmSurroundings
 
@@ -110,15 +116,23 @@ def test_an_arm_weighs_its_gripper_by_small_tilts(sensor, told, monkeypatch):
     assert told is not None or found.mass == pytest.approx(MASS, abs=0.05)
 
 
-def test_a_sensor_that_was_never_weighed_is_a_warning_before_a_motion(monkeypatch, tmp_path):
-    """Until the same gripper was weighed without a fault; another mass is untested again."""
+def test_a_gripper_is_weighed_before_the_branch_is_held(monkeypatch, tmp_path):
+    """Refused until it was weighed without a fault, and for another mass with both values."""
     monkeypatch.setenv("LIMBER_STATE", str(tmp_path))
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, tool={"mass_kg": MASS})
-    other = cell.model_copy(update={"tool": cell.tool.model_copy(update={"mass_kg": 0.3})})
-    assert "not tested by the gripper's weight" in never_weighed(cell)
-    assert never_weighed(weightless(cell)) is None
-    path = tmp_path / "cell.toml"
-    log_move(path, "weigh", {"armed": True, "faults": ["the sensor's sign"]} | weighed_as(cell))
-    assert never_weighed(cell) is not None
-    log_move(path, "weigh", {"armed": True, "faults": []} | weighed_as(cell))
-    assert never_weighed(cell) is None and never_weighed(other) is not None
+    path, weighed_mass = tmp_path / "cell.toml", {"mass_kg": MASS + 0.01, "mass_sigma_kg": 0.01}
+    with pytest.raises(InputError, match="was never weighed"):
+        require_weighed(cell)
+    require_weighed(weightless(cell))
+    log_move(path, "weigh", weighed_mass | {"faults": ["the sensor's sign"]} | weighed_as(cell))
+    with pytest.raises(InputError, match="The last weighing found that the sensor's sign"):
+        require_weighed(cell)
+    log_move(path, "weigh", weighed_mass | {"faults": []} | weighed_as(cell))
+    require_weighed(cell)
+    for stated in (MASS + 0.3, MASS - 0.3, 0.0):
+        other = cell.model_copy(update={"tool": cell.tool.model_copy(update={"mass_kg": stated})})
+        told = rf"weighed {MASS + 0.01:.3f} kg .* tool\.mass_kg is {stated:g}"
+        with pytest.raises(InputError, match=told):
+            require_weighed(other)
+    sensor = cell.sensor.model_copy(update={"pose": (0, 0, 0.04, 0, 0, 0)})
+    assert "never weighed" in unweighed(cell.model_copy(update={"sensor": sensor}))

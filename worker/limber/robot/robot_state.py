@@ -16,7 +16,7 @@ from limber.robot.driver.controls import calibration_of, control_of
 from limber.robot.driver.force_sensors import ForceTorqueSensor, open_sensor
 from limber.robot.interface import ArmControl, Sample
 from limber.robot.ur.factory_calibration import FactoryCalibration
-from limber.robot.weighing import never_weighed
+from limber.robot.weighing import unweighed
 
 _FEWEST = 3
 _FIRST_READING_SECONDS = 0.2
@@ -148,8 +148,8 @@ def show_before_motion(cell: Cell, warn: Callable[[str], None]) -> None:
                          "check`.")
     for each in seen.differences:
         warn(f"{each}.")
-    if untested := never_weighed(cell):
-        warn(untested)
+    if untested := unweighed(cell):
+        warn(f"{untested} (limber robot weigh).")
 
 
 def _read(control: ArmControl, sensor: ForceTorqueSensor, seconds: float,

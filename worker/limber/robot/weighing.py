@@ -23,6 +23,7 @@ _ALIKE = 0.8  # cosine of the angle between measured and expected change
 _UNITS = {0.1019: "kilograms-force", 0.2248: "pounds-force", 0.001: "kilonewtons",
           1000.0: "millinewtons"}
 _NEAR = 0.15  # relative
+_FEEL_NO_WEIGHT = ("none", "replay")
 
 
 @dataclass(frozen=True)
@@ -46,21 +47,51 @@ def weighed_as(cell: Cell) -> dict[str, Any]:
             "sensor": cell.sensor.kind, "sensor_pose": list(cell.sensor.pose)}
 
 
-def never_weighed(cell: Cell) -> str | None:
-    """Return a warning if the log of motions has no good weighing of this sensor and gripper."""
-    if not cell.tool.mass_kg:
+def unweighed(cell: Cell) -> str | None:
+    """Return why the last weighing does not confirm sensor and stated mass; None if it does.
+
+    A bare flange that was never weighed, and a sensor that feels no weight, need none.
+    """
+    stated = cell.tool.mass_kg or 0.0
+    last = _last_weighing(cell)
+    if cell.sensor.kind in _FEEL_NO_WEIGHT or (last is None and not stated):
         return None
+    if last is None:
+        return (f"The gripper of {stated:g} kg was never weighed with this sensor, so a wrong "
+                "mass, unit, sign or axis is not known")
+    mass = float(last.get("mass_kg", np.nan))
+    off = _mass_off(mass, float(last.get("mass_sigma_kg", 0.0)), stated)
+    if off or not np.isfinite(mass):
+        return (f"The sensor weighed {mass:.3f} kg at the last weighing, but tool.mass_kg is "
+                f"{stated:g}")
+    if last.get("faults"):
+        return f"The last weighing found that {'; '.join(last['faults'])}"
+    return None
+
+
+def require_weighed(cell: Cell) -> None:
+    """Refuse a motion with the branch whose sensor and gripper no weighing confirms.
+
+    Raises:
+        InputError: states what the last weighing found, with both masses.
+    """
+    if reason := unweighed(cell):
+        raise InputError(f"{reason}.", "The guard would feel another force than the branch's, and "
+                         "the branch's moduli would be wrong.",
+                         "Correct [sensor] or tool.mass_kg in the cell file, and weigh the empty "
+                         "gripper away from the branch: limber robot weigh.")
+
+
+def _last_weighing(cell: Cell) -> dict[str, Any] | None:
+    """The last line of the log of motions that is a weighing by this sensor."""
     wanted, path = weighed_as(cell), log_path()
-    lines: list[dict[str, Any]] = []
-    if path.is_file():
-        with open(path, encoding="utf-8") as stream:
-            lines = [line for line in json_objects(stream) if line.get("command") == "weigh"
-                     and all(line.get(key) == value for key, value in wanted.items())]
-    if lines and lines[-1].get("faults") == []:
+    del wanted["stated_kg"]
+    if not path.is_file():
         return None
-    return ("The force sensor was not tested by the gripper's weight with these values of [sensor] "
-            "and tool.mass_kg: a wrong mass or unit may show only in the branch's estimate "
-            "(limber robot weigh).")
+    with open(path, encoding="utf-8") as stream:
+        found = [line for line in json_objects(stream) if line.get("command") == "weigh"
+                 and all(line.get(key) == value for key, value in wanted.items())]
+    return found[-1] if found else None
 
 
 def tilted_joints(joints: np.ndarray, mass: float) -> np.ndarray:
@@ -137,6 +168,11 @@ def _faults(along: float, size: float, sigma: float, stated: float) -> list[str]
     for unit, name in _UNITS.items():
         if abs(factor / unit - 1.0) < _NEAR:
             return [f"the sensor's unit seems to be {name} ({message})"]
-    if abs(along - stated) > max(0.05, 0.1 * stated, 4 * sigma):
+    if _mass_off(along, sigma, stated):
         return [f"tool.mass_kg or the sensor's scale is wrong ({message})"]
     return []
+
+
+def _mass_off(mass: float, sigma: float, stated: float) -> bool:
+    """Whether a weighed mass [kg], known to ``sigma``, is not the stated one."""
+    return abs(mass - stated) > max(0.05, 0.1 * stated, 4 * sigma)
