@@ -1,6 +1,7 @@
 """A path as motion of a robot, and `limber execute` on the virtual robot that holds the branch."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from limber.robot.cell.cell import ApproachEntry, Cell
 from limber.robot.cell.compatibility import check_plan
 from limber.robot.motion.execution import across, followed, robot_motion
 from limber.robot.motion.expected_wrench import Predicted
+from limber.robot.pull_plausibility import NUDGE_M
 from limber.robot.ur.arms import ARMS
 from limber.stages.paths import execute_path
 from limber.stages.paths.execute import (
@@ -26,6 +28,7 @@ from limber.stages.paths.execute import (
     execute,
 )
 from limber.stages.paths.execute_path import planned_poses
+from limber.stages.pulls.record_prediction import PullModel
 from limber.store import Branch
 from limber.store.loading import load_skeleton
 
@@ -369,6 +372,26 @@ def test_an_armed_run_feels_what_was_predicted_and_ends_where_it_should(planned_
     assert state["branch"] == "free" and np.linalg.norm(state["tool_speed"]) < 1e-3
     assert (planned_folder / "executions" / "path" / "samples.csv").stat().st_size > 1e5
     assert np.linalg.norm(np.subtract(state["pose"][:3], result["start_pose_base"][:3])) < 1e-3
+
+
+def test_a_sensor_that_the_nudge_finds_wrong_stops_before_the_path(planned_folder, armed, robot,
+                                                                  monkeypatch):
+    """The prediction is turned round instead of the sensor: the approach and a nudge, no more."""
+    predicted, motions = PullModel.predicted, []
+
+    def turned_round(model: PullModel, trajectory):
+        motions.append(trajectory)
+        found = predicted(model, trajectory)
+        return replace(found, forces=-found.forces)
+    monkeypatch.setattr(PullModel, "predicted", turned_round)
+    with pytest.raises(SafetyStop, match="implausible: the force points against") as stop:
+        armed(unexpected=3.0)
+    result = stop.value.result
+    assert not result["reached"] and result["path_error_m"] is None
+    assert 1e-3 < result["nudge_m"] <= NUDGE_M and result["nudge_force_n"] <= 0.5 * 15.0
+    held = motions[0].poses[0, :3]
+    assert np.linalg.norm(robot.state["pose"][:3] - held) < 0.006
+    assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
 
 
 @pytest.mark.slow

@@ -173,11 +173,8 @@ def test_a_nudge_goes_across_and_back_on_the_side_that_is_free():
     joints = np.array(CELL.arm.home)
     start = pose_vectors(CELL.arm.forward(joints) @ tool)
     pull = Trajectory(np.array([0.0, 1.0]), np.array([start, start + [0.006, 0, 0, 0, 0, 0]]))
-    sample = np.full(37, np.nan)
-    sample[1:7], sample[19:25] = start, joints
-
     def ended(blocked) -> np.ndarray:
-        motion = nudge(CELL, np.diag([200.0, 100.0, 9e3]), sample, pull, blocked)
+        motion = nudge(CELL, np.diag([200.0, 100.0, 9e3]), start, joints, pull, blocked)
         assert motion.poses[-1] == pytest.approx(motion.poses[0])
         gone = motion.poses[:, :3] - start[:3]
         return gone[np.linalg.norm(gone, axis=1).argmax()]
@@ -187,5 +184,5 @@ def test_a_nudge_goes_across_and_back_on_the_side_that_is_free():
     other = ended(lambda flange, _: NoPathError("a wall", "", "") if (
         (flange[:, :3, 3] - flange[0, :3, 3]) @ first > 1e-6).any() else None)
     assert other == pytest.approx(-first, abs=1e-9)
-    assert nudge(CELL, np.eye(3), sample, pull,
+    assert nudge(CELL, np.eye(3), start, joints, pull,
                  lambda *_: NoPathError("walls", "", "")) is None

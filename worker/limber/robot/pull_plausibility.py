@@ -254,13 +254,14 @@ class PullPlausibility:
         predicted: Expected forces.
 
     Attributes:
+        predicted: As given.
         reason: Why the sensor cannot be right, once that is certain.
     """
 
     def __init__(self, cell: Cell, predicted: PredictedPull):
         self._noise = _NOISES * cell.sensor.force_sigma_n / np.sqrt(_SMOOTHED)
         self._drift = cell.sensor.drift_n_per_minute / 60.0
-        self._predicted = predicted
+        self.predicted = predicted
         self._direction = _Direction(cell.sensor.force_sigma_n)
         self._growth = _Growth(cell.sensor.force_sigma_n, float(predicted.travels[-1]))
         self._start: np.ndarray | None = None
@@ -308,17 +309,17 @@ class PullPlausibility:
 
     def _grow(self, samples: np.ndarray, travels: np.ndarray) -> None:
         # Before it moves nothing is predicted, but the direction is known.
-        predicted = self._predicted.at(np.maximum(travels, _MOVED_M)) @ self._predicted.certain
+        predicted = self.predicted.at(np.maximum(travels, _MOVED_M)) @ self.predicted.certain
         sizes = np.linalg.norm(predicted, axis=1)
         good = np.isfinite(samples[:, _RAW]).all(axis=1) & (sizes > 0.0)
         self._direction.take(travels[good], predicted[good],
-                             samples[good, _RAW] @ self._predicted.certain)
+                             samples[good, _RAW] @ self.predicted.certain)
         along = (samples[good, _RAW] * predicted[good]).sum(axis=1) / sizes[good]
         self._growth.take(travels[good], sizes[good], along)
 
     def _scale(self) -> str | None:
         """As :meth:`_suspicion`, for a soft branch, whose single readings are mostly noise."""
-        factor, whole = self._predicted.factor, self._growth.whole()
+        factor, whole = self.predicted.factor, self._growth.whole()
         if factor is None or whole is None:
             return None
         share, margin = whole[0], _CERTAIN * whole[1]
@@ -337,7 +338,7 @@ class PullPlausibility:
                 f"{100 * max(share, 0.0):.0f} % of what came before)")
 
     def _suspicion(self, travel: float, force: np.ndarray) -> str:
-        factor, predicted = self._predicted.factor, self._predicted.at(travel)
+        factor, predicted = self.predicted.factor, self.predicted.at(travel)
         size = float(np.linalg.norm(predicted))
         if size < 1e-9 or factor is None:
             return ""

@@ -147,11 +147,16 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
     run the node of scripts/examples/ros2 beside the controller; it also acts on silence.
     """
     from limber.core.errors import InputError, SafetyStop
+    from limber.robot.cell.cell import read_cell
+    from limber.robot.weighing import require_weighed
     from limber.stages.paths.execute import ExecuteSettings, planned_motion
 
-    _, cell, _, motion, result = planned_motion(
+    if armed:
+        require_weighed(read_cell(cell_file))
+    planned = planned_motion(
         branch_folder, name, cell_file, ExecuteSettings(speed=speed), progress=run.progress,
         is_to_move=armed)
+    cell, motion, result = planned.cell, planned.motion, planned.result
     trajectory = {"approach": motion.approach, "path": motion.path, "return": motion.return_path,
                   "leaving": motion.leaving}[leg]
     result |= {"leg": leg, "leg_seconds": trajectory.duration, "armed": armed}

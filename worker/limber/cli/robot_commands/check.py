@@ -24,7 +24,7 @@ _SECONDS = 1.0
 @click.option("--plan", help="Plan of the branch folder whose motion the arm must be able to "
               "follow; with --offline.")
 @click.option("--realsense", is_flag=True, help="Compare [camera] with the connected RealSense "
-              "camera too: goals in its view are planned with [camera].")
+              "camera too.")
 def check(run: Run, cell_file: Path, offline: bool, folder: Path | None, plan: str | None,
           realsense: bool) -> dict[str, Any]:
     """Read model, version, settings, mode and force, and compare them with the cell.
@@ -67,9 +67,9 @@ def _from_files(run: Run, cell: Cell, cell_file: Path, folder: Path | None, plan
             warning := check_branch(cell, Branch.read(folder).uuid, folder)):
         run.progress.warn(warning)
     if plan is not None and folder is not None:
-        *_, motion = planned_motion(folder, plan, cell_file, ExecuteSettings(),
-                                    progress=run.progress, is_to_move=True)
-        result |= {"plan": plan, "motion": motion}
+        planned = planned_motion(folder, plan, cell_file, ExecuteSettings(),
+                                 progress=run.progress, is_to_move=True)
+        result |= {"plan": plan, "motion": planned.result}
     run.close(f"{cell_file} describes a {cell.arm.name}; its base is known to "
               f"{1000 * cell.base.position_sigma_m:.1f} mm"
               f"{f', and the arm can follow {plan}' if plan else ''}. No robot was asked.")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 import time
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -27,16 +29,19 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from limber.robot.cell.cell import Cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.driver.live_force import LiveForce
     from limber.robot.motion.execution import RobotMotion
     from limber.robot.motion.legs import Leg
     from limber.robot.motion.trajectory import Trajectory
+    from limber.robot.pull_plausibility import PullPlausibility
+    from limber.stages.pulls.record_nudge import Nudge
 
 _SPEED, _HOLD_SECONDS = 0.03, 2.0  # m/s, s: of a plan that states none
 _TARE_SECONDS = 1.0
-_BEFORE_PATH_SECONDS = 10.0  # from the tare to the path's start
 
 
 class ExecuteInputs(BranchInputs):
@@ -87,7 +92,8 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
 
     The branch's force along the path is computed again with the full model; the guard stops if the
     measured force differs from it. If armed, the robot approaches the branch and the gripper
-    closes; the path is followed, held and retraced; then the gripper opens and the robot leaves.
+    closes and nudges the branch, which shows a wrong sensor as in `limber record`; the path is
+    followed, held and retraced; then the gripper opens and the robot leaves.
 
     Returns:
         ``armed``, ``reached``, ``stop_reason``, ``after_stop`` (as
@@ -100,20 +106,43 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
         NoPathError: the arm cannot follow the path; the message states where and why.
         SafetyStop: the motion was stopped; the log is nevertheless in the folder.
     """
-    branch, cell, settings, motion, result = planned_motion(
-        folder, name, cell_file, settings, progress=progress, is_to_move=options.arm)
+    if options.arm:
+        from limber.robot.cell.cell import read_cell
+        from limber.robot.weighing import require_weighed
+
+        require_weighed(read_cell(cell_file))
+    planned = planned_motion(folder, name, cell_file, settings, progress=progress,
+                             is_to_move=options.arm)
     if not options.arm:
-        write_preview(branch, name, settings, cell, motion)
-        return result | {"armed": False, "reached": None, "stop_reason": None,
+        write_preview(planned.branch, name, planned.settings, planned.cell, planned.motion)
+        return planned.result | {"armed": False, "reached": None, "stop_reason": None,
                          "after_stop": None, "peak_force_n": None, "path_error_m": None}
-    require_confirmation(name, options.confirm, cell, progress)
-    return _armed(branch, cell, name, settings, options, motion, result, progress)
+    require_confirmation(name, options.confirm, planned.cell, progress)
+    return _armed(planned, name, options, progress)
+
+
+@dataclass(frozen=True)
+class PlannedMotion:
+    """What :func:`execute` follows.
+
+    Attributes:
+        settings: With the plan's own values where none were given.
+        across: The nudge before the path; None where the arm can make none.
+        result: Computed values, as :func:`execute` returns them.
+    """
+
+    branch: Branch
+    cell: Cell
+    settings: ExecuteSettings
+    motion: RobotMotion
+    across: Nudge | None
+    result: dict[str, Any]
 
 
 def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings, *,
                    progress: Progress, is_to_move: bool,
-                   ) -> tuple[Branch, Cell, ExecuteSettings, RobotMotion, dict[str, Any]]:
-    """Return branch, cell, settings and the checked motion of a plan, and the computed values.
+                   ) -> PlannedMotion:
+    """Return the checked motion of a plan.
 
     Raises:
         InputError, NoPathError: as :func:`execute`.
@@ -126,7 +155,13 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
     from limber.robot.motion.execution import robot_motion
     from limber.robot.motion.expected_wrench import Predicted
     from limber.robot.motion.turning import turned
-    from limber.stages.paths.execute_path import offsets_along, planned_poses, predicted_along
+    from limber.stages.paths.execute_path import (
+        offsets_along,
+        path_nudge,
+        planned_poses,
+        predicted_along,
+        require_within_limits,
+    )
     from limber.stages.paths.plan_cell import KeptClear, blocked_by
     from limber.stages.paths.plan_legs import legs_in_cell
     from limber.store.loading import load_grasp_model
@@ -150,11 +185,12 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
                                 progress)
     progress(0.4, "inverse kinematics")
     motion = robot_motion(cell, predicted, model.reach.axis, **asked)
-    result = execution_summary(cell, motion) | clear.describe() | {"legs": legs_in_cell(
+    across = path_nudge(branch, model, cell, motion, asked["blocked"], progress)
+    result = execution_summary(cell, motion, across) | clear.describe() | {"legs": legs_in_cell(
         cell, clear.obstacles, motion, predicted.poses[:, :3], np.array(clear.surfaces),
         present(settings.hold, "time at the path's end"), progress)}
-    _check_limits(cell, predicted.poses, predicted.wrenches[:, :3])
-    return branch, cell, settings, motion, result
+    require_within_limits(cell, predicted.poses, predicted.wrenches[:, :3])
+    return PlannedMotion(branch, cell, settings, motion, across, result)
 
 
 def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
@@ -216,45 +252,21 @@ def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSetting
             cell.model_copy(update={"limits": limits}))
 
 
-def _force_sigma(cell: Cell, samples: np.ndarray) -> float:
-    """Deviation of the smoothed force due to the sensor's noise and its drift since the tare [N].
-    """
-    from limber.robot.driver.force_sensors import INDEPENDENT_READINGS
-
-    minutes = (samples[-1, 0] - samples[0, 0] + _BEFORE_PATH_SECONDS) / 60.0
-    return float(np.hypot(cell.sensor.force_sigma_n / np.sqrt(INDEPENDENT_READINGS),
-                          cell.sensor.drift_n_per_minute * minutes))
-
-
-def _check_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:
-    peak = float(np.linalg.norm(forces, axis=1).max())
-    if peak >= cell.limits.soft_force_n:
-        raise InputError(
-            f"The path needs {peak:.3g} N, the soft limit is {cell.limits.soft_force_n:.3g} N.",
-            "The guard would pause the motion.",
-            "Plan with a lower --max-force, or raise limits.soft_force_n in the cell file.")
-    box = cell.workspace
-    if box is not None:
-        outside = np.any((poses[:, :3] < box.low_m) | (poses[:, :3] > box.high_m), axis=1)
-        if outside.any():
-            position = ", ".join(f"{x:.3f}" for x in poses[int(outside.argmax()), :3])
-            raise InputError(f"The path leaves the workspace at ({position}) m.",
-                             "The guard would stop there.", "Plan inside it, or correct the cell "
-                                                            "file.")
-
-
-def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
-           options: ExecuteOptions, motion: RobotMotion, summary: dict[str, Any],
-           progress: Progress) -> dict[str, Any]:
+def _armed(planned: PlannedMotion, name: str, options: ExecuteOptions, progress: Progress,
+           ) -> dict[str, Any]:
     from limber.core.numerics.rigid import matrices
     from limber.robot.driver.link import COLUMNS, RobotLink
     from limber.robot.driver.live_force import LiveForce
     from limber.robot.motion.execution import followed
+    from limber.stages.paths.execute_path import force_sigma
+    from limber.stages.pulls.record_nudge import nudged
 
+    branch, cell, motion, across = planned.branch, planned.cell, planned.motion, planned.across
     log = f"executions/{name}/samples.csv"
     with branch.writing(f"the execution of {name}"):
         stream = branch.stream(log)
         batches: list[np.ndarray] = []
+        judging: list[PullPlausibility] = []
         try:
             stream.append(",".join(COLUMNS))
 
@@ -265,9 +277,13 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
                 for row in rows:
                     stream.append(",".join("" if np.isnan(x) else f"{x:.7g}" for x in row))
                 live.take(rows)
+                if judging and judging[-1].reason is None and judging[-1].take(rows):
+                    link.stop()
             with live, RobotLink(cell, take) as link:
-                event, on_path = _steps(cell, link, motion, settings, options, batches, live,
-                                        progress)
+                before_path = None if across is None else partial(nudged, link, live, across,
+                                                                  judging)
+                event, on_path = _steps(cell, link, motion, planned.settings, options, batches,
+                                        live, before_path, progress)
         finally:
             stream.close()
         for warning in link.warnings:
@@ -275,10 +291,10 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
         samples = np.concatenate(batches)[on_path[0]:on_path[1]] if on_path else None
         base = matrices(np.array(cell.base.pose))
         path = (base @ matrices(motion.path.poses))[:, :3, 3]
-        found = (followed(samples, path, _force_sigma(cell, samples))
+        found = (followed(samples, path, force_sigma(cell, samples))
                  if samples is not None and len(samples) else None)
         reached = event["event"] == "reached"
-        result = summary | {
+        result = planned.result | {
             "armed": True, "reached": reached,
             "stop_reason": None if reached else event["reason"],
             "after_stop": event.get("after_stop"),
@@ -286,7 +302,8 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
             "path_error_m": found.path_error if found else None,
             "force_error_of_peak": found.force_error if found else None,
             "force_within_share": found.force_within if found else None}
-        with branch.stage(f"execute:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
+        with branch.stage(f"execute:{name}", planned.settings,
+                          reads=[f"plans/{name}.csv"]) as stage:
             stage.adopt(log)
             from limber.core.json_values import plain
 
@@ -303,8 +320,9 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
 
 def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSettings,
            options: ExecuteOptions, batches: list[np.ndarray], live: LiveForce,
-           progress: Progress) -> tuple[dict[str, Any], tuple[int, int] | None]:
-    """Execute the legs in order; end at the first one that is stopped."""
+           before_path: Callable[[], dict[str, Any]] | None, progress: Progress,
+           ) -> tuple[dict[str, Any], tuple[int, int] | None]:
+    """Execute the legs in order, the nudge before the path; end at the first that is stopped."""
     from limber.robot.motion.legs import legs_of
 
     _open_at_start(cell, link, motion)
@@ -315,6 +333,10 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
     event: dict[str, Any] = {}
     for number, leg in enumerate(legs_of(cell, motion, present(settings.hold, "hold"))):
         progress(0.55 + 0.06 * number, leg.name)
+        if leg.name == "path" and before_path is not None:
+            event = before_path()
+            if event["event"] != "reached":
+                break
         live.at(leg.name)
         if leg.trajectory is None:
             _stand(cell, link, leg, progress)
@@ -324,8 +346,9 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
         if leg.name == "path":
             on_path = (begin, sum(map(len, batches)))
         if event["event"] != "reached":
-            after = retreat_if_chosen(cell, link, options.after_stop, progress)
-            return event | {"after_stop": after}, on_path
+            break
+    if event["event"] != "reached":
+        event |= {"after_stop": retreat_if_chosen(cell, link, options.after_stop, progress)}
     return event, on_path
 
 

@@ -8,7 +8,7 @@ from scipy.interpolate import Akima1DInterpolator
 
 from limber.core.errors import InputError, WorkError
 from limber.core.files.reading import csv_records, read_columns
-from limber.core.numerics.rigid import composed
+from limber.core.numerics.rigid import composed, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.mechanics import BranchModel, Grasp, StaticResult, follow_poses
 from limber.mechanics.sensitivities import grasp_slopes, static_sensitivities
@@ -16,15 +16,22 @@ from limber.planning.constraints.chance import YoungUncertainty
 from limber.planning.cost import arc_lengths
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.recordings.recording import POSE_COLUMNS
+from limber.robot.cell.cell import Cell
+from limber.robot.driver.force_sensors import INDEPENDENT_READINGS
+from limber.robot.motion.execution import Blocked, RobotMotion
 from limber.robot.motion.expected_wrench import Predicted
 from limber.stages.paths.plan_cell import KeptClear
 from limber.stages.paths.plan_uncertainty import estimated_uncertainty
+from limber.stages.pulls.record_nudge import Nudge, checked_nudge
 from limber.stages.pulls.record_path import GRASP_RADIUS_M
+from limber.stages.pulls.record_prediction import PullModel
 from limber.store import Branch
+from limber.store.loading import young_deviation
 
 _SPACING = 0.0025  # m between poses that are solved: a chord of it on a bend of 0.3 m stretches
 # a branch by 3 micrometres
 _MOST_POSES = 120
+_BEFORE_PATH_SECONDS = 10.0  # from the tare to the path's start
 
 
 def planned_poses(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
@@ -109,6 +116,54 @@ def predicted_along(branch: Branch, model: GraspModel, positions: np.ndarray,
         progress(0.05 + 0.35 * number / len(positions), "forces along the path")
     return Predicted(np.array(poses), np.array(wrenches), np.array(stiffness),
                      np.array(covariances))
+
+
+def path_nudge(branch: Branch, model: GraspModel, cell: Cell, motion: RobotMotion,
+               blocked: Blocked, progress: Progress) -> Nudge | None:
+    """Return the nudge of the held branch before its path; None where the arm can make none.
+
+    Raises:
+        ConvergenceError: its force cannot be predicted.
+    """
+    path = motion.path
+    assert path.joints is not None
+    base = matrices(np.array(cell.base.pose))
+    held = PullModel(model.model, young_deviation(branch), cell, model.rest_position)
+    return checked_nudge(cell, held, pose_vectors(base @ matrices(path.poses[0])), path.joints[0],
+                         path, blocked, progress)
+
+
+def require_within_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:
+    """Refuse a path at ``poses`` [n, 6] with ``forces`` [n, 3] that the guard would stop.
+
+    Raises:
+        InputError: states the limit and the value, or the position outside the workspace.
+    """
+    peak = float(np.linalg.norm(forces, axis=1).max())
+    if peak >= cell.limits.soft_force_n:
+        raise InputError(
+            f"The path needs {peak:.3g} N, the soft limit is {cell.limits.soft_force_n:.3g} N.",
+            "The guard would pause the motion.",
+            "Plan with a lower --max-force, or raise limits.soft_force_n in the cell file.")
+    box = cell.workspace
+    if box is not None:
+        outside = np.any((poses[:, :3] < box.low_m) | (poses[:, :3] > box.high_m), axis=1)
+        if outside.any():
+            position = ", ".join(f"{x:.3f}" for x in poses[int(outside.argmax()), :3])
+            raise InputError(f"The path leaves the workspace at ({position}) m.",
+                             "The guard would stop there.", "Plan inside it, or correct the cell "
+                                                            "file.")
+
+
+def force_sigma(cell: Cell, samples: np.ndarray) -> float:
+    """Return the deviation of the smoothed force by noise and by drift since the tare [N].
+
+    Args:
+        samples: Of the path, as :data:`limber.robot.driver.link.COLUMNS`.
+    """
+    minutes = (samples[-1, 0] - samples[0, 0] + _BEFORE_PATH_SECONDS) / 60.0
+    return float(np.hypot(cell.sensor.force_sigma_n / np.sqrt(INDEPENDENT_READINGS),
+                          cell.sensor.drift_n_per_minute * minutes))
 
 
 def _by_young(model: BranchModel, grasp: Grasp, result: StaticResult, uncertainty: YoungUncertainty,

@@ -13,10 +13,11 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell
     from limber.robot.motion.execution import RobotMotion
+    from limber.stages.pulls.record_nudge import Nudge
 
 
-def execution_summary(cell: Cell, motion: RobotMotion) -> dict[str, Any]:
-    """Return what is known of a motion before it runs, for the result."""
+def execution_summary(cell: Cell, motion: RobotMotion, across: Nudge | None) -> dict[str, Any]:
+    """Return what is known of a motion, and of the nudge before it, for the result."""
     steps = np.concatenate([motion.approach.times,
                             motion.approach.duration + motion.path.times[1:]])
     felt = motion.path.expected
@@ -31,7 +32,10 @@ def execution_summary(cell: Cell, motion: RobotMotion) -> dict[str, Any]:
         "joint_limit_margin_rad": motion.joints.limit_margin,
         "joint_speed_share": motion.joints.speed_share(cell.arm, steps),
         "gripper_rotation": motion.rotation, "start_pose_base": motion.approach.poses[0],
-        "start_joints_rad": motion.joints.joints[0]}
+        "start_joints_rad": motion.joints.joints[0],
+        "nudge_m": None if across is None else float(across.check.predicted.travels[-1]),
+        "nudge_force_n": None if across is None else float(
+            np.linalg.norm(across.check.predicted.forces[-1]))}
 
 
 def write_preview(branch: Branch, name: str, settings: Settings, cell: Cell,

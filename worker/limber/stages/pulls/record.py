@@ -22,7 +22,6 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell
     from limber.robot.driver.link import RobotLink
-    from limber.robot.driver.live_force import LiveForce
     from limber.robot.motion.execution import Blocked
     from limber.robot.motion.trajectory import Trajectory
     from limber.robot.pull_plausibility import PullPlausibility
@@ -122,6 +121,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
     """
     from limber.robot.cell.cell import read_cell
     from limber.robot.cell.compatibility import check_branch, require_payload
+    from limber.robot.weighing import require_weighed
     from limber.stages.paths.plan_cell import blocked_by, cell_obstacles
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
@@ -142,6 +142,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
         raise InputError(f"A recording {name} was interrupted.", "It would be lost.",
                          "Recover it with --recover, or give another --name.")
     require_payload(cell)
+    require_weighed(cell)
     blocked = blocked_by(cell, cell_obstacles(cell, cell_file.parent))
     require_confirmation(name, options.confirm, cell, progress)
     with branch.writing(f"the recording {name}"):
@@ -178,7 +179,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
     from limber.robot.driver.live_force import LiveForce
     from limber.robot.pull_plausibility import off_axis
     from limber.robot.recorder import PullRecorder
-    from limber.stages.pulls.record_nudge import nudge_and_checks
+    from limber.stages.pulls.record_nudge import nudge_and_checks, nudged
     from limber.stages.pulls.record_observers import Observers
     from limber.stages.pulls.record_path import grasp_point
 
@@ -217,16 +218,16 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             grip(cell, link, close=True, progress=progress)
             time.sleep(_SETTLE_SECONDS)
             if across is not None:
-                doubts.append(predicted[1])
-                event = _nudged(link, live, recorder, across, predicted[1], progress)
+                progress(0.13, "nudging the branch across the pull")
+                event = nudged(link, live, across, doubts)
                 if event["event"] != "reached":
-                    return {"ended": _how_it_ended(event, doubts), "after_stop": retreat_if_chosen(
+                    return {"ended": event["reason"], "after_stop": retreat_if_chosen(
                         cell, link, options.after_stop, progress), "peak_force_n": 0.0,
                         "sample_count": 0, "warnings": list(link.warnings)}
             _write_entry(entry_lines, cell, point, tared, trajectory.duration, observers)
             recorder.close_gripper()
             live.at("pulling")
-            doubts += predicted[:1]
+            doubts += predicted
             link.start(trajectory)
             event = _watched(link, observers, recorder, trajectory, progress)
             ended = {"ended": _how_it_ended(event, doubts)}
@@ -243,18 +244,6 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                         "warnings": list(link.warnings)}
     finally:
         _close_lines([stream, entry_lines, observers.lines], recorders)
-
-
-def _nudged(link: RobotLink, live: LiveForce, recorder: PullRecorder, across: Trajectory,
-            doubt: PullPlausibility, progress: Progress) -> dict[str, Any]:
-    """Nudge the branch across the pull and back, which is not recorded; return how it ended."""
-    progress(0.13, "nudging the branch across the pull")
-    live.at("nudging")
-    link.start(across)
-    event = _watched(link, None, recorder, across, progress.part(0.13, 0.15))
-    time.sleep(_SETTLE_SECONDS)
-    # Its last samples may have come after its end.
-    return event if doubt.reason is None else {"event": "stopped", "reason": doubt.reason}
 
 
 def _close_lines(streams: list[Stream | None], recorders: list[PullRecorder]) -> None:
@@ -282,7 +271,7 @@ def _warn_of_what_is_left(doubts: list[PullPlausibility], recorder: PullRecorder
         progress.warn(f"{warning}.")
 
 
-def _watched(link: RobotLink, observers: Observers | None, recorder: PullRecorder,
+def _watched(link: RobotLink, observers: Observers, recorder: PullRecorder,
              trajectory: Trajectory, progress: Progress) -> dict[str, Any]:
     """Wait for the end of the motion; observations are written as they arrive."""
     begin = time.monotonic()
@@ -297,8 +286,7 @@ def _watched(link: RobotLink, observers: Observers | None, recorder: PullRecorde
             # Ctrl-C stops the arm before anything else.
             link.stop()
             raise
-        if observers is not None:
-            observers.write(recorder)
+        observers.write(recorder)
         progress(0.15 + 0.8 * min((time.monotonic() - begin) / trajectory.duration, 1.0),
                  "pulling", force_n=recorder.peak_force)
 

@@ -1,8 +1,14 @@
-"""A small move across a pull with the branch held: it shows a sensor whose axes are wrong.
+"""A small move across a pull with the branch held: it shows a sensor that is wrong.
 
 A sensor turned about the force of a pull shows that force correctly. The force of a nudge across
-it lies in another direction.
+it lies in another direction. A path is followed only after such a nudge as well.
 """
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,43 +30,92 @@ from limber.stages.pulls.record_path import there_and_back
 from limber.stages.pulls.record_prediction import PullModel
 from limber.store import Branch
 
+if TYPE_CHECKING:
+    from limber.robot.driver.link import RobotLink
+    from limber.robot.driver.live_force import LiveForce
+
+_SETTLE_SECONDS = 0.5  # until the branch rests again
 _SHARE = 0.5  # of the pull's own travel, and of the force at which a motion pauses
+
+
+@dataclass(frozen=True)
+class Nudge:
+    """A nudge of the held branch, out and back, and the check of the forces that it shows."""
+
+    motion: Trajectory
+    check: PullPlausibility
 
 
 def nudge_and_checks(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
                      pull: Trajectory, blocked: Blocked, progress: Progress,
-                     ) -> tuple[Trajectory | None, list[PullPlausibility]]:
-    """Return the nudge before a pull, if there is one; and the checks of the pull and of the nudge.
+                     ) -> tuple[Nudge | None, list[PullPlausibility]]:
+    """Return the nudge before a pull, if there is one; and the check of the pull.
 
     Args:
         point: Position of the grasp, branch frame [m], shape [3].
-        sample: As :func:`nudge` takes it.
+        sample: Of the robot at the start, as :data:`limber.robot.driver.link.COLUMNS`.
     """
-    across: Trajectory | None = None
-    checks: list[PullPlausibility] = []
     try:
-        model = PullModel(branch, cell, point, progress)
-        checks.append(PullPlausibility(cell, model.predicted(pull)))
-        across = nudge(cell, model.stiffness, sample, pull, blocked)
-        if across is None:
-            progress.warn("The arm cannot nudge the branch across the pull, so a sensor whose "
-                          "axes are turned about the pull's force is not noticed.")
-        else:
-            checks.append(PullPlausibility(cell, model.predicted(across)))
+        model = PullModel.of_branch(branch, cell, point, progress)
+        checks = [PullPlausibility(cell, model.predicted(pull))]
+        return checked_nudge(cell, model, sample[1:7], sample[19:25], pull, blocked,
+                             progress), checks
     except LimberError as error:
         progress.warn(f"The force of this pull could not be predicted ({error}), so the sensor's "
                       "sign and axes are not checked by it.")
         return None, []
-    return across, checks
 
 
-def nudge(cell: Cell, stiffness: np.ndarray, sample: np.ndarray, pull: Trajectory,
-          blocked: Blocked | None) -> Trajectory | None:
+def checked_nudge(cell: Cell, model: PullModel, pose: np.ndarray, joints: np.ndarray,
+                  pull: Trajectory, blocked: Blocked | None, progress: Progress) -> Nudge | None:
+    """Return the nudge before a motion that holds the branch; None where the arm can make none.
+
+    Args:
+        pose, joints: As :func:`nudge` takes them.
+
+    Raises:
+        ConvergenceError: its force cannot be predicted.
+    """
+    across = nudge(cell, model.stiffness, pose, joints, pull, blocked)
+    if across is None:
+        progress.warn("The arm cannot nudge the branch across the pull, so a sensor whose "
+                      "axes are turned about the pull's force is not noticed.")
+        return None
+    return Nudge(across, PullPlausibility(cell, model.predicted(across)))
+
+
+def nudged(link: RobotLink, live: LiveForce, across: Nudge, judging: list[PullPlausibility],
+           ) -> dict[str, Any]:
+    """Nudge the held branch and return how it ended, as :meth:`.RobotLink.follow` does.
+
+    Args:
+        judging: Gets the check while it is in use: whoever takes the samples lets the last one
+            judge them, and stops the arm for its reason.
+    """
+    live.at("nudging")
+    judging.append(across.check)
+    try:
+        event = link.follow(across.motion)
+        # Its last samples may come after its end, and the branch comes to rest.
+        time.sleep(_SETTLE_SECONDS)
+    except BaseException:
+        # Ctrl-C stops the arm before anything else.
+        link.stop()
+        raise
+    finally:
+        judging.remove(across.check)
+    reason = across.check.reason
+    return event if reason is None else {"event": "stopped", "reason": f"implausible: {reason}"}
+
+
+def nudge(cell: Cell, stiffness: np.ndarray, pose: np.ndarray, joints: np.ndarray,
+          pull: Trajectory, blocked: Blocked | None) -> Trajectory | None:
     """Return the nudge before a pull, out and back; None where the arm can make none.
 
     Args:
         stiffness: Of the held branch, branch frame [N/m], shape [3, 3].
-        sample: Of the robot at the start, as :data:`limber.robot.driver.link.COLUMNS`.
+        pose: Of the gripper at the start, branch frame [m, rad], shape [6].
+        joints: Of the arm there [rad], shape [n].
     """
     away = np.linalg.norm(pull.poses[:, :3] - pull.poses[0, :3], axis=1)
     farthest = float(away.max())
@@ -70,12 +125,12 @@ def nudge(cell: Cell, stiffness: np.ndarray, sample: np.ndarray, pull: Trajector
     # A stiff branch is nudged less far, so that the nudge itself stays below the limits.
     gentle = cell.limits.soft_force_n / float(np.linalg.norm(stiffness @ side))
     travel = min(NUDGE_M, _SHARE * farthest, _SHARE * gentle)
-    frames = np.array([matrices(sample[1:7])] * 2)
+    frames = np.array([matrices(pose)] * 2)
     for sign in (1.0, -1.0):
         frames[1, :3, 3] = frames[0, :3, 3] + sign * travel * side
         try:
             return there_and_back(cell, frames, speed=min(NUDGE_M_S, cell.limits.speed_m_s),
-                                  cycles=1, pause=NUDGE_SECONDS, start=sample[19:25],
+                                  cycles=1, pause=NUDGE_SECONDS, start=joints,
                                   blocked=blocked)
         except (NoPathError, SafetyStop):
             continue

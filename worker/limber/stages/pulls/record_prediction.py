@@ -13,6 +13,7 @@ from limber.stages.pulls.record_path import GRASP_RADIUS_M
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from limber.mechanics import BranchModel
     from limber.robot.cell.cell import Cell
     from limber.robot.motion.trajectory import Trajectory
 
@@ -27,21 +28,22 @@ class PullModel:
     """The branch's model, clamped where the gripper holds it.
 
     Args:
+        model: The branch as it hangs.
+        deviation: Standard deviation of log E; None: the moduli are not known.
+        cell: States the robot's base.
         point: Position of the grasp, branch frame [m], shape [3].
 
     Attributes:
         stiffness: Force over displacement of the gripper that does not turn [N/m], shape [3, 3].
 
     Raises:
-        LimberError: there is no usable model.
+        ConvergenceError: a small displacement has no solution.
     """
 
-    def __init__(self, branch: Branch, cell: Cell, point: np.ndarray, progress: Progress):
+    def __init__(self, model: BranchModel, deviation: float | None, cell: Cell,
+                 point: np.ndarray):
         from limber.mechanics import Grasp
-        from limber.store.loading import load_branch, young_deviation
 
-        model = load_branch(branch, progress=progress).model
-        deviation = young_deviation(branch)
         self._factor = None if deviation is None else max(
             float(np.exp(_DEVIATIONS * deviation)), _LEAST_FACTOR)
         self._grasp = Grasp.gripping(model.mesh, point, GRASP_RADIUS_M)
@@ -50,6 +52,19 @@ class PullModel:
         self._rest = np.eye(4)
         self._rest[:3, 3] = point
         self.stiffness = self._stiffness()
+
+    @classmethod
+    def of_branch(cls, branch: Branch, cell: Cell, point: np.ndarray, progress: Progress,
+                  ) -> PullModel:
+        """Return the model of a branch folder.
+
+        Raises:
+            LimberError: there is no usable model.
+        """
+        from limber.store.loading import load_branch, young_deviation
+
+        return cls(load_branch(branch, progress=progress).model, young_deviation(branch), cell,
+                   point)
 
     def _stiffness(self) -> np.ndarray:
         from limber.mechanics import solve_static
