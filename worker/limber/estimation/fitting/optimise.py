@@ -275,6 +275,7 @@ class _Settling:
         self.count = 0
         self._best = (np.inf, np.inf)
         self._course: list[float] = []
+        self._iterations = 0
         self._has_settled = False
 
     @property
@@ -293,6 +294,7 @@ class _Settling:
 
     def after_iteration(self, _free: np.ndarray) -> None:
         self._course.append(self._best[0])
+        self._iterations += 1
         if len(self._course) > self._window:
             fell = self._course[-1 - self._window] - self._course[-1]
             self._has_settled = fell <= min(SETTLED_FALL, 1e-3 * self._course[-1])
@@ -304,9 +306,20 @@ class _Settling:
         error = f"the mean squared distance of the points, {self._error:.3g} m2,"
         if not is_settled:
             return FitStatus.out_of_evaluations, (
-                f"{limit} simulations were not enough: {error} is still falling. Use "
-                "--method gauss-newton")
+                f"{limit} simulations were not enough: {error} is still falling. "
+                f"{self._outlook()} Use --method gauss-newton")
         return FitStatus.converged, f"{error} settled"
+
+    def _outlook(self) -> str:
+        """After how many simulations it would settle if its fall went on shrinking as it does."""
+        course, half = self._course, len(self._course) // 2
+        early, late = (course[0] - course[half], course[half] - course[-1]) if half else (0, 0)
+        if not 0 < late < early < np.inf:
+            return f"It would take more than {2 * self.count}."
+        negligible = min(SETTLED_FALL, 1e-3 * course[-1])
+        halves = max(np.log(negligible / late) / np.log(late / early), 1.0)
+        more = halves * half * self.count / self._iterations
+        return f"At this rate it would settle after about {float(f'{self.count + more:.2g}'):.0f}."
 
 
 def _required(objective: Objective, free: np.ndarray) -> Evaluation:
