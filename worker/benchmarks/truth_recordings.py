@@ -198,9 +198,9 @@ CASES: tuple[tuple[str, tuple[str, ...], Callable[[Rig], tuple[int, str]]], ...]
     ("an unknown label", ("base2",), _unknown),
     ("a grasp point off the branch", ("from the branch",), _beside),
     ("a swing that has not ended", ("at rest",), _swinging),
-    ("no load shows", ("no load shows",), _nothing_moves),
+    ("no load shows", ("no visible effect",), _nothing_moves),
     ("nothing that gives the scale", ("soft or stiff",), _not_identified),
-    ("a load in another unit", ("another unit",), _in_another_unit),
+    ("a load in another unit", ("it is in N",), _in_another_unit),
 )
 """The fault, words in the message, and the function that makes it."""
 BAD_RECORDINGS = Asked("bad recordings: " + ", ".join(name for name, _, _ in CASES),
