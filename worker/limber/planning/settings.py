@@ -64,7 +64,7 @@ class PlanSettings(Settings):
         json_schema_extra=BOX)
     in_view: bool = Field(False, description=(
         "The target must be visible to the cell's camera: inside its image, within its range, and "
-        "not hidden by the branch."))
+        "not hidden by the branch, nor by what a connected RealSense camera sees now."))
     second_arm: bool = Field(False, description=(
         "The target must be within reach of the cell's second arm."))
     goal_seed: int | None = Field(None, ge=0, description=(
