@@ -5,8 +5,10 @@ import time
 import numpy as np
 import pytest
 
+from limber.geometry.skeleton.joining import bridge_kernels, pieces
 from limber.geometry.skeleton.joining import join_pieces as joining
-from limber.geometry.skeleton.joining import pieces
+from limber.geometry.skeleton.joining.boxes import boxes
+from limber.geometry.skeleton.joining.free_ends import free_ends
 from limber.geometry.skeleton.joining.join_pieces import join_pieces
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -54,21 +56,49 @@ def test_a_crown_of_many_pieces_is_joined_in_seconds():
     assert state.label.max() == 0 and len(state.bridges) == 47
 
 
+def _sticks(count, seed=5):
+    """Short sticks in all directions, each of three nodes: nodes and edges."""
+    rng = np.random.default_rng(seed)
+    way = rng.normal(size=(count, 1, 3))
+    way /= np.linalg.norm(way, axis=2, keepdims=True)
+    nodes = rng.uniform(0, 1, (count, 1, 3)) + np.linspace(0, 0.01, 3)[:, None] * way
+    first = 3 * np.arange(count)
+    return nodes.reshape(-1, 3), np.stack(
+        [np.r_[first, first + 1], np.r_[first + 1, first + 2]], axis=1)
+
+
 @pytest.mark.slow
 def test_strewn_sticks_end_in_seconds() -> None:
-    """400 short sticks in all directions: 100 of them once took minutes."""
+    """2,000 short sticks: 100 of them once took minutes, 2,000 over 400 s."""
     _joined(2)  # compiles
-    rng = np.random.default_rng(5)
-    way = rng.normal(size=(400, 1, 3))
-    way /= np.linalg.norm(way, axis=2, keepdims=True)
-    nodes = (rng.uniform(0, 1, (400, 1, 3)) + np.linspace(0, 0.01, 3)[:, None] * way).reshape(-1, 3)
-    first = 3 * np.arange(400)
-    edges = np.stack([np.r_[first, first + 1], np.r_[first + 1, first + 2]], axis=1)
+    nodes, edges = _sticks(2000)
+    radius = np.full(len(nodes), 0.002)
     started = time.process_time()
-    state = join_pieces(nodes, edges, np.full(1200, 0.002), np.full(1200, 20),
-                        np.full(1200, 0.002), gap=0.03, bridge_limit=0.5, up=Z, join_plants=False)
-    assert time.process_time() - started < 12
+    state = join_pieces(nodes, edges, radius, np.full(len(nodes), 20), radius, gap=0.03,
+                        bridge_limit=0.5, up=Z, join_plants=False)
+    assert time.process_time() - started < 20
     assert state.label.max() == 0
+
+
+def test_boxes_leave_out_no_path() -> None:
+    """The search over boxes keeps the paths that one over all nodes keeps."""
+    nodes, edges = _sticks(60)
+    radius, label = np.full(len(nodes), 0.002), np.repeat(np.arange(60), 3)
+    ends = free_ends(nodes, edges, radius)
+    end_of = np.full(len(nodes), -1)
+    end_of[ends.node] = np.arange(len(ends.node))
+    given = (nodes, radius, np.zeros_like(nodes), np.zeros(len(nodes), bool), label, ends.node,
+             ends.direction, ends.radius, end_of, 0.4)
+    whole = (np.arange(len(nodes)), np.array([[0, len(nodes)]]), nodes.min(axis=0)[None],
+             nodes.max(axis=0)[None], np.array([-1]))
+    kept = bridge_kernels.priced(*given, boxes(nodes, label))
+    for one, other in zip(kept, bridge_kernels.priced(*given, whole), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert len(kept[0]) < len(ends.node) * 177
+    for one, other in zip(*(bridge_kernels.nearest_others(
+            nodes, label, np.arange(len(nodes)), 0.4, 3, tree) for tree in (
+                boxes(nodes, label), whole)), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_stem_takes_many_twigs_in_a_round():

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from limber.geometry.skeleton.joining.boxes import Boxes, boxes
 from limber.geometry.skeleton.joining.bridge_kernels import nearest_others, priced
 from limber.geometry.skeleton.joining.free_ends import UNSURE, Ends, Known
 
@@ -64,9 +65,10 @@ def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, labe
     end_of[ends.node] = np.arange(len(ends.node))
     nodes, label = np.ascontiguousarray(nodes, float), label.astype(np.int64)
     single = np.bincount(label)[label] <= UNSURE
+    tree = boxes(nodes, label)
     parts = [priced(nodes, thickness, axes, single, label, ends.node, ends.direction, ends.radius,
-                    end_of, float(limit)),
-             _blind(nodes, label, int(np.argmax(weight)), limit)]
+                    end_of, float(limit), tree),
+             _blind(nodes, label, int(np.argmax(weight)), limit, tree)]
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     thick = thickness.copy()
     thick[ends.node] = ends.radius
@@ -123,12 +125,12 @@ def _axes(nodes: np.ndarray, edges: np.ndarray, known: Known) -> np.ndarray:
     return axes
 
 
-def _blind(nodes: np.ndarray, label: np.ndarray, largest: int, limit: float,
+def _blind(nodes: np.ndarray, label: np.ndarray, largest: int, limit: float, tree: Boxes,
            ) -> tuple[np.ndarray, ...]:
     """The shortest paths from each piece to others, regardless of direction."""
     own = np.argsort(label, kind="stable")
     own = own[label[own] != largest]
-    near, distance = nearest_others(nodes, label, own, float(limit), _BLIND_NEAR)
+    near, distance = nearest_others(nodes, label, own, float(limit), _BLIND_NEAR, tree)
     row, which = np.nonzero(near >= 0)
     length = distance[row, which]
     return (own[row], near[row, which], length, (1 + _BLIND) * length,

@@ -63,11 +63,11 @@ def _joined(first: Joined, rules: Rules, refused: frozenset[tuple[int, int]] = f
         if len(weight) == 1 or state.cost() >= dearest:
             break
         ends = state.ends()
-        found = _unrefused(hypotheses(state.nodes, state.edges, state.thickness, state.label,
-                                      weight, rules.bridge_limit, ends, state.known),
-                           state.piece, refused)
+        every = hypotheses(state.nodes, state.edges, state.thickness, state.label, weight,
+                           rules.bridge_limit, ends, state.known)
+        found = _unrefused(every, state.piece, refused)
         chosen, decisive = mutual(found, state, ends, weight, rules, alone)
-        state.rounds.append(Round(state.copy([]), alone, decisive,
+        state.rounds.append(Round(state.copy([]), alone, decisive, every,
                                   (len(ends.node) + _NODE_WORK) * len(state.nodes)))
         if not chosen and alone:
             alone = False

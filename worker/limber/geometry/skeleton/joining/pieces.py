@@ -100,12 +100,14 @@ class Round:
         alone: Whether pieces without a direction had to wait.
         decisive: The pairs of given pieces between which a hypothesis mattered. Without the
             hypotheses of any other pair, the round is the same.
+        found: All hypotheses, those of refused pairs included.
         work: Its work, in paths between ends and nodes: these, and what each node costs besides.
     """
 
     before: Joined
     alone: bool
     decisive: set[tuple[int, int]]
+    found: Hypotheses
     work: int
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.geometry.skeleton.joining.bridges import Hypotheses, hypotheses
+from limber.geometry.skeleton.joining.bridges import Hypotheses
 from limber.geometry.skeleton.joining.pieces import Joined, Rules
 
 _ELSEWHERE = 3.0  # thicknesses within which two places are the same fork
@@ -45,12 +45,10 @@ def rivals(state: Joined, rules: Rules) -> list[Rival | None]:
         if len(made) == 0:
             continue
         weight = np.bincount(before.label, before.support)
-        able = hypotheses(before.nodes, before.edges, before.thickness, before.label, weight,
-                          rules.bridge_limit, before.ends(), before.known)
         for bridge in made:
             one, other = state.bridges[bridge]
             small_first = weight[before.label[one]] <= weight[before.label[other]]
-            found[bridge] = _rival(before, able, *(
+            found[bridge] = _rival(before, past.found, *(
                 (one, other) if small_first else (other, one)))
     return found
 
