@@ -1,8 +1,6 @@
 """Grab the branch at the mouse and bend it by hand, with the worker's answers in real time."""
 
-import enum
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -18,6 +16,8 @@ from ..session import HeldFrame, Session
 from ..stages import stages
 from ..worker import WorkerNotFound
 from . import limits, live_loads
+from .hold import Hold, Kept
+from .lighter_view import LighterView
 from .live_loads import LiveLoads
 from .needs_result import NeedsBranchInObjectMode, check_identity
 
@@ -35,38 +35,6 @@ _NAVIGATION = {"MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WHEELINMOUSE", 
 _WORDS = {"learning": "full model, slow; learning", "reduced": "learnt model",
           "full": "full model", "untrusted": "NOT RELIABLE"}
 _NORMAL, _OVER = (1.0, 1.0, 1.0, 1.0), (1.0, 0.25, 0.2, 1.0)
-
-
-class Kept(enum.Enum):
-    """Use of a grab that is kept."""
-
-    MOTION = "RET"
-    START = "S"
-    GOAL = "G"
-
-
-@dataclass
-class Hold:
-    """The place that the mouse holds.
-
-    Attributes:
-        rest: Position of that place on the branch as scanned [m]; once the grasp is known, its
-            centre there.
-        begin: Its position when the mouse took it, in the world.
-        asked: Number of the command that the session answers with the grasp.
-        number: Number of the grasp, None until it is known.
-        position: Position of the grasp when it was taken [m].
-        wanted: Target position [m].
-        is_dragged: Whether the mouse button is down.
-    """
-
-    rest: Vector
-    begin: Vector
-    asked: int
-    number: int | None = None
-    position: Vector | None = None
-    wanted: Vector | None = None
-    is_dragged: bool = True
 
 
 class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
@@ -129,6 +97,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         self._panel_drawn = 0.0
         self._rest = meshes.positions(mesh)
         self._is_ready, self._rate = False, FrameRate()
+        self._lighter = LighterView(context.preferences)
         self._mouse = self._waiting = None
         motion = self._surface.modifiers.get(animation.MODIFIER)
         self._had_motion = motion is not None and motion.show_viewport
@@ -174,11 +143,13 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             return {"CANCELLED"}
         elif event.type in {"RET", "NUMPAD_ENTER", "S", "G"} and event.value == "PRESS":
             return self._keep(context, Kept("RET" if "ENTER" in event.type else event.type))
-        self._area.tag_redraw()
+        # Not the whole area: its header and sidebars would be drawn again at each move.
+        self._region.tag_redraw()
         return {"RUNNING_MODAL"}
 
     def _answered(self, context):
         """Read the session's messages, show its newest frame, send the next target."""
+        self._lighter.turned()
         for told in self._session.poll():
             if self._loads.hear(told):
                 if self._loads.error:
@@ -204,6 +175,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             self._show_limits(context, frame)
             self._region.tag_redraw()
             self._draw_panel()
+            self._lighter.shown()
         self._loads.step(self._session)
         if self._waiting is not None and self._session.hello:
             self._take(context, self._waiting)
@@ -323,6 +295,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             return
         context.window_manager.event_timer_remove(self._timer)
         bpy.types.SpaceView3D.draw_handler_remove(self._drawing, "WINDOW")
+        self._lighter.end()
         context.workspace.status_text_set(None)
         self._area.header_text_set(None)
         self._session.close()
