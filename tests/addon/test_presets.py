@@ -28,6 +28,15 @@ def test_a_camera_of_millimetres(bpy, registered):
     assert not settings.use_camera_at
 
 
+def test_up_is_opposite_to_the_axis_that_points_down(bpy, registered):
+    """A camera's own frame has y down; the files of RealSense's Viewer are turned upright."""
+    settings = bpy.context.scene.limber.reconstruct
+    for sensor, up in (("depth_camera", -1.0), ("realsense_ply", 1.0), ("zivid", -1.0),
+                       ("kinect_v2", 1.0)):
+        bpy.ops.limber.sensor(sensor=sensor)
+        assert list(settings.up) == [0.0, up, 0.0] and list(settings.camera_at) == [0.0] * 3
+
+
 def test_a_force_sensor(bpy, registered):
     """Half of the precision of its data sheet; the torque only where it is known."""
     settings = bpy.context.scene.limber.import_pull

@@ -1,12 +1,14 @@
 """Sensor presets: how the files of a scanner or camera are read, and the noise of a force sensor.
 
-Axes of a camera: x right, y down, z forward, so that up is -y and the camera is the origin.
+Axes of most cameras: x right, y down, z forward, so that up is -y. Some files have y up. The camera
+is the origin of both.
 """
 
 from dataclasses import dataclass, field
 from typing import Any
 
-_IN_CAMERA_AXES = {"up": [0.0, -1.0, 0.0], "camera_at": [0.0, 0.0, 0.0]}
+_Y_DOWN = {"up": [0.0, -1.0, 0.0], "camera_at": [0.0, 0.0, 0.0]}
+_Y_UP = {"up": [0.0, 1.0, 0.0], "camera_at": [0.0, 0.0, 0.0]}
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,23 @@ SENSORS = {
         {"unit": "m", "up": [0.0, 0.0, 1.0]}),
     "depth_camera": SensorPreset(
         "Depth camera, ROS optical frame", "reconstruct",
-        "REP 103: metres; x right, y down, z forward", {"unit": "m", **_IN_CAMERA_AXES}),
+        "REP 103: metres; x right, y down, z forward", {"unit": "m", **_Y_DOWN}),
+    "realsense_ply": SensorPreset(
+        "RealSense, PLY of its Viewer", "reconstruct",
+        "librealsense, issues 3589 and 5833, from 2.19: metres; x right, y up, z backward",
+        {"unit": "m", **_Y_UP}),
     "azure_kinect": SensorPreset(
         "Azure Kinect", "reconstruct",
-        "Azure Kinect Sensor SDK, depth_image_to_point_cloud: millimetres in the camera's axes",
-        {"unit": "mm", **_IN_CAMERA_AXES}),
+        "Azure Kinect DK, Coordinate systems: millimetres; x right, y down, z forward",
+        {"unit": "mm", **_Y_DOWN}),
+    "kinect_v2": SensorPreset(
+        "Kinect for Windows, version 2", "reconstruct",
+        "Kinect for Windows SDK 2.0, CameraSpacePoint: metres; x left, y up, z forward",
+        {"unit": "m", **_Y_UP}),
+    "zivid": SensorPreset(
+        "Zivid", "reconstruct",
+        "Zivid, Camera Coordinate System: millimetres; x right, y down, z outward",
+        {"unit": "mm", **_Y_DOWN}),
     "ur5e": SensorPreset(
         "UR5e, own sensor", "import-pull",
         "UR5e data sheet: precision 3.5 N and 0.2 Nm, taken as two standard deviations",
