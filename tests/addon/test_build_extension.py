@@ -121,6 +121,29 @@ def test_the_zip_is_for_the_blenders_with_its_python(build):
         build.blender_versions("3.15")
 
 
+def test_a_repository_names_the_python_of_each_zip(build, tmp_path, bpy):
+    """Blender then takes the zip for its Python alone; the zip without wheels is not listed."""
+    if not list((ROOT / ".venv").glob("lib/python3*/site-packages/bpy")):
+        pytest.skip("NO BPY in .venv: scripts/setup brings it")
+    plain = (ROOT / "addon" / "blender_manifest.toml").read_text()
+    (tmp_path / "limber-0.1.0.zip").touch()
+    for python in ("3.11", "3.13"):
+        tag = python.replace(".", "")
+        wheels = [_wheel(tmp_path, f"a-1.0-cp{tag}-cp{tag}-manylinux_2_17_x86_64.whl", a=ELF),
+                  _wheel(tmp_path, "b-1.0-py3-none-any.whl")]
+        with zipfile.ZipFile(tmp_path / f"limber-0.1.0-linux-x64-py{tag}.zip", "w") as archive:
+            archive.writestr("blender_manifest.toml",
+                             build.with_wheels(plain, wheels, "linux-x64", python))
+            archive.writestr("__init__.py", "")
+            for wheel in wheels:
+                archive.write(wheel, f"wheels/{wheel.name}")
+    subprocess.run([sys.executable, ROOT / "scripts" / "make_repository", tmp_path], check=True)
+    listed = json.loads((tmp_path / "index.json").read_text())["data"]
+    assert {each["archive_url"]: each["python_versions"] for each in listed} == {
+        "./limber-0.1.0-linux-x64-py311.zip": ["3.11"],
+        "./limber-0.1.0-linux-x64-py313.zip": ["3.13"]}
+
+
 def test_a_worker_that_does_not_load_says_what_to_do(tmp_path):
     """Wheels of another Python or a numpy too old: a sentence, not a trace."""
     package = tmp_path / "limber" / "cli"
