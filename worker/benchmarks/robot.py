@@ -14,6 +14,7 @@ import numpy as np
 from benchmarks import robot_faults
 from benchmarks.machine_stalls import Voided, Witness
 from benchmarks.robot_branches import FOLLOWED_ROWS, LOST_ROW, followed_paths, lost_branches
+from benchmarks.robot_calibration import CALIBRATION_ROWS, calibrations
 from benchmarks.robot_faults import (
     ENDS_ROBOT,
     EVERY,
@@ -286,6 +287,7 @@ PARTS = {
                    grows=True),
     "wrong-states": Part(wrong_states, 30, (STATES_ROW,), grows=True),
     "retreats": Part(retreats, 60, (RETREAT_ROW,), grows=True),
+    "calibration": Part(calibrations, 30, CALIBRATION_ROWS, grows=True),
     "ros": Part(_watched(ros_door), LEAST_ROS_S, ROS_ROWS, grows=True),
     "branches": Part(_watched(partial(followed_paths, address=_ADDRESS)), 60, FOLLOWED_ROWS,
                      grows=True),
