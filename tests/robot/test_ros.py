@@ -19,6 +19,7 @@ from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.pull_plausibility import PredictedPull, PullPlausibility
 from limber.robot.ros import guarded_robot
 from limber.robot.ros.bridge import Bridge
 from limber.robot.ros.cloud_topic import CloudTopic
@@ -105,6 +106,33 @@ def test_after_a_stop_it_goes_back_along_its_way_until_no_force_is_left(monkeypa
         assert event["event"] == "reached" and event["force_n"] < 1.0, event
         assert server.joints == pytest.approx(HOME, abs=2e-3)
         other.close()
+
+
+@pytest.mark.real_time
+@pytest.mark.usefixtures("first_in_line")
+@pytest.mark.parametrize("sign, told", [(1.0, None), (-1.0, "the force points against")])
+def test_a_nudge_shows_a_sensor_whose_sign_is_wrong(sign, told):
+    """A branch of 500 N/m, there and back by 4 mm; judged as in `limber record`."""
+    out, start = line(0.004, 0.01), CELL.arm.forward(HOME)[:3, 3]
+    nudge = Trajectory(np.r_[out.times, out.duration + 0.5 + out.times],
+                       np.concatenate([out.poses, out.poses[::-1]]), None,
+                       np.concatenate([out.joints, out.joints[::-1]]))
+
+    def felt(joints: np.ndarray) -> np.ndarray:
+        """Of the surroundings on the tool, flange axes."""
+        flange = CELL.arm.forward(joints)
+        force = -500.0 * sign * flange[:3, :3].T @ (flange[:3, 3] - start)
+        return np.r_[force, np.cross(TOOL[:3, 3], force)]
+    travels = np.array([0.0, 0.004])
+    check = PullPlausibility(CELL, PredictedPull(
+        travels, 500.0 * travels[:, None] * [0.0, 1.0, 0.0], None))
+    with RosBridge(HOME) as server:
+        server.load = felt
+        robot = robot_at(server)
+        event = robot.follow(nudge, check=check)
+        assert event["event"] == ("stopped" if told else "reached"), event
+        assert told is None or f"implausible: {told}" in event["reason"]
+        robot.close()
 
 
 @pytest.mark.real_time

@@ -270,8 +270,8 @@ class PullPlausibility:
         self.reason: str | None = None
 
     def take(self, samples: np.ndarray) -> str | None:
-        """Judge samples [n, 37], as in :data:`limber.robot.driver.link.COLUMNS`; returns why the
-        sensor cannot be right, or None."""
+        """Judge samples [n, 19 or more], as in :data:`limber.robot.driver.link.COLUMNS`; returns
+        why the sensor cannot be right, or None."""
         if self._start is None:
             self._start, self._began = samples[0, 1:4].copy(), float(samples[0, 0])
         travels = np.linalg.norm(samples[:, 1:4] - self._start, axis=1)

@@ -16,6 +16,7 @@ from limber.cli.main import Run, stage_command
 if TYPE_CHECKING:
     from limber.robot.cell.cell import Cell
     from limber.robot.motion.trajectory import Trajectory
+    from limber.stages.pulls.record_nudge import Nudge
 
 _SECONDS = 1.0
 _LEGS = ("approach", "path", "return", "leaving")
@@ -168,7 +169,7 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
                          "emergency stop.")
     began = time.monotonic()
     event = _followed(run, cell, trajectory, url, is_held=leg in ("path", "return"),
-                      goes_on=leg == "return")
+                      goes_on=leg == "return", across=planned.across if leg == "path" else None)
     result |= {"reached": event["event"] == "reached", "stop_reason": event.get("reason"),
                "followed_s": time.monotonic() - began}
     if not result["reached"]:
@@ -309,12 +310,13 @@ def gripper(run: Run, cell_file: Path, position: float, effort: float, action: s
 
 
 def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, is_held: bool,
-              goes_on: bool = False) -> dict[str, Any]:
+              goes_on: bool = False, across: Nudge | None = None) -> dict[str, Any]:
     """Tare, or with the branch held recall the tare, and follow; return how that ended.
 
     Args:
         trajectory: None: go back along the path that was followed last.
         goes_on: It belongs to the path of the leg before: a retreat goes back along both.
+        across: Nudge of the held branch before it, which shows a wrong sensor.
     """
     from limber.core.errors import SafetyStop
     from limber.robot.driver.real_time import claim_real_time
@@ -332,8 +334,13 @@ def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, 
             else:
                 robot.tare(_SECONDS)
             claim_real_time()
-            event = (robot.retreat() if trajectory is None
-                     else robot.follow(trajectory, goes_on=goes_on))
+            event = {"event": "reached"}
+            if across is not None:
+                event = robot.follow(across.motion, check=across.check)
+                robot.watched(_SECONDS)  # until the branch rests again
+            if event["event"] == "reached":
+                event = (robot.retreat() if trajectory is None
+                         else robot.follow(trajectory, goes_on=goes_on))
         except ConnectionError as error:
             raise SafetyStop(f"{error}.", "Whether the arm stands is not known.",
                              "Check the robot; its stop node acts on silence.") from error

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import SafetyStop, WorkError
+from limber.core.numerics.rigid import pose_vectors
 from limber.core.numerics.rigid_kernels import frame_of, turn_between, turned_wrench
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.delays import HoldUps
@@ -25,6 +26,7 @@ from limber.robot.motion.followed_path import FollowedPathFile, read_followed_pa
 from limber.robot.motion.retreat import RetreatPath
 from limber.robot.motion.start_check import require_start
 from limber.robot.motion.trajectory import Trajectory
+from limber.robot.pull_plausibility import PullPlausibility
 from limber.robot.ros.bridge import SECONDS, Bridge
 from limber.robot.ros.messages import (
     FOLLOW,
@@ -185,12 +187,14 @@ class RosRobot:
                    uncertainty=np.eye(6), grasp=self.last.pose[:3], sent=self.last.pose[:3])
         turn_between(self.last.pose, self.last.pose)
 
-    def follow(self, trajectory: Trajectory, *, goes_on: bool = False) -> dict[str, Any]:
+    def follow(self, trajectory: Trajectory, *, goes_on: bool = False,
+               check: PullPlausibility | None = None) -> dict[str, Any]:
         """Follow a trajectory to its end; returns the event that ended it, as
         :meth:`.RobotLink.follow`: ``reached``, or ``stopped`` with its reason.
 
         Args:
             goes_on: The branch is held as in the leg before, whose path belongs to this one.
+            check: Stops the motion where its force cannot be right.
 
         Raises:
             SafetyStop: the arm is not at its start, or the guard refuses.
@@ -205,7 +209,7 @@ class RosRobot:
             raise _moves_already()
         self.guard.begin()
         self._way.begin(sample, trajectory, goes_on=goes_on)
-        return self._watched_goal(trajectory, goal)
+        return self._watched_goal(trajectory, goal, check)
 
     def retreat(self) -> dict[str, Any]:
         """Go back along the path that was followed, while the force falls; a person has chosen it.
@@ -252,7 +256,8 @@ class RosRobot:
         assert self.last is not None
         return self.last
 
-    def _watched_goal(self, trajectory: Trajectory, content: dict[str, Any]) -> dict[str, Any]:
+    def _watched_goal(self, trajectory: Trajectory, content: dict[str, Any],
+                      check: PullPlausibility | None = None) -> dict[str, Any]:
         """Send a trajectory as the goal ``content`` and watch it to its end."""
         self._goals += 1
         goal = f"limber-{self._goals}"
@@ -273,7 +278,7 @@ class RosRobot:
             if (sample := self._take(message)) is not None:
                 self._way.note(sample)
                 place = self._nearest(trajectory, sample.joints, place)
-                decision = self._judge(trajectory, sample, place)
+                decision = self._judge(trajectory, sample, place, check)
             else:
                 decision = self._silence()
             if decision.verdict != Verdict.GO:
@@ -303,7 +308,8 @@ class RosRobot:
             return self._stop(goal, self.guard.event("a stop was published"))
         return None
 
-    def _judge(self, trajectory: Trajectory, sample: Sample, index: int) -> Decision:
+    def _judge(self, trajectory: Trajectory, sample: Sample, index: int,
+               check: PullPlausibility | None) -> Decision:
         assert self._reading is not None
         reading = Reading(self._reading.wrench, sample.arrived - self._reading_at,
                           self._reading.raw)
@@ -313,6 +319,9 @@ class RosRobot:
             self._on_sample(sample.clock, sample.pose, self.smooth)
         if reading.age > _OLDEST_READING_SECONDS:
             return self.guard.event(f"the wrench has been silent for {reading.age:.3f} s")
+        if check is not None and (reason := check.take(np.concatenate((
+                [sample.clock], pose_vectors(grasp), now, self.smooth))[None])):
+            return self.guard.event(f"implausible: {reason}")
         expected, uncertainty = self._expected(trajectory, sample, index)
         return self.guard.look(
             sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=expected,
