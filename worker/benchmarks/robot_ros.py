@@ -15,7 +15,7 @@ from benchmarks.robot_rosbridge import STEP, RosBridge
 from benchmarks.table import Asked, Row, Setting
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.robot.cell.cell import Cell
-from limber.robot.driver.real_time import claim_real_time
+from limber.robot.driver.real_time import claim_real_time, keep_awake
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.trajectory import Trajectory, along, densely
@@ -39,6 +39,7 @@ def ros_door(setting: Setting, voided: Voided) -> list[Row]:
     """
     seconds = 10.0 if setting.quick else min(_ASKED_S, setting.budget.remaining - _AROUND_S)
     claim_real_time()
+    keep_awake()
     with tempfile.TemporaryDirectory() as state, patch.dict(os.environ, LIMBER_STATE=state):
         try:
             lost, count = voided.again(partial(_lost, seconds), "path through rosbridge")
@@ -55,7 +56,8 @@ def _lost(seconds: float) -> tuple[int, int]:
     """Samples between the first and the last of a path that the guard did not see; and all."""
     times: list[float] = []
     with RosBridge(_HOME) as server:
-        # A million objects that are kept would be searched by Python's garbage collector.
+        # The server is another program in reality: a million objects that it keeps here would be
+        # searched by the guard's garbage collector.
         server.sent = deque(maxlen=0)
         robot = RosRobot(_CELL, Bridge(server.url), Topics(),
                          lambda clock, pose, wrench: times.append(clock))

@@ -319,10 +319,13 @@ def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, 
         across: Nudge of the held branch before it, which shows a wrong sensor.
     """
     from limber.core.errors import SafetyStop
-    from limber.robot.driver.real_time import claim_real_time
+    from limber.robot.driver.real_time import claim_real_time, keep_awake
     from limber.robot.ros.bridge import Bridge
     from limber.robot.ros.guarded_robot import RosRobot, Topics
 
+    # Before the connection: the thread that receives has the priority of the one that begins it.
+    claim_real_time()
+    keep_awake()
     with ExitStack() as around:
         bridge = Bridge(url)
         around.callback(bridge.close)
@@ -333,7 +336,6 @@ def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, 
                 robot.recall_tare()
             else:
                 robot.tare(_SECONDS)
-            claim_real_time()
             event = {"event": "reached"}
             if across is not None:
                 event = robot.follow(across.motion, check=across.check)

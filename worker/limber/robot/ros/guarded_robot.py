@@ -21,6 +21,7 @@ from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import Reading, WrenchChain
 from limber.robot.driver.guard import Guard
 from limber.robot.driver.guard_states import Decision, GuardSettings, Verdict
+from limber.robot.driver.real_time import spare_what_is_loaded
 from limber.robot.interface import Sample
 from limber.robot.motion.followed_path import FollowedPathFile, read_followed_path
 from limber.robot.motion.retreat import RetreatPath
@@ -202,6 +203,8 @@ class RosRobot:
         assert self._states is not None and trajectory.joints is not None
         # It takes a while for a long path; what arrives meanwhile is read before it is sent.
         goal = goal_of(trajectory, self._states.ordered)
+        # Or a garbage collection during the motion holds up the guard for a tenth of a second.
+        spare_what_is_loaded()
         sample = self._newest()
         require_start(sample.pose, sample.joints, trajectory.poses[0], trajectory.joints[0],
                       self._cell.arm.joint_names)
@@ -222,6 +225,7 @@ class RosRobot:
         """
         assert self.last is not None
         before = self.last.joints
+        spare_what_is_loaded()
         sample = self._settled()
         # By the way, not by the speed: its noise must not refuse a retreat that is needed.
         if not np.abs(sample.joints - before).max() <= _STILL_RAD:
