@@ -119,7 +119,8 @@ def test_an_arm_weighs_its_gripper_by_small_tilts(sensor, told, monkeypatch):
 def test_a_gripper_is_weighed_before_the_branch_is_held(monkeypatch, tmp_path):
     """Refused until it was weighed without a fault, and for another mass with both values."""
     monkeypatch.setenv("LIMBER_STATE", str(tmp_path))
-    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, tool={"mass_kg": MASS})
+    cell = Cell(robot={"model": "ur5e", "address": "192.0.2.5"}, base={"pose": (0,) * 6},
+                tool={"mass_kg": MASS})
     path, weighed_mass = tmp_path / "cell.toml", {"mass_kg": MASS + 0.01, "mass_sigma_kg": 0.01}
     with pytest.raises(InputError, match="was never weighed"):
         require_weighed(cell)

@@ -24,6 +24,7 @@ _UNITS = {0.1019: "kilograms-force", 0.2248: "pounds-force", 0.001: "kilonewtons
           1000.0: "millinewtons"}
 _NEAR = 0.15  # relative
 _FEEL_NO_WEIGHT = ("none", "replay")
+_LOOPBACK = "127."
 
 
 @dataclass(frozen=True)
@@ -50,11 +51,12 @@ def weighed_as(cell: Cell) -> dict[str, Any]:
 def unweighed(cell: Cell) -> str | None:
     """Return why the last weighing does not confirm sensor and stated mass; None if it does.
 
-    A bare flange that was never weighed, and a sensor that feels no weight, need none.
+    A sensor that feels no weight needs none, nor does a bare flange that was never weighed or is
+    the virtual robot's, whose gripper is another at each start.
     """
-    stated = cell.tool.mass_kg or 0.0
-    last = _last_weighing(cell)
-    if cell.sensor.kind in _FEEL_NO_WEIGHT or (last is None and not stated):
+    stated, last = cell.tool.mass_kg or 0.0, _last_weighing(cell)
+    is_bare = not stated and (last is None or cell.robot.address.startswith(_LOOPBACK))
+    if is_bare or cell.sensor.kind in _FEEL_NO_WEIGHT:
         return None
     if last is None:
         return (f"The gripper of {stated:g} kg was never weighed with this sensor, so a wrong "

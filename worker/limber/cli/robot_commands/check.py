@@ -36,11 +36,14 @@ def check(run: Run, cell_file: Path, offline: bool, folder: Path | None, plan: s
     """
     from limber.core.errors import InputError
     from limber.robot.cell.cell import read_cell
+    from limber.robot.weighing import unweighed
 
     if ((folder or plan) and not offline) or (plan and folder is None):
         raise InputError("--branch and --plan are checked from files.", "A plan belongs to a "
                          "branch.", "Give --offline --branch FOLDER, and --plan NAME if you want.")
     cell = read_cell(cell_file)
+    if reason := unweighed(cell):
+        run.progress.warn(f"{reason}. No branch is held before it was (limber robot weigh).")
     camera = _camera(run, cell) if realsense else {}
     if offline:
         return camera | _from_files(run, cell, cell_file, folder, plan)

@@ -116,7 +116,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     if not options.arm:
         write_preview(planned.branch, name, planned.settings, planned.cell, planned.motion)
         return planned.result | {"armed": False, "reached": None, "stop_reason": None,
-                         "after_stop": None, "peak_force_n": None, "path_error_m": None}
+                                 "after_stop": None, "peak_force_n": None, "path_error_m": None}
     require_confirmation(name, options.confirm, planned.cell, progress)
     return _armed(planned, name, options, progress)
 
