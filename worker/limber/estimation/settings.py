@@ -142,8 +142,8 @@ class VirtualPullSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "material": ("young", "poisson", "density", "damping", "gravity", "own_weight", "shape"),
-        "motion": ("motion", "drive", "weight", "frames", "duration", "grasp_fraction", "mode",
-            "reach", "phase"),
+        "motion": ("model", "motion", "drive", "weight", "frames", "duration", "grasp_fraction",
+            "mode", "reach", "phase"),
         "noise": ("position_noise", "force_noise", "torque_noise", "camera", "outliers", "seed"),
         "errors of the cell": ("cell_errors", "pose_sigma", "pose_turn_sigma", "force_gain_sigma",
             "force_bias_sigma", "force_drift_sigma", "torque_bias_sigma", "camera_sigma",
@@ -157,6 +157,10 @@ class VirtualPullSettings(Settings):
         "generated branch, or a gradient from 160 to 40 MPa.")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="True Poisson's ratio.")
     density: float = Field(900.0, gt=0, description="True density [kg/m^3].")
+    model: Literal["tetrahedra", "rod"] = Field(
+        "tetrahedra", description="tetrahedra: a finer mesh than the fit's. rod: a Cosserat rod of "
+        "the true axes and radii, which shares no code with the fit's simulation. Only for slow "
+        "pulls without --camera. Side branches are then rigid.")
     motion: Literal["quasi_static", "dynamic"] = Field(
         "quasi_static", description="dynamic: fast, with inertia and damping. The gripper shakes "
         "the branch; with --drive force it pulls and releases it.")

@@ -1,8 +1,8 @@
 """Simulated pulls with a known Young's modulus and sensor noise, without a robot.
 
 The truth is on another mesh than the fit: finer, swept along the axes, with the true geometry if
-the branch was generated. The known truth is stored in ``pull.toml`` under ``truth``, so that an
-estimate can be scored; no estimate reads it.
+the branch was generated; or it is a rod that shares no code with the fit. The known truth is stored
+in ``pull.toml`` under ``truth``, so that an estimate can be scored; no estimate reads it.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,8 @@ from limber.core.constants import GRAVITY
 from limber.core.errors import InputError, WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
-from limber.estimation.forward.gripper_path import MotionWanted, moved
+from limber.estimation.forward.gripper_path import MotionMade, MotionWanted, moved
+from limber.estimation.rod import Rod, RodMotion
 from limber.estimation.settings import VirtualPullSettings
 from limber.estimation.uncertainty.model_error import refined
 from limber.estimation.virtual_cell import CellErrors, marked_points
@@ -66,6 +67,7 @@ class TrueBranch:
         gravity: In the branch's frame [m/s^2].
         is_weightless: Whether it has no weight, regardless of the settings.
         is_assumed: Whether its moduli are assumed: the scan is of a branch without pulls.
+        is_meshed: Whether its body was meshed directly, and need not be round.
     """
 
     mesh: TetMesh
@@ -76,6 +78,7 @@ class TrueBranch:
     gravity: tuple[float, float, float] = GRAVITY
     is_weightless: bool = False
     is_assumed: bool = False
+    is_meshed: bool = False
 
 
 def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
@@ -109,7 +112,7 @@ def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
         skeleton, mesh = _another(skeleton, mesh, scan, np.random.default_rng([settings.seed, 2]))
     mesh = mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
     return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions,
-                      np.array(young, float), gravity)
+                      np.array(young, float), gravity, is_meshed=body is not None)
 
 
 def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random.Generator,
@@ -135,20 +138,19 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     model = _model(truth, settings, progress)
     is_weightless = not (model.gravity.any() and (settings.own_weight or model.prestress))
     entry = _entry(truth, settings, is_weightless)
-    grasp = grasp_on(truth.mesh, entry.grasp)
-    model = model.gripped(grasp)
-    arc = settings.grasp_fraction * truth.skeleton.arc_length[truth.skeleton.main_path()[-1]]
     phase = rng.uniform(0, 2 * np.pi) if settings.phase is None else settings.phase
-    made = moved(model, grasp, MotionWanted(
-        kind=_kind(settings), point=np.array(entry.grasp.point_m),
-        axis=np.array(entry.grasp.point_m) - truth.skeleton.nodes[0], travel=settings.reach * arc,
-        turn=_PULL_TURN, phase=phase, times=settings.times,
-        weight=(settings.weight or 0.0) * np.array(truth.gravity)
-        / np.linalg.norm(truth.gravity)), progress=progress)
+    requested = _requested(truth, settings, entry, phase)
     shifts, points = _marked(truth, settings)
-    operator = point_operator(truth.mesh, points)
-    positions = np.array([points + (operator @ displacement.ravel()).reshape(-1, 3)
-                          for displacement in made.displacements])
+    made: MotionMade | RodMotion
+    if settings.model == "rod":
+        made = _rod(truth, settings, is_weightless).pulled(requested, progress=progress)
+        positions, displacements = made.seen(points), []
+    else:
+        grasp = grasp_on(truth.mesh, entry.grasp)
+        made = moved(model.gripped(grasp), grasp, requested, progress=progress)
+        operator, displacements = point_operator(truth.mesh, points), made.displacements
+        positions = np.array([points + (operator @ displacement.ravel()).reshape(-1, 3)
+                              for displacement in displacements])
     sizes = [float(np.linalg.norm(made.wrenches[:, part], axis=1).max())
              for part in (slice(0, 3), slice(3, 6))]
     wrenches = made.wrenches.copy()
@@ -169,7 +171,40 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
         torque_sigma_nm=torque_sigma if settings.mode == "clamped" and torque_sigma > 0 else None)})
     observations = None if settings.camera else Observations(settings.times, positions)
     pull = Pull(name, entry, settings.times, poses, wrenches, observations)
-    return pull, made.displacements
+    return pull, displacements
+
+
+def _requested(truth: TrueBranch, settings: VirtualPullSettings, entry: PullEntry,
+               phase: float) -> MotionWanted:
+    point = np.array(entry.grasp.point_m)
+    arc = settings.grasp_fraction * truth.skeleton.arc_length[truth.skeleton.main_path()[-1]]
+    return MotionWanted(
+        kind=_kind(settings), point=point, axis=point - truth.skeleton.nodes[0],
+        travel=settings.reach * arc, turn=_PULL_TURN, phase=phase, times=settings.times,
+        weight=(settings.weight or 0.0) * np.array(truth.gravity)
+        / np.linalg.norm(truth.gravity))
+
+
+def _rod(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool) -> Rod:
+    """The true branch as a rod, with the same moduli between the control points.
+
+    Raises:
+        InputError: a rod cannot move as requested.
+    """
+    if settings.motion == "dynamic" or settings.camera or truth.is_meshed:
+        raise InputError("--model rod was given with " + (
+            "a fast motion." if settings.motion == "dynamic" else
+            "--camera." if settings.camera else "a branch that was meshed directly."),
+            "The rod is a round branch at rest, without a surface.", "Omit --model rod.")
+
+    def young_at(positions: np.ndarray) -> np.ndarray:
+        away = np.linalg.norm(positions[:, None] - truth.control_points, axis=2)
+        shares = 1 / np.maximum(away, 1e-9)**2
+        return shares @ truth.young / shares.sum(axis=1)
+
+    gravity = np.zeros(3) if is_weightless else np.array(truth.gravity)
+    return Rod.of(truth.skeleton, young_at, settings.poisson, settings.density, gravity,
+                  settings.grasp_fraction, as_scanned=not settings.own_weight)
 
 
 def _marked(truth: TrueBranch, settings: VirtualPullSettings) -> tuple[np.ndarray, np.ndarray]:

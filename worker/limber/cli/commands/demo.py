@@ -227,7 +227,8 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
     failure = None
     try:
         demo.stage("a simulated pull, with noise and the errors of a cell", "virtual-pull", branch,
-                   "--name", "pull-1", "--seed", seed, "--cell-errors", "realistic", *truth)
+                   "--name", "pull-1", "--seed", seed, "--cell-errors", "realistic",
+                   "--model", "rod", *truth)
         demo.stage("Young's modulus from the pull", "estimate", branch)
         demo.stage("a pull with the estimated modulus", "simulate", branch)
         demo.stage("energy over grasp poses", "energy", branch, "--seed", seed)
