@@ -11,11 +11,12 @@ from limber.geometry.generated import generate_branch
 pytestmark = [pytest.mark.real_blender, pytest.mark.slow]
 
 
-def test_four_clicks_to_a_bent_branch(run, blender, environment, tmp_path):
+@pytest.mark.parametrize("size", [(1280, 720), (1600, 900)])
+def test_four_clicks_to_a_bent_branch(run, blender, environment, tmp_path, size):
     """The tab, the example, the grab, the press on the branch; the branch bends under the mouse.
     Then the goal is dragged by its handle: it is the plan's."""
     require_screen()
-    seen = driven("drive_clicks.py", blender, environment, tmp_path, (1280, 720))
+    seen = driven("drive_clicks.py", blender, environment, tmp_path, size)
     assert seen["category"] == "Limber"
     assert seen["bent_m"] > 0.01
     assert seen["clicks_to_bent"] == 4
