@@ -11,6 +11,7 @@ from limber.planning.certificate.subsolution import Terrain, corner_values, seco
 from limber.planning.path_problem import GentleProblem
 
 _BEYOND = 1.2  # factor on the steepest measured growth of the goal's distance
+_FLAT = 0.5  # least fraction of that growth that its mean counts as
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,11 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     open_cells = ground.open_cells[box]
     distance = spread(open_cells.shape, cells - low, away)
     filled = np.nan_to_num(distance, nan=np.inf)
-    growth = _growth(distance, np.abs(filled) <= 4.0 * edges.max(), edges)
+    growth, slope = _growth(distance, edges)
     corners = tuple(map(slice, low, high + 1))
     rate = np.where(ground.level[box], ground.floor,
                     corner_values(ground.rate[corners]).mean(axis=0))
-    cost = _cost_left(distance / growth, goal.tolerance / growth, rate, edges)
+    cost = _cost_left(distance / slope, goal.tolerance / slope, rate, edges)
     curved = CURVATURE_FACTOR / 8.0 * sum(
         scipy.ndimage.maximum_filter(second, 3) for second in second_differences(cost))
     half = 0.5 * float(np.linalg.norm(edges))
@@ -75,7 +76,7 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
                       whole(filled <= growth * 8.0 * half))
 
 
-def _cost_left(length: np.ndarray, depth: float, rate: np.ndarray, edges: np.ndarray,
+def _cost_left(length: np.ndarray, depth: np.ndarray, rate: np.ndarray, edges: np.ndarray,
                ) -> np.ndarray:
     """Return the cost of a ``length`` [m] to the goal, at the ``rate`` half-way, for cells with
     ``edges`` [3] [m]; nan where not known.
@@ -93,14 +94,27 @@ def _cost_left(length: np.ndarray, depth: float, rate: np.ndarray, edges: np.nda
     return flat * np.where(length > 0.0, np.clip(mid_rate, 0.5 * rate, 1.5 * rate), rate)
 
 
-def _growth(distance: np.ndarray, near: np.ndarray, edges: np.ndarray) -> float:
-    """Return the largest growth of the goal's distance per metre, among cells ``near`` it."""
-    growth = 1.0
-    for axis in range(3):
-        step = np.abs(np.diff(distance, axis=axis)) / edges[axis]
-        first, second = (np.take(near, range(k, near.shape[axis] - 1 + k), axis=axis)
-                         for k in (0, 1))
-        growth = max(growth, float(np.max(step, where=first & second, initial=0.0)))
-    # A grasp's distance grows by at most a metre per metre; a target's by the field's rate plus a
-    # reserve.
-    return growth if growth <= 1.0 + 1e-9 else growth * _BEYOND * np.sqrt(3.0)
+def _growth(distance: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest growth of the goal's ``distance`` per metre in each cell, and a smooth
+    mean, of the same shape; by which the distance is divided to be a length.
+
+    The mean needs no reserve: the sub-solution is scaled down wherever it is too steep.
+    """
+    ahead, behind = [], []
+    for axis, edge in enumerate(edges):
+        unknown = np.full_like(distance.take([0], axis), np.nan)
+        step = np.diff(distance, axis=axis) / edge
+        ahead.append(np.concatenate([step, unknown], axis))
+        behind.append(np.concatenate([unknown, step], axis))
+    either = np.nan_to_num(np.stack([ahead, behind]))
+    known = np.isfinite([ahead, behind])
+    steepest = np.abs(either).max(axis=0)
+    if steepest.max() <= 1.0 + 1e-9:  # a grasp's distance: by at most a metre per metre
+        return np.ones_like(distance), np.ones_like(distance)
+    growth = scipy.ndimage.maximum_filter(np.linalg.norm(steepest, axis=0), 3)
+    mean = np.linalg.norm(either.sum(axis=0) / np.maximum(known.sum(axis=0), 1), axis=0)
+    weight = known.any(axis=(0, 1)).astype(float)
+    smooth = scipy.ndimage.uniform_filter(mean * weight, 3) / np.maximum(
+        scipy.ndimage.uniform_filter(weight, 3), 1e-9)
+    # A target's by the field's rate, and a reserve.
+    return _BEYOND * growth, np.maximum(smooth, _FLAT * growth) + 1e-12

@@ -38,7 +38,7 @@ _SETTLED = 3e-4  # change of the cost in a round, relative
 _MARGINS = (2e-5, 3e-4, 2e-3)  # [m] distance kept from the limits; the next if one was not enough
 _FIRST_STEP = 0.1  # fraction of an edge: the first step, without known curvature
 _FLAT = 1e-8  # slope in those units, for a cost of about 1
-_INSIDE = 1e-3  # fraction of the goal's tolerance by which an end lies inside
+_INSIDE = 1e-3  # fraction of the goal's tolerance by which an end lies inside; at most the margin
 _STEP = 1e-5  # [m] of the two finite differences
 
 
@@ -219,7 +219,8 @@ class Limited:
                     outward = side * np.eye(3)[axis] / scale
                     yield _Excess((side * (points[:, axis] - bound) + self.margin) / scale,
                                   lambda push, outward=outward: push[:, None] * outward)
-        outside = (problem.goal_excess(points[-1]) + _INSIDE * problem.goal.tolerance) / scale
+        inside = min(_INSIDE * problem.goal.tolerance, self.margin)
+        outside = (problem.goal_excess(points[-1]) + inside) / scale
         yield _Excess(np.array([outside]), lambda push: self._at_end(points, push))
         if problem.longest < np.inf:
             yield self._on_length(points)
