@@ -104,13 +104,13 @@ def test_an_empty_workspace_names_its_axis():
 
 
 def test_a_random_start_lies_outside_a_large_goal(ridge_field):
-    """By half the largest deflection, also where the goal is deeper than that."""
+    """By a quarter of the largest deflection, also where the goal is deeper than that."""
     goal = TargetGoal(Ball((0.0, 0.9, 0.3), 0.8))
     away = np.linalg.norm(ridge_field.samples.positions - ridge_field.rest, axis=1)
     for seed in range(4):
         start = random_start(ridge_field, goal, PlanSettings(), seed)
         outside = goal.distance(ridge_field, start[None])[0] - goal.tolerance
-        assert outside >= 0.5 * away.max()
+        assert outside >= 0.25 * away.max()
 
 
 def test_a_second_arm_reaches_a_part_of_the_poses_and_not_rest(ridge_field):

@@ -72,13 +72,15 @@ class PathPair:
 
 def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
                 limits: Limits, *, asked: Limits | None = None, asked_goal: Goal | None = None,
-                before: PathPair | None = None, progress: Progress = SILENT) -> PathPair:
+                before: PathPair | None = None, is_bounded: bool = True,
+                progress: Progress = SILENT) -> PathPair:
     """Plan both paths within ``limits``, tightened by the field's possible error where feasible.
 
     ``asked`` are the limits before they were tightened for the field's error, ``limits`` if not
     given: a proof that no path exists refers to those. ``asked_goal`` is the goal before it was
     drawn in, for the bound. ``before`` has the results before the field
-    learnt: its trees are not grown again if their paths still hold.
+    learnt: its trees are not grown again if their paths still hold, and its plan is one of the
+    paths to start from. Without ``is_bounded`` the bound is left to :func:`with_bound`.
 
     If no path keeps the margins, one that keeps the limits on the field alone is planned. If none
     does either, and that proves nothing, one is planned that may keep them on the branch
@@ -94,7 +96,8 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     none = dict.fromkeys(margins, 0.0)
     surely = (asked or limits).beyond(field)
     errors = (asked or limits).errors(field)
-    options = {"errors": errors, "asked_goal": asked_goal, "before": before}
+    options = {"errors": errors, "asked_goal": asked_goal, "before": before,
+               "is_bounded": is_bounded}
     if closed is not None:
         return replace(_in_doubt(closed, field, start, goal, settings, limits, surely, **options,
                                  progress=progress), margins=none)
@@ -155,7 +158,7 @@ def _in_doubt(none: BlockedError, field: EnergyField, start: np.ndarray, goal: G
     Raises:
         BlockedError: ``none``, if it is proven, the field has no error, or relaxing does not help.
     """
-    doubts = limits.doubts(field)
+    doubts, options = limits.doubts(field), options | {"is_bounded": False}
     if UNPROVEN not in none.seen or not any(doubts.values()):
         raise none
     options["progress"].warn(
@@ -164,7 +167,7 @@ def _in_doubt(none: BlockedError, field: EnergyField, start: np.ndarray, goal: G
         "decides whether it is allowed.")
     try:
         return plan_pair(field, start, goal, settings, limits.beyond(field), beyond=surely,
-                         is_bounded=False, **options)
+                         **options)
     except NoPathError:
         raise none from None
 
@@ -210,8 +213,12 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     trees = _trees(problem, goals, settings, weighed, {} if before is None else before.trees,
                    progress.part(0.0, 0.5)) if nobody is None else {}
     try:
-        gentle, detour = _gentle(problem, trees, settings, detour_from_tree,
-                                 ENOUGH if is_bounded else _ANY, progress.part(0.5, 1.0))
+        known = [path.points for path in trees.values()]
+        if before is not None:
+            known.append(before.plan.points)
+        tree = trees["RRT*"].raw if detour_from_tree and "RRT*" in trees else None
+        gentle, detour = _gentle(problem, known, tree, settings, ENOUGH if is_bounded else _ANY,
+                                 progress.part(0.5, 1.0))
     except BlockedError as error:
         if nobody is None or UNPROVEN in error.seen:
             raise
@@ -272,14 +279,12 @@ def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSe
                     {"straight line": path.points, "eikonal": path.points})
 
 
-def _gentle(problem: GentleProblem, trees: Mapping[str, FoundPath], settings: PlanSettings,
-            detour_from_tree: bool, enough: float, progress: Progress,
+def _gentle(problem: GentleProblem, known: list[np.ndarray], tree: np.ndarray | None,
+            settings: PlanSettings, enough: float, progress: Progress,
             ) -> tuple[GentlePath, DetourPath | None]:
     """Return the gentlest path, and the effect of a limit on its length."""
-    known = [path.points for path in trees.values()]
     if settings.max_detour is None:
         return plan_gentle(problem, known, enough=enough, progress=progress), None
-    tree = trees["RRT*"].raw if detour_from_tree and "RRT*" in trees else None
     detour = _detour(problem, known, tree, settings, progress)
     return detour.found, detour
 

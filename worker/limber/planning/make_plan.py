@@ -210,7 +210,7 @@ class _Rounds:
         def paths(aim: Goal, ahead: Progress) -> PathPair:
             return plan_within(self.field, self.start, aim, self.settings, self.planned_limits,
                                asked=self.limits, asked_goal=self.goal, before=self.pair,
-                               progress=ahead)
+                               is_bounded=self.pair is None, progress=ahead)
         try:
             return paths(self.aim, ahead.part(0.0, 0.5))
         except NoPathError as none:

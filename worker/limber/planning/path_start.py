@@ -31,7 +31,7 @@ def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: i
 
     The paper's trials start from "randomized initial configurations", without stating how they were
     drawn. Here: uniform over the allowed region, at least half the largest deflection away from
-    rest, and as far outside the goal.
+    rest and from the goal's middle, and a quarter of it from its border.
 
     Raises:
         NoPathError: no such configuration was found.
@@ -41,7 +41,7 @@ def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: i
     half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())
     fit = np.linalg.norm(points - field.rest, axis=1) >= half
     away = goal.distance(field, points)
-    fit &= away >= half + goal.tolerance
+    fit &= (away >= half) & (away >= goal.tolerance + 0.5 * half)
     fit &= allowed_points(points, Limits.of(settings).on(field))
     if not fit.any():
         raise NoPathError("No allowed deformed start is far from rest and far from the goal.",
