@@ -78,9 +78,9 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
 
     ``asked`` are the limits before they were tightened for the field's error, ``limits`` if not
     given: a proof that no path exists refers to those. ``asked_goal`` is the goal before it was
-    drawn in, for the bound. ``before`` has the results before the field
-    learnt: its trees are not grown again if their paths still hold, and its plan is one of the
-    paths to start from. Without ``is_bounded`` the bound is left to :func:`with_bound`.
+    drawn in, for the bound. ``before`` has the results before the field learnt: its trees are not
+    grown again if their paths still hold, and its plan is one of the paths to start from. Without
+    ``is_bounded`` the bound is left to :func:`with_bound`.
 
     If no path keeps the margins, one that keeps the limits on the field alone is planned. If none
     does either, and that proves nothing, one is planned that may keep them on the branch
