@@ -7,7 +7,7 @@ import pytest
 
 from limber.geometry.shape_samples import reshaped, sample_skeletons
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
-from limber.geometry.skeleton.radii.normal_equations import fit_precision
+from limber.geometry.skeleton.radii.normal_equations import fitted_system
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
 
@@ -30,15 +30,32 @@ def _scan(rng: np.random.Generator, arc: float = 2 * np.pi) -> np.ndarray:
 def test_drawn_shapes_scatter_as_the_fit_says():
     """Of 300 shapes each radius has the deviation that the precision's inverse gives it."""
     points = _scan(np.random.default_rng(0))
-    tube = fit_axes(_tube(), points).skeleton
+    tube = replace(fit_axes(_tube(), points).skeleton, radius_sigma=np.zeros(51))
     drawn = sample_skeletons(tube, points, 300, np.random.default_rng(1))
-    matrix, noise = fit_precision(tube, points)
+    system, noise = fitted_system(tube, points)
     assert noise == pytest.approx(NOISE, rel=0.1)
-    exact = noise * np.sqrt(np.diag(np.linalg.inv(matrix.toarray())).reshape(-1, 4)[:, 3])
+    exact = noise * np.sqrt(np.diag(np.linalg.inv(system.matrix.toarray())).reshape(-1, 4)[:, 3])
     found = np.std([shape.radius - tube.radius for shape in drawn], axis=0)
     assert found == pytest.approx(exact, rel=0.2)
     moved = np.array([shape.nodes - tube.nodes for shape in drawn])
     assert np.abs(moved[..., 2]).max() < 0.1 * np.abs(moved[..., 0]).max()  # across only
+
+
+@pytest.mark.parametrize("factor", [0.3, 4.0])
+def test_drawn_radii_scatter_as_their_stated_deviation(factor: float) -> None:
+    """Less than by the noise alone, or more; then the whole run together, and the axis with it."""
+    points = _scan(np.random.default_rng(0), 0.8 * np.pi)
+    tube = fit_axes(_tube(), points).skeleton
+    system, noise = fitted_system(tube, points)
+    own = noise * np.sqrt(system.inverse_blocks(np.array([3]))[:, 0, 0])
+    drawn = sample_skeletons(replace(tube, radius_sigma=factor * own), points, 400,
+                             np.random.default_rng(1))
+    moved = np.array([shape.radius - tube.radius for shape in drawn])
+    assert np.std(moved, axis=0) == pytest.approx(factor * own, rel=0.2)
+    axis = np.array([shape.nodes[25, 0] - tube.nodes[25, 0] for shape in drawn])
+    if factor > 1:
+        assert np.corrcoef(moved[:, 10], moved[:, 40])[0, 1] > 0.8
+        assert np.corrcoef(moved[:, 25], axis)[0, 1] < -0.8
 
 
 def test_twigs_are_missing_as_often_as_they_are_doubted():
@@ -77,7 +94,9 @@ def test_new_scans_scatter_as_the_drawn_shapes_foretell():
     for arc in (2 * np.pi, np.pi):
         fits = [fit_axes(_tube(), _scan(rng, arc)).skeleton for _ in range(20)]
         points = _scan(rng, arc)
-        drawn = sample_skeletons(fit_axes(_tube(), points).skeleton, points, 200, rng)
+        # Without stated deviations, only the noise scatters: these scans share no other error.
+        tube = replace(fit_axes(_tube(), points).skeleton, radius_sigma=np.zeros(51))
+        drawn = sample_skeletons(tube, points, 200, rng)
         found, foretold = (np.std([means(shape) for shape in shapes], axis=0)
                            for shapes in (fits, drawn))
         assert found == pytest.approx(foretold, rel=0.5)

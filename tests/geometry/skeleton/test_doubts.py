@@ -33,6 +33,21 @@ def test_each_doubt_is_found_with_its_place(y_skeleton) -> None:
     np.testing.assert_allclose(bridged.at, y_skeleton.nodes[4])
 
 
+def test_a_radius_jump_is_found_where_no_fork_explains_it() -> None:
+    """Half as thick within four radii; the same beside a fork with a twig is no jump."""
+    z = np.arange(0, 0.4, 0.004)
+    nodes = np.outer(z, [0, 0, 1.0])
+    radius = np.where(z < 0.2, 0.01, 0.0055)
+    told = doubtful_parts(Skeleton.from_edges(nodes, np.arange(-1, 99), radius))
+    assert [part.kind for part in told] == [DoubtfulKind.jump]
+    assert told[0].value == pytest.approx(0.55) and abs(told[0].at[2] - 0.2) < 0.01
+    twig = np.outer(np.arange(0.004, 0.1, 0.004), [1.0, 0, 0]) + [0, 0, 0.2]
+    forked = Skeleton.from_edges(np.vstack([nodes, twig]), np.r_[
+        np.arange(-1, 99), 50, 100 + np.arange(len(twig) - 1)], np.r_[
+            radius, np.full(len(twig), 0.004)])
+    assert doubtful_parts(forked) == []
+
+
 def test_kinks_and_backward_starts_are_found() -> None:
     """A stem that turns by 90 degrees, and a twig that starts down along it."""
     z, x = np.linspace(0, 0.2, 21), np.linspace(0.01, 0.2, 20)

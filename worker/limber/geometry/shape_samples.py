@@ -2,7 +2,9 @@
 
 A scan's axis and the thickness of its branch are known to the points' noise, averaged over a length
 of the branch. Errors of neighbouring positions are correlated, and where only one side was seen, an
-axis too near goes with a radius too small. Drawing them together keeps these correlations. Twigs
+axis too near goes with a radius too small. Drawing them together keeps these correlations. What a
+radius's stated deviation has beyond the noise, the fits of a run share; where it has less, the
+prior of wood knew the radius better than the points. The axis goes with both. Twigs
 that may not exist are missing in as many of the shapes as their probability implies.
 """
 
@@ -13,9 +15,8 @@ from scipy.sparse.linalg import splu
 
 from limber.geometry.skeleton.confidence import probability_given_carrier
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
-from limber.geometry.skeleton.radii.normal_equations import fit_precision
+from limber.geometry.skeleton.radii.normal_equations import fitted_system
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.sweep import tangents
 from limber.geometry.tets.element_types import between_corners
 from limber.geometry.tets.tet_mesh import TetMesh
 
@@ -43,8 +44,8 @@ def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
     """
     chosen = points[::max(1, -(-len(points) // POINT_LIMIT))]
     # Fewer points of the same noise hold the axis less firmly than those of the fit.
-    matrix, noise = fit_precision(skeleton, chosen)
-    factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+    system, noise = fitted_system(skeleton, chosen)
+    factor = splu(system.matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                   options={"SymmetricMode": True})
     # With A = L D L^T, L sqrt(D) times white noise has the covariance A; solving instead gives its
     # inverse.
@@ -52,10 +53,8 @@ def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
     white = rng.standard_normal((len(pivots), count)) * pivots[:, None]
     coloured = (factor.L @ white)[factor.perm_r]
     moves = noise * factor.solve(coloured).T.reshape(count, -1, 4)
-    along = np.zeros_like(skeleton.nodes)
-    for members in skeleton.runs():
-        fresh = members if members[0] == 0 else members[1:]
-        along[fresh] = tangents(skeleton.nodes[members])[-len(fresh):]
+    moves += _beyond_noise(skeleton, noise**2 * system.inverse_blocks(np.arange(4)), moves, rng)
+    along = skeleton.axes()
     across = moves[..., :3] - np.einsum("snj,nj->sn", moves[..., :3], along)[..., None] * along
     radius = np.clip(skeleton.radius + moves[..., 3], _LEAST * skeleton.radius,
                      _MOST * skeleton.radius)
@@ -63,6 +62,24 @@ def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
     radius = np.where(_existing(skeleton, count, rng), radius, _MISSING * skeleton.radius)
     return [replace(skeleton, nodes=skeleton.nodes + move, radius=thick)
             for move, thick in zip(across, radius, strict=True)]
+
+
+def _beyond_noise(skeleton: Skeleton, covariance: np.ndarray, moves: np.ndarray,
+                  rng: np.random.Generator) -> np.ndarray:
+    """What changes draws of the noise into draws of the stated deviations, [count, n, 4].
+
+    Args:
+        skeleton: Where a radius's deviation is 0, it is unknown, and nothing changes.
+        covariance: Of each node's position and radius by the noise [m^2], shape [n, 4, 4].
+        moves: Draws of the noise [m], shape [count, n, 4].
+        rng: Random number generator.
+    """
+    own = np.sqrt(np.maximum(covariance[:, 3, 3], 1e-300))
+    stated = np.where(skeleton.radius_sigma > 0, skeleton.radius_sigma, own)
+    together = rng.standard_normal((len(moves), skeleton.branch_count))[:, skeleton.branch]
+    more = (np.minimum(stated / own, 1.0) - 1) * moves[..., 3] + np.sqrt(
+        np.maximum(stated**2 - own**2, 0.0)) * together
+    return more[..., None] * covariance[:, :, 3] / own[:, None]**2
 
 
 def _existing(skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -7,12 +7,14 @@ from scipy.spatial import cKDTree
 
 from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
-from limber.geometry.skeleton.radii.likeliest_radii import (
+from limber.geometry.skeleton.radii.likeliest_shape import (
     SPACINGS,
-    RadiusEvidence,
-    likeliest_radii,
+    ShapeEvidence,
+    likeliest_shape,
     point_spacing,
 )
+from limber.geometry.skeleton.radii.normal_equations import fit_covariance
+from limber.geometry.skeleton.radii.projected_widths import sight_field, width_covariance
 from limber.geometry.skeleton.radii.shared_errors import shared_error
 from limber.geometry.skeleton.repair.run_radii import tapered
 from limber.geometry.skeleton.skeleton import BRIDGED, LIMITED, STATES, UNRESOLVED, Skeleton
@@ -32,7 +34,7 @@ _NOISE_MOST = 2.0  # noise in radii above which it no longer matters
 
 def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool = False,
              one_sided: bool = False, view: View | None = None) -> Skeleton:
-    """Return the skeleton with the likeliest radii, their intervals, states and probabilities.
+    """Return the skeleton with the likeliest axes and radii, intervals, states, probabilities.
 
     Args:
         skeleton: Fitted to the points.
@@ -48,14 +50,17 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool
     pixel = None if view is None else view.pitch * np.linalg.norm(skeleton.nodes - view.eye, axis=1)
     if rays and view is None:
         pixel = spacing
-    shown = RadiusEvidence(spacing, 0.0 if rays else noise, shared, rays or one_sided, pixel)
-    likeliest = likeliest_radii(skeleton, shown)
+    covariance = width_covariance(skeleton, sight_field(skeleton, points, view), noise) if (
+        rays) else fit_covariance(skeleton, points)
+    shown = ShapeEvidence(covariance, spacing, 0.0 if rays else noise, shared, rays or one_sided,
+                          pixel)
+    likeliest = likeliest_shape(skeleton, shown)
     # Wood hardly thickens outwards. What does so nevertheless, beyond its interval, is a bunch of
     # twigs or two limbs in one: it counts for nothing.
     swollen = tapered(replace(likeliest, radius_state=skeleton.radius_state),
                       count).radius_state == LIMITED
     if swollen.any():
-        likeliest = likeliest_radii(replace(skeleton, radius_state=np.where(
+        likeliest = likeliest_shape(replace(skeleton, radius_state=np.where(
             swollen, LIMITED, skeleton.radius_state).astype(np.int8)), shown)
     return _with_probability(likeliest, count, _gaps(likeliest, count, spacing), noise)
 

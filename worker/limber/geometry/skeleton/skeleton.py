@@ -7,6 +7,7 @@ import numpy as np
 
 from limber.core.alignment import Alignment
 from limber.core.errors import InputError
+from limber.geometry.skeleton.sweep import tangents
 
 MEASURED, LIMITED, INTERPOLATED, UNRESOLVED, BRIDGED = 0, 1, 2, 3, 4
 """Values of ``radius_state``: fitted to points, limited to the cloud's scale, filled in, too
@@ -168,6 +169,13 @@ class Skeleton:
     def moved(self, nodes: np.ndarray) -> "Skeleton":
         """Return the skeleton with other node positions [m], shape [n, 3]."""
         return replace(self, nodes=np.asarray(nodes, float))
+
+    def axes(self) -> np.ndarray:
+        """Unit vector along the axis at each node, shape [n, 3]."""
+        axis = np.empty_like(self.nodes)
+        for members, own in zip(self.runs(), self.own_runs(), strict=True):
+            axis[own] = tangents(self.nodes[members])[-len(own):]
+        return axis
 
     def subset(self, keep: np.ndarray, parent: np.ndarray | None = None) -> "Skeleton":
         """Return the skeleton of the nodes where ``keep`` [n] is true; a parent must be kept.

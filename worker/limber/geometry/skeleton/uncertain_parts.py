@@ -5,12 +5,14 @@ from enum import StrEnum
 
 import numpy as np
 
+from limber.geometry.skeleton.radii.likeliest_shape import FORK, WANDER
 from limber.geometry.skeleton.skeleton import BRIDGED, LIMITED, UNRESOLVED, Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths, stretches
 
 _LIKELY = 0.8  # probability above which a branch is not listed
 KINK = np.deg2rad(70.0)  # wood does not turn this sharply within a branch
 _BACKWARDS = np.deg2rad(110.0)  # the same for a twig against its carrier
+_JUMP = 3.0  # standard deviations of a radius's change from which it is listed
 _CHORD = 2.0  # radii on each side of a node over which its turn is measured
 
 
@@ -21,6 +23,7 @@ class DoubtfulKind(StrEnum):
     unresolved = "unresolved radius"
     limited = "limited radius"
     bridged = "bridged gap"
+    jump = "radius jump"
     kink = "kink"
     backwards = "starts backwards"
     attachment = "attachment"
@@ -38,7 +41,8 @@ class DoubtfulPart:
         length: Length of the part [m]; 0 for a single node.
         radius: Median radius there [m].
         value: Probability of an unlikely branch, an attachment or a root; standard deviation over
-            radius of an unresolved or limited one; angle [rad] of a kink; NaN for a gap.
+            radius of an unresolved or limited one; factor of a radius jump outwards; angle [rad]
+            of a kink; NaN for a gap.
     """
 
     kind: DoubtfulKind
@@ -65,6 +69,11 @@ def doubtful_parts(skeleton: Skeleton) -> list[DoubtfulPart]:
                       for part in _stretches(own, skeleton.radius_state[own] == state)]
         for part in _stretches(own, skeleton.radius_state[own] == BRIDGED):
             found.append(_part(skeleton, DoubtfulKind.bridged, run, part, float("nan")))
+        factor, is_jump = jumps(skeleton, own)
+        for part in _stretches(own, is_jump):
+            changes = factor[np.searchsorted(own, part)]
+            found.append(_part(skeleton, DoubtfulKind.jump, run, part, float(
+                changes[np.argmax(np.abs(np.log(changes)))])))
         turn = turns(skeleton, members)
         for part in _stretches(np.arange(len(members)), turn > KINK):
             worst = part[np.argmax(turn[part])]
@@ -90,6 +99,21 @@ def _part(
 def _stretches(nodes: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
     """Consecutive nodes where ``chosen`` is true."""
     return [nodes[part] for part in stretches(chosen)]
+
+
+def jumps(skeleton: Skeleton, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Factor by which the radius changes outwards around each node of a run, and whether wood
+    hardly does so, shape [k] each.
+
+    Measured over two radii to each side. At a fork a radius may change more.
+    """
+    along, log = skeleton.arc_length[own], np.log(skeleton.radius[own])
+    reach = _CHORD * skeleton.radius[own]
+    change = np.interp(along + reach, along, log) - np.interp(along - reach, along, log)
+    forks = along[skeleton.child_counts()[own] > 1]
+    count = (np.abs(along[:, None] - forks) < 1.1 * reach[:, None]).sum(axis=1)
+    sigma = np.sqrt(2 * _CHORD * WANDER + FORK**2 * count)
+    return np.exp(change), np.abs(change) > _JUMP * sigma
 
 
 def turns(skeleton: Skeleton, members: np.ndarray) -> np.ndarray:

@@ -275,6 +275,7 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
                      "attachment": "probability {:.2f}", "root": "probability {:.2f}",
                      "unresolved radius": "sigma {:.0%} of the radius",
                      "limited radius": "sigma {:.0%} of the radius",
+                     "radius jump": "{:.2f} times outwards",
                      "kink": "{:.0f} degrees", "starts backwards": "{:.0f} degrees"}
     rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "uncertainty"]]
     for part in doubtful:

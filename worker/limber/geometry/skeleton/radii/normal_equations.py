@@ -12,7 +12,6 @@ from limber.geometry.skeleton.radii.noisy_rings import Aims
 from limber.geometry.skeleton.radii.robust_noise import robust_sigma, settled_weights
 from limber.geometry.skeleton.radii.smoothness import smoothness
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.sweep import tangents
 
 _PROBE = 128  # distance in nodes at which radii count as independent
 
@@ -38,6 +37,22 @@ class NormalEquations:
     def solve(self) -> np.ndarray:
         """Step of each node: x, y, z, radius [m], shape [n, 4]."""
         return self.factor().solve(self.right).reshape(-1, 4)
+
+    def inverse_blocks(self, chosen: np.ndarray) -> np.ndarray:
+        """Blocks of the inverse at each node, of the ``chosen`` k of x, y, z, radius, [n, k, k].
+
+        Nodes that far apart do not affect each other: the blocks come from one solve for all of
+        them. Nodes of a run have consecutive numbers.
+        """
+        own = np.arange(len(self.per_node))
+        period = min(_PROBE, len(own))
+        rows = 4 * own[:, None] + chosen
+        factor, columns = self.factor(), []
+        for each in chosen:
+            unit = np.zeros((4 * len(own), period))
+            unit[4 * own + each, own % period] = 1.0
+            columns.append(factor.solve(unit)[rows, (own % period)[:, None]])
+        return np.stack(columns, axis=2)
 
 
 def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
@@ -67,8 +82,8 @@ def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, 
     return NormalEquations(matrix, right - smooth @ state, per_node)
 
 
-def fit_precision(skeleton: Skeleton, points: np.ndarray) -> tuple[sparse.csc_matrix, float]:
-    """How firmly points hold a fitted skeleton, and their noise [m].
+def fitted_system(skeleton: Skeleton, points: np.ndarray) -> tuple[NormalEquations, float]:
+    """The normal equations at the end of a fit to points, and their noise [m].
 
     The covariance of (x, y, z, radius) of all nodes is noise^2 times the inverse of the matrix,
     shape [4 n, 4 n], as for a smoothing spline (Wahba 1983). Its noise is that of single,
@@ -82,21 +97,21 @@ def fit_precision(skeleton: Skeleton, points: np.ndarray) -> tuple[sparse.csc_ma
     noise = max(robust_sigma(match.residual, match.thick), 1e-12)
     weight = settled_weights(match.residual, noise)
     return normal_equations(skeleton, skeleton.nodes, skeleton.radius, match, weight,
-                            noise).matrix, noise
+                            noise), noise
 
 
 def radius_deviations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
                       weight: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviation of each radius [m], and whether the node has points of its own."""
     system = normal_equations(skeleton, nodes, radius, match, weight, noise)
-    # Nodes that far apart do not affect each other: the diagonal of the inverse comes from one
-    # solve for all of them. Nodes of a run have consecutive numbers.
-    period = min(_PROBE, len(nodes))
-    unit = np.zeros((4 * len(nodes), period))
-    own = np.arange(len(nodes))
-    unit[4 * own + 3, own % period] = 1.0
-    variance = system.factor().solve(unit)[4 * own + 3, own % period]
+    variance = system.inverse_blocks(np.array([3]))[:, 0, 0]
     return noise * np.sqrt(np.maximum(variance, 0)), system.per_node > 2.0
+
+
+def fit_covariance(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
+    """Covariance of each node's position and radius by a fit to points [m^2], shape [n, 4, 4]."""
+    system, noise = fitted_system(skeleton, points)
+    return noise**2 * system.inverse_blocks(np.arange(4))
 
 
 def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
@@ -130,10 +145,7 @@ def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.
 def _anchor(skeleton: Skeleton, nodes: np.ndarray, per_node: np.ndarray) -> sparse.csc_matrix:
     """Hold nodes along their axis, where points give no information, and weakly elsewhere."""
     typical = float(np.median(per_node[per_node > 0])) if (per_node > 0).any() else 1.0
-    direction = np.zeros_like(nodes)
-    for members in skeleton.runs():
-        direction[members[1:]] = tangents(nodes[members])[1:]
-    direction[0] = tangents(nodes[skeleton.runs()[0]])[0]
+    direction = skeleton.moved(nodes).axes()
     block = np.zeros((len(nodes), 4, 4))
     block[:, :3, :3] = typical * direction[:, :, None] * direction[:, None, :]
     block[:, range(4), range(4)] += 1e-3 * typical

@@ -14,7 +14,7 @@ import scipy
 from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
-from limber.geometry.skeleton.sweep import arc_lengths, tangents
+from limber.geometry.skeleton.sweep import arc_lengths
 
 _ROUNDS = 3
 _NEAR = 30  # points to each side along the axis, whose spread is one width, at least
@@ -28,6 +28,7 @@ _ASIDE = 0.5  # sine of the angle between axis and sight, from which a width sho
 _BESIDE = 3.0  # radii across, from which a point belongs to something else
 _CHANGE = 3.0  # times a radius of the fit by distances, and of these that its axis may move
 _PRIOR = 0.03  # weight of the mean normal as the sight, against that of all points
+_RISE = np.pi / 4  # mean height of a half circle over its chord
 _HALF_CIRCLE = np.pi / 4  # length of the mean normal of points evenly spread across
 
 
@@ -61,7 +62,7 @@ def sight_field(skeleton: Skeleton, points: np.ndarray, view: View | None = None
         far = float(np.linalg.norm(view.eye - middle))
         return SightField((view.eye - middle) / far, 1 / far, middle)
     _, high, _, offset = on_cylinders(skeleton, points)
-    axis = _axes(skeleton)
+    axis = skeleton.axes()
     size = np.linalg.norm(offset, axis=1)
     near = size < _BESIDE * skeleton.radius[high]
     out = offset[near] / np.maximum(size[near], 1e-300)[:, None]
@@ -113,7 +114,7 @@ def _near(start: Skeleton, moved: Skeleton) -> Skeleton:
 def _moved(skeleton: Skeleton, points: np.ndarray, field: SightField) -> Skeleton:
     """One round: each run by the points that are nearest to it."""
     low, high, share, offset = on_cylinders(skeleton, points)
-    axis = _axes(skeleton)
+    axis = skeleton.axes()
     beside, depth, aside = _across_sight(offset, axis[high], field.at(points))
     good = (aside > _ASIDE) & (np.abs(beside) < _BESIDE * skeleton.radius[high])
     nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
@@ -158,7 +159,7 @@ def cross_sections(skeleton: Skeleton, points: np.ndarray, field: SightField,
     Points of branches that point to the sensor have NaN.
     """
     _, high, _, offset = on_cylinders(skeleton, points)
-    beside, depth, aside = _across_sight(offset, _axes(skeleton)[high], field.at(points))
+    beside, depth, aside = _across_sight(offset, skeleton.axes()[high], field.at(points))
     hidden = aside <= _ASIDE
     return (np.where(hidden, np.nan, beside), np.where(hidden, np.nan, depth),
             skeleton.radius[high])
@@ -209,9 +210,23 @@ def _width(at: np.ndarray, beside: np.ndarray, depth: np.ndarray, here: float, t
             _QUANTILE_SIGMA * radius / np.sqrt(count))
 
 
-def _axes(skeleton: Skeleton) -> np.ndarray:
-    """Unit vector along the axis at each node, shape [n, 3]."""
-    axis = np.zeros_like(skeleton.nodes)
-    for members, own in zip(skeleton.runs(), skeleton.own_runs(), strict=True):
-        axis[own] = tangents(skeleton.nodes[members])[-len(own):]
-    return axis
+def width_covariance(skeleton: Skeleton, field: SightField, noise: float) -> np.ndarray:
+    """Covariance of each node's position and radius by their widths [m^2], shape [n, 4, 4].
+
+    Across the sight, the middle of a width is known as its half is. In depth the points show where
+    the front is: the axis is behind it by the mean rise of a circle.
+
+    Args:
+        skeleton: Fitted by widths.
+        field: The sight.
+        noise: Standard deviation of the ranges [m].
+    """
+    across = np.cross(skeleton.axes(), field.at(skeleton.nodes))
+    across /= np.maximum(np.linalg.norm(across, axis=1), 1e-300)[:, None]
+    towards = np.cross(across, skeleton.axes())
+    ways = np.zeros((skeleton.node_count, 3, 4))
+    ways[:, 0, :3] = skeleton.radius_sigma[:, None] * across
+    ways[:, 1, :3] = -_RISE * skeleton.radius_sigma[:, None] * towards
+    ways[:, 1, 3] = skeleton.radius_sigma
+    ways[:, 2, :3] = noise / np.sqrt(2 * _NEAR) * towards
+    return np.einsum("nki,nkj->nij", ways, ways)

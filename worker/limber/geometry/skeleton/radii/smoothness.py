@@ -33,7 +33,7 @@ def smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_no
              for chain in chains]
     mean = np.concatenate([(step[:-1] + step[1:]) / 2 for step in steps])
     band = np.concatenate([_bandwidth(skeleton, chain, forks, noise) for chain in chains])
-    second = _second_differences(chains, steps, size)
+    second = second_differences(chains, steps, size)
     along = second.T @ sparse.diags(0.5 * density * band**4 * mean) @ second
     thick = (second.T @ sparse.diags(density * (2.0 * band)**4 * mean) @ second
              + _slope_terms(chains, steps, radius, density))
@@ -54,7 +54,7 @@ def _bandwidth(skeleton: Skeleton, chain: np.ndarray, forks: np.ndarray, noise: 
     return band * (np.where(forks[chain[1:-1]], 0.6, 1.0) * _straightness(skeleton.nodes[chain]))
 
 
-def _second_differences(chains: list[np.ndarray], steps: list[np.ndarray], size: int,
+def second_differences(chains: list[np.ndarray], steps: list[np.ndarray], size: int,
                         ) -> sparse.csr_matrix:
     """Second differences at the inner nodes of all chains, shape [inner nodes, size]."""
     rows, columns, values, count = [], [], [], 0

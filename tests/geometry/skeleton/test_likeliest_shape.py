@@ -1,4 +1,4 @@
-"""Radii of all branches together: measured ones as measured, others as wood grows."""
+"""Axes and radii of all branches together: as measured, elsewhere as wood grows."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.geometry.skeleton.confidence import assessed
-from limber.geometry.skeleton.radii.likeliest_radii import RadiusEvidence, likeliest_radii
+from limber.geometry.skeleton.radii.likeliest_shape import ShapeEvidence, likeliest_shape
 from limber.geometry.skeleton.skeleton import (
     INTERPOLATED,
     LIMITED,
@@ -30,14 +30,20 @@ def _plant(stem: np.ndarray | float = 0.008, twig: np.ndarray | float = 0.003,
                                radius_state=np.full(len(radius), MEASURED, np.int8))
 
 
-def _seen(spacing: float = 0.001, noise: float = 0.0005, **more: object) -> RadiusEvidence:
-    return RadiusEvidence(np.full(_STEM + _TWIG, spacing), noise, **more)
+def _told(plant: Skeleton, spacing: float = 0.001, noise: float = 0.0005, depth: float = 0.0,
+          **more: object) -> Skeleton:
+    """The likeliest shape; of an error of the radius, the axis has ``depth`` times that in y."""
+    covariance = np.zeros((plant.node_count, 4, 4))
+    way = np.array([0.0, depth, 0.0, 1.0])
+    covariance += plant.radius_sigma[:, None, None]**2 * np.outer(way, way) + 1e-10 * np.eye(4)
+    return likeliest_shape(plant, ShapeEvidence(
+        covariance, np.full(plant.node_count, spacing), noise, **more))
 
 
 def test_well_measured_radii_stay() -> None:
     """Also a twig far thinner than most are against their carrier."""
     for twig in (0.006, 0.003, 0.001):
-        told = likeliest_radii(_plant(twig=twig), _seen(0.0003, 0.0001))
+        told = _told(_plant(twig=twig), 0.0003, 0.0001)
         np.testing.assert_allclose(told.radius, _plant(twig=twig).radius, rtol=0.05)
         assert (told.radius_state == MEASURED).all()
         assert (told.radius_sigma > 0.005 * told.radius).all()
@@ -48,7 +54,7 @@ def test_a_gap_gets_the_radius_between_and_a_wider_interval() -> None:
     stem = np.linspace(0.009, 0.006, _STEM)
     plant = _plant(np.where(np.isin(np.arange(_STEM), range(20, 50)), 4e-4, stem))
     state = np.where(plant.radius < 5e-4, INTERPOLATED, MEASURED).astype(np.int8)
-    told = likeliest_radii(replace(plant, radius_state=state), _seen())
+    told = _told(replace(plant, radius_state=state))
     np.testing.assert_allclose(told.radius[:_STEM], stem, rtol=0.08)
     sigma = told.radius_sigma / told.radius
     assert sigma[35] > 1.5 * sigma[10] and (told.radius_state[20:50] == INTERPOLATED).all()
@@ -58,7 +64,7 @@ def test_a_gap_gets_the_radius_between_and_a_wider_interval() -> None:
 def test_an_unresolved_twig_follows_its_carrier(fitted: float) -> None:
     """Fits of a few points far apart come out anywhere: carrier and interval decide."""
     plant = _plant(twig=fitted, sigma=0.3)
-    told = likeliest_radii(plant, _seen(0.008, 0.0005))
+    told = _told(plant, 0.008, 0.0005)
     twig = told.branch == 1
     assert (told.radius_state[twig] == UNRESOLVED).all()
     low, high = (told.radius[twig] * np.exp(way * 1.96 * (told.radius_sigma / told.radius)[twig])
@@ -71,7 +77,7 @@ def test_one_fit_that_failed_among_good_ones_moves_little() -> None:
     """A knot of 30 mm between radii of 8 mm does not thicken its neighbours."""
     radius = np.full(_STEM, 0.008)
     radius[40:43] = 0.03
-    told = likeliest_radii(_plant(radius), _seen())
+    told = _told(_plant(radius))
     np.testing.assert_allclose(told.radius[:36], 0.008, rtol=0.06)
     assert told.radius[41] < 0.02
 
@@ -88,20 +94,44 @@ def test_a_bunch_at_the_end_of_a_stem_is_stated_and_not_believed() -> None:
     assert (told.radius_state[62:] == LIMITED).all() and told.radius[62:].max() < 0.012
 
 
-def test_an_image_widens_its_branches_by_a_fraction_of_a_pixel() -> None:
-    """A quarter of a pixel is taken off, and the interval holds no pixel and half a one."""
+def test_an_image_may_widen_its_branches_by_a_fraction_of_a_pixel() -> None:
+    """The interval holds half a pixel less and a quarter more."""
     pixel = np.full(_STEM + _TWIG, 0.002)
-    told = likeliest_radii(_plant(), _seen(0.0002, 0.0, pixel=pixel, one_sided=True))
-    np.testing.assert_allclose(told.radius[:_STEM], 0.0075, rtol=0.02)
-    assert (1.96 * told.radius_sigma[:_STEM] > 0.0005).all()
-    coarse = likeliest_radii(_plant(), _seen(0.0002, 0.0, pixel=50 * pixel, one_sided=True))
+    told = _told(_plant(), 0.0002, 0.0, pixel=pixel, one_sided=True)
+    np.testing.assert_allclose(told.radius[:_STEM], 0.008, rtol=0.02)
+    assert (1.96 * told.radius_sigma[:_STEM] > 0.45 * 0.002).all()
+    coarse = _told(_plant(), 0.0002, 0.0, pixel=50 * pixel, one_sided=True)
     assert (coarse.radius > 0).all() and np.isfinite(coarse.radius_sigma).all()
+
+
+def test_an_axis_goes_with_the_radius_that_the_points_leave_open() -> None:
+    """A twig as thick as its stem gets thinner, and its seen side stays."""
+    plant = _plant(twig=0.016, sigma=0.3)
+    twig, y = plant.branch == 1, plant.nodes[:, 1]
+    told = _told(plant, depth=-1.0)
+    thinner = plant.radius - told.radius
+    assert thinner[twig].min() > 0.002
+    np.testing.assert_allclose((told.nodes[:, 1] - y)[twig], thinner[twig], rtol=0.35)
+    assert np.abs((_told(plant).nodes[:, 1] - y)[twig]).max() < 1e-4
+
+
+def test_a_scattered_axis_is_smoothed_and_a_bend_is_kept() -> None:
+    """Scatter of half a radius is nearly halved; a bend stays within a fifth of a radius."""
+    plant, rng = _plant(), np.random.default_rng(0)
+    bend = 0.3 * plant.nodes[:, 2]**2 * (plant.branch == 0)
+    off = 0.004 * rng.standard_normal(plant.node_count) * (plant.branch == 0)
+    nodes = plant.nodes + np.outer(bend + off, [0, 1.0, 0])
+    covariance = np.tile(np.diag([1, 1, 1, 1e-2])[None] * 0.004**2, (plant.node_count, 1, 1))
+    told = likeliest_shape(replace(plant, nodes=nodes), ShapeEvidence(
+        covariance, np.full(plant.node_count, 0.001), 0.0005))
+    left = (told.nodes[:, 1] - bend)[:_STEM]
+    assert np.std(left) < 0.6 * np.std(off[:_STEM]) and abs(np.mean(left)) < 0.0016
 
 
 def test_errors_that_all_fits_share_widen_all_intervals() -> None:
     """Of a coarser scan, of registration, and of sections that one side shows."""
-    plain = likeliest_radii(_plant(), _seen(0.0005, 0.0))
-    for more, factor in ((_seen(0.005, 0.0), 1.5), (_seen(0.0005, 0.0, shared=0.0008), 1.5),
-                         (_seen(0.0005, 0.0, one_sided=True), 1.15)):
-        told = likeliest_radii(_plant(), more)
+    plain = _told(_plant(), 0.0005, 0.0)
+    for told, factor in ((_told(_plant(), 0.005, 0.0), 1.5),
+                         (_told(_plant(), 0.0005, 0.0, shared=0.0008), 1.5),
+                         (_told(_plant(), 0.0005, 0.0, one_sided=True), 1.15)):
         assert (told.radius_sigma > factor * plain.radius_sigma)[5:_STEM - 5].all()
