@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.geometry.skeleton.repair.test_feet import two_in_one, two_limbs
 
 from limber.geometry.skeleton.radii.axis_fit import AxisFit
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
@@ -108,11 +109,13 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
         "unpinch radii": lambda: (_before(_hair(slice(0, 40)), strip, pinched=_branch()), _thick),
         "limit radii": lambda: (_before(_branch(radius=0.3)),
                                 lambda now: bool((now.skeleton.radius == 0.05).all())),
+        "follow feet down": lambda: (_before(two_in_one(0.2), two_limbs()), lambda now: float(
+            now.skeleton.nodes[now.skeleton.forks()[0], 2]) < 0.17),
         "fit finely": lambda: (_before(_aside()), _centred),
         "settle": lambda: (_before(_aside(), strands=1), _centred),
         "draw ends back": lambda: (_before(_branch(np.vstack([
             [0, 0, -0.012], ALONG[1:-1], [0, 0, 0.412]]))), _ends(0.0, 0.4)),
-        "find the likeliest radii": lambda: (_before(blank, gap), _thick),
+        "find the likeliest axes and radii": lambda: (_before(blank, gap), _thick),
         "mend kinks": lambda: (_before(_branch(folded, radius=0.005)), lambda now: bool(
             turns(now.skeleton, now.skeleton.runs()[0]).max() <= KINK)),
     }

@@ -14,6 +14,7 @@ from limber.geometry.skeleton.radii.ray_fit import fit_of_rays
 from limber.geometry.skeleton.repair.attachment import attached
 from limber.geometry.skeleton.repair.backward_twigs import without_backward_starts
 from limber.geometry.skeleton.repair.double_strands import without_strands
+from limber.geometry.skeleton.repair.feet import with_feet
 from limber.geometry.skeleton.repair.kinks import without_kinks
 from limber.geometry.skeleton.repair.resampling import resampled
 from limber.geometry.skeleton.repair.run_ends import ends_within, with_full_tips, without_bare_ends
@@ -176,6 +177,8 @@ PASSES = (
     Pass("unpinch radii", "Where only a strip of a stem is visible, the radius is far too small.",
          lambda now: now if now.pinched is None else now.of(unpinched(now.skeleton, now.points))),
     LIMIT,
+    Pass("follow feet down", "Two limbs side by side have one axis, up to a fork too far out.",
+         lambda now: now.of(with_feet(now.skeleton, now.points, now.noise)[0])),
     Pass("fit finely",
          "Axes and radii come from too few nodes, and from forks that have moved since.",
          lambda now: now.fitted(resampled(now.skeleton), uncertainty=False), until=0.8),
@@ -186,7 +189,7 @@ PASSES = (
     Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
          lambda now: now.of(ends_within(now.skeleton, now.points))),
     LIMIT,
-    Pass("find the likeliest radii",
+    Pass("find the likeliest axes and radii",
          "A radius that few points, the spacing or the noise determine, or that no wood has, is "
          "treated as measured.",
          lambda now: now.of(assessed(

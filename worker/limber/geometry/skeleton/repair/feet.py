@@ -1,0 +1,187 @@
+"""Feet of side branches: their axes are followed down while the points show two limbs, not one.
+
+Where a side branch leaves at a small angle, or beside a limb as thick as itself, the contraction
+makes one axis of both for some way. Its points then lie on two circles in a section, and on one
+below the fork. The likelihoods of both decide at each node, from the fork towards the root.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.sweep import any_normal
+
+_HALF = 1.0  # radii to each side of a section whose points belong to it
+_LEAST = 10  # points of a circle
+_APART = 1.0  # radii of the thicker limb between two axes
+_LIKELIER = 3.0  # logarithm: twenty times
+_ALIKE = 3.0  # points whose errors are correlated, so that they count as one
+_ROUGH = 0.08  # fraction of the radius by which sections of wood are not round
+_STRAY = 3.0  # standard deviations from which a point belongs to something else
+_KNOWN = 0.3  # deviation of a limb's radius from that above, logarithm
+_ROUNDS = 12
+_HIDDEN = 2  # sections at the fork that may show one circle
+_SECTIONS = 3  # sections in a row that must show two: a few stray points are in one
+
+
+@dataclass(frozen=True)
+class _Foot:
+    """The axes of a side run beside its carrier: carrier's nodes from the fork down, shape [k],
+    and of both limbs there the positions [m], [k, 3], and radii [m], [k]."""
+
+    nodes: np.ndarray
+    carrier: np.ndarray
+    carrier_radius: np.ndarray
+    side: np.ndarray
+    side_radius: np.ndarray
+
+
+def with_feet(skeleton: Skeleton, points: np.ndarray, noise: float) -> tuple[Skeleton, int]:
+    """Return the skeleton with side runs that start where their points meet the carrier's.
+
+    Args:
+        skeleton: Fitted to the points.
+        points: Scanned points [m], shape [m, 3].
+        noise: Standard deviation of the points [m].
+
+    Returns:
+        The skeleton, and the number of side runs that were followed down.
+    """
+    run = skeleton.branch[nearest_cylinders(skeleton, points)[0]]
+    nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
+    parent, below, count = skeleton.parent.copy(), [], 0
+    added: list[tuple[np.ndarray, np.ndarray]] = []
+    done = np.zeros(skeleton.node_count, bool)
+    for members in skeleton.runs()[1:]:
+        own = np.isin(run, skeleton.branch[members[:2]])
+        foot = _foot(skeleton, members, points[own], noise)
+        if foot is None or done[foot.nodes].any():
+            continue
+        done[foot.nodes] = True
+        nodes[foot.nodes], radius[foot.nodes] = foot.carrier, foot.carrier_radius
+        first = len(nodes) + sum(len(side) for side, _ in added)
+        chain = np.arange(first, first + len(foot.nodes))
+        parent[members[1]] = chain[0]
+        below.append(np.append(chain[1:], skeleton.parent[foot.nodes[-1]]))
+        added.append((foot.side, foot.side_radius))
+        count += 1
+    if not count:
+        return skeleton, 0
+    return Skeleton.from_edges(
+        np.vstack([nodes, *(side for side, _ in added)]), np.concatenate([parent, *below]),
+        np.concatenate([radius, *(thick for _, thick in added)])), count
+
+
+def _foot(skeleton: Skeleton, members: np.ndarray, points: np.ndarray, noise: float,
+          ) -> _Foot | None:
+    """The part of a side run that its carrier's axis hides; None if there is none."""
+    fork = int(members[0])
+    run = int(skeleton.branch[fork])
+    side = float(np.median(skeleton.radius[members[1:6]]))
+    at = skeleton.nodes[members[1]]
+    found: list[tuple[int, tuple[np.ndarray, np.ndarray, float, float]]] = []
+    node, hidden = fork, 0
+    way = at - skeleton.nodes[members[min(6, len(members) - 1)]]
+    way /= max(float(np.linalg.norm(way)), 1e-300)
+    while skeleton.parent[node] >= 0 and skeleton.branch[node] == run and hidden < _HIDDEN:
+        step = min(float(np.linalg.norm(at - skeleton.nodes[node])), float(skeleton.steps[node]))
+        both = _two_limbs(skeleton, node, at + way * step, side, points, noise)
+        if both is not None:
+            found.append((node, both))
+            at = both[1]
+        elif found:
+            break
+        else:
+            hidden += 1
+        node = int(skeleton.parent[node])
+    if len(found) < _SECTIONS:
+        return None
+    return _Foot(np.array([each for each, _ in found]), *(
+        np.array([both[k] for _, both in found]) for k in (0, 2, 1, 3)))
+
+
+def _two_limbs(skeleton: Skeleton, node: int, at: np.ndarray, side: float, points: np.ndarray,
+               noise: float) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+    """Axes and radii of carrier and side limb in the section at a node; None if it shows one.
+
+    Args:
+        at: Where the side limb's axis is expected [m], shape [3].
+        side: Its radius above [m].
+    """
+    before = int(skeleton.parent[node])
+    axis = skeleton.nodes[node] - skeleton.nodes[before]
+    size = float(np.linalg.norm(axis))
+    if size == 0:
+        return None
+    axis /= size
+    middle, thick = skeleton.nodes[node], float(skeleton.radius[node])
+    near = np.flatnonzero(np.linalg.norm(points - middle, axis=1) < 3 * thick + 2 * side)
+    offset = points[near] - middle
+    along = offset @ axis
+    kept = np.abs(along) < max(_HALF * min(thick, side), size / 2)
+    one = any_normal(axis)
+    frame = np.stack([one, np.cross(axis, one)])
+    flat = offset[kept] @ frame.T
+    spread = float(np.hypot(noise, _ROUGH * min(thick, side)))
+    aside = (at - middle) @ frame.T
+    single = _fitted(flat, np.array([[0.0, 0.0, thick]]), spread, np.inf)
+    above = float(skeleton.radius[_outwards(skeleton, node)])
+    first = np.array([[*(-0.3 * aside), above], [*aside, side]])
+    double = _fitted(flat, first, spread, _KNOWN)
+    if single is None or double is None:
+        return None
+    (carrier, limb), gap = double[0], float(np.linalg.norm(double[0][0, :2] - double[0][1, :2]))
+    if gap < _APART * max(carrier[2], limb[2]) or (
+            (double[1] - single[1]) / _ALIKE - 1.5 * np.log(len(flat)) < _LIKELIER):
+        return None
+    return (middle + carrier[:2] @ frame, middle + limb[:2] @ frame, float(carrier[2]),
+            float(limb[2]))
+
+
+def _outwards(skeleton: Skeleton, node: int) -> int:
+    """The node of the same run some radii above."""
+    own = np.flatnonzero(skeleton.branch == skeleton.branch[node])
+    above = own[own > node]
+    far = skeleton.arc_length[above] - skeleton.arc_length[node] > 3 * skeleton.radius[node]
+    return int(above[far][0]) if far.any() else int(above[-1]) if len(above) else node
+
+
+def _fitted(flat: np.ndarray, first: np.ndarray, spread: float, known: float,
+            ) -> tuple[np.ndarray, float] | None:
+    """Circles fitted to points of a section, each point to the nearest, and the log-likelihood.
+
+    Args:
+        flat: Points [m], shape [k, 2].
+        first: Middle and radius of each circle to start from [m], shape [c, 3].
+        spread: Standard deviation of the points [m].
+        known: Deviation of the radii's logarithms from the first.
+
+    Returns:
+        None if a circle has too few points.
+    """
+    circles = first.copy()
+    for _ in range(_ROUNDS):
+        offset = flat[:, None] - circles[:, :2]
+        distance = np.maximum(np.linalg.norm(offset, axis=2), 1e-12)
+        miss = distance - circles[:, 2]
+        nearest = np.argmin(np.abs(miss), axis=1)
+        for number, circle in enumerate(circles):
+            own = np.flatnonzero((nearest == number) & (
+                np.abs(miss[:, number]) < np.maximum(2 * _STRAY * spread, circle[2])))
+            if len(own) < _LEAST:
+                return None
+            off = miss[own, number] / spread
+            weight = 1 / (1 + (off / _STRAY)**2)
+            slope = np.column_stack([-offset[own, number] / distance[own, number, None],
+                                     -np.ones(len(own))]) / spread
+            prior = np.diag([0, 0, (known * first[number, 2])**-2]) + 1e-9 / spread**2 * np.eye(3)
+            pull = prior @ (circle - first[number]) * [0, 0, 1]
+            step = np.linalg.solve((slope * weight[:, None]).T @ slope + prior,
+                                   (slope * weight[:, None]).T @ off + pull)
+            circles[number] = circle - np.clip(step, -0.5 * circle[2], 0.5 * circle[2])
+            circles[number, 2] = max(circles[number, 2], 0.2 * first[number, 2])
+    off = np.abs(np.linalg.norm(flat[:, None] - circles[:, :2], axis=2) - circles[:, 2]).min(
+        axis=1) / spread
+    return circles, float(-0.5 * np.minimum(off, _STRAY)**2 @ np.ones(len(off)))
