@@ -109,9 +109,16 @@ def radius_deviations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
 
 
 def fit_covariance(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
-    """Covariance of each node's position and radius by a fit to points [m^2], shape [n, 4, 4]."""
+    """Covariance of each node's position and radius by a fit to points [m^2], shape [n, 4, 4].
+
+    Where the skeleton states a larger deviation of the radius than noise with known positions on
+    the circle gives, the axis goes with the difference as it goes with the noise.
+    """
     system, noise = fitted_system(skeleton, points)
-    return noise**2 * system.inverse_blocks(np.arange(4))
+    covariance = noise**2 * system.inverse_blocks(np.arange(4))
+    way = covariance[:, :, 3] / np.maximum(covariance[:, 3, 3], 1e-300)[:, None]
+    more = np.maximum(skeleton.radius_sigma**2 - covariance[:, 3, 3], 0.0)
+    return covariance + more[:, None, None] * way[:, :, None] * way[:, None, :]
 
 
 def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
