@@ -1,4 +1,4 @@
-"""Pots, stakes and posts are found by their shape, and named; no plant is one."""
+"""Pots, stakes, posts and wires are found by their shape, and named; no plant is one."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ import pytest
 from benchmarks.worlds.sources import bare_case, potted_case
 from limber.core.errors import InputError
 from limber.geometry.cloud.supports import find_supports, named_if_refused, supports_text
+from limber.geometry.point_classes import COLOURS
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -18,6 +19,17 @@ def _rod(radius: float, top: float, tip: float | None = None, bend: float = 0.0,
     thick = radius + ((radius if tip is None else tip) - radius) * z / top
     points = np.stack([at[0] + thick * np.cos(angle) + bend * (z / top)**2,
                        at[1] + thick * np.sin(angle), z], axis=1)
+    return points + 0.0003 * rng.standard_normal(points.shape)
+
+
+def _wire(long: float, sag: float, tip: float = 0.0015, bend: float = 0.0,
+          count: int = 1500) -> np.ndarray:
+    """Points of a wire along x at a height of 0.5 m, which thins to ``tip`` and bends aside."""
+    rng = np.random.default_rng(1)
+    angle, t = rng.uniform(0, 2 * np.pi, count), rng.uniform(0, 1, count)
+    thick = 0.0015 + (tip - 0.0015) * t
+    points = np.stack([long * (t - 0.5), 0.05 + bend * t**2 + thick * np.cos(angle),
+                       0.5 - 4 * sag * t * (1 - t) + thick * np.sin(angle)], axis=1)
     return points + 0.0003 * rng.standard_normal(points.shape)
 
 
@@ -44,6 +56,24 @@ def test_a_stake_is_straight_and_even_and_a_stem_is_not() -> None:
     for wood in (_rod(0.006, 0.8, tip=0.003, at=(0.0, 0.15)),
                  _rod(0.006, 0.8, bend=0.15, at=(0.0, 0.15))):
         assert find_supports(np.vstack([stem, wood]), UP) == []
+
+
+@pytest.mark.parametrize("sag", [0.0, 0.04])
+def test_a_wire_hangs_from_border_to_border_or_from_its_posts(sag: float) -> None:
+    """Straight or sagging; one that thins, bends, sags upwards or ends in the air is wood."""
+    stem = _rod(0.01, 1.0, tip=0.004, bend=0.1)
+    scan = np.vstack([stem, _wire(1.2, sag)])
+    found = find_supports(scan, UP)
+    assert [each.kind for each in found] == ["wire"]
+    assert (found[0].points >= len(stem)).mean() > 0.95 and len(found[0].points) > 1400
+    posts = [_rod(0.03, 0.9, at=(x, 0.05)) for x in (-0.6, 0.6)]
+    beyond = [_rod(0.004, 0.9, tip=0.002, bend=0.1, at=(x, 0.1)) for x in (-0.8, 0.8)]
+    found = find_supports(np.vstack([stem, *posts, *beyond, _wire(1.2, sag)]), UP)
+    assert sorted(each.kind for each in found) == ["post", "post", "wire"]
+    assert {"post", "wire"} < COLOURS.keys()
+    for wood in ([_wire(1.2, sag, tip=0.0004)], [_wire(1.2, sag, bend=0.1)],
+                 [_wire(1.2, -0.04)], [_wire(0.5, sag), *beyond]):
+        assert find_supports(np.vstack([stem, *wood]), UP) == []
 
 
 def test_supports_of_a_dense_scan_have_all_of_their_points() -> None:

@@ -13,7 +13,8 @@ from limber.geometry.cloud.supports import Support
 from limber.geometry.leaf_removal import leaf_mask
 
 COLOURS = {"wood": (139, 90, 43), "leaf": (60, 170, 60), "on no round axis": (220, 40, 40),
-           "pot": (150, 150, 150), "stake": (60, 110, 230), "post": (30, 50, 140)}
+           "pot": (150, 150, 150), "stake": (60, 110, 230), "post": (30, 50, 140),
+           "wire": (90, 200, 230)}
 """Red, green and blue of each class; its place is the value of the column ``class``."""
 
 Show = Callable[[Cloud], None]
@@ -30,7 +31,7 @@ def shown_if_refused(show: Show | None, prepared: Prepared, leaves: list[Leaf],
         show: Receives the cloud; None: nobody looks.
         prepared: The whole scan.
         leaves: Its leaves.
-        supports: Its pots, stakes and posts.
+        supports: Its pots, stakes, posts and wires.
         off_axes: Which of the other points are on no round axis, shape [rest]; None: not known.
     """
     try:

@@ -1,8 +1,9 @@
-"""Pots, stakes and posts in a scan of a plant, found by their shape; they are named, never removed.
+"""Pots, stakes, posts and wires in a scan of a plant, found by their shape and never removed.
 
 A pot is a body turned about an upright axis at the foot of the scan, which ends where the stem
 leaves it. A stake is straight to a fraction of its radius and as thick above as below, for far
-longer than wood is.
+longer than wood is. A wire of a trellis is a thin line of even thickness, straight from above and
+at most sagging from the side, from one support or border of the scan to another.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
+from limber.geometry.cloud.canonical_frame import own_order
 
 _ENOUGH = 100_000  # points that show supports
 _SLICES = 40  # over the height of the scan
@@ -30,6 +32,17 @@ _STRAIGHT, _EVEN, _FALL, _SLOPE = 0.15, 0.12, 0.08, 0.27
 _STAKES_MOST = 3
 _WIDE = (0.5, 2.0)  # thicknesses of a slice around its first middle in which a stake is looked for
 _THICK_POST = 0.02  # radius of a post [m]; thinner ones are stakes
+# A wire is looked for among so many points, from so many places that are on thin lines at this
+# fraction of the scan's diagonal.
+_WIRE_POINTS, _WIRE_STARTS, _WIRE_SCALE = 20_000, 120, 0.03
+_LINE = 0.1  # largest second spread of points on a thin line, over the first
+# A wire: length over its radius, at least; sag over its length, slope, distance of its ends from a
+# support or the scan's border over its length, at most; fraction of its slices without points, and
+# with points around it as of laterals, at most.
+_THIN, _SAG, _WIRE_SLOPE, _ENDS = 120.0, 0.1, 0.6, 0.04
+_MISSING, _LATERALS = 0.15, 0.3
+_BESIDE = (3.0, 8.0)  # radii between which points beside a wire show a lateral
+_WIRES_MOST = 12
 
 
 @dataclass(frozen=True)
@@ -37,7 +50,7 @@ class Support:
     """A thing beside the plant.
 
     Attributes:
-        kind: ``pot``, ``stake`` or ``post``.
+        kind: ``pot``, ``stake``, ``post`` or ``wire``.
         points: Indices of its points in the scan.
         at: One of its points, in its middle [m], shape [3].
     """
@@ -48,7 +61,7 @@ class Support:
 
 
 def find_supports(points: np.ndarray, up: np.ndarray) -> list[Support]:
-    """Return the pot, the stakes and the posts that a scan shows.
+    """Return the pot, the stakes, the posts and the wires that a scan shows.
 
     Args:
         points: The scan [m], shape [n, 3].
@@ -107,6 +120,10 @@ def _in_sample(points: np.ndarray, up: np.ndarray) -> list[Support]:
         own, radius = stake
         rest[own] = False
         found.append(("post" if radius > _THICK_POST else "stake", own))
+    held = points[np.concatenate([own for _, own in found])] if found else np.empty((0, 3))
+    found += [("wire", own) for own in _wires(points, np.column_stack([flat, height]),
+                                              np.flatnonzero(rest), held @ np.vstack(
+                                                  [across, up]).T)]
     return [Support(kind, own, points[own][np.argmin(np.linalg.norm(
         points[own] - np.median(points[own], axis=0), axis=1))]) for kind, own in found]
 
@@ -195,6 +212,120 @@ def _rod(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, rest: np.ndarr
             or np.linalg.norm(line[:, 1]) > _SLOPE):
         return None
     return near, size
+
+
+def _wires(points: np.ndarray, placed: np.ndarray, rest: np.ndarray, held: np.ndarray,
+           ) -> list[np.ndarray]:
+    """Indices of the points of each wire.
+
+    Args:
+        points: The sample [m], shape [n, 3].
+        placed: The same with the height as the last coordinate, shape [n, 3].
+        rest: Points of no other support, shape [r].
+        held: Points of other supports, placed likewise, shape [k, 3].
+    """
+    size = float(np.linalg.norm(np.ptp(placed, axis=0)))
+    rest = rest[own_order(points[rest])][:_WIRE_POINTS]
+    if len(rest) < _LONG * _LEAST:
+        return []
+    places, reach, found = placed[rest], _WIRE_SCALE * size, []
+    free, tried, tree = np.ones(len(rest), bool), np.zeros(len(rest), bool), cKDTree(places)
+    supports = cKDTree(held) if len(held) else None
+    for start in range(min(_WIRE_STARTS, len(rest))):
+        if tried[start] or not free[start] or len(found) == _WIRES_MOST:
+            continue
+        near = tree.query_ball_point(places[start], reach)
+        if len(near) < _LEAST:
+            continue
+        spread, axes = np.linalg.eigh(np.cov(places[near].T))
+        if spread[1] > _LINE**2 * spread[2] or abs(axes[2, 2]) > _WIRE_SLOPE:
+            continue
+        tried[near] = True
+        told = _wire(places, free, supports, placed, places[near].mean(axis=0), axes[:, 2], reach)
+        if told is not None:
+            found.append(told)
+            free &= ~np.isin(rest, told)
+    return found
+
+
+def _wire(places: np.ndarray, free: np.ndarray, supports: cKDTree | None, every: np.ndarray,
+          middle: np.ndarray, way: np.ndarray, reach: float) -> np.ndarray | None:
+    """Indices among ``every`` of the wire through ``middle``; None if that is none.
+
+    Args:
+        places: Positions with the height last [m], shape [r, 3].
+        free: Which of them may be on a wire, shape [r].
+        supports: The points of other supports.
+        every: All points of the sample, placed likewise, shape [n, 3].
+        middle: Where a thin line was seen [m], shape [3].
+        way: Its direction, shape [3].
+        reach: Half of the length that was looked at [m].
+    """
+    way = np.array([way[0], way[1], 0.0]) / np.hypot(way[0], way[1])
+    aside = np.array([-way[1], way[0], 0.0])
+    frame = np.array([way, aside, [0.0, 0.0, 1.0]])
+    own = (places[free] - middle) @ frame.T
+    # It grows from what is known of it: a line from above, a parabola from the side.
+    line, hang, wide = np.zeros(2), np.zeros(3), 0.1 * reach
+    low = high = 0.0
+    for _ in range(40):
+        off = _off(own, line, hang)
+        near = (np.abs(own[:, 0] - (low + high) / 2) < (high - low) / 2 + reach) & (
+            np.linalg.norm(off, axis=1) < wide)
+        if near.sum() < _LEAST:
+            return None
+        along = own[near, 0]
+        line, hang = np.polyfit(along, own[near, 1], 1), np.polyfit(
+            along, own[near, 2], 2 if high - low > 6 * reach else 1)
+        hang = np.pad(hang, (3 - len(hang), 0))
+        wide = max(4 * float(np.median(np.linalg.norm(_off(own[near], line, hang), axis=1))),
+                   1e-9)
+        if along.min() > low - 1e-3 * reach and along.max() < high + 1e-3 * reach and high > low:
+            break
+        low, high = float(along.min()), float(along.max())
+    return _proven(((every - middle) @ frame.T), line, hang, wide, (low, high), supports,
+                   lambda ends: ends @ frame + middle)
+
+
+def _off(own: np.ndarray, line: np.ndarray, hang: np.ndarray) -> np.ndarray:
+    """Offset of points from a wire, aside and in height [m], shape [n, 2]."""
+    return np.column_stack([own[:, 1] - np.polyval(line, own[:, 0]),
+                            own[:, 2] - np.polyval(hang, own[:, 0])])
+
+
+def _proven(own: np.ndarray, line: np.ndarray, hang: np.ndarray, wide: float,
+            span: tuple[float, float], supports: cKDTree | None,
+            back: Callable[[np.ndarray], np.ndarray]) -> np.ndarray | None:
+    """Indices of the points of a line, if it is thin, even, bare and held as a wire is."""
+    low, high = span
+    long, off = high - low, np.linalg.norm(_off(own, line, hang), axis=1)
+    inside = (own[:, 0] >= low) & (own[:, 0] <= high)
+    near = np.flatnonzero(inside & (off < wide))
+    size = float(np.sqrt(np.mean(off[near]**2))) if len(near) else 0.0
+    if size <= 0 or long < _THIN * size or abs(hang[0]) * long**2 / 4 > _SAG * long or (
+            hang[0] * long**2 / 4 < -size or abs(hang[1]) > _WIRE_SLOPE):
+        return None
+    slices = np.minimum(((own[:, 0] - low) / long * _SLICES).astype(np.int64), _SLICES - 1)
+    rows, beside = [], 0
+    shell = inside & (off > _BESIDE[0] * size) & (off < _BESIDE[1] * size)
+    for number in range(_SLICES):
+        part = near[slices[near] == number]
+        beside += int((shell & (slices == number)).sum() > len(part) / 4)
+        if len(part) >= 3:
+            middle = np.mean(_off(own[part], line, hang), axis=0)
+            rows.append((number / _SLICES, np.linalg.norm(middle),
+                         np.log(max(np.sqrt(np.mean(off[part]**2)), 1e-300))))
+    level, bent, radius = np.array(rows).reshape(-1, 3).T
+    if len(rows) < (1 - _MISSING) * _SLICES or beside > _LATERALS * _SLICES or (
+            np.median(bent) > 2 * _STRAIGHT * size or abs(_line(level, radius)[1]) > 2 * _EVEN
+            or np.median(np.abs(radius - np.median(radius))) > 2 * _EVEN):
+        return None
+    for end, beyond in ((low, own[:, 0] < low - _ENDS * long),
+                        (high, own[:, 0] > high + _ENDS * long)):
+        place = np.array([end, np.polyval(line, end), np.polyval(hang, end)])
+        if beyond.any() and (supports is None or supports.query(back(place))[0] > _ENDS * long):
+            return None
+    return near
 
 
 def _line(level: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -145,8 +145,8 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         with replacing(place) as file:
             classes.write_ply(file)
         progress.warn(f"The points are coloured by class in {place}, in metres: wood brown, leaves "
-                      "green, points on no round axis red, a pot grey, stakes and posts "
-                      "blue.")
+                      "green, points on no round axis red, a pot grey, stakes, posts "
+                      "and wires blue.")
     with branch.dropped_if_empty(), branch.stage(
             "reconstruct", settings, digests=digests) as stage:
         own = None if skeleton_path is None else read_skeleton(
