@@ -167,6 +167,10 @@ class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator
     restore: bpy.props.BoolProperty(
         name="Restore", options={"SKIP_SAVE"},
         description="Undo all edits instead, also the applied ones")
+    alternative: bpy.props.IntProperty(
+        name="Alternative", default=0, min=0, options={"SKIP_SAVE"},
+        description="Number of the alternative to use, from 2; 0 uses none. Edits that are not "
+        "yet applied come first")
     _temporary = None
 
     @classmethod
@@ -178,7 +182,7 @@ class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator
         thing = branches.find_skeleton(context.scene)
         edits = [] if self.restore else edits_of(
             skeletons.as_given(thing.data), skeletons.nodes_of(thing))
-        if not edits and not self.restore:
+        if not edits and not self.restore and not self.alternative:
             raise ValueError("Nothing has been edited yet. Move or delete nodes first.")
         self._folder = bpy.path.abspath(branches.branch_of(thing)[branches.FOLDER_KEY])
         check_identity(context.scene, Path(self._folder))
@@ -186,6 +190,8 @@ class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator
         path = Path(self._temporary.name) / "edits.json"
         path.write_text(json.dumps(edits), encoding="utf-8")
         how = [] if self.restore else ["--frame", "branch", "--append"]
+        if self.alternative:
+            how += ["--alternative", str(self.alternative)]
         return ["skeleton", "--edits", str(path), *how, "--", self._folder]
 
     def folder(self, context):

@@ -1,21 +1,28 @@
-"""The part of the skeleton's panel that edits its nodes."""
+"""The parts of the skeleton's panel that choose an alternative of it and edit its nodes."""
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
 
 import bpy
 
-from .. import branches
+from .. import branch_folder, branches
 from ..lines import draw_text
 from ..overlays import skeleton as overlay
 
 _BUTTONS = (("DELETE", "CONFIRM"), ("BRIDGE", "MERGE"), ("SPLIT", "ROOT"), ("RADIUS", "NONE"))
 _LABELS = {"DELETE": "Delete Branch", "CONFIRM": "Confirm", "BRIDGE": "Bridge", "MERGE": "Merge",
            "SPLIT": "Split", "ROOT": "Set Root", "RADIUS": "Set Radius", "NONE": "Unmark"}
+_DIFFERENCES = {"delete": ("branch less", "branches less"), "add": ("twig more", "twigs more"),
+                "split": ("attached elsewhere",) * 2, "root": ("root elsewhere",) * 2}
 
 
 def draw_skeleton(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw the buttons that edit nodes, and those that apply or discard the edits."""
+    """Draw the alternatives, the buttons that edit nodes, and those that apply or discard edits."""
     thing = branches.find_skeleton(context.scene)
     if thing is None:
         return
+    _draw_alternatives(layout, context, thing)
     header, body = layout.panel("limber_skeleton_nodes", default_closed=True)
     header.label(text="Edit Nodes")
     if body is None:
@@ -42,3 +49,34 @@ def draw_skeleton(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
                  icon="CHECKMARK")
     row.operator("limber.discard_skeleton", icon="LOOP_BACK")
     body.operator("limber.apply_skeleton", text="Restore as Found").restore = True
+
+
+def _draw_alternatives(layout: bpy.types.UILayout, context: bpy.types.Context,
+                       thing: bpy.types.Object) -> None:
+    """Draw a button for each other skeleton that the scan leaves possible."""
+    record = branch_folder.read_record(
+        bpy.path.abspath(branches.branch_of(thing)[branches.FOLDER_KEY]))
+    made = record.stages.get("reconstruct") if record else None
+    graphs = (made.result.get("alternatives") or []) if made else []
+    if len(graphs) < 2:
+        return
+    header, body = layout.panel("limber_skeleton_alternatives", default_closed=True)
+    header.label(text=f"Alternatives ({len(graphs) - 1})")
+    if body is None:
+        return
+    draw_text(body, context, "Other skeletons that the scan allows, the most likely first. "
+              "Using one makes surface and mesh again", "INFO")
+    for number, graph in enumerate(graphs[1:], start=2):
+        column = body.column(align=True)
+        draw_text(column, context, alternative_text(graphs[0], graph), "DOT")
+        column.operator("limber.apply_skeleton", text=f"Use Alternative {number}",
+                        icon="CHECKMARK").alternative = number
+
+
+def alternative_text(used: Mapping[str, Any], graph: Mapping[str, Any]) -> str:
+    """Describe an alternative of the skeleton in use: how likely, how long, what differs."""
+    count = Counter(edit["do"] for edit in graph["edits"])
+    differs = ", ".join(f"{number} {_DIFFERENCES[kind][number > 1]}"
+                        for kind, number in count.items())
+    return (f"{graph['probability'] / max(used['probability'], 1e-300):.2g} times as likely, "
+            f"{1e3 * graph['length_m']:.0f} mm: {differs}")

@@ -1,12 +1,15 @@
 """The skeleton edited in Blender and by the worker: what is done to its nodes is what comes out."""
 
 import importlib
+import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.addon.test_panels import Layout
 
+from limber.core.alignment import Alignment
 from limber.geometry.io.skeletons import read_skeleton
 
 pytestmark = pytest.mark.usefixtures("worker_here")
@@ -92,6 +95,35 @@ def test_edits_not_applied_outlive_opening_and_a_saved_file(bpy, opened, tmp_pat
     np.testing.assert_allclose(_places(skeleton())[5], was, atol=1e-7)
     with pytest.raises(RuntimeError, match="Nothing has been edited"):
         bpy.ops.limber.apply_skeleton()
+
+
+@pytest.mark.slow
+def test_an_alternative_has_a_button(bpy, opened):
+    """Beside an edit that is not applied yet; the panel says how it differs."""
+    folder, _ = opened
+    before, path = read_skeleton(folder / "skeleton.csv"), folder / "branch.json"
+    content = json.loads(path.read_text())
+    made = content["stages"]["reconstruct"]["result"]
+    alignment = Alignment.model_validate(content["alignment"])
+    tip = alignment.undo(before.nodes[_tip(folder)][None])[0].tolist()
+    made["alternatives"] = [{"probability": 0.5, "length_m": before.length, "edits": []},
+                            {"probability": 0.25, "length_m": 0.4,
+                             "edits": [{"do": "delete", "at": tip}]}]
+    path.write_text(json.dumps(content))
+    panel = importlib.import_module("limber_addon.panels.skeleton")
+    assert panel.alternative_text(*made["alternatives"]) == (
+        "0.5 times as likely, 400 mm: 1 branch less")
+    drawn = Layout()
+    panel.draw_skeleton(drawn, bpy.context)
+    assert ("operator", "limber.apply_skeleton", "Use Alternative 2") in drawn.calls
+    with pytest.raises(RuntimeError, match="has 1 alternatives"):
+        bpy.ops.limber.apply_skeleton(alternative=3)
+    bpy.ops.limber.edit_node(action="RADIUS", node=3, radius=0.012)
+    assert bpy.ops.limber.apply_skeleton(alternative=2) == {"FINISHED"}
+    after = read_skeleton(folder / "skeleton.csv")
+    assert after.node_count == before.node_count - 1
+    assert after.radius[np.linalg.norm(after.nodes - before.nodes[3], axis=1).argmin()] == (
+        pytest.approx(0.012, rel=1e-5))
 
 
 @pytest.mark.slow

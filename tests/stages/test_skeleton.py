@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
+import limber
 from limber import store
 from limber.cli.main import call
 from limber.core.errors import InputError, MeshingError
@@ -73,6 +74,8 @@ def test_an_alternative_is_applied_by_its_number(made, tmp_path) -> None:
     assert [edit["do"] for edit in listed[1]["edits"]] == ["delete"]
     with pytest.raises(InputError, match=f"has {len(listed) - 1} alternatives"):
         review_skeleton(target, alternative=9)
+    other = limber.open(target).alternatives[1]
+    assert (other.length, other.edits[0].do) == (listed[1]["length_m"], "delete")
     chosen = review_skeleton(target, alternative=2)
     assert chosen["branch_count"] == result["branch_count"] - 1
     assert chosen["length_m"] == pytest.approx(listed[1]["length_m"], rel=1e-6)

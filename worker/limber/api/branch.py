@@ -22,6 +22,7 @@ from limber.store import Branch as Folder
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from limber.geometry.skeleton.alternatives import Alternative
     from limber.geometry.skeleton.skeleton import Skeleton
     from limber.geometry.tets.tet_mesh import TetMesh
     from limber.session.client import InteractiveSession
@@ -83,6 +84,25 @@ class Branch:
         from limber.store.loading import load_skeleton
 
         return load_skeleton(self._read())
+
+    @property
+    def alternatives(self) -> "tuple[Alternative, ...]":
+        """The most likely skeletons, the one in use first: ``probability``, ``length`` [m] and
+        ``edits``, which make it of the one in use and are in the scan's coordinates.
+
+        ``branch.run("skeleton", alternative=2)`` applies those of the second. There are none in a
+        folder of an older version.
+
+        >>> [other.length for other in limber.open("a.branch").alternatives]
+        []
+
+        Raises:
+            BranchFolderError: the folder is damaged.
+        """
+        from limber.geometry.skeleton.alternatives import from_entries
+
+        made = self._read().made
+        return from_entries(made.result.get("alternatives") or [] if made else [])
 
     @property
     def pulls(self) -> Mapping[str, Pull]:

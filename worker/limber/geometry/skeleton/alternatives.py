@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
+from limber.core.json_values import validated
 from limber.geometry.skeleton.confidence import probability_given_carrier
 from limber.geometry.skeleton.edits import (
     FAR,
@@ -249,3 +250,9 @@ def entries(graphs: Sequence[Alternative], in_file: Callable[[Edit], Edit]) -> l
     return [{"probability": graph.probability, "length_m": graph.length,
              "edits": [in_file(edit).model_dump(mode="json", exclude_none=True)
                        for edit in graph.edits]} for graph in graphs]
+
+
+def from_entries(known: Sequence[dict[str, Any]]) -> tuple[Alternative, ...]:
+    """Return the graphs of a stage's result, their edits in the coordinates of the scan's file."""
+    return tuple(Alternative(one["probability"], one["length_m"],
+                             tuple(validated(list[Edit], one["edits"]))) for one in known)

@@ -147,8 +147,7 @@ def _requested_edits(branch: Branch, path: Path, frame: str, append: bool) -> li
 
 def _edits_of(branch: Branch, number: int) -> list[Edit]:
     """The edits of an alternative, numbered from 1."""
-    from limber.core.json_values import validated
-    from limber.geometry.skeleton.edits import Edit
+    from limber.geometry.skeleton.alternatives import from_entries
 
     known = branch.made.result.get("alternatives", []) if branch.made else []
     if number > len(known):
@@ -157,7 +156,7 @@ def _edits_of(branch: Branch, number: int) -> list[Edit]:
             f"{max(len(known) - 1, 0)} alternatives.",
             "Alternatives are numbered from 2; number 1 is the skeleton in use.",
             "Choose one of those listed, or reconstruct again if there are none.")
-    return validated(list[Edit], known[number - 1]["edits"])
+    return list(from_entries(known)[number - 1].edits)
 
 
 def _applied(branch: Branch) -> list[Edit]:
