@@ -1,6 +1,7 @@
 """Puts the add-on's modules into the wheel: `limber scene` has a process with bpy run them.
 
-The list of packages that it was tested with (SBOM) goes beside them. Everything else stands in pyproject.toml.
+The list of packages that it was tested with (SBOM) goes beside them. Everything else stands
+in pyproject.toml.
 """
 
 import runpy
