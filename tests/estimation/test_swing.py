@@ -1,12 +1,14 @@
 """A branch that is let go: Young's modulus and damping of virtual swings on another mesh."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
 from limber.core.errors import InputError
 from limber.estimation.vibration.free_swing import fit_swing
-from limber.estimation.vibration.modal_swing import Ends, ModalSwing
+from limber.estimation.vibration.modal_swing import Ends, ModalSwing, _creeping, _released
 from limber.estimation.vibration.swing_record import SwingSeen, first_guess
 from limber.mechanics import (
     BranchModel,
@@ -136,3 +138,38 @@ def test_markers_that_are_jostled_before_are_no_release():
                                              1e-5))
     assert released == pytest.approx(0.4, abs=0.02)
     assert period == pytest.approx(0.25, rel=0.03)
+
+
+def test_creeping_oscillators_follow_their_equations():
+    from scipy.integrate import solve_ivp
+
+    square, decay, share, seconds = 300.0, 0.8, 0.15, 0.4
+    times = np.linspace(0.0, 2.0, 60)
+    exact = solve_ivp(lambda _, y: [y[1], -square * (y[0] - share * y[2]) - 2 * decay * y[1],
+                                    (y[0] - y[2]) / seconds], (0.0, 2.0), [1.0, 0.0, 1.0],
+                      t_eval=times, rtol=1e-9, atol=1e-11)
+    found = _creeping(times, np.array([square]), np.array([decay]), share, seconds)
+    assert found[:, 0] == pytest.approx(exact.y[0], abs=1e-6)
+    elastic = _creeping(times, np.array([square]), np.array([decay]), 1e-9, seconds)
+    assert elastic == pytest.approx(_released(times[:, None], np.array([square]),
+                                              np.array([decay])), abs=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 0.12])
+def test_creep_is_fitted_where_the_tracks_show_it(share):
+    """The rest position of the true beam sinks as that of a standard linear solid."""
+    mesh, end = beam((1, 1, 10))
+    model = BranchModel(mesh, young=YOUNG, poisson=0.4, density=DENSITY, gravity=GRAVITY)
+    seen, seconds = virtual_swing("held"), 0.25
+    settled = seen.moved[-5:].mean(axis=0)
+    since = np.clip(seen.times - 0.2034, 0, None)
+    late = share / (1 - share) * (1 - np.exp(-(1 - share) * since / seconds))
+    crept = replace(seen, moved=seen.moved + late[:, None, None] * settled)
+    found = fit_swing(model, end, crept, periods=2.0, density_sigma=0.02)
+    if not share:
+        assert found.creep is None
+        return
+    low, high = found.creep["interval"]
+    assert found.creep["share"] == pytest.approx(share, abs=0.04) and low < share < high
+    assert YOUNG * found.factor == pytest.approx(YOUNG, rel=0.04)

@@ -18,6 +18,7 @@ from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.bending_stiffness import SectionMean
 from limber.estimation.uncertainty.covariance import Uncertainty, outliers
+from limber.estimation.uncertainty.creep import creep_sentence
 from limber.estimation.uncertainty.identifiability import (
     SCALE_DEVIATION,
     Identifiability,
@@ -208,12 +209,7 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
     for sentence in in_words(found.cell_errors):
         progress.warn(sentence)
     if (creep := found.creep) is not None:
-        low, high = (100 * end for end in creep["interval"])
-        progress.warn(
-            f"The branch creeps: under a lasting bend its force falls by {100 * creep['share']:.2g}"
-            f" % ({low:.2g} to {high:.2g} %) with a time constant of about {creep['time_s']:.2g} "
-            "s. The moduli are those under a quick load. Under a lasting load they are lower by "
-            "this share.")
+        progress.warn(creep_sentence(creep))
     named = outliers(found.fit.evaluation, found.objective)
     if named:
         worst = "; ".join(f"{entry['pull']} {entry['what']} at {entry['time_s']:.2f} s "

@@ -7,6 +7,9 @@ unknown of the fit beside the errors of the cell. It is added only if the residu
 a pull one way at constant speed hardly shows it.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from limber.estimation.fitting.nuisances import CREEP_SIGMA, ErrorSlopes, relaxed
@@ -100,3 +103,12 @@ def _change(forces: np.ndarray, forward: Forward, seconds: float) -> ErrorSlopes
         slope[..., 0] = -CREEP_SIGMA * relaxed(forward.frames.times, forces, seconds)
     none = np.zeros((count, 3, 1))
     return ErrorSlopes(np.zeros((count, points, 3, 1)), slope, none, none)
+
+
+def creep_sentence(creep: Mapping[str, Any]) -> str:
+    """Return what creep means for the moduli; ``share``, ``interval`` and ``time_s`` [s]."""
+    low, high = (100 * end for end in creep["interval"])
+    return (f"The branch creeps: under a lasting bend its force falls by {100 * creep['share']:.2g}"
+            f" % ({low:.2g} to {high:.2g} %) with a time constant of about {creep['time_s']:.2g} "
+            "s. The moduli are those under a quick load. Under a lasting load they are lower by "
+            "this share.")

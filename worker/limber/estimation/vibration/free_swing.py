@@ -6,6 +6,7 @@ tracks. Free are one factor on Young's modulus, the time of release, Rayleigh's 
 gain of each marker's motion for the error of its position on the branch (known from the
 registration), and the branch's density within its prior. Both frequency and displacement determine
 the modulus. The fit is by the branch's modes, and the full model corrects it for the last digits.
+Where the tracks show it, the branch creeps as a standard linear solid.
 
 Errors of the model persist through many frames. The number of independent readings therefore
 follows from the autocorrelation of the residual, and the intervals are based on the residual, not
@@ -19,6 +20,7 @@ import numpy as np
 from limber.core.errors import WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
+from limber.estimation.uncertainty.creep import LIKELIER, TIME_SHARES, creep_sentence
 from limber.estimation.uncertainty.model_error import MeshStiffness, mesh_error
 from limber.estimation.vibration.modal_swing import Ends, ModalSwing
 from limber.estimation.vibration.swing_record import SwingFit, SwingSeen, first_guess
@@ -48,6 +50,8 @@ _ROUNDS = 200
 """Most evaluations of a fit: by modes each takes milliseconds, and the two damping parameters, of
 which one vibration determines the sum, take many.
 """
+_SHARE_BOUNDS = (-0.5, 0.9)
+"""Bounds of the share by which creep lowers the modulus; a negative one is not creep."""
 _MARGIN = 0.1
 """Deviation of a marker's gain if the registration is not known."""
 
@@ -78,12 +82,18 @@ def fit_swing(model: BranchModel, grasp: Grasp, seen: SwingSeen, *, periods: flo
     for number in range(_FULL_RUNS):
         progress((1 + number) / (1 + _FULL_RUNS), "correcting it by the full model")
         swing.correct(found)
+        if number == 0:
+            # Large deflections, which modes do not have, must not pass for creep.
+            found = swing.with_creep(released, swing.fitted(released, periods * period, found))
         before, found = found, swing.fitted(released, periods * period, found)
         if swing.is_settled(before, found):
             break
     else:
         found = replace(found, converged=False)
-    return swing.judged(found)
+    result = swing.judged(found)
+    if result.creep is not None:
+        progress.warn(creep_sentence(result.creep))
+    return result
 
 
 class _Swing:
@@ -108,6 +118,7 @@ class _Swing:
         self.forward_count, self.factor0 = 0, 1.0
         self._modes: ModalSwing | None = None
         self._correction: np.ndarray | None = None
+        self.creep_time: float | None = None
 
     def scale_to(self, period: float, released: float) -> None:
         """Estimate the modulus from the period, and damping from the decay of the swing."""
@@ -172,9 +183,33 @@ class _Swing:
     def correct(self, found: "_Found") -> None:
         """Add the full model's difference from the modes at a result."""
         duration = found.duration + self.period
-        self._correction = None
+        self._correction, creep_time, self.creep_time = None, self.creep_time, None
+        # The full model does not creep.
         times, moved, _ = self.simulated(found.free, duration)
-        self._correction = self._full(found.free, times) - moved
+        self._correction, self.creep_time = self._full(found.free, times) - moved, creep_time
+
+    def with_creep(self, released: float, found: "_Found") -> "_Found":
+        """Return a fit with creep if it is more likely, else the same.
+
+        The evidence of one more parameter and its time constant (Schwarz 1978), for as many
+        readings as count as independent.
+        """
+        best, likeliest = (found, None), LIKELIER
+        for share in TIME_SHARES:
+            self.creep_time = share * found.duration
+            creeping = self.fitted(released, found.duration,
+                                   replace(found, free=np.r_[found.free, 0.0]), found.sigma)
+            if not creeping.converged or creeping.free[-1] <= 0:
+                continue
+            rms, stretch, _ = self.left_over(creeping)
+            readings = creeping.known.sum() / stretch
+            self.creep_time = None
+            likelier = readings * np.log(self.left_over(found)[0] / rms) - 0.5 * np.log(
+                readings) - np.log(len(TIME_SHARES))
+            if likelier > likeliest:
+                best, likeliest = (creeping, share * found.duration), likelier
+        found, self.creep_time = best
+        return found
 
     def is_settled(self, before: "_Found", found: "_Found") -> bool:
         """Whether a correction has changed the motion by less than matters."""
@@ -193,7 +228,8 @@ class _Swing:
     def simulated(self, free: np.ndarray, duration: float) -> tuple[np.ndarray, ...]:
         """Return times from the release [s], displacements of markers, and their derivatives.
 
-        To log factor, log alpha, log beta and log density: shapes [f], [f, m, 3], [f, m, 3, 4].
+        To log factor, log alpha, log beta, log density, and with creep its share: shapes [f],
+        [f, m, 3], [f, m, 3, 4 or 5].
         """
         step = self.period / STEPS_PER_PERIOD
         times = step * np.arange(int(np.ceil(duration / step)) + 2)
@@ -201,10 +237,11 @@ class _Swing:
         modes = present(self._modes, "modes of the branch")
         values = (np.maximum(times - self.ramp, 0.0), free[0],
                   (damping.mass, damping.stiffness), free[4])
-        moved = modes.moved(*values)
+        creep = () if self.creep_time is None else ((float(free[-1]), self.creep_time),)
+        moved = modes.moved(*values, *creep)
         if self._correction is not None:
             moved[:len(self._correction)] += self._correction[:len(moved)]
-        return times, moved, modes.slopes(*values)
+        return times, moved, modes.slopes(*values, *creep)
 
     def _full(self, free: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Return displacements of the markers by the full model [m], shape [f, m, 3]."""
@@ -237,30 +274,36 @@ class _Swing:
         at = self.seen.times[chosen] - free[1]
         since = np.clip(at, 0.0, times[-1])
         track = CubicSpline(times, moved, axis=0)
-        gain = 1 + free[5:, None]
+        markers = self.seen.moved.shape[1]
+        gain = 1 + free[5:5 + markers, None]
         model = gain * track(since)
         d = np.zeros((*model.shape, len(free)))
-        d[..., [0, 2, 3, 4]] = gain[..., None] * CubicSpline(times, slopes, axis=0)(since)
+        by_values = [0, 2, 3, 4, *range(5 + markers, len(free))]
+        d[..., by_values] = gain[..., None] * CubicSpline(times, slopes, axis=0)(since)
         d[..., 1] = -gain * track(since, 1) * ((at > 0) & (at < times[-1]))[:, None, None]
-        for marker in range(model.shape[1]):
+        for marker in range(markers):
             d[:, marker, :, 5 + marker] = track(since)[:, marker]
         return model, d
 
-    def fitted(self, released: float, duration: float, start: "_Found | None") -> "_Found":
+    def fitted(self, released: float, duration: float, start: "_Found | None",
+               sigma: float | None = None) -> "_Found":
         from scipy.optimize import least_squares
 
         seen = self.seen
         chosen = np.flatnonzero((seen.times >= released - 2 * self.period / STEPS_PER_PERIOD)
                                 & (seen.times <= released + duration))
-        count = 5 + seen.moved.shape[1]
+        markers = seen.moved.shape[1]
+        count = 5 + markers + (self.creep_time is not None)
         free = np.zeros(count) if start is None else start.free
         if start is None:
             free[1], free[2:4] = released, np.log(self.ratio0)
         known = np.isfinite(seen.moved[chosen])
-        sigma = (max(seen.noise, 1e-3 * float(np.nanmax(np.abs(seen.moved)))) if start is None
-                 else self.left_over(start)[2])
+        if start is None:
+            sigma = max(seen.noise, 1e-3 * float(np.nanmax(np.abs(seen.moved))))
+        elif sigma is None:
+            sigma = self.left_over(start)[2]
         priors = np.r_[np.inf, np.inf, np.inf, np.inf, self.density_sigma,
-                       np.full(count - 5, self.gain_sigma)]
+                       np.full(markers, self.gain_sigma), np.full(count - 5 - markers, np.inf)]
 
         def residual(x: np.ndarray) -> np.ndarray:
             model, _ = self.rows(x, chosen, duration + self.period)
@@ -273,6 +316,7 @@ class _Swing:
         low, high = np.full(count, -np.inf), np.full(count, np.inf)
         low[2:4], high[2:4] = np.log(_DAMPING_BOUNDS[0]), np.log(_DAMPING_BOUNDS[1])
         low[1], high[1] = released - 0.5 * self.period, released + 0.5 * self.period
+        low[5 + markers:], high[5 + markers:] = _SHARE_BOUNDS
         scale = np.r_[0.1, 0.02 * self.period, 1.0, 1.0, 0.1, np.full(count - 5, 0.05)]
         found = least_squares(residual, np.clip(free, low + 1e-9, high - 1e-9), jacobian,
                               bounds=(low, high), x_scale=scale, xtol=1e-5, ftol=1e-6, gtol=1e-8,
@@ -321,7 +365,9 @@ class _Swing:
             readings=float(found.known.sum() / stretch), forward_count=self.forward_count,
             window=(float(seen.times[found.chosen[0]]), float(seen.times[found.chosen[-1]])),
             times=seen.times[found.chosen], seen=seen.moved[found.chosen], simulated=model,
-            converged=bool(found.converged))
+            converged=bool(found.converged), creep=None if self.creep_time is None else {
+                "share": float(free[-1]), "interval": (free[-1] + wide[-1] * ends).tolist(),
+                "time_s": self.creep_time})
 
 
 @dataclass(frozen=True)

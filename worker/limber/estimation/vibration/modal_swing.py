@@ -62,7 +62,7 @@ class ModalSwing:
         self._seen = (operator @ flat.T).reshape(-1, 3, len(basis))
 
     def moved(self, times: np.ndarray, stretch: float, damping: tuple[float, float],
-              heavier: float) -> np.ndarray:
+              heavier: float, creep: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
         """Return the markers' displacements from the shape at rest [m], shape [f, m, 3].
 
         Args:
@@ -70,23 +70,31 @@ class ModalSwing:
             stretch: Logarithm of the factor on the modulus.
             damping: Rayleigh's alpha [1/s] and beta [s].
             heavier: Logarithm of the factor on the density.
+            creep: Share of the stiffness that a lasting load relaxes, and its time constant [s].
         """
         stiffness = np.exp(stretch) * self._stiffness
         squares, shapes = scipy.linalg.eigh(stiffness, np.exp(heavier) * self._body + self._added)
         begin, end = (np.linalg.solve(stiffness, force + heavier * change)
                       for force, change in self._forces)
         start = np.linalg.solve(shapes, begin - end)
-        course = _released(times[:, None], np.maximum(squares, 0.0),
-                           0.5 * (damping[0] + damping[1] * squares))
-        return np.einsum("mip,fp->fmi", self._seen, (course * start) @ shapes.T + end)
+        squares, decay = np.maximum(squares, 0.0), 0.5 * (damping[0] + damping[1] * squares)
+        course = (_creeping(times, squares, decay, *creep) if creep[0]
+                  else _released(times[:, None], squares, decay))
+        # Both ends were held long enough to be relaxed.
+        return np.einsum("mip,fp->fmi", self._seen,
+                         (course * start) @ shapes.T + end) / (1 - creep[0])
 
     def slopes(self, times: np.ndarray, stretch: float, damping: tuple[float, float],
-               heavier: float) -> np.ndarray:
-        """Return derivatives to log factor, log alpha, log beta and log density, [f, m, 3, 4]."""
-        centre = np.array([stretch, *np.log(damping), heavier])
+               heavier: float, creep: tuple[float, float] | None = None) -> np.ndarray:
+        """Return derivatives to log factor, log alpha, log beta and log density, [f, m, 3, 4]; with
+        creep also to its share, [f, m, 3, 5].
+        """
+        share, seconds = creep or (0.0, 1.0)
+        centre = np.array([stretch, *np.log(damping), heavier, share])
         columns = []
-        for step in STEP * np.eye(4):
-            ahead, behind = (self.moved(times, at[0], (np.exp(at[1]), np.exp(at[2])), at[3])
+        for step in STEP * np.eye(5)[:4 if creep is None else 5]:
+            ahead, behind = (self.moved(times, at[0], (np.exp(at[1]), np.exp(at[2])), at[3],
+                                        (at[4], seconds))
                              for at in (centre + step, centre - step))
             columns.append((ahead - behind) / (2 * STEP))
         return np.stack(columns, axis=-1)
@@ -111,6 +119,21 @@ def _released(times: np.ndarray, squares: np.ndarray, decay: np.ndarray) -> np.n
     fast = -(decay + root)
     slow = squares / fast
     return ((slow * np.exp(fast * times) - fast * np.exp(slow * times)) / (slow - fast)).real
+
+
+def _creeping(times: np.ndarray, squares: np.ndarray, decay: np.ndarray, share: float,
+              seconds: float) -> np.ndarray:
+    """Return such oscillators of standard linear solids, shape [f, k]: part of the spring force
+    follows the motion late, y'' + 2 d y' + w^2 (y - share z) = 0 with z' = (y - z) / seconds.
+    """
+    system = np.zeros((len(squares), 3, 3))
+    system[:, 0, 1] = 1.0
+    system[:, 1] = np.column_stack([-squares, -2 * decay, share * squares])
+    system[:, 2, [0, 2]] = 1 / seconds, -1 / seconds
+    rates, shapes = np.linalg.eig(system)
+    parts = np.linalg.solve(shapes, np.tile([[1.0], [0.0], [1.0]], (len(squares), 1, 1)))[..., 0]
+    return np.einsum("kr,fkr->fk", shapes[:, 0] * parts,
+                     np.exp(times[:, None, None] * rates)).real
 
 
 def _independent(model: BranchModel, columns: list[np.ndarray]) -> np.ndarray:

@@ -1,6 +1,7 @@
 """A recorded swing, the result of its fit, and a first guess of frequency and damping."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +57,8 @@ class SwingFit:
         window: First and last time used [s].
         times, seen, simulated: For figures [s, m], shapes [f], [f, m, 3].
         converged: Whether the last fit converged.
+        creep: ``share``, its ``interval`` and ``time_s`` as for a pull; None: the record does not
+            show any.
     """
 
     factor: float
@@ -77,6 +80,7 @@ class SwingFit:
     seen: np.ndarray
     simulated: np.ndarray
     converged: bool
+    creep: dict[str, Any] | None = None
 
 
 def first_guess(seen: SwingSeen) -> tuple[float, float]:

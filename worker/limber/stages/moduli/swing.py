@@ -118,7 +118,7 @@ def _summary(found: SwingFit, young: np.ndarray, pull: Pull, warnings: list[str]
         "frequency_hz": found.frequency, "residual_m": found.residual,
         "relative_residual": found.relative_residual, "independent_readings": found.readings,
         "forward_count": found.forward_count, "window_s": list(found.window),
-        "converged": found.converged, "warnings": warnings}
+        "converged": found.converged, "creep": found.creep, "warnings": warnings}
 
 
 STAGE = StageDescription(
