@@ -63,11 +63,15 @@ class Progress:
         """Return the same progress, its warnings prefixed with ``name``."""
         return self._with_warnings(lambda message: self.warn(f"{name}: {message}"))
 
-    def keeping(self, warnings: list[str]) -> "Progress":
-        """Return the same progress, each of its warnings also appended to ``warnings``."""
+    def keeping(self, warnings: list[str], *, silently: bool = False) -> "Progress":
+        """Return the same progress, each of its warnings also appended to ``warnings``.
+
+        ``silently``: the user does not hear them until they are passed on.
+        """
         def keep(message: str) -> None:
             warnings.append(message)
-            self.warn(message)
+            if not silently:
+                self.warn(message)
         return self._with_warnings(keep)
 
     def _with_warnings(self, on_warning: Callable[[str], None]) -> "Progress":

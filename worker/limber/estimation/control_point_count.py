@@ -2,82 +2,60 @@
 
 More control points always fit as well or better; whether the data ask for them is told by the
 evidence, the probability of the data under all moduli that the prior allows. Here it is Laplace's
-approximation at the end of each fit (MacKay, Information Theory, 2003, ch. 28): the fit less the
-factor by which the data narrow the prior. The prior of the steps of log E is that of an
-undetermined modulus, for each distance of the control points.
+approximation (MacKay, Information Theory, 2003, ch. 28) about one finished fit: with its bumps, its
+modulus is piecewise linear in the logarithm between stations twice as dense as the control points.
+Every other number of control points is a linear model of the values there, so no pull is simulated
+again.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from limber.core.errors import InputError, WorkError
-from limber.core.progress import SILENT, Progress
-from limber.estimation.estimated_branch import Subject
-from limber.estimation.fit import fit_pulls
+from limber.core.errors import InputError
 from limber.estimation.fit_assessment import Estimate
-from limber.estimation.fit_preparation import forwards_of, parameter_space
-from limber.estimation.fitting.objective import Objective
+from limber.estimation.interpolation_prior import bump_deviations, hats, stations_of
 from limber.estimation.parameters import LINK_DEVIATION, Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import repeated, scaled_rows
-from limber.recordings.recording import Pull
+from limber.geometry.skeleton.control_points import FRACTIONS
 
 MOST = 6
-"""Largest number of control points that is tried."""
+"""Largest number of control points that is considered."""
 LEVEL_DEVIATION = 3.0
 """Prior deviation of the mean log E: a factor of 20."""
 LINK_DISTANCE = 0.2
 """Distance of control points, over the path's length, to which ``LINK_DEVIATION`` belongs."""
+LIKELIER = 3.0
+"""Difference of log evidences above which the number of control points is changed: below it the
+pulls do not tell, and fewer moduli would only look better known.
+"""
 ALIKE = 1.0
-"""Difference of log evidences below which the smaller number is taken."""
-WORSE = 3.0
-"""Difference of log evidences after which two further control points are not tried."""
+"""Difference of log evidences below which the smaller of two numbers is taken."""
 
 
-def supported_fractions(pulls: Sequence[Pull], subject_with: Callable[[tuple[float, ...]], Subject],
-                        settings: EstimateSettings, progress: Progress = SILENT,
-                        ) -> tuple[tuple[float, ...], dict[int, float]]:
-    """Return the positions of as many control points as the pulls support.
+@dataclass(frozen=True)
+class Support:
+    """What one fit says about the number of control points.
 
-    Args:
-        pulls: Each with the rest positions of its observed points.
-        subject_with: Makes the branch with control points at these fractions.
-        settings: Settings of the fits.
-
-    Returns:
-        Positions as fractions of the main path, and the log evidence by their number.
-
-    Raises:
-        InputError: the method is not Gauss-Newton.
-        WorkError: no number gives a fit.
+    Attributes:
+        fractions: Their positions on the main path.
+        evidence: Log evidence by number.
+        start: Values near the solution with these control points.
     """
-    if settings.method != "gauss-newton":
-        raise InputError("The evidence of control points needs the Gauss-Newton method.",
-                         "Nelder-Mead gives no derivatives.",
-                         "Omit --method, or give the control points (--fractions).")
-    fits: dict[int, Estimate] = {}
-    near: tuple[tuple[float, ...], np.ndarray] | None = None
-    failure: WorkError | None = None
-    for count in range(1, MOST + 1):
-        progress((count - 1) / MOST, f"fitting {count} control points")
-        fractions = equal_fractions(count)
-        try:
-            found = _fitted(list(pulls), subject_with(fractions), settings, near, fractions)
-        except WorkError as error:
-            failure = error
-            continue
-        fits[count], near = found, (fractions, found.values.young)
-        known = evidences(fits)
-        if max(list(known.values())[-2:]) < max(known.values()) - WORSE:
-            break
-    if not fits:
-        assert failure is not None
-        raise failure
-    known = evidences(fits)
-    alike = [count for count in known if known[count] > max(known.values()) - ALIKE]
-    return equal_fractions(min(alike)), known
+
+    fractions: tuple[float, ...]
+    evidence: dict[int, float]
+    start: Values
+
+
+def is_open(settings: EstimateSettings) -> bool:
+    """Whether the number of control points is to be chosen: it is not given, and can be.
+
+    Nelder-Mead has no derivatives; the paper's field and a reduced model have no bumps.
+    """
+    return (not settings.fractions and settings.method == "gauss-newton"
+            and settings.forward == "full" and settings.field == "open")
 
 
 def equal_fractions(count: int) -> tuple[float, ...]:
@@ -85,47 +63,96 @@ def equal_fractions(count: int) -> tuple[float, ...]:
     return tuple((k + 1) / (count + 1) for k in range(count))
 
 
-def evidences(fits: dict[int, Estimate]) -> dict[int, float]:
-    """Return the log evidence of each fit by its number of control points.
+def supported(found: Estimate) -> Support:
+    """Return as many control points as the pulls support.
 
-    All are compared with one noise: that of the residuals of the fit that is closest.
+    Args:
+        found: A fit with the control points at ``FRACTIONS``.
+
+    Raises:
+        InputError: the fit has no derivatives, or its field no bumps.
     """
-    closest = min(fits.values(), key=lambda found: found.fit.evaluation.mean_square)
-    noise = closest.fit.evaluation.mean_square * repeated(
-        closest.objective.standardised(closest.fit.evaluation))
-    return {count: _log_evidence(found, noise) for count, found in fits.items()}
+    problem = _Problem.of(found)
+    parts = {count: problem.posterior(equal_fractions(count)) for count in range(1, MOST + 1)}
+    evidence = {count: part[0] for count, part in parts.items()}
+    best, used = max(evidence.values()), len(FRACTIONS)
+    count = used if evidence[used] > best - LIKELIER else min(
+        count for count, value in evidence.items() if value > best - ALIKE)
+    return Support(FRACTIONS if count == used else equal_fractions(count), evidence,
+                   replace(found.values, young=np.exp(parts[count][1]), form=()))
 
 
-def _log_evidence(found: Estimate, noise: float) -> float:
-    evaluation, space = found.fit.evaluation, found.objective.space
-    count = len(space.groups)
-    # Links are a prior of the steps as well.
-    kept = len(evaluation.residual) - len(space.links)
-    own = space.own_row_count - len(space.links)
-    residual = scaled_rows(evaluation.residual[:kept, None], own, noise)[:, 0]
-    slopes = scaled_rows(evaluation.slopes[:kept], own, noise)
-    prior = np.vstack([np.full(count, 1 / (count * LEVEL_DEVIATION)),
-                       np.diff(np.eye(count), axis=0) / (
-                           LINK_DEVIATION * (1 / (count + 1) / LINK_DISTANCE)**0.5)])
-    log_young = np.log(found.values.young)
-    # The level of the prior is that of the fits, which agree about it.
-    off = prior @ (log_young - log_young.mean())
-    rows = np.hstack([prior @ space.membership, np.zeros((count, len(space.extra)))])
-    information = slopes.T @ slopes + rows.T @ rows
-    return float(-0.5 * residual @ residual - 0.5 * off @ off
-                 + np.linalg.slogdet(prior)[1] - 0.5 * np.linalg.slogdet(information)[1])
+@dataclass(frozen=True)
+class _Problem:
+    """A fit's residuals as linear in log E at stations and in the other unknowns.
 
+    Attributes:
+        stations: Positions on the main path, ascending, shape [S].
+        log_young: At the stations, at the end of the fit, shape [S].
+        residual: Of measurements and of the other unknowns' priors, over deviations, shape [r].
+        by_young: Its derivative to log E at the stations, shape [r, S].
+        by_others: The same to the other unknowns, shape [r, q].
+    """
 
-def _fitted(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
-            near: tuple[tuple[float, ...], np.ndarray] | None,
-            fractions: tuple[float, ...]) -> Estimate:
-    quick = settings.model_copy(update={"fractions": fractions, "hold_out": False,
-                                        "forward": "full"})
-    forwards = forwards_of(pulls, subject, quick)
-    objective = Objective(forwards, parameter_space(subject, forwards, quick),
-                          force_sigma=[pull.entry.sensor.force_sigma_n for pull in pulls])
-    start: Values | None = None
-    if near is not None:
-        start = replace(subject.start, young=np.exp(np.interp(fractions, near[0],
-                                                              np.log(near[1]))))
-    return fit_pulls(objective, subject.start, quick, near=start, quick=True)
+    stations: np.ndarray
+    log_young: np.ndarray
+    residual: np.ndarray
+    by_young: np.ndarray
+    by_others: np.ndarray
+
+    @classmethod
+    def of(cls, found: Estimate) -> "_Problem":
+        evaluation, space = found.fit.evaluation, found.objective.space
+        field = getattr(found.objective.forwards[0].full, "field", None)
+        if evaluation.jacobian is None or field is None or field.straight is None:
+            raise InputError("The evidence of control points needs derivatives and an open field.",
+                             "Only a Gauss-Newton fit with the full model has both.",
+                             "Give the control points (--fractions).")
+        noise = evaluation.mean_square * repeated(found.objective.standardised(evaluation))
+        residual, slopes = (scaled_rows(rows, space.own_row_count, noise) for rows in (
+            evaluation.residual[:, None], evaluation.slopes))
+        stations = stations_of(FRACTIONS)
+        bumps = [number for number, place in enumerate(stations)
+                 if not np.isclose(place, FRACTIONS).any()]
+        # Log E at the stations by log E at the control points and by the bumps.
+        moved = np.zeros((len(stations), space.size))
+        moved[:, :space.group_count] = hats(stations, np.array(FRACTIONS)) @ space.membership
+        first = space.names.index(field.names[1])
+        moved[bumps, np.arange(first, first + len(bumps))] = field.deviations(
+            found.values)[:len(bumps)]
+        chosen = np.r_[:space.group_count, first:first + len(bumps)]
+        others = np.setdiff1d(np.arange(space.size), [*chosen, space.names.index(field.names[0])])
+        # Their own prior is that of each model; links and the mixture belong to the fit's field.
+        kept = np.r_[:len(residual) - space.own_row_count,
+                     [len(residual) - space.own_row_count + number
+                      for number, (name, _, _) in enumerate(space.priors)
+                      if space.names.index(name) in others]].astype(int)
+        return cls(stations, moved @ evaluation.free, residual[kept, 0],
+                   slopes[np.ix_(kept, chosen)] @ np.linalg.inv(moved[:, chosen]),
+                   slopes[np.ix_(kept, others)])
+
+    def posterior(self, fractions: tuple[float, ...]) -> tuple[float, np.ndarray]:
+        """Log evidence of control points, less a constant, and log E there, shape [K]."""
+        positions, count = np.array(fractions), len(fractions)
+        guess = np.interp(positions, self.stations, self.log_young)
+        places, deviations = bump_deviations(fractions, guess)
+        # Log E at the stations by log E at these control points, and by the bumps between them.
+        of_bumps = hats(self.stations, stations_of(fractions))[:, places] * deviations
+        shape = np.hstack([hats(self.stations, positions), of_bumps])
+        prior = np.vstack([np.full(count, 1 / (count * LEVEL_DEVIATION)),
+                           np.diff(np.eye(count), axis=0) / (
+                               LINK_DEVIATION * (1 / (count + 1) / LINK_DISTANCE)**0.5)])
+        level = np.interp(FRACTIONS, self.stations, self.log_young).mean()
+        unknowns = shape.shape[1] + self.by_others.shape[1]
+        own = np.eye(shape.shape[1], unknowns)
+        own[:count, :count] = prior
+        rows = np.vstack([np.hstack([self.by_young @ shape, self.by_others]), own])
+        # The level of the prior is that of the fit, about which all models agree.
+        target = np.r_[self.by_young @ self.log_young - self.residual,
+                       prior @ np.full(count, level), np.zeros(len(places))]
+        known = np.linalg.lstsq(rows, target, rcond=None)[0]
+        off = rows @ known - target
+        information = np.linalg.slogdet(rows.T @ rows)[1]
+        return (float(-0.5 * off @ off + np.linalg.slogdet(prior)[1] - 0.5 * information),
+                known[:count])
+

@@ -73,7 +73,7 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     Raises:
         InputError: an initial modulus of the mesh is not positive.
     """
-    points = control_points(skeleton, settings.fractions)
+    points = control_points(skeleton, settings.initial_fractions)
     wrong = np.flatnonzero(~(mesh.cell_data["young"] > 0))
     if len(wrong) and settings.young is None:
         raise InputError(
@@ -94,8 +94,8 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     field = None
     if settings.field == "open" and settings.forward == "full" and (
             settings.method == "gauss-newton"):
-        field = open_field(mesh, skeleton, weights, settings.fractions, log_factor=np.log(factor),
-                           by_order=settings.orders)
+        field = open_field(mesh, skeleton, weights, settings.initial_fractions,
+                           log_factor=np.log(factor), by_order=settings.orders)
     return Subject(mesh, skeleton, points, weights, model, start, field)
 
 
@@ -104,7 +104,7 @@ def observed(folder: Path, pull: Pull, subject: Subject, settings: EstimateSetti
     """Return a pull of images with the control points that are found in them."""
     from limber.perception.observe import observe
 
-    observations, warnings = observe(folder, pull, subject.skeleton, settings.fractions,
+    observations, warnings = observe(folder, pull, subject.skeleton, settings.initial_fractions,
                                      progress=progress)
     return replace(pull, observations=observations).warned(*warnings)
 

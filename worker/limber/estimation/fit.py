@@ -68,13 +68,13 @@ class _ForceLeadsNowhereError(WorkError):
 
 
 def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, *,
-               log: EvaluationLog, cache: Path | None = None,
-               progress: Progress = SILENT) -> Estimate:
+               log: EvaluationLog, cache: Path | None = None, near: Values | None = None,
+               quick: bool = False, progress: Progress = SILENT) -> Estimate:
     """Estimate Young's modulus of a branch from its pulls.
 
     Args:
         log: Stores the evaluations. Those of a stopped run are reused.
-        cache: As for :func:`fit_pulls`.
+        cache, near, quick: As for :func:`fit_pulls`.
 
     Raises:
         InputError: the pulls cannot determine Young's modulus.
@@ -100,17 +100,16 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
     def in_frame(pulls: list[Pull], branch: Subject, chosen: EstimateSettings,
                  log: EvaluationLog) -> Estimate:
         shifts: dict[str, np.ndarray] = {}
-        near: Values | None = None
-        earlier: FarPointsError | None = None
+        begin, earlier = near, None
         for rounds_left in reversed(range(ROUNDS)):
             forwards = forwards_of(pulls, branch, chosen, progress, shifts)
             if earlier is not None:
                 earlier.begin(forwards)
             try:
-                return of_forwards(forwards, branch, chosen, log, near,
+                return of_forwards(forwards, branch, chosen, log, begin,
                                    FarPoints(shifts) if rounds_left else None)
             except FarPointsError as far:
-                shifts, near, earlier, log = far.shifts, far.values, far, EvaluationLog(None, "")
+                shifts, begin, earlier, log = far.shifts, far.values, far, EvaluationLog(None, "")
         raise AssertionError("the last round looks for no far points")
 
     def of_forwards(forwards: list[Forward], branch: Subject, chosen: EstimateSettings,
@@ -120,7 +119,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
                                                     for pull in pulls], progress=progress,
                               expected_count=20 if chosen.method == "gauss-newton" else 200)
         return fit_pulls(objective, branch.start, chosen, progress, cache=cache, near=near,
-                         far=far)
+                         far=far, quick=quick)
 
     def fitted(branch: Subject) -> Estimate:
         try:
@@ -189,7 +188,8 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     """Check what the data determine, fit the moduli, and compute their uncertainty.
 
     Args:
-        quick: Leave Gauss' approximation of the intervals as it is.
+        quick: Leave Gauss' approximation of the intervals as it is, and judge nothing; see
+            :func:`complete`.
         near: Values near the solution, to start from if they have an equilibrium.
         far: Ends the fit if it finds points far from where they were simulated.
         cache, digest: Folder of the reduced bases, and digest of their dependencies; see
@@ -225,14 +225,20 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     elif not stopped:
         for message in link_unresolved(fit.evaluation, objective.space)[1]:
             progress.warn(message)
-    sure = uncertainty(fit.evaluation, objective)
-    if not stopped and not quick:
-        sure = profiled(sure, fit.evaluation, objective, progress)
-    found = Estimate(fit, objective, sure, judged)
-    judge_fit(found, progress)
-    if settings.hold_out and len(objective.forwards) > 1 and not stopped:
-        hold_out(found, settings)
+    found = Estimate(fit, objective, uncertainty(fit.evaluation, objective), judged)
+    if not quick:
+        complete(found, settings, progress)
     return found
+
+
+def complete(found: Estimate, settings: EstimateSettings, progress: Progress = SILENT) -> None:
+    """Compute the intervals of a quick fit by the profile of its likelihood, and judge it."""
+    if not found.stopped:
+        found.uncertainty = profiled(found.uncertainty, found.fit.evaluation, found.objective,
+                                     progress)
+    judge_fit(found, progress)
+    if settings.hold_out and len(found.objective.forwards) > 1 and not found.stopped:
+        hold_out(found, settings)
 
 
 def _standing(objective: Objective, start: Values, settings: EstimateSettings, progress: Progress,

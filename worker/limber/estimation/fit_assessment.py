@@ -106,6 +106,7 @@ class Estimate:
         error = self.model_error
         return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
                 "path": error.path, "hung": error.hung, "grip": error.grip,
+                "graph": error.graph,
                 "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
 
     @property
@@ -146,6 +147,8 @@ class Estimate:
             parts["mass of twigs and leaves"] = self.model_error.hung**2
         if self.model_error.grip is not None:
             parts["length in the gripper"] = self.model_error.grip**2
+        if self.model_error.graph is not None:
+            parts["skeleton of the scan"] = self.model_error.graph**2
         if self.model_error.path is not None:
             parts["gripper frame"] = parts.get("gripper frame", 0.0) + self.model_error.path**2
         return parts

@@ -166,23 +166,13 @@ def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
     along, order = _element_positions(mesh, skeleton)
     if is_uniform and not (by_order and order.any()):
         return YoungField(weights)
-    straight = _hats(along, positions)
-    halfway = (positions[1:] + positions[:-1]) / 2
-    stations = positions if is_uniform else np.sort(
-        np.r_[positions, halfway, *([0.0] if positions[0] > 0 else []),
-              *([1.0] if positions[-1] < 1 else [])])
-    hats = _hats(along, stations)
+    straight = hats(along, positions)
     names, bumps, widths, steps = ["form"], [], [], []
-    for number, station in enumerate(stations):
-        if np.any(np.isclose(station, positions)):
-            continue
-        inside = positions[0] < station < positions[-1]
-        names.append(f"form at {station:.2g}")
-        bumps.append(hats[:, number])
-        widths.append(BUMP_BETWEEN if inside else BUMP_BEYOND)
-        beside = int(np.clip(np.searchsorted(positions, station), 1, len(positions) - 1))
-        steps.append((STEP_BETWEEN if inside else STEP_BEYOND) * (
-            np.eye(len(positions))[beside] - np.eye(len(positions))[beside - 1]))
+    if not is_uniform:
+        stations = stations_of(fractions)
+        places, widths, steps = _bumps(fractions)
+        names += [f"form at {stations[place]:.2g}" for place in places]
+        bumps = list(hats(along, stations)[:, places].T)
     for number in np.unique(order[order > 0]) if by_order else [0] if order.any() else []:
         names.append(f"{_ORDER}{number}" if by_order else "form of side branches")
         bumps.append((order == number if by_order else order > 0).astype(float))
@@ -190,6 +180,41 @@ def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
         steps.append(np.zeros(len(positions)))
     return YoungField(weights, straight, np.column_stack(bumps), np.array(widths),
                       np.array(steps), tuple(names), log_factor)
+
+
+def stations_of(fractions: tuple[float, ...]) -> np.ndarray:
+    """Return the control points and the positions of the bumps on the main path, ascending."""
+    positions = np.asarray(fractions, float)
+    return np.sort(np.r_[positions, (positions[1:] + positions[:-1]) / 2,
+                         *([0.0] if positions[0] > 0 else []),
+                         *([1.0] if positions[-1] < 1 else [])])
+
+
+def bump_deviations(fractions: tuple[float, ...], log_young: np.ndarray,
+                    ) -> tuple[list[int], np.ndarray]:
+    """Return which stations have a bump, and their deviations of log E for these moduli; none for a
+    single control point.
+    """
+    if len(fractions) < 2:
+        return [], np.zeros(0)
+    places, widths, steps = _bumps(fractions)
+    return places, np.hypot(widths, np.array(steps) @ log_young)
+
+
+def _bumps(fractions: tuple[float, ...]) -> tuple[list[int], list[float], list[np.ndarray]]:
+    """Stations with a bump; its deviation, and its increase by log E at the control points [K]."""
+    positions = np.asarray(fractions, float)
+    places, widths, steps = [], [], []
+    for number, station in enumerate(stations_of(fractions)):
+        if np.any(np.isclose(station, positions)):
+            continue
+        inside = positions[0] < station < positions[-1]
+        places.append(number)
+        widths.append(BUMP_BETWEEN if inside else BUMP_BEYOND)
+        beside = int(np.clip(np.searchsorted(positions, station), 1, len(positions) - 1))
+        steps.append((STEP_BETWEEN if inside else STEP_BEYOND) * (
+            np.eye(len(positions))[beside] - np.eye(len(positions))[beside - 1]))
+    return places, widths, steps
 
 
 def _element_positions(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
@@ -218,6 +243,6 @@ def _element_positions(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, n
     return np.clip(np.concatenate(positions)[nearest], 0.0, 1.0), side[nearest]
 
 
-def _hats(along: np.ndarray, stations: np.ndarray) -> np.ndarray:
+def hats(along: np.ndarray, stations: np.ndarray) -> np.ndarray:
     """Weights of linear interpolation between stations, constant beyond, shape [n, stations]."""
     return np.column_stack([np.interp(along, stations, row) for row in np.eye(len(stations))])

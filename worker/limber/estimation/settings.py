@@ -23,8 +23,7 @@ class EstimateSettings(Settings):
     """Options for estimating Young's modulus from pulls."""
 
     groups: ClassVar[Groups] = {
-        "input": ("pull", "drive", "motion", "fractions", "control_points",
-                  "free_frame"),
+        "input": ("pull", "drive", "motion", "fractions", "free_frame"),
         "material": ("young", "poisson", "density", "gravity", "fit_poisson", "fit_density",
                      "fit_damping", "orders", "pith_radius", "bark_thickness", "bark_modulus"),
         "solver": ("method", "forward", "key_frames"),
@@ -33,7 +32,7 @@ class EstimateSettings(Settings):
     }
     common = ("pull", "fractions")
     retired: ClassVar[dict[str, Any]] = {
-        "evaluations": 400, "delta_m2": None, "robust": True}
+        "evaluations": 400, "delta_m2": None, "robust": True, "control_points": "evidence"}
 
     pull: tuple[str, ...] = Field((), description="Names of the pulls to use. Default: all.")
     method: Literal["gauss-newton", "nelder-mead"] = Field(
@@ -48,11 +47,9 @@ class EstimateSettings(Settings):
     motion: Literal["quasi_static", "dynamic"] | None = Field(
         None, description="dynamic: simulate inertia and damping. Default: as each pull states.")
     fractions: tuple[float, ...] = Field(
-        (0.2, 0.4, 0.6, 0.8), description="Positions of the control points as fractions of the "
-            "main path.")
-    control_points: Literal["fractions", "evidence"] = Field(
-        "fractions", description="fractions: control points at --fractions. evidence: 1 to 6 at "
-        "equal distances, as many as the pulls support.")
+        (), description="Positions of the control points as fractions of the main path. Default: "
+        "0.2,0.4,0.6,0.8, or fewer or more (1 to 6 at equal distances) where the pulls clearly "
+        "support them.")
     free_frame: bool = Field(
         False, description="Fit the frame of the observed points freely, to 10 cm and 17 degrees, "
         "instead of within the pull's calibration. The result states what that costs.")
@@ -105,6 +102,13 @@ class EstimateSettings(Settings):
 
     _young = field_validator("young")(possible_young)
     _density = field_validator("density")(possible_density)
+
+    @property
+    def initial_fractions(self) -> tuple[float, ...]:
+        """Positions of the control points of a first fit, as fractions of the main path."""
+        from limber.geometry.skeleton.control_points import FRACTIONS
+
+        return self.fractions or FRACTIONS
 
     @property
     def section(self) -> dict[str, float]:

@@ -106,7 +106,15 @@ def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
     Twigs and leaves, as rigid bodies that move with the section they grow from; masses stated in a
     table; and targets.
     """
-    return (*(_hung(mass) for mass in load_masses(branch)), *target_masses(load_targets(branch)))
+    return hung_masses(load_masses(branch), load_targets(branch))
+
+
+def hung_masses(masses: Iterable[dict[str, Any]], targets: tuple[NamedTarget, ...],
+                ) -> tuple[PointMass, ...]:
+    """Return the point masses of pruned twigs and leaves, as reconstruct lists them, and of
+    targets.
+    """
+    return (*(_hung(mass) for mass in masses), *target_masses(targets))
 
 
 def _hung(mass: dict[str, Any]) -> PointMass:

@@ -35,7 +35,11 @@ class Planned:
 def compared(truth: TrueBranch, moved: np.ndarray, planned: Planned, executed: dict[str, Any],
              watch: Watch, stopped: tuple[str, Watch], soft_force: float) -> dict[str, Any]:
     """Return estimated against true E, force along the path, the flower, the overload."""
+    from limber.results.report.report_tables import true_moduli
+
     estimated, goal = planned.estimated, planned.goal
+    young = np.array(true_moduli(estimated, {"young_true_pa": truth.young,
+                                             "fractions": truth.fractions}))
     seen = watch.at_the_end()
     flower = None if seen is None else seen[-1] + moved
     off = np.inf if flower is None else float(np.linalg.norm(flower - goal))
@@ -43,9 +47,9 @@ def compared(truth: TrueBranch, moved: np.ndarray, planned: Planned, executed: d
     reason, second = stopped
     overload = second.overloaded
     return plain({
-        "young_true_pa": truth.young,
+        "young_true_pa": young,
         "young_pa": estimated["young_pa"], "young_interval_pa": interval,
-        "covered": (interval[:, 0] <= truth.young) & (truth.young <= interval[:, 1]),
+        "covered": (interval[:, 0] <= young) & (young <= interval[:, 1]),
         "force_within_share": executed["force_within_share"],
         "force_error_of_peak": executed["force_error_of_peak"],
         "predicted_peak_force_n": executed["predicted_peak_force_n"],

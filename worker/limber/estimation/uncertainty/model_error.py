@@ -57,6 +57,7 @@ class ModelError:
             (:func:`limber.estimation.uncertainty.shape_error.hung_error`).
         grip: From the length of the piece in a clamping gripper, shape [K]; None if none clamps
             (:func:`limber.estimation.uncertainty.grip_error.grip_error`).
+        graph: From other likely skeletons of the scan, shape [K]; None if none matters.
     """
 
     geometry: np.ndarray | None = None
@@ -67,11 +68,12 @@ class ModelError:
     path: np.ndarray | None = None
     hung: np.ndarray | None = None
     grip: np.ndarray | None = None
+    graph: np.ndarray | None = None
 
     def total(self, sensor: np.ndarray) -> np.ndarray:
         """Standard deviation of log E with that of the sensors, shape [K]."""
         parts = [part for part in (sensor, self.geometry, self.mesh, self.path, self.hung,
-                                   self.grip) if part is not None]
+                                   self.grip, self.graph) if part is not None]
         return np.sqrt(np.sum(np.square(parts), axis=0))
 
     def total_of_bending(self, sensor: np.ndarray) -> np.ndarray:

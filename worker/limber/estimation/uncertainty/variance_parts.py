@@ -33,6 +33,8 @@ ADVICE = {
     "density": "weigh a piece of the branch (--density, --density-sigma)",
     "moduli that the pulls do not determine": "pull at a point farther out",
     "shape of the scan": "scan from more sides, or with less noise",
+    "skeleton of the scan": "look at the alternatives (`limber skeleton`), and confirm or edit the "
+                            "doubtful parts",
     "mass of twigs and leaves": "weigh the twigs and leaves, and state the uncertainty "
                                 "(--hung-sigma); or mesh more twigs (--twig-radius of "
                                 "reconstruct)",

@@ -16,9 +16,7 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
         pull: Result of ``limber virtual-pull`` (``young_true_pa`` [K], and ``young_assumed`` if
             these are of a scan without a real pull), or None.
     """
-    truth = (pull or {}).get("young_true_pa")
-    if truth and len(truth) != len(estimate["young_pa"]):
-        truth = None  # at other control points
+    truth = true_moduli(estimate, pull or {})
     header = ["control point", "E [MPa]", "95 % interval [MPa]"]
     titles = ["assumed E [MPa]", "difference"] if is_assumed(pull) else ["true E [MPa]", "error"]
     rows = [[*header, *titles, "in the interval"] if truth else header]
@@ -29,6 +27,24 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
                     "yes" if _holds(estimate, number, truth[number]) else "NO"]
         rows.append(row)
     return rows
+
+
+def true_moduli(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> list[float]:
+    """Return the true moduli of a simulated pull at an estimate's control points [Pa], [K].
+
+    The true field has inverse-distance weights, as the paper's. Empty if it is not known there.
+
+    Args:
+        estimate, pull: As for :func:`modulus_rows`; ``fractions`` are the control points of each.
+    """
+    truth, count = list(pull.get("young_true_pa") or []), len(estimate["young_pa"])
+    known, asked = pull.get("fractions"), estimate.get("fractions")
+    if not (truth and known and asked):
+        return truth if len(truth) == count else []
+    return [math.fsum(share * value for share, value in zip(shares, truth, strict=True))
+            / math.fsum(shares)
+            for shares in ([1 / max(abs(place - each), 1e-6)**2 for each in known]
+                           for place in asked)]
 
 
 def rigidity_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
@@ -46,7 +62,7 @@ def rigidity_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
 
 def held_sentence(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> str:
     """How many 95 % intervals contain the truth, in words; arguments of :func:`modulus_rows`."""
-    truth = pull["young_true_pa"]
+    truth = true_moduli(estimate, pull)
     held = sum(_holds(estimate, number, value) for number, value in enumerate(truth))
     return f"{held} of {len(truth)} intervals (95 %) contain the " + (
         f"assumed modulus. {ASSUMED}" if is_assumed(pull) else "true modulus.")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import Cancelled, InputError, LimberError
+from limber.core.errors import Cancelled, InputError, LimberError, WorkError
 from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
@@ -24,6 +24,7 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from limber.estimation.estimated_branch import Subject
     from limber.estimation.fit_assessment import Estimate
+    from limber.estimation.fitting.evaluations import EvaluationLog
     from limber.recordings.recording import Pull
 
 
@@ -86,10 +87,12 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
 
 def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume: bool,
               progress: Progress) -> dict[str, Any]:
+    from limber.estimation.control_point_count import is_open
     from limber.estimation.estimate_summary import details, summary
     from limber.estimation.fit import fit_branch
     from limber.estimation.fit_assessment import judge_model, require_result
     from limber.estimation.fitting.evaluations import EvaluationLog
+    from limber.stages.moduli.other_skeletons import add_other_skeletons
     from limber.store.loading import load_pulls, load_subject, pull_names, pulls_digest
 
     names = pull_names(branch, settings)
@@ -103,28 +106,31 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
     warnings: list[str] = []
     heard = progress.keeping(warnings)
     pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
-    asked, evidence = settings, None
-    if settings.control_points == "evidence":
-        settings, evidence = _with_supported_points(branch, pulls, subject, settings, heard)
-        subject = load_subject(branch, settings)
-        pulls = _placed(pulls, load_subject(branch, asked))
     log_path = branch.folder / EVALUATIONS
     if force or not resume:
         log_path.unlink(missing_ok=True)
     bases = _finished_bases(branch)
     log = EvaluationLog(log_path, json.dumps([plain(settings), digests], sort_keys=True))
-    found = fit_branch(pulls, subject, settings, log=log, cache=branch.folder,
-                       progress=heard.part(0.2, 0.9))
+    asked, initial, evidence = settings, subject, None
+    if is_open(settings):
+        pulls = _placed(pulls, initial)
+        found, settings, subject, evidence = _with_supported_points(
+            branch, pulls, subject, settings, log, heard.part(0.2, 0.9))
+    else:
+        found = fit_branch(pulls, subject, settings, log=log, cache=branch.folder,
+                           progress=heard.part(0.2, 0.9))
     found.warnings = warnings
     if not found.stopped:
         require_result(found)
         judge_model(found, subject, pulls[0].entry.grasp, settings,
                     axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None,
-                    cloud=_cloud(branch), progress=heard.part(0.9, 0.98))
+                    cloud=_cloud(branch), progress=heard.part(0.9, 0.95))
+        add_other_skeletons(found, branch, _placed(pulls, initial), settings,
+                            heard.part(0.95, 0.98))
         if settings.hold_out:
-            _foretell_others(branch, names, subject, found, settings, heard)
+            _foretell_others(branch, names, subject, found, settings, initial, heard)
     result = summary(found, settings) | ({} if evidence is None else {
-        "control_point_evidence": evidence, "fractions": settings.fractions})
+        "control_point_evidence": evidence, "fractions": settings.initial_fractions})
     earlier = branch.manifest.stages.get("estimate")
     if found.stopped and earlier is not None and not earlier.result.get("stopped"):
         raise Cancelled("The estimate was stopped.",
@@ -150,18 +156,43 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
     return stage.result
 
 
-def _with_supported_points(branch: Branch, pulls: list[Pull], subject: Subject,
-                           settings: EstimateSettings, progress: Progress,
-                           ) -> tuple[EstimateSettings, dict[int, float]]:
-    """The settings with as many control points as the pulls support, and their evidence."""
-    from limber.estimation.control_point_count import supported_fractions
+def _with_supported_points(
+        branch: Branch, pulls: list[Pull], subject: Subject, settings: EstimateSettings,
+        log: EvaluationLog, progress: Progress,
+        ) -> tuple[Estimate, EstimateSettings, Subject, dict[int, float] | None]:
+    """Fit with as many control points as the pulls support, starting from a fit with four.
+
+    Returns:
+        The fit, its settings and its branch, and the log evidence by number of control points.
+    """
+    from limber.estimation.control_point_count import supported
+    from limber.estimation.fit import complete, fit_branch
+    from limber.estimation.fitting.evaluations import EvaluationLog
     from limber.store.loading import load_subject
 
-    fractions, known = supported_fractions(
-        _placed(pulls, subject), lambda chosen: load_subject(
-            branch, settings.model_copy(update={"fractions": chosen})), settings,
-        progress.part(0.2, 0.5))
-    return settings.model_copy(update={"fractions": fractions}), known
+    told: list[str] = []
+    first = fit_branch(pulls, subject, settings, log=log, quick=True,
+                       progress=progress.part(0.0, 0.7).keeping(told, silently=True))
+    found, chosen, model, evidence = first, settings, subject, None
+    if not first.stopped and first.is_bad is None:
+        support = supported(first)
+        evidence = support.evidence
+        if support.fractions != settings.initial_fractions:
+            chosen = settings.model_copy(update={"fractions": support.fractions})
+            model = load_subject(branch, chosen)
+            heard: list[str] = []
+            try:
+                found = fit_branch(pulls, model, chosen, log=EvaluationLog(None, ""), quick=True,
+                                   near=support.start,
+                                   progress=progress.part(0.7, 0.9).keeping(heard, silently=True))
+                told = heard
+            except WorkError:
+                # Of the two the first has an equilibrium.
+                chosen, model = settings, subject
+    for message in told:
+        progress.warn(message)
+    complete(found, chosen, progress.part(0.9, 1.0))
+    return found, chosen, model, evidence
 
 
 def _placed(pulls: list[Pull], subject: Subject) -> list[Pull]:
@@ -244,15 +275,18 @@ def _cloud(branch: Branch) -> np.ndarray | None:
 
 
 def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,
-                     settings: EstimateSettings, progress: Progress) -> None:
-    """Score the branch's pulls that this estimate did not use."""
+                     settings: EstimateSettings, initial: Subject, progress: Progress) -> None:
+    """Score the branch's pulls that this estimate did not use.
+
+    ``initial``: the branch with the control points where markers without a position are.
+    """
     from limber.estimation.fit_assessment import foretell
     from limber.store.loading import known_pulls, load_pulls
 
     for name in [name for name in known_pulls(branch) if name not in names]:
         try:
-            pull = load_pulls(branch, [name], subject, settings)[0]
-            foretell(pull, subject, found, settings)
+            pulls = load_pulls(branch, [name], initial, settings)
+            foretell(_placed(pulls, initial)[0], subject, found, settings)
         except LimberError as error:
             progress.warn(
                 f"The pull {name}, which the estimate did not use, could not be scored: {error}")
