@@ -42,6 +42,7 @@ class _Deviation(_Told):
     path: list[_Maybe] | None = None
     hung: list[_Maybe] | None = None
     grip: list[_Maybe] | None = None
+    graph: list[_Maybe] | None = None
     total: list[_Maybe] | None = None
 
 
@@ -163,7 +164,7 @@ class _Estimate(_Told):
             "control_points_m": self.control_points_m, "fractions": self.fractions,
             "groups": self.groups,
             **{f"young_deviation.{name}": getattr(deviation, name)
-               for name in ("sensor", "geometry", "mesh", "path", "hung", "grip",
+               for name in ("sensor", "geometry", "mesh", "path", "hung", "grip", "graph",
                             "total")}}
         for name, values in lists.items():
             if values and len(values) != count:

@@ -145,6 +145,7 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
              **({"path": "from the gripper's path"} if parts.get("path") else {}),
              **({"hung": "from the mass of twigs"} if parts.get("hung") else {}),
              **({"grip": "from the length in the gripper"} if parts.get("grip") else {}),
+             **({"graph": "from other skeletons"} if parts.get("graph") else {}),
              "total": "together"}
     if not any(parts.get(name) for name in known):
         return []
