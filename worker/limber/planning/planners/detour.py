@@ -28,7 +28,7 @@ from limber.planning.certificate.lower_bound import ENERGY
 from limber.planning.cost import arc_lengths, resample
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.eikonal import GentlePath, plan_gentle_all
-from limber.planning.planners.refine import refine
+from limber.planning.planners.refine import distinct, refine
 
 _LIGHT = 1e-2  # fraction of the given weight of a metre: energy alone counts, nearly
 _HEAVY = 1e3  # the same: length alone counts
@@ -130,9 +130,11 @@ class _Search:
             NoPathError: the shortest path is not allowed.
         """
         light = _weighed(self.problem, _LIGHT)
-        free = [refine(path, light)[0] for path in (self.shortest, *others)]
+        free = distinct([refine(path, light)[0] for path in distinct([*others, self.shortest])])
         limited = replace(light, longest=self.longest)
-        for path in [self.shortest, *others, *free]:
+        for path in free:
+            self._take(path)
+        for path in distinct([*others, self.shortest, *free]):
             self._take(refine(path, limited)[0])
         if not np.isfinite(limited.cost(self.path)):
             raise NoPathError("No allowed path was found as a starting point.",

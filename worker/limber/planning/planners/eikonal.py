@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
@@ -19,10 +18,9 @@ from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
 from limber.planning.cost import arc_lengths
 from limber.planning.path_problem import BlockedError, GentleProblem, no_path_error, not_found
 from limber.planning.planners.least_violation import easiest_path
-from limber.planning.planners.refine import refine
+from limber.planning.planners.refine import is_along, refine
 
 _GAIN = 1e-3  # relative gain of cost that another refinement must bring
-_SAME_WAY = 0.05  # fraction of a path's length; another path around a ridge is farther away
 
 
 @dataclass(frozen=True)
@@ -74,10 +72,12 @@ class _Gentlest:
     def __call__(self, rough: np.ndarray | None) -> float:
         """Return the cost after refining a ``rough`` path [n, 3]; None: those known before."""
         problem, before = self.problem, self.cost
-        along = rough is not None and self.points is not None and _is_along(rough, self.points)
+        along = rough is not None and self.points is not None and is_along(rough, self.points)
         if along and self._is_in_vain:
             return before  # leads to the same optimum
-        if self._found_from([_straight(problem), *self._others] if rough is None else [rough]):
+        # Those of planners first: mostly the straight line then leads to the same optimum.
+        if self._found_from([*self._others[::-1], _straight(problem)] if rough is None else [rough],
+                            rough is None):
             self._is_in_vain |= along and self.cost > (1.0 - _GAIN) * before
             return self.cost
         if self._verdict is not None:
@@ -92,9 +92,11 @@ class _Gentlest:
             raise separated(problem, verdict)
         return self.cost
 
-    def _found_from(self, paths: list[np.ndarray]) -> bool:
+    def _found_from(self, paths: list[np.ndarray], skips_same: bool = False) -> bool:
         for path in paths:
             if len(path) < 2 or not arc_lengths(path)[-1] > 0.0:
+                continue
+            if skips_same and self.points is not None and is_along(path, self.points):
                 continue
             points, cost = refine(path, self.problem)
             if cost < self.cost:
@@ -107,14 +109,6 @@ def separated(problem: GentleProblem, verdict: Verdict) -> BlockedError:
     return no_path_error(problem,
                          f"This is proven on {_grid(verdict)}: forbidden cells separate the "
                          "start from the goal.").behind(verdict.wall, verdict.nearest)
-
-
-def _is_along(rough: np.ndarray, path: np.ndarray) -> bool:
-    """Return whether a rough path [n, 3] is so near to a refined one [k, 3] that refining it would
-    give the same path.
-    """
-    away = cKDTree(path).query(rough)[0]
-    return bool(away.max() <= _SAME_WAY * arc_lengths(path)[-1])
 
 
 def _easiest(problem: GentleProblem) -> list[np.ndarray]:

@@ -12,13 +12,14 @@ The variables are corners in the chart of the shell that the grasp follows
 to the branch's stiffness: chords in space leave the valley between their ends.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
+from scipy.spatial import cKDTree
 
-from limber.planning.cost import resample
+from limber.planning.cost import arc_lengths, resample
 from limber.planning.field.interpolation.local_error import slacks_at
 from limber.planning.field.interpolation.valid_region import nearest_of
 from limber.planning.path_problem import GentleProblem
@@ -40,6 +41,7 @@ _FIRST_STEP = 0.1  # fraction of an edge: the first step, without known curvatur
 _FLAT = 1e-8  # slope in those units, for a cost of about 1
 _INSIDE = 1e-3  # fraction of the goal's tolerance by which an end lies inside; at most the margin
 _STEP = 1e-5  # [m] of the two finite differences
+_SAME_WAY = 0.05  # fraction of a path's length; another path around a ridge is farther away
 
 
 def refine(path: np.ndarray, problem: GentleProblem) -> tuple[np.ndarray, float]:
@@ -58,6 +60,23 @@ def refine(path: np.ndarray, problem: GentleProblem) -> tuple[np.ndarray, float]
         if np.isfinite(cost) or over > _FAR:
             break
     return best, least
+
+
+def is_along(rough: np.ndarray, path: np.ndarray) -> bool:
+    """Return whether a rough path [n, 3] is so near to a refined one [k, 3] that refining it would
+    give the same path.
+    """
+    away = cKDTree(resample(path, _FINE)).query(rough)[0]
+    return bool(away.max() <= _SAME_WAY * arc_lengths(path)[-1])
+
+
+def distinct(paths: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return those of ``paths`` [n, 3] that are not along one before."""
+    found: list[np.ndarray] = []
+    for path in paths:
+        if not any(is_along(path, other) for other in found):
+            found.append(path)
+    return found
 
 
 def _moved(path: np.ndarray, problem: GentleProblem, margin: float) -> tuple[np.ndarray, float]:
