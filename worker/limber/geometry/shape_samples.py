@@ -15,7 +15,7 @@ from scipy.sparse.linalg import splu
 
 from limber.geometry.skeleton.confidence import probability_given_carrier
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
-from limber.geometry.skeleton.radii.normal_equations import fitted_system
+from limber.geometry.skeleton.radii.normal_equations import fitted_system, noise_covariance
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.element_types import between_corners
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -53,7 +53,8 @@ def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
     white = rng.standard_normal((len(pivots), count)) * pivots[:, None]
     coloured = (factor.L @ white)[factor.perm_r]
     moves = noise * factor.solve(coloured).T.reshape(count, -1, 4)
-    moves += _beyond_noise(skeleton, noise**2 * system.inverse_blocks(np.arange(4)), moves, rng)
+    moves += _beyond_noise(skeleton, noise_covariance(system, noise, skeleton.radius), moves,
+                           rng)
     along = skeleton.axes()
     across = moves[..., :3] - np.einsum("snj,nj->sn", moves[..., :3], along)[..., None] * along
     radius = np.clip(skeleton.radius + moves[..., 3], _LEAST * skeleton.radius,
@@ -74,7 +75,7 @@ def _beyond_noise(skeleton: Skeleton, covariance: np.ndarray, moves: np.ndarray,
         moves: Draws of the noise [m], shape [count, n, 4].
         rng: Random number generator.
     """
-    own = np.sqrt(np.maximum(covariance[:, 3, 3], 1e-300))
+    own = np.sqrt(covariance[:, 3, 3])
     stated = np.where(skeleton.radius_sigma > 0, skeleton.radius_sigma, own)
     together = rng.standard_normal((len(moves), skeleton.branch_count))[:, skeleton.branch]
     more = (np.minimum(stated / own, 1.0) - 1) * moves[..., 3] + np.sqrt(

@@ -13,6 +13,7 @@ from limber.geometry.skeleton.radii.robust_noise import robust_sigma, settled_we
 from limber.geometry.skeleton.radii.smoothness import smoothness
 from limber.geometry.skeleton.skeleton import Skeleton
 
+_SURE = (1e-4, 3.0)  # radii: least and largest deviation of a fitted node
 _PROBE = 128  # distance in nodes at which radii count as independent
 
 
@@ -108,15 +109,29 @@ def radius_deviations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
     return noise * np.sqrt(np.maximum(variance, 0)), system.per_node > 2.0
 
 
+def noise_covariance(system: NormalEquations, noise: float, radius: np.ndarray) -> np.ndarray:
+    """Covariance of each node's position and radius by the noise [m] alone [m^2], [n, 4, 4].
+
+    Args:
+        system: At the end of a fit.
+        noise: Standard deviation of the points [m].
+        radius: Fitted radii [m], shape [n].
+    """
+    covariance = noise**2 * system.inverse_blocks(np.arange(4))
+    # Nodes that no points hold are nearly free: their inverses are rounding errors.
+    values, vectors = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
+    least, most = (np.outer(_SURE, radius)**2)[:, :, None]
+    return np.einsum("nik,nk,njk->nij", vectors, np.clip(values, least, most), vectors)
+
+
 def fit_covariance(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
     """Covariance of each node's position and radius by a fit to points [m^2], shape [n, 4, 4].
 
     Where the skeleton states a larger deviation of the radius than noise with known positions on
     the circle gives, the axis goes with the difference as it goes with the noise.
     """
-    system, noise = fitted_system(skeleton, points)
-    covariance = noise**2 * system.inverse_blocks(np.arange(4))
-    way = covariance[:, :, 3] / np.maximum(covariance[:, 3, 3], 1e-300)[:, None]
+    covariance = noise_covariance(*fitted_system(skeleton, points), skeleton.radius)
+    way = covariance[:, :, 3] / covariance[:, 3, 3, None]
     more = np.maximum(skeleton.radius_sigma**2 - covariance[:, 3, 3], 0.0)
     return covariance + more[:, None, None] * way[:, :, None] * way[:, None, :]
 
