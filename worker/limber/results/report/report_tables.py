@@ -294,7 +294,11 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
                      "limited radius": "sigma {:.0%} of the radius",
                      "radius jump": "{:.2f} times outwards",
                      "kink": "{:.0f} degrees", "starts backwards": "{:.0f} degrees"}
-    rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "uncertainty"]]
+    edits = {"unlikely branch": "confirm, delete", "unresolved radius": "radius",
+             "limited radius": "radius, split (two limbs)", "radius jump": "radius, split",
+             "bridged gap": "confirm, bridge", "kink": "move", "starts backwards": "bridge",
+             "attachment": "bridge", "root": "root"}
+    rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "uncertainty", "edit"]]
     for part in doubtful:
         value = part["value"]
         if part["kind"] in ("kink", "starts backwards"):
@@ -303,7 +307,7 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
                      " ".join(f"{value:.8g}" for value in part["at"]),
                      f"{1e3 * part['length_m']:.0f}", f"{1e3 * part['radius_m']:.2f}",
                      value_formats[part["kind"]].format(value) if part["kind"] in value_formats
-                     else "no points"])
+                     else "no points", edits[part["kind"]]])
     return rows
 
 
