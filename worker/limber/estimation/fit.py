@@ -47,6 +47,7 @@ from limber.estimation.fitting.optimise import (
 )
 from limber.estimation.fitting.reduced_fit import Reduction, fit_reduced
 from limber.estimation.forward.forward_model import Forward, under_its_weight
+from limber.estimation.forward.observed_path import is_path_observed
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import uncertainty
@@ -204,6 +205,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
         start = near
     else:
         start, first = _standing(objective, start, settings, progress, reduction)
+        _require_stable(objective, start)
     judged = identifiability(first, objective.space)
     if not _force_is_measured(objective):
         require_scale(judged)
@@ -221,6 +223,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     if settings.method == "gauss-newton" and not stopped:
         fit, objective = _linked_at_the_end(fit, objective, settings, progress)
         fit, objective = with_creep(fit, objective)
+        _require_stable(objective, objective.space.unpack(fit.evaluation.free))
         fit = averaged(fit, objective)
     elif not stopped:
         for message in link_unresolved(fit.evaluation, objective.space)[1]:
@@ -261,6 +264,18 @@ def _standing(objective: Objective, start: Values, settings: EstimateSettings, p
     if standing is None:
         raise _without_equilibrium(judged_on)
     return standing
+
+
+def _require_stable(objective: Objective, values: Values) -> None:
+    """Refuse to drive pulls by a force under which the observed states are unstable."""
+    names = [forward.name for forward in objective.forwards
+             if is_path_observed(forward) and forward.is_held_against_its_force(values)]
+    if names:
+        raise _ForceLeadsNowhereError(
+            f"{', '.join(names)}: the clamping gripper holds the branch in states that are "
+            "unstable under its force and torque alone.",
+            "It compresses the branch. Simulated by the force, the branch would move elsewhere.",
+            "Pull outwards or sideways rather than towards the base.")
 
 
 def _force_is_measured(objective: Objective) -> bool:

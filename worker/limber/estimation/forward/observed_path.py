@@ -19,7 +19,7 @@ from limber.core.not_none import present
 from limber.core.numerics.rigid import principal_axes
 from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.forward.input_force import Response
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.quasi_static import FEW_KEYS, QuasiStaticForward
 from limber.estimation.parameters import Values, equal_values
 
 AT_REST_M = 5e-3
@@ -89,6 +89,22 @@ class ObservedPathForward(QuasiStaticForward):
         super().begin_at(other)
         if isinstance(other, ObservedPathForward):
             self._drives_for = other._drives_for
+
+    def is_held_against_its_force(self, values: Values) -> bool:
+        """Whether a clamping gripper holds states that its force and torque alone would let go.
+
+        A branch that is compressed buckles under a steady force and torque, but not between base
+        and gripper. Simulated by force, it would end in another state.
+        """
+        if self.grasp.mode != "clamped":
+            return False
+        held = QuasiStaticForward(self.name, self._model, self.weights, self.entry, self.frames,
+                                  self.rest_points, key_count=FEW_KEYS, field=self.field)
+        if held.simulate(values, (), False) is None:
+            return False
+        model = held.model_with(values)
+        return not all(model.equations(()).exact_tangent(model, state).is_positive_definite
+                       for state in held.displacements())
 
     def keep(self) -> None:
         """Store force and states; :meth:`step_back` returns to them."""
