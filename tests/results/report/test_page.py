@@ -21,6 +21,7 @@ from limber.results.report.report_tables import (
     held_sentence,
     leg_rows,
     modulus_rows,
+    true_moduli,
 )
 from limber.results.scene.graphs import young_graph
 from limber.stages.results.report import write_report
@@ -276,3 +277,15 @@ def test_a_deviation_that_is_not_known_is_told_so():
     rows = deviation_rows({"fractions": [0.2, 0.8], "young_deviation": {
         "sensor": [0.1, None], "geometry": None, "mesh": None, "total": [0.1, 0.2]}})
     assert rows[2][2:] == ["not known", "not examined", "not examined", "20.0 %"]
+
+
+def test_the_truth_is_compared_at_the_control_points_of_the_estimate():
+    """The true field between its own control points has the paper's inverse-distance weights."""
+    pull = {"young_true_pa": [4e7, 1e7], "fractions": [0.25, 0.75]}
+    estimate = {"young_pa": [3e7, 2e7, 1e7], "fractions": [0.25, 0.5, 0.6],
+                "young_interval_pa": [[2e7, 5e7], [1e7, 2e7], [1e7, 2e7]]}
+    near, far = 1 / 0.15**2, 1 / 0.35**2
+    assert true_moduli(estimate, pull) == pytest.approx(
+        [4e7, 2.5e7, (1e7 * near + 4e7 * far) / (near + far)])
+    assert held_sentence(estimate, pull).startswith("2 of 3 ")
+    assert true_moduli({"young_pa": [1e7]}, pull) == []
