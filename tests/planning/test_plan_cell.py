@@ -10,13 +10,21 @@ from limber.core.numerics.rigid import angle_between, pose_vectors
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.constraints.obstacles import Box
+from limber.planning.goals.camera_view import View
 from limber.planning.plan_file import read_plan
 from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.known_arms import arm_named
+from limber.stages.paths.arm_surroundings import ArmSurroundings
 from limber.stages.paths.execute import _stated_by_plan
 from limber.stages.paths.execute_path import offsets_along
 from limber.stages.paths.plan import plan as plan_paths
-from limber.stages.paths.plan_cell import KeptClear, blocked_by, cell_positions, clearance_in
+from limber.stages.paths.plan_cell import (
+    KeptClear,
+    blocked_by,
+    cell_positions,
+    clearance_in,
+    hiding,
+)
 from limber.store import Branch
 
 # No plan made anew because a field of 60 samples is rough.
@@ -168,6 +176,43 @@ def test_a_second_arm_reaches_as_far_as_it_can():
         place.require("the tip", np.array([1.0, 0.9, 0.3]), None)
     with pytest.raises(NoPathError, match="directions"):
         place.require("the tip", np.array([1.0, 0.0, 0.15]), None)
+
+
+def test_a_tip_is_hidden_by_other_wood_but_its_own(small_mesh, small_skeleton):
+    """The tip is on the axis, a radius inside the surface: a camera beside it sees it, one that
+    looks along the branch from its foot does not, nor one behind a board."""
+    surface = small_mesh.nodes[small_mesh.surface_faces()]
+    tip = small_skeleton.nodes[-1]
+    for place, obstacles, hides in (
+            (tip + [0.0, -0.5, 0.0], (), ""), (np.array([-0.02, 0.0, -0.4]), (), "the branch"),
+            (tip + [0.0, -0.5, 0.0], (Box("the board", np.array([0.1, 0.01, 0.1]),
+                                          tip + [0.0, -0.2, 0.0], np.eye(3)),), "the board")):
+        frame = np.eye(4)
+        frame[:3, 3] = place
+        view = View(frame, (-1.0, 1.0, -1.0, 1.0), (0.1, 2.0))
+        assert hiding(view, obstacles, tip, surface) == (hides and f"{hides} hides it")
+
+
+def test_an_obstacles_kind_follows_from_its_entries():
+    """Without one, a file is a mesh's, and any other a box's."""
+    common = {"robot": {"model": "ur5e"}, "base": {"pose": (0.5,) + (0.0,) * 5}}
+    cell = Cell(**common, obstacles=[{"size_m": (0.1, 0.1, 0.1), "pose": (0, 0, 0.9, 0, 0, 0)},
+                                     {"file": "post.stl"}])
+    assert [one.kind for one in cell.obstacles] == ["box", "mesh"]
+
+
+def test_the_distance_that_is_reported_is_no_less_than_the_clearance_kept():
+    """Of the arm from an obstacle, to the half spacing of the points along its links."""
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.0,) * 6})
+    rods, joints = cell.arm.rods(np.array(cell.arm.home)[None]), np.array(cell.arm.home)[None]
+    along = np.linspace(rods.starts[0], rods.ends[0], 2000)
+    centre = along[1000, 2] + [0.0, 0.0, 0.3]
+    box = Box("the post", np.full(3, 0.02), centre, np.eye(3))
+    true = min(float((box.clearance(along[:, k]) - rods.radii[k]).min())
+               for k in range(len(rods.radii)))
+    assert not cell.tool.parts
+    found = ArmSurroundings(cell, (box,), None).least_distances(joints)["obstacle_distance_m"]
+    assert true - 0.0026 <= found <= true
 
 
 def test_the_clearance_is_what_the_base_leaves_uncertain():

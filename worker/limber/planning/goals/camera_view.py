@@ -59,7 +59,9 @@ class View(Convex):
         first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
         across = np.cross(ray, second)
         volume = np.einsum("ij,ij->i", first, across)
-        safe = np.where(np.abs(volume) > 1e-30, volume, np.inf)
+        # A triangle that the ray lies in hides nothing; rounding would give it a place anywhere.
+        size = np.linalg.norm(first, axis=1) * np.linalg.norm(across, axis=1)
+        safe = np.where(np.abs(volume) > 1e-9 * size + 1e-30, volume, np.inf)
         to_eye = eye - triangles[:, 0]
         u = np.einsum("ij,ij->i", to_eye, across) / safe
         turned = np.cross(to_eye, first)

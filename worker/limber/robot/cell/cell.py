@@ -267,6 +267,14 @@ class Cell(_Entry):
     workspace: WorkspaceEntry | None = None
     obstacles: tuple[Obstacle, ...] = ()
 
+    @field_validator("obstacles", mode="before")
+    @classmethod
+    def _of_its_kind(cls, value: Any) -> Any:
+        """Without a kind, an entry with a file is a mesh and any other a box."""
+        return value if not isinstance(value, list | tuple) else [
+            {"kind": "mesh" if "file" in one else "box", **one} if isinstance(one, dict) else one
+            for one in value]
+
     @model_validator(mode="after")
     def _carries_its_tool(self) -> "Cell":
         if (self.tool.mass_kg or 0.0) > self.arm.payload:

@@ -10,7 +10,7 @@ from limber.planning.constraints.obstacles import Obstacle
 from limber.robot.cell.cell import Cell
 
 _CLEAR_M = 0.02  # m kept between the arm and everything else
-_SPACING_M = 0.03  # m between points along a rod
+_SPACING_M, _FINE_M = 0.03, 0.005  # m between points along a rod; where its distance is reported
 
 
 class ArmSurroundings:
@@ -50,7 +50,7 @@ class ArmSurroundings:
         """
         rods = self._rods(joints)
         found = {"self_distance_m": self._from_itself(rods),
-                 "obstacle_distance_m": self._from_obstacles(rods)}
+                 "obstacle_distance_m": self._from_obstacles(rods, _FINE_M)}
         return {name: float(least) if np.isfinite(least := far.min()) else None
                 for name, far in found.items()}
 
@@ -70,9 +70,10 @@ class ArmSurroundings:
             found = np.minimum(found, _apart(rods, *pair))
         return found
 
-    def _from_obstacles(self, rods: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+    def _from_obstacles(self, rods: tuple[np.ndarray, np.ndarray, np.ndarray],
+                        spacing: float = _SPACING_M) -> np.ndarray:
         found = np.full(len(rods[0]), np.inf)
-        places, radii = self._rod_points(rods)
+        places, radii = self._rod_points(rods, spacing)
         for obstacle in self._obstacles:
             far = obstacle.clearance(places.reshape(-1, 3)).reshape(len(found), -1) - radii
             found = np.minimum(found, far.min(axis=1))
@@ -97,15 +98,17 @@ class ArmSurroundings:
         return np.concatenate(starts, axis=1), np.concatenate(ends, axis=1), np.concatenate(radii)
 
     def _rod_points(self, rods: tuple[np.ndarray, np.ndarray, np.ndarray],
-                    ) -> tuple[np.ndarray, np.ndarray]:
-        """Points along the rods, branch frame, shape [n, k, 3], and the radius at each, [k]."""
+                    spacing: float = _SPACING_M) -> tuple[np.ndarray, np.ndarray]:
+        """Points along the rods, branch frame, shape [n, k, 3], and the radius at each, [k]; larger
+        by half the ``spacing`` [m] for what is between them.
+        """
         starts, ends, radii = rods
         points, thick = [], []
         for k, radius in enumerate(radii):
             length = float(np.linalg.norm(ends[0, k] - starts[0, k]))
-            share = np.linspace(0.0, 1.0, int(np.ceil(length / _SPACING_M)) + 1)[:, None]
+            share = np.linspace(0.0, 1.0, int(np.ceil(length / spacing)) + 1)[:, None]
             points.append(starts[:, None, k] + share * (ends[:, None, k] - starts[:, None, k]))
-            thick.append(np.full(len(share), radius + 0.5 * _SPACING_M))
+            thick.append(np.full(len(share), radius + 0.5 * spacing))
         found = np.concatenate(points, axis=1) @ self._base[:3, :3].T + self._base[:3, 3]
         return found, np.concatenate(thick)
 

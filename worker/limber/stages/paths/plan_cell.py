@@ -37,7 +37,9 @@ _ROD_SPACING = 0.02  # [m] between points along a part of gripper or arm
 _POSE_SPACING = 0.01  # [m] largest step of a part between checked poses
 _BETWEEN = 0.006  # [m] added to the parts' radii for the motion between poses
 _SIGHT_SPACING = 0.005  # [m] between points on a line of sight
-_OWN_SURFACE = 0.003  # [m] of surface around a target that does not hide it
+_OWN_SURFACE = 0.003  # [m] of surface around a target that does not hide it at least
+_OWN_WOOD = 1.5  # times the distance of the surface next to a target: the wood that it sits on
+_NEXT = 36  # corners of triangles that are next to a target
 _DEVIATIONS = 2.0  # standard deviations of the branch's position that a clearance covers
 _AT_REST = 0.9  # fraction of the clearance at rest that is kept at most if none was requested
 _CLAMPED = 0.001  # [m] by which a piece that is clamped, not only held, moves the branch at most
@@ -121,9 +123,14 @@ def hiding(view: View, obstacles: tuple[Obstacle, ...], point: np.ndarray,
            surface: np.ndarray | None, live: LiveView | None = None) -> str:
     """Return in words that the branch's surface, an obstacle or what the camera sees now hides a
     target at ``point`` [3]; empty if nothing does.
+
+    The wood that the target sits on does not: a tip, on the axis, would be seen from ahead only.
     """
-    if surface is not None and view.hidden_by(surface, point, _OWN_SURFACE):
-        return "the branch hides it"
+    if surface is not None:
+        away = np.linalg.norm(surface.reshape(-1, 3) - point, axis=1)
+        own = _OWN_WOOD * float(np.median(np.sort(away)[:_NEXT]))
+        if view.hidden_by(surface, point, max(own, _OWN_SURFACE)):
+            return "the branch hides it"
     eye = view.frame[:3, 3]
     count = int(np.ceil(np.linalg.norm(point - eye) / _SIGHT_SPACING)) + 1
     hit = closest(obstacles, eye + np.linspace(0.0, 1.0, count)[:, None] * (point - eye))
