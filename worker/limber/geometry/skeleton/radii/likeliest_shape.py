@@ -25,10 +25,9 @@ SPACINGS = 1.0
 """Diameter in point spacings, under which a radius is not resolved: too few points around it."""
 _BESIDE = 4  # nodes on each side whose points show the spacing
 _NOISES = 1.0  # radius in standard deviations of the noise, under which it is not resolved
-# Wood, in logarithms of radii: a side branch against its carrier (mean, deviation; of two alike, by
-# the laws of da Vinci and Murray, -0.35 and -0.23), fall along a whole run (mean, deviation),
-# and of a root from any radius (deviation).
-_SIDE, _SIDE_SIGMA = -0.5, 0.6
+# Wood, in logarithms of radii: a side branch against its carrier and the fall along a whole run
+# (mean and deviation each); deviation of a root from any radius.
+_SIDE, _SIDE_SIGMA = -1.0, 0.8
 _TAPER, _TAPER_SIGMA, _ROOT = -0.5, 0.7, 3.0
 WANDER, FORK = 5e-3, 0.3
 """Variance of a radius's logarithm per radius of length, and its deviation at a fork."""
