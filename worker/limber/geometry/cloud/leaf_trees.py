@@ -74,6 +74,11 @@ def leaf_log_odds(features: np.ndarray) -> np.ndarray:
     return total
 
 
+def prior_log_odds() -> float:
+    """Logarithm of the odds that any point is on a leaf, in the scans of the training."""
+    return float(_trees()["start"])
+
+
 @cache
 def _trees() -> dict[str, np.ndarray]:
     return read_arrays(TREES, "the classifier of leaves, a part of Limber")

@@ -8,15 +8,15 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from limber.geometry.cloud.canonical_frame import OwnFrame
-from limber.geometry.cloud.leaf_trees import leaf_log_odds, surroundings
+from limber.geometry.cloud.leaf_trees import leaf_log_odds, prior_log_odds, surroundings
 
 _SMALLEST = 40  # fewest points of a leaf
 _NEAR = 3.0  # largest distance between connected points, in spacings
 _AROUND, _ROUNDS = 16, 2  # neighbours whose evidence counts for a point, and how often
 _MOST_ODDS = 4.0  # logarithm of the odds above which a single point is no more evidence
-# Mean of it from which a piece is a leaf: of real bare scans the trees, trained on generated ones,
-# take clumps of twigs and scatter for leaves at lower odds.
-_LIKELY = 2.5
+# Mean of it from which a piece is a leaf: first by the training's fraction of leaf points, then by
+# the scan's own, which is at least and at most this.
+_LIKELY, _SHARES = 2.5, (0.005, 0.95)
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,32 @@ def _found(points: np.ndarray) -> list[Leaf]:
     spacing = point_spacing(points)
     if spacing <= 0:
         return []  # Neighbourhoods have no shape.
-    odds = np.clip(leaf_log_odds(surroundings(points, spacing)), -_MOST_ODDS, _MOST_ODDS)
+    return leaves_by_odds(points, leaf_log_odds(surroundings(points, spacing)), spacing,
+                          prior_log_odds())
+
+
+def leaves_by_odds(points: np.ndarray, odds: np.ndarray, spacing: float, prior: float,
+                   ) -> list[Leaf]:
+    """Find the leaves of a scan from the evidence of each point.
+
+    A scan with many certain leaves has more, and a bare one with a few flat clumps has none: the
+    odds are those of a training in which a fraction of the points was on leaves, and move with the
+    fraction in this scan (Saerens, Latinne and Decaestecker 2002, doi:10.1162/089976602753284446).
+
+    Args:
+        points: Positions [m], shape [n, 3].
+        odds: Logarithm of the odds that each point is on a leaf, shape [n].
+        spacing: Of the points [m].
+        prior: The same of any point of the training.
+    """
+    odds = np.clip(odds, -_MOST_ODDS, _MOST_ODDS)
     near = cKDTree(points).query(points, k=min(_AROUND, len(points)))[1]
     for _ in range(_ROUNDS):
         odds = odds[near].mean(axis=1)
+    certain = [leaf for leaf in _pieces(points, odds > 0, _NEAR * spacing)
+               if odds[leaf.points].mean() > _LIKELY]
+    share = np.clip(sum(len(leaf.points) for leaf in certain) / len(points), *_SHARES)
+    odds += np.log(share / (1 - share)) - prior
     return [leaf for leaf in _pieces(points, odds > 0, _NEAR * spacing)
             if odds[leaf.points].mean() > _LIKELY]
 
