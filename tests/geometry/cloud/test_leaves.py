@@ -10,7 +10,7 @@ from benchmarks.scan_cases import one_sided_case
 from limber.core.errors import InputError
 from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.leaves import Leaf, find_leaves
+from limber.geometry.cloud.leaves import Leaf, find_leaves, leaves_by_odds
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.cloud.supports import Support
 from limber.geometry.generated import generate_branch
@@ -246,3 +246,18 @@ def test_lines_in_a_plane_fill_no_sheet() -> None:
     assert find_leaves(comb) == []
     leaf, = find_leaves(_leaf(np.zeros(3), np.array([1.0, 0.2, 0.0]), rng))
     assert len(leaf.points) > 0.9 * 1400
+
+
+def test_doubtful_leaves_are_judged_by_the_sure_ones() -> None:
+    """The same patch beside many sure leaves is one; on a bare branch with a single one it is not.
+    """
+    grid = 0.001 * np.stack(np.meshgrid(range(10), range(10), [0.0]), axis=-1).reshape(-1, 3)
+    line = 0.001 * np.stack([np.arange(900), np.full(900, -100), np.zeros(900)], axis=1)
+
+    def found(sure: int) -> list[int]:
+        points = np.vstack([line, *(grid + [0.1 * k, 0, 0] for k in range(sure + 1))])
+        odds = np.concatenate([np.full(900, -4.0), np.full(100, 2.0), np.full(100 * sure, 4.0)])
+        return sorted(int(leaf.points.min()) for leaf in leaves_by_odds(points, odds, 0.001, -1.4))
+
+    assert found(7) == [900 + 100 * k for k in range(8)]
+    assert found(1) == [1000]
