@@ -167,7 +167,10 @@ def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
     if is_uniform and not (by_order and order.any()):
         return YoungField(weights)
     straight = hats(along, positions)
-    names, bumps, widths, steps = ["form"], [], [], []
+    names = ["form"]
+    bumps: list[np.ndarray] = []
+    widths: list[float] = []
+    steps: list[np.ndarray] = []
     if not is_uniform:
         stations = stations_of(fractions)
         places, widths, steps = _bumps(fractions)

@@ -256,7 +256,7 @@ class Rod:
                          relative[1, 0] - relative[0, 1]]
 
         found = solve_bvp(
-            lambda s, y, *unknown: self._slopes(s, y, unknown[0] if unknown else force), off,
+            lambda s, y, *unknown: self._slopes(s, y, *(unknown or (force,))), off,
             near.along, near.values, near.force if force is None else None, tol=TOLERANCE,
             max_nodes=MOST_NODES)
         if found.status or not np.isfinite(found.y).all():

@@ -194,7 +194,7 @@ class _Swing:
         The evidence of one more parameter and its time constant (Schwarz 1978), for as many
         readings as count as independent.
         """
-        best, likeliest = (found, None), LIKELIER
+        best, best_time, likeliest = found, None, LIKELIER
         for share in TIME_SHARES:
             self.creep_time = share * found.duration
             creeping = self.fitted(released, found.duration,
@@ -207,9 +207,9 @@ class _Swing:
             likelier = readings * np.log(self.left_over(found)[0] / rms) - 0.5 * np.log(
                 readings) - np.log(len(TIME_SHARES))
             if likelier > likeliest:
-                best, likeliest = (creeping, share * found.duration), likelier
-        found, self.creep_time = best
-        return found
+                best, best_time, likeliest = creeping, share * found.duration, likelier
+        self.creep_time = best_time
+        return best
 
     def is_settled(self, before: "_Found", found: "_Found") -> bool:
         """Whether a correction has changed the motion by less than matters."""
