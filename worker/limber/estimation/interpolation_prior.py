@@ -167,15 +167,10 @@ def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
     if is_uniform and not (by_order and order.any()):
         return YoungField(weights)
     straight = hats(along, positions)
-    names = ["form"]
-    bumps: list[np.ndarray] = []
-    widths: list[float] = []
-    steps: list[np.ndarray] = []
-    if not is_uniform:
-        stations = stations_of(fractions)
-        places, widths, steps = _bumps(fractions)
-        names += [f"form at {stations[place]:.2g}" for place in places]
-        bumps = list(hats(along, stations)[:, places].T)
+    places, widths, steps = ([], [], []) if is_uniform else _bumps(fractions)
+    stations = positions if is_uniform else stations_of(fractions)
+    names = ["form", *(f"form at {stations[place]:.2g}" for place in places)]
+    bumps = list(hats(along, stations)[:, places].T)
     for number in np.unique(order[order > 0]) if by_order else [0] if order.any() else []:
         names.append(f"{_ORDER}{number}" if by_order else "form of side branches")
         bumps.append((order == number if by_order else order > 0).astype(float))
