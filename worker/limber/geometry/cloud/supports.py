@@ -273,9 +273,9 @@ def _wire(places: np.ndarray, free: np.ndarray, supports: cKDTree | None, every:
         off = _off(own, line, hang)
         near = (np.abs(own[:, 0] - (low + high) / 2) < (high - low) / 2 + reach) & (
             np.linalg.norm(off, axis=1) < wide)
-        if near.sum() < _LEAST:
-            return None
         along = own[near, 0]
+        if len(along) < _LEAST or np.ptp(along) < 1e-3 * reach:
+            return None
         line, hang = np.polyfit(along, own[near, 1], 1), np.polyfit(
             along, own[near, 2], 2 if high - low > 6 * reach else 1)
         hang = np.pad(hang, (3 - len(hang), 0))
