@@ -228,8 +228,7 @@ def _wires(points: np.ndarray, placed: np.ndarray, rest: np.ndarray, held: np.nd
     rest = rest[own_order(points[rest])][:_WIRE_POINTS]
     if len(rest) < _LONG * _LEAST:
         return []
-    places, reach = placed[rest], _WIRE_SCALE * size
-    found: list[np.ndarray] = []
+    places, reach, found = placed[rest], _WIRE_SCALE * size, list[np.ndarray]()
     free, tried, tree = np.ones(len(rest), bool), np.zeros(len(rest), bool), cKDTree(places)
     supports = cKDTree(held) if len(held) else None
     for start in range(min(_WIRE_STARTS, len(rest))):
