@@ -194,8 +194,7 @@ class _Swing:
         The evidence of one more parameter and its time constant (Schwarz 1978), for as many
         readings as count as independent.
         """
-        best: tuple[_Found, float | None] = found, None
-        likeliest = LIKELIER
+        best, best_time, likeliest = found, None, LIKELIER
         for share in TIME_SHARES:
             self.creep_time = share * found.duration
             creeping = self.fitted(released, found.duration,
