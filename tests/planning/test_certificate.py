@@ -497,7 +497,7 @@ def test_no_path_short_enough_leaves_the_cells_that_count(well_field):
     near = np.zeros(grid.open_cells.shape, bool)
     near[tuple(numbers.T)] = np.linalg.norm(centres - GOAL.position, axis=1) <= (
         GOAL.tolerance + grid.spacing)
-    found = lower_bound._short_enough(problem, grid, grid.open_cells, near, cell)
+    found = lower_bound.short_enough(problem, grid, grid.open_cells, near, cell)
     points = grid.points(numbers + np.random.default_rng(0).uniform(size=numbers.shape))
     through = np.linalg.norm(points - START, axis=1) + np.maximum(
         np.linalg.norm(points - GOAL.position, axis=1) - GOAL.tolerance, 0.0)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import Cancelled, InputError, WorkError
+from limber.core.errors import InputError, WorkError
 from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
@@ -42,6 +42,7 @@ from limber.estimation.fitting.optimise import (
     ROUGH_ENDING,
     Fit,
     FitStatus,
+    best_so_far,
     gauss_newton,
     nelder_mead,
 )
@@ -365,24 +366,6 @@ def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
         fit = gauss_newton(fresh, fit.evaluation.free, evaluation_limit=EVALUATION_LIMIT)
         objective.forward_count = fresh.forward_count
     return fit
-
-
-def best_so_far(objective: Objective) -> Fit:
-    """Return the best evaluation of a stopped fit.
-
-    Raises:
-        Cancelled: there is no evaluation yet.
-    """
-    best = objective.log.best
-    if best is None or len(best.parameters) != objective.space.size:
-        raise Cancelled("The estimate was stopped before the first step of the fit.",
-                        "There is no result to keep yet.", "Run it again.")
-    quiet = Objective(objective.forwards, objective.space, force_sigma=objective.force_sigma)
-    evaluation = quiet.evaluate(np.array(best.parameters), jacobian=True)
-    if evaluation is None:
-        raise Cancelled("The estimate was stopped before it found an equilibrium.",
-                        "There is no result to keep yet.", "Run it again.")
-    return Fit(evaluation, FitStatus.stopped, "stopped")
 
 
 def _linked_at_the_end(fit: Fit, objective: Objective, settings: EstimateSettings,

@@ -7,7 +7,7 @@ from enum import StrEnum
 import numpy as np
 import scipy
 
-from limber.core.errors import WorkError
+from limber.core.errors import Cancelled, WorkError
 from limber.estimation.fitting.objective import FAILED_OBJECTIVE, Evaluation, Objective
 
 EVALUATION_LIMIT = 400
@@ -332,3 +332,21 @@ def _required(objective: Objective, free: np.ndarray) -> Evaluation:
                         "Check the grasp point and the poses, or give another --young to start "
                         "from.")
     return found
+
+
+def best_so_far(objective: Objective) -> Fit:
+    """Return the best evaluation of a stopped fit.
+
+    Raises:
+        Cancelled: there is no evaluation yet.
+    """
+    best = objective.log.best
+    if best is None or len(best.parameters) != objective.space.size:
+        raise Cancelled("The estimate was stopped before the first step of the fit.",
+                        "There is no result to keep yet.", "Run it again.")
+    quiet = Objective(objective.forwards, objective.space, force_sigma=objective.force_sigma)
+    evaluation = quiet.evaluate(np.array(best.parameters), jacobian=True)
+    if evaluation is None:
+        raise Cancelled("The estimate was stopped before it found an equilibrium.",
+                        "There is no result to keep yet.", "Run it again.")
+    return Fit(evaluation, FitStatus.stopped, "stopped")

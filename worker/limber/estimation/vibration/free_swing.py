@@ -42,14 +42,11 @@ _DAMPING_BOUNDS = (1e-4, 1e3)
 _FULL_RUNS = 4
 """Most simulations by the full model."""
 _SETTLED = 0.5
-"""Change of the motion by a correction, in standard deviations, after which there is no other.
-Nearly all of it is then an exchange between the two damping parameters: of the virtual beams the
-modulus changed by 0.03 %, a fiftieth of its deviation.
+"""Change of the motion by a correction, in standard deviations, after which there is no other. The
+modulus of virtual beams then changed by 0.03 %, a fiftieth of its deviation.
 """
 _ROUNDS = 200
-"""Most evaluations of a fit: by modes each takes milliseconds, and the two damping parameters, of
-which one vibration determines the sum, take many.
-"""
+"""Most evaluations of a fit: of two damping parameters one vibration determines the sum only."""
 _SHARE_BOUNDS = (-0.5, 0.9)
 """Bounds of the share by which creep lowers the modulus; a negative one is not creep."""
 _MARGIN = 0.1

@@ -76,6 +76,22 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
                       whole(filled <= growth * 8.0 * half))
 
 
+def short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, near: np.ndarray,
+                 cell: np.ndarray) -> np.ndarray:
+    """Return the open cells that a path no longer than allowed may enter: an ellipsoid's, about the
+    start and the cells ``near`` the goal."""
+    numbers = np.argwhere(open_cells)
+    nearest = scipy.ndimage.distance_transform_edt(
+        ~near, sampling=grid.edges, return_distances=False, return_indices=True)[:, *numbers.T].T
+    away = sum(np.linalg.norm(grid.edges * (numbers - other), axis=1) for other in (cell, nearest))
+    within = np.zeros_like(open_cells)
+    # Half a diagonal in the cell itself, as much in the goal's, and at both ends of the path there.
+    within[tuple(numbers.T)] = away - 1.5 * np.linalg.norm(grid.edges) <= problem.longest
+    within[tuple(cell)] = True
+    together = scipy.ndimage.label(within, np.ones((3, 3, 3)))[0]
+    return together == together[tuple(cell)]
+
+
 def _cost_left(length: np.ndarray, depth: np.ndarray, rate: np.ndarray, edges: np.ndarray,
                ) -> np.ndarray:
     """Return the cost of a ``length`` [m] to the goal, at the ``rate`` half-way, for cells with

@@ -22,7 +22,7 @@ import scipy
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, least_between, least_size
-from limber.planning.certificate.goal_cells import about_goal
+from limber.planning.certificate.goal_cells import about_goal, short_enough
 from limber.planning.certificate.grid import COARSEST, FINEST, Grid, descent, first_grid, refined
 from limber.planning.certificate.subsolution import (
     RIM,
@@ -322,28 +322,12 @@ def _bound(problem: GentleProblem, land: _Land, grid: Grid, cell: np.ndarray) ->
         raise _separated(problem, grid, ground.open_cells, grid.points(np.argwhere(wall) + 0.5))
     if problem.longest < np.inf:
         ground = ground._replace(
-            open_cells=_short_enough(problem, grid, ground.open_cells, goal.near, cell))
+            open_cells=short_enough(problem, grid, ground.open_cells, goal.near, cell))
     to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
     slack = factor * goal.slack
     lower = spline_value(to_goal, cell) - slack
     return _Bounds(max(lower, 0.0), ground, to_goal, cell, slack, descent(grid, to_goal, cell),
                    goal.near)
-
-
-def _short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, near: np.ndarray,
-                  cell: np.ndarray) -> np.ndarray:
-    """Return the open cells that a path no longer than allowed may enter: an ellipsoid's, about the
-    start and the cells ``near`` the goal."""
-    numbers = np.argwhere(open_cells)
-    nearest = scipy.ndimage.distance_transform_edt(
-        ~near, sampling=grid.edges, return_distances=False, return_indices=True)[:, *numbers.T].T
-    away = sum(np.linalg.norm(grid.edges * (numbers - other), axis=1) for other in (cell, nearest))
-    within = np.zeros_like(open_cells)
-    # Half a diagonal in the cell itself, as much in the goal's, and at both ends of the path there.
-    within[tuple(numbers.T)] = away - 1.5 * np.linalg.norm(grid.edges) <= problem.longest
-    within[tuple(cell)] = True
-    together = scipy.ndimage.label(within, _NEAR)[0]
-    return together == together[tuple(cell)]
 
 
 def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:
