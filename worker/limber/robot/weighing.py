@@ -60,7 +60,7 @@ def unweighed(cell: Cell) -> str | None:
         return None
     if last is None:
         return (f"The gripper of {stated:g} kg was never weighed with this sensor, so a wrong "
-                "mass, unit, sign or axis is not known")
+                "mass, unit, sign or axis would go unnoticed")
     mass = float(last.get("mass_kg", np.nan))
     off = _mass_off(mass, float(last.get("mass_sigma_kg", 0.0)), stated)
     if off or not np.isfinite(mass):

@@ -43,7 +43,7 @@ def check(run: Run, cell_file: Path, offline: bool, folder: Path | None, plan: s
                          "branch.", "Give --offline --branch FOLDER, and --plan NAME if you want.")
     cell = read_cell(cell_file)
     if reason := unweighed(cell):
-        run.progress.warn(f"{reason}. No branch is held before it was (limber robot weigh).")
+        run.progress.warn(f"{reason}. Weigh it before the arm moves a branch (limber robot weigh).")
     camera = _camera(run, cell) if realsense else {}
     if offline:
         return camera | _from_files(run, cell, cell_file, folder, plan)
