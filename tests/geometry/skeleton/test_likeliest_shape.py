@@ -128,6 +128,30 @@ def test_a_scattered_axis_is_smoothed_and_a_bend_is_kept() -> None:
     assert np.std(left) < 0.6 * np.std(off[:_STEM]) and abs(np.mean(left)) < 0.0016
 
 
+def test_nodes_at_one_place_have_no_direction_that_moves_them() -> None:
+    """On a real scan a joint doubled a node, and the bend about it moved that by 290 mm."""
+    plant = _plant()
+    nodes = plant.nodes.copy()
+    nodes[:_STEM, 1] += 1e-3 * np.sin(np.arange(_STEM))
+    nodes[30] = nodes[29]
+    state = plant.radius_state.copy()
+    state[20:40] = INTERPOLATED
+    told = _told(replace(plant.moved(nodes), radius_state=state))
+    assert np.linalg.norm(told.nodes - nodes, axis=1).max() < 3e-3
+
+
+@pytest.mark.parametrize("depth", [1.0, -1.0])
+def test_how_an_axis_bends_does_not_decide_a_radius_that_is_hardly_known(depth: float) -> None:
+    """Depth and radius of thin fits are one unknown: an axis 30 mm off made kilometres of it."""
+    radius, sigma = np.full(_STEM, 0.004), np.full(_STEM + _TWIG, 8e-5)
+    radius[:12], sigma[:12] = 0.0015, 0.0012
+    plant = _plant(radius)
+    nodes = plant.nodes.copy()
+    nodes[:12, 1] -= 0.03 * np.linspace(1.0, 0.0, 12)**2
+    told = _told(replace(plant.moved(nodes), radius_sigma=sigma), depth=depth)
+    assert told.radius[:_STEM].max() < 0.0045 and told.radius[:12].min() > 0.0015
+
+
 def test_errors_that_all_fits_share_widen_all_intervals() -> None:
     """Of a coarser scan, of registration, and of sections that one side shows."""
     plain = _told(_plant(), 0.0005, 0.0)

@@ -33,6 +33,7 @@ WANDER, FORK = 5e-3, 0.3
 """Variance of a radius's logarithm per radius of length, and its deviation at a fork."""
 # Its axis: variance of the direction per radius of length [rad^2], deviation at a fork [rad].
 _BEND, _KINK = 1e-3, 0.25
+_DISTINCT = 1e-3  # radii between nodes at different places
 _ALONG = 0.01  # radii that nodes may move along their axis, where no point holds them
 _APART = 8.0  # radii along a run from which fits are independent
 # Fraction of the radius by which fits scatter about the steady radius of wood: least, most, first.
@@ -52,6 +53,7 @@ _BIAS = 0.15
 # from one side, which shows one of its diameters.
 _OVAL, _OVAL_SIDE = 0.012, 0.04
 _VAGUE = 1.0  # the same, of fits that the points do not resolve
+_LINEAR = 0.3  # the largest for which a change of the axis is one of the logarithm, in proportion
 _FREEDOM = 4.0  # of Student's distribution of a fit's error: some fits fail
 _ROUNDS = 5
 _AT_ONCE, _EACH = 256, 4  # columns of an inverse; nodes of a run between them
@@ -91,7 +93,8 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
     resolution = _RESOLUTION * evidence.spacing if evidence.pixel is None else (
         _EDGE * evidence.pixel)
     measured = skeleton.radius_state == MEASURED
-    independent = np.minimum(skeleton.steps / (_APART * first), 1.0)
+    evidence = replace(evidence, covariance=_coupled(evidence.covariance, first, measured))
+    independent = np.clip(skeleton.steps / first, _DISTINCT, _APART) / _APART
     vague = np.where(_is_coarse(first, evidence), _VAGUE**2, 0.0)
     trust, local, bends = np.ones(len(radius)), _LOCAL[2], _Bends.of(skeleton)
     for _ in range(_ROUNDS):
@@ -119,6 +122,19 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
     return replace(skeleton.moved(skeleton.nodes + moves), radius=radius,
                    radius_sigma=radius * sigma,
                    radius_state=np.where(coarse, UNRESOLVED, skeleton.radius_state))
+
+
+def _coupled(covariance: np.ndarray, radius: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return the covariances, shape [n, 4, 4], without the part that ties axes to radii [m] where a
+    fit counts for nothing, and with little of it where the radius is hardly known: there the bend
+    of an axis would decide the radius.
+    """
+    relative = np.sqrt(covariance[:, 3, 3]) / radius
+    share = np.where(measured, np.minimum(_LINEAR / np.maximum(relative, 1e-12), 1.0)**2, 0.0)
+    out = covariance.copy()
+    out[:, :3, 3] *= share[:, None]
+    out[:, 3, :3] *= share[:, None]
+    return out
 
 
 def _is_coarse(radius: np.ndarray, evidence: ShapeEvidence) -> np.ndarray:
@@ -200,8 +216,11 @@ class _Bends:
 
     @classmethod
     def of(cls, skeleton: Skeleton) -> "_Bends":
-        chains = [own for own in skeleton.own_runs() if len(own) > 2]
-        steps = [np.maximum(skeleton.steps[chain[1:]], 1e-12) for chain in chains]
+        # Between nodes at one place there is no direction.
+        apart = skeleton.steps > _DISTINCT * skeleton.radius
+        chains = [np.append(own[:1], own[1:][apart[own[1:]]]) for own in skeleton.own_runs()]
+        chains = [chain for chain in chains if len(chain) > 2]
+        steps = [skeleton.steps[chain[1:]] for chain in chains]
         length = np.concatenate([np.empty(0), *((step[:-1] + step[1:]) / 2 for step in steps)])
         inner = np.concatenate([np.empty(0, np.int64), *(chain[1:-1] for chain in chains)])
         second = second_differences(chains, steps, skeleton.node_count) if chains else (
