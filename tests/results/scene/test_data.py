@@ -101,7 +101,7 @@ def test_scale(tmp_path, mesh, low, high, log, ticks):
 
 def test_a_goal_larger_than_the_branch_is_shown_where_the_path_ends(tmp_path, mesh):
     """A second arm's reach would hide the branch: the target's end stands for it."""
-    goal = {"kind": "tip", "position_m": [1.2, 0.0, 0.5], "tolerance_m": 0.85}
+    goal = {"kind": "tip", "position_m": [0.6, 0.0, 0.5], "tolerance_m": 0.3}
     end = {"target_end_m": [0.36, 0.01, 0.41]}
     plan = {"plans/p.json": json.dumps({"goal": goal} | end),
             "plans/p.csv": "x_m,y_m,z_m\n0,0,0.3\n0.1,0,0.3\n"}

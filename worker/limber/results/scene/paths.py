@@ -120,7 +120,7 @@ def _goal(summary: dict[str, Any], path: np.ndarray | None, size: float) -> dict
     """
     goal = summary.get("goal") or {}
     centre, radius = goal.get("position_m"), goal.get("tolerance_m")
-    if summary.get("target_end_m") is not None and (radius or 0.0) > size:
+    if summary.get("target_end_m") is not None and 2.0 * (radius or 0.0) > size:
         centre, radius = summary["target_end_m"], None
     if centre is None:
         if path is None:
