@@ -108,6 +108,18 @@ def test_a_right_sensor_is_not_doubted(factor):
         assert judged(rows(askew, bias=(0.0, 0.0, 0.3), seed=seed), factor)[0] is None
 
 
+def test_a_force_along_the_branch_itself_makes_no_size_wrong():
+    """A model a few degrees off predicts one where there is none; what is across it still counts.
+    """
+    ways = np.array([0.0, 0.0035, 0.007, 0.01])
+    askew = PredictedPull(ways, ways[:, None] * (STIFF + [0.0, 0.0, 400.0]), 2.0,
+                          np.diag([1.0, 1.0, 0.0]))
+    for seed in range(5):
+        assert PullPlausibility(CELL, askew).take(rows(np.eye(3), seed=seed)) is None
+        told = PullPlausibility(CELL, askew).take(rows(0.1 * np.eye(3), seed=seed))
+        assert told is not None and "smaller" in told
+
+
 def test_moduli_that_are_not_known_make_no_size_wrong():
     assert judged(rows(0.1 * np.eye(3)), None)[0] is None
     assert judged(rows(10.0 * np.eye(3)), None)[0] is None

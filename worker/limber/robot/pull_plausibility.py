@@ -338,7 +338,8 @@ class PullPlausibility:
                 f"{100 * max(share, 0.0):.0f} % of what came before)")
 
     def _suspicion(self, travel: float, force: np.ndarray) -> str:
-        factor, predicted = self.predicted.factor, self.predicted.at(travel)
+        factor, certain = self.predicted.factor, self.predicted.certain
+        predicted, force = self.predicted.at(travel) @ certain, force @ certain
         size = float(np.linalg.norm(predicted))
         if size < 1e-9 or factor is None:
             return ""
