@@ -1,6 +1,7 @@
 """The closed loop's own parts; the whole of it takes minutes and is a row of `scripts/bench robot`.
 """
 
+from collections import defaultdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +15,7 @@ from limber.cli.closed_loop.cell_layout import (
     gripper_at,
     write_touched,
 )
-from limber.cli.closed_loop.comparison import comparison
+from limber.cli.closed_loop.comparison import Planned, compared, comparison
 from limber.cli.closed_loop.loop import ClosedLoop
 from limber.cli.closed_loop.robot_observer import Watch
 from limber.cli.robot_commands.calibrate import _points
@@ -156,6 +157,19 @@ def test_the_demo_takes_a_scan_or_a_robot(tmp_path):
     scan = tmp_path / "scan.xyz"
     scan.write_text("0 0 0\n")
     assert main.call(["demo", str(scan), "--robot"]) == 2
+
+
+def test_an_estimate_at_other_control_points_is_compared_with_the_truth_there():
+    """The truth's moduli are arrays; two control points lie on its own first and last."""
+    truth = SimpleNamespace(young=np.array([4e9, 3e9, 2e9, 1e9]), fractions=(0.2, 0.4, 0.6, 0.8))
+    estimated = {"young_pa": [4.1e9, 2e9], "young_interval_pa": [[3.5e9, 4.5e9], [2e9, 3e9]],
+                 "fractions": [0.2, 0.8]}
+    watch = SimpleNamespace(at_the_end=lambda: None, extrapolation_error=0.0, overloaded=None)
+    planned = Planned(estimated, np.zeros(3),
+                      SimpleNamespace(holding_force=1.0, max_force=2.0), {})
+    found = compared(truth, np.zeros(3), planned, defaultdict(float), watch, ("", watch), 10.0)
+    assert found["young_true_pa"] == pytest.approx([4e9, 1e9], rel=1e-6)
+    assert found["covered"] == [True, False]
 
 
 def test_what_is_compared_fits_a_terminal():

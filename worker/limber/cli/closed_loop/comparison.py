@@ -38,8 +38,8 @@ def compared(truth: TrueBranch, moved: np.ndarray, planned: Planned, executed: d
     from limber.results.report.report_tables import true_moduli
 
     estimated, goal = planned.estimated, planned.goal
-    young = np.array(true_moduli(estimated, {"young_true_pa": truth.young,
-                                             "fractions": truth.fractions}))
+    young = np.array(true_moduli(estimated, {"young_true_pa": list(truth.young),
+                                             "fractions": list(truth.fractions)}))
     seen = watch.at_the_end()
     flower = None if seen is None else seen[-1] + moved
     off = np.inf if flower is None else float(np.linalg.norm(flower - goal))
