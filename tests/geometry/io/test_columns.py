@@ -202,6 +202,15 @@ def test_further_titles_and_separators(tmp_path, titles, mark):
     np.testing.assert_array_equal(read_points(tmp_path / "a.csv").points, points)
 
 
+@pytest.mark.parametrize("first", ["nan nan nan", "NaN nan NA", "nan nan nan nan nan nan"])
+def test_pixels_without_depth_may_come_first(tmp_path, first):
+    """A depth image written as text often begins with them; they are no titles."""
+    points = np.random.default_rng(0).uniform(0, 1, (9, len(first.split()))).round(4)
+    (tmp_path / "a.xyz").write_text((first + "\n") * 3 + "".join(
+        " ".join(map(str, row)) + "\n" for row in points))
+    np.testing.assert_array_equal(read_points(tmp_path / "a.xyz").points, points[:, :3])
+
+
 def test_arrays_of_named_fields(tmp_path):
     """A structured array; and one whose names are not those of coordinates."""
     points = np.random.default_rng(0).uniform(0, 1, (9, 3))
