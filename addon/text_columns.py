@@ -314,7 +314,9 @@ def _first_row(lines: list[str], separator: str | None) -> int:
         numbers = [_number(part, separator != ",") for part in parts]
         known = [number for number in numbers if number is not None]
         # A row of a table may contain words besides numbers, but they are never the majority.
-        if len(known) >= max(3, (len(parts) + 1) // 2) and not all(np.isnan(known)):
+        # A line of separators alone belongs to what stands above the titles.
+        if len(known) >= max(3, (len(parts) + 1) // 2) and (
+                any(parts) if len(known) == len(parts) else not all(np.isnan(known))):
             return index
     return int(any(part[:1].isalpha() for part in _parts(lines[0], separator)))
 

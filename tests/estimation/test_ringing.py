@@ -165,6 +165,22 @@ def test_the_readings_of_a_logger_are_found(tmp_path, stamp):
     assert identify(record.times, record.values).frequencies[0] == pytest.approx(5.0, rel=2e-3)
 
 
+@pytest.mark.parametrize(("head", "rate"), [
+    ("# Sample rate: 200 Hz\nacc\n", None), ("Sampling Rate [Hz],200\nax,ay\n", None),
+    ("sample,acc\n", 200.0), ("acc\n", 200.0)])
+def test_readings_without_times_have_a_rate(tmp_path, head, rate):
+    """The file states it, or the user does; without either the error names the option."""
+    _, values = decays(np.random.default_rng(9), starts=(1.0,), seconds=8.0)
+    rows = [{"sample,acc": f"{k},{value}", "ax,ay": f"{value},{0.4 * value}"}.get(
+        head.splitlines()[-1], f"{value}") for k, value in enumerate(values[:, 0])]
+    (tmp_path / "a.csv").write_text(head + "\n".join(rows) + "\n")
+    record = read_record(tmp_path / "a.csv", rate)
+    assert identify(record.times, record.values).frequencies[0] == pytest.approx(5.0, rel=2e-3)
+    if rate:
+        with pytest.raises(InputError, match="--rate-hz"):
+            read_record(tmp_path / "a.csv")
+
+
 @pytest.mark.parametrize("axes", [1, 3])
 def test_the_magnitude_of_the_others_is_no_reading(axes):
     """Telephones add it; it rings at twice the frequency. Of two equal columns both stay."""

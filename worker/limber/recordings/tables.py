@@ -102,7 +102,7 @@ def read_table(path: str | Path) -> Table:
     separator = separator_of(bare)
     rows = [fields_of(line, separator) for line in bare]
     first, width = first_numbers(path, rows)
-    capture = capture_preamble(rows[:first], width)
+    capture = capture_preamble(rows[:first], width, comments)
     titles = capture.titles or _titles(rows[:first], comments, width, separator)
     if titles is None:
         raise InputError(f"{path} has no header line with {width} column names.",

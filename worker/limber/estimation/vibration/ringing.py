@@ -73,11 +73,11 @@ class Ringing:
         return self.damping[:, None] * np.exp(np.clip(wide, 0, 30)[:, None] * np.array([-1, 1]))
 
 
-def read_record(path: Path) -> Stream:
+def read_record(path: Path, rate_hz: float | None = None) -> Stream:
     """Read a record: a table of times and readings in any unit, or a C3D file's marker tracks.
 
     Columns with gaps, such as those of a hidden marker, are discarded, and those that do not ring
-    (:func:`.readings.ringing_columns`).
+    (:func:`.ringing_detection.ringing_columns`). ``rate_hz`` is the rate of readings without times.
 
     Raises:
         InputError: it cannot be read, has no times or no readings, or its times do not ascend in
@@ -88,7 +88,7 @@ def read_record(path: Path) -> Stream:
     if tracks:
         stream = RECORDINGS.read_as(tracks[0], path, request=ImportRequest(path))[0]
     else:
-        stream = time_stream(read_table(path))
+        stream = time_stream(read_table(path), rate_hz)
     used = [number for number, title in enumerate(stream.columns)
             if np.isfinite(stream.values[:, number]).all()
             and not re.fullmatch(_COUNTS, split_title(title).plain)]

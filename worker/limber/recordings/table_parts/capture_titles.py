@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 _RATES = ("exportframerate", "framerate", "captureframerate", "frequency", "datarate",
-          "camerarate")
+          "camerarate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency")
 _UNITS = ("lengthunits", "units")
 _KINDS = ("position", "rotation", "markerquality", "meanmarkererror", "quality", "error")
 _TYPES = ("marker", "rigid body marker", "bone marker", "rigid body", "bone")
@@ -32,19 +32,22 @@ class Preamble:
     unit: str | None
 
 
-def capture_preamble(above: Sequence[Sequence[str]], width: int) -> Preamble:
+def capture_preamble(above: Sequence[Sequence[str]], width: int,
+                     comments: Sequence[str] = ()) -> Preamble:
     """Return what the rows above the numbers state about a capture.
 
     Args:
         above: Cells of these rows.
         width: Number of columns of numbers.
+        comments: Lines of comments, without their marks.
     """
     rows = [[*row[:width], *[""] * (width - len(row))] for row in above]
     at = next((k for k in reversed(range(len(rows))) if len(above[k]) <= width + 1
                and sum(_axis(cell) is not None for cell in rows[k]) >= 3), None)
     titles = _without_axes(above, width) if at is None or at == 0 else _titled(rows, at)
     is_qualisys = any(row and _letters(row[0]) == "markernames" for row in above)
-    rate = _stated(above, _RATES)
+    rate = _stated(above, _RATES) or _stated(
+        [_pair(line) for line in (*comments, *map(" ".join, above))], _RATES)
     if rate is None and titles is not None:
         # Vicon writes the rate alone in a row.
         rate = next((row[0] for row in above if row and _is_number(row[0])
@@ -123,6 +126,13 @@ def _stated(above: Sequence[Sequence[str]], keys: Sequence[str]) -> str | None:
                         _letters(value[0]) not in (*_RATES, *_UNITS, "origdatarate")):
                     return value[0]
     return None
+
+
+def _pair(line: str) -> list[str]:
+    """``Sampling rate [Hz]: 200`` or ``Sample Rate = 200 Hz``, as cells of a row."""
+    found = re.fullmatch(r"\W*([a-z ]+?)\s*[(\[]?(?:hz)?[)\]]?\s*[:=\s]\s*([\d.]+)\s*(?:hz)?\W*",
+                         line.lower())
+    return list(found.groups()) if found else []
 
 
 def _axis(cell: str) -> str | None:

@@ -8,6 +8,8 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.recordings.table_parts.clocks import clock_seconds
 
+_COLUMN = 20
+"""Rows that make single numbers a column."""
 _EMPTY = ("", "nan", "na", "n/a", "null", "none", "-")
 
 
@@ -105,13 +107,19 @@ def first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:
         follows = rows[index + 1] if index + 1 < len(rows) else row
         # A preamble (NO_OF_FRAMES 600) also has numbers, but never two consecutive rows of several
         # numbers, nor words at the same positions twice.
-        if len(row) > 1 and len(known) - len(words) > len(row) // 2 and (
+        if (len(row) > 1 or _is_column(rows[index:index + _COLUMN])) and (
+                len(known) - len(words) > len(row) // 2) and (
                 not words or (words == words_in(follows) and len(words) <= len(row) // 3)) and (
                 len(follows) == len(row) or index + 2 >= len(rows)):
             return index, len(row)
     raise InputError(f"{path} has no row of numbers." if rows else f"{path} is empty.",
                      "A header and rows of numbers were expected.",
                      "Check the file, or export it again.")
+
+
+def _is_column(rows: list[list[str]]) -> bool:
+    """Whether these are readings alone: a preamble has fewer single numbers below each other."""
+    return len(rows) == _COLUMN and all(len(row) == 1 and not words_in(row) for row in rows)
 
 
 def words_in(row: list[str]) -> list[int]:

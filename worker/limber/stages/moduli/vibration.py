@@ -48,7 +48,7 @@ class VibrationInputs(BranchInputs):
 class VibrationSettings(Settings):
     """Settings of the record."""
 
-    groups: ClassVar[Groups] = {"record": ("start", "sensor"),
+    groups: ClassVar[Groups] = {"record": ("start", "sensor", "rate_hz"),
                                 "known": ("density_sigma", "radius_sigma")}
     common = ("sensor",)
 
@@ -57,6 +57,8 @@ class VibrationSettings(Settings):
     sensor: tuple[float, float, float, float] | None = Field(
         None, description="Position [m] and mass [kg] of a sensor that swings with the branch.",
         json_schema_extra={"metavar": "X Y Z KG"})
+    rate_hz: float | None = Field(
+        None, gt=0, description="Readings per second, if RECORD has no times.")
     density_sigma: float = Field(0.1, ge=0, le=1, description="Relative standard deviation of the "
                                  "wood's density.")
     radius_sigma: float = Field(0.02, ge=0, le=1, description="Relative standard deviation of the "
@@ -87,7 +89,7 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
     if not Path(record).is_file():
         raise InputError(f"There is no file {record}.", "A record of the branch's vibration was "
                          "expected.", "Check the path.")
-    rung = read_record(Path(record))
+    rung = read_record(Path(record), settings.rate_hz)
     for text in rung.warnings:
         progress.warn(text)
     branch = Branch.open(branch_folder)
