@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
 from limber.recordings.robot_tables import robot_stream
@@ -167,3 +168,44 @@ def test_loggers_of_laboratory_and_telephone(tmp_path, text, row):
     assert stream.columns == ("Force (N)",)
     np.testing.assert_allclose(stream.times, times, atol=1e-9)
     np.testing.assert_allclose(stream.values[:, 0], values, atol=1e-4)
+
+
+_TURNS = Rotation.from_rotvec([[0.1, -0.2, 0.3], [1.2, 0.4, -2.0], [-0.5, 2.5, 0.7]])
+_PLACES = np.array([[0.4, 0.1, 0.6], [0.5, 0.2, 0.6], [0.6, 0.3, 0.5]])
+_WRENCHES = np.arange(18.0).reshape(3, 6) / 7
+
+
+def _franka():
+    matrices = np.tile(np.eye(4), (3, 1, 1))
+    matrices[:, :3, :3], matrices[:, :3, 3] = _TURNS.as_matrix(), _PLACES
+    return ([f"O_T_EE_{k}" for k in range(16)] + [f"O_F_ext_hat_K_{k}" for k in range(6)],
+            np.column_stack([matrices.transpose(0, 2, 1).reshape(3, 16), _WRENCHES]))
+
+
+def _angles(titles, order, degrees):
+    return (["x", "y", "z", *titles, "fx", "fy", "fz", "tx", "ty", "tz"],
+            np.column_stack([_PLACES, _TURNS.as_euler(order, degrees), _WRENCHES]))
+
+
+@pytest.mark.parametrize(("titles", "rows"), [
+    _franka(), _angles(("roll [rad]", "pitch [rad]", "yaw [rad]"), "xyz", False),
+    _angles(("roll_deg", "pitch_deg", "yaw_deg"), "xyz", True),
+    _angles(("A [deg]", "B [deg]", "C [deg]"), "ZYX", True)])
+def test_rotations_of_other_robots(tmp_path, titles, rows):
+    """Franka's transform by columns, angles about fixed axes, KUKA's angles."""
+    path = written(tmp_path, "\n".join([",".join(["t_s", *titles]), *(
+        ",".join(f"{value:.12g}" for value in (k, *row)) for k, row in enumerate(rows))]) + "\n")
+    stream = robot_stream(path)
+    assert not stream.warnings
+    np.testing.assert_allclose(stream.values[:, :3], _PLACES, atol=1e-9)
+    turns = Rotation.from_rotvec(stream.values[:, 3:6])
+    assert (turns * _TURNS.inv()).magnitude().max() < 1e-6
+    np.testing.assert_allclose(stream.values[:, 6:], _WRENCHES, atol=1e-9)
+
+
+def test_degrees_without_a_unit_are_not_radians(tmp_path):
+    titles, rows = _angles(("roll", "pitch", "yaw"), "xyz", True)
+    path = written(tmp_path, "\n".join([",".join(["t_s", *titles]), *(
+        ",".join(map(str, (k, *row))) for k, row in enumerate(rows))]) + "\n")
+    with pytest.raises(InputError, match=r"reach .* roll \[deg\]"):
+        robot_stream(path)
