@@ -252,9 +252,9 @@ def test_what_is_off_is_found_and_named(found):
     held = [each["interval"][0] - 2e-3 < value < each["interval"][1] + 2e-3
             for name, value in true.items() if (each := errors[name])]
     assert sum(held) >= 2
-    sentences = " ".join(in_words(found.cell_errors))
-    assert "force zero x" in sentences
-    assert re.search(r"an error of [+-][\d.e+-]+ N ", sentences)
+    sentence = in_words(found.cell_errors)
+    assert re.search(r"force zero x [+-][\d.e+-]+ N \(± ", sentence)
+    assert in_words([]) is None
 
 
 def test_causes_add_up_to_the_variance(found):

@@ -209,8 +209,8 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
             f"The residuals are {found.uncertainty.variance_factor**0.5:.1f} times the stated "
             "noise. Either the model lacks an effect, or the sensors are noisier than stated. The "
             "intervals are widened by this factor.")
-    for sentence in in_words(found.cell_errors):
-        progress.warn(sentence)
+    if (corrected := in_words(found.cell_errors)) is not None:
+        progress.warn(corrected)
     if (creep := found.creep) is not None:
         progress.warn(creep_sentence(creep))
     named = outliers(found.fit.evaluation, found.objective)

@@ -34,6 +34,7 @@ UNLIKELY = 10.0
 off, with moduli five times too high and narrow intervals.
 """
 
+_MOST_NAMED = 4
 CREEP = "creep of the branch"
 CREEP_SIGMA = 0.1
 """Prior deviation of the share by which the force under a lasting bend falls: of green wood within
@@ -344,12 +345,16 @@ def nuisance_records(nuisances: Sequence[Nuisance], found: Eliminated,
     return listed
 
 
-def in_words(listed: Sequence[dict]) -> list[str]:
-    """Return a sentence for each error without which the fit would be poor, largest first."""
+def in_words(listed: Sequence[dict]) -> str | None:
+    """Return a sentence with the errors without which the fit would be poor, largest first."""
     named = sorted((each for each in listed
                     if each["explains_misfit"] and each["name"] != CREEP),
                    key=lambda each: -abs(each["value"] / each["prior_sigma"]))
-    return [_sentence(each) for each in named]
+    if not named:
+        return None
+    more = f"; {len(named) - _MOST_NAMED} more stand in estimate.json" if len(named) > _MOST_NAMED else ""
+    return ("The fit found these errors of the measurement and corrected for them; the intervals "
+            f"include them: {'; '.join(map(_shown, named[:_MOST_NAMED]))}{more}.")
 
 
 def unlikely(listed: Sequence[dict]) -> str | None:
@@ -372,10 +377,8 @@ _SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "degrees"), "N": (1.0, "N"),
           "N m": (1.0, "N m"), "s": (1e3, "ms"), "": (100.0, "%")}
 
 
-def _sentence(each: dict) -> str:
+def _shown(each: dict) -> str:
     scale, unit = _SHOWN[each["unit"]]
     width = scale * (each["interval"][1] - each["value"])
-    whose = f"{each['pull']}: the" if each["pull"] else "The"
-    return (f"{whose} {each['name']} seems to have an error of {scale * each['value']:+.2g} "
-            f"{unit} (± {width:.1g} {unit}). The fit corrects for it, so that it does not affect "
-            "the moduli.")
+    whose = f"{each['pull']}, " if each["pull"] else ""
+    return f"{whose}{each['name']} {scale * each['value']:+.2g} {unit} (± {width:.1g} {unit})"
