@@ -13,7 +13,7 @@ from limber.planning.certificate.goal_cells import about_goal
 from limber.planning.certificate.grid import first_grid, refined
 from limber.planning.certificate.lower_bound import certify
 from limber.planning.constraints.limits import Limits
-from limber.planning.cost import CostWeights, arc_lengths, resample
+from limber.planning.cost import CostWeights, arc_lengths, path_cost, resample
 from limber.planning.field.energy_field import knowing
 from limber.planning.field.interpolation.valid_region import TrustRegion
 from limber.planning.goals.grasp_goal import GraspGoal
@@ -53,6 +53,19 @@ def bulges(problem, count):
     for _ in range(count):
         side = 0.05 * generator.normal(size=3)
         yield problem.start + part * (end - problem.start) + np.sin(np.pi * part) * side
+
+
+def test_the_bound_from_anywhere_is_as_close_as_the_certificate(across):
+    """On the finest grid that has a place: at the start the certificate's own, along the path never
+    over what is left of its cost."""
+    problem, found = across
+    path = resample(found.points, 0.002)
+    bound = found.certificate.to_go.at(path)
+    left = found.cost - np.array([path_cost(path[:k + 1], problem.limits, problem.weights)
+                                  for k in range(len(path))])
+    assert bound[0] == pytest.approx(found.certificate.lower, rel=2e-3)
+    assert (bound <= left + 2e-3 * found.cost).all()
+    assert (bound >= left - 0.1 * found.cost).all()
 
 
 def test_bound_is_below_and_plan_within_a_percent_of_an_independent_optimum(across):

@@ -1,8 +1,8 @@
 """Search results saved beside a plan: ``plans/NAME-trees.csv`` and ``plans/NAME-bound.npz``.
 
 The trees: one row per node with its planner, its position, and the row of its parent (-1: none).
-The bound: least cost of a path from any position, on the first grid of the certificate, which
-covers the whole sampled region.
+The bound: least cost of a path from any position, on the grids of the certificate. The first
+covers the whole sampled region, each later one what was left of it.
 """
 
 from dataclasses import dataclass
@@ -15,55 +15,110 @@ from limber.core.files.reading import csv_records, read_arrays, require_shapes
 
 _POSITION = ("x_m", "y_m", "z_m")
 _WHAT = "the bound of a plan"
+_OF_GRID = ("origin_m", "edges_m", "costs", "has_cost", "known")
+
+
+@dataclass(frozen=True)
+class BoundGrid:
+    """The bound on one grid: a quadratic B-spline with one coefficient a cell, at its centre.
+
+    Attributes:
+        origin: Corner of the first cell [m], shape [3].
+        edges: Edges of a cell [m], shape [3].
+        costs: Coefficients; NaN where there is none, shape [nx, ny, nz].
+        known: Cells in which the bound holds, bool, of that shape.
+    """
+
+    origin: np.ndarray
+    edges: np.ndarray
+    costs: np.ndarray
+    known: np.ndarray
+
+    def at(self, points: np.ndarray, axes: np.ndarray, *, fills: bool) -> np.ndarray:
+        """Return it at ``points`` [n, 3]; NaN in cells where it is not known.
+
+        With ``fills``, a missing coefficient is that of the nearest cell, and the bound is known in
+        the whole grid.
+        """
+        from scipy.ndimage import distance_transform_edt, map_coordinates
+
+        costs, known = self.costs, self.known
+        if fills:
+            costs = costs[tuple(distance_transform_edt(
+                np.isnan(costs), return_distances=False, return_indices=True))]
+            known = np.ones_like(known)
+        numbers = (points - self.origin) @ axes.T / self.edges
+        cells, last = np.floor(numbers).astype(int), np.array(costs.shape) - 1
+        inside = ((cells >= 0) & (cells <= last)).all(axis=1)
+        inside &= known[tuple(np.clip(cells, 0, last).T)]
+        values = map_coordinates(np.nan_to_num(costs), numbers.T - 0.5, order=2, prefilter=False,
+                                 mode="nearest")
+        return np.where(inside, np.maximum(values, 0.0), np.nan)
 
 
 @dataclass(frozen=True)
 class CostToGo:
-    """A lower bound on the cost of any path to the goal, from the centres of a grid's cells.
+    """A lower bound on what a path still costs from a place to the goal.
+
+    The first grid's holds for every path. A later grid has the places where a path could still be
+    cheaper than the known one; its bound is of paths from the start that are no dearer than that.
 
     Attributes:
-        origin: Corner of the first cell [m], shape [3].
-        axes: Axes of the grid, unit, as rows, shape [3, 3].
-        spacing: Edge of a cell [m].
-        costs: NaN where no path leads, shape [nx, ny, nz].
+        axes: Axes of all grids, unit, as rows, shape [3, 3].
+        grids: From the coarsest, which has cubes for cells.
     """
 
-    origin: np.ndarray
     axes: np.ndarray
-    spacing: float
-    costs: np.ndarray
+    grids: tuple[BoundGrid, ...]
 
     def at(self, points: np.ndarray) -> np.ndarray:
-        """Return it at ``points`` [n, 3] between the centres, for pictures.
+        """Return the largest bound of all grids at ``points`` [n, 3], for pictures.
 
-        A region may be thinner than a cell: an unknown cell takes the value of the nearest known
-        one. NaN outside the grid.
+        A region may be thinner than a cell of the first grid: there the nearest known cell counts.
+        NaN outside that grid.
         """
-        from scipy.ndimage import distance_transform_edt, map_coordinates
-
-        nearest = distance_transform_edt(np.isnan(self.costs), return_distances=False,
-                                         return_indices=True)
-        indices = ((points - self.origin) @ self.axes.T) / self.spacing - 0.5
-        return map_coordinates(self.costs[tuple(nearest)], indices.T, order=1, cval=np.nan)
+        out = self.grids[0].at(points, self.axes, fills=True)
+        for grid in self.grids[1:]:
+            out = np.fmax(out, grid.at(points, self.axes, fills=False))
+        return out
 
     def write(self, path: Path) -> None:
-        """Write it as plain arrays; -1 where it is not known."""
-        np.savez_compressed(path, origin_m=self.origin, axes=self.axes,
-                            costs=np.nan_to_num(self.costs, nan=-1.0),
-                            spacing_m=np.array(self.spacing))
+        """Write it as plain arrays; 0 where there is no coefficient. Later grids have a number."""
+        arrays = {"axes": self.axes}
+        for number, grid in enumerate(self.grids):
+            arrays |= {_numbered("origin_m", number): grid.origin,
+                       _numbered("edges_m", number): grid.edges,
+                       _numbered("costs", number): np.nan_to_num(grid.costs),
+                       _numbered("has_cost", number): np.isfinite(grid.costs),
+                       _numbered("known", number): grid.known}
+        np.savez_compressed(path, **arrays)
 
     @classmethod
     def read(cls, path: Path) -> "CostToGo":
-        """Read a file that :meth:`write` wrote.
+        """Read a file that :meth:`write` wrote, or an older version with one grid of cubes.
 
         Raises:
             InputError: the file is damaged.
         """
         arrays = read_arrays(path, _WHAT)
-        require_shapes(path, arrays, {"origin_m": (3,), "axes": (3, 3), "spacing_m": (),
-                                      "costs": ("x", "y", "z")}, _WHAT)
-        costs = np.where(arrays["costs"] < 0.0, np.nan, arrays["costs"])
-        return cls(arrays["origin_m"], arrays["axes"], float(arrays["spacing_m"]), costs)
+        if "known" not in arrays:
+            require_shapes(path, arrays, {"spacing_m": (), "costs": ("x", "y", "z")}, _WHAT)
+            own = arrays["costs"] >= 0.0
+            arrays |= {"edges_m": np.full(3, arrays["spacing_m"]), "has_cost": own, "known": own}
+        grids: list[BoundGrid] = []
+        while not grids or _numbered("costs", len(grids)) in arrays:
+            origin, edges, costs, has_cost, known = names = [
+                _numbered(name, len(grids)) for name in _OF_GRID]
+            require_shapes(path, arrays, {"axes": (3, 3)} | dict(zip(
+                names, ((3,), (3,), *3 * [("x", "y", "z")]), strict=True)), _WHAT,
+                flags=(has_cost, known))
+            grids.append(BoundGrid(arrays[origin], arrays[edges], np.where(
+                arrays[has_cost], arrays[costs], np.nan), arrays[known].astype(bool)))
+        return cls(arrays["axes"], tuple(grids))
+
+
+def _numbered(name: str, number: int) -> str:
+    return f"{name}_{number}" if number else name
 
 
 def read_trees(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -42,7 +42,7 @@ from limber.planning.path_problem import (
     no_path_error,
     not_found,
 )
-from limber.planning.search_files import CostToGo
+from limber.planning.search_files import BoundGrid, CostToGo
 
 _MOST_CELLS = 400_000  # in any grid's tube; a further refinement is skipped
 _LEVELS = 6
@@ -64,7 +64,7 @@ class Certificate:
         upper: Cost of the best known path, infinite without one.
         levels: For each grid ``spacing_m``, ``open_cells``, ``lower``, ``upper`` and when [s].
         field_error_j: Subtracted from the energy before bounding [J].
-        to_go: The bound from any position, on the first grid.
+        to_go: The bound from any position, on all grids; None if the first has none.
         stopped: Whether it was cancelled before the gap was small enough.
         quantity: Bounded quantity, ``COST`` or ``ENERGY``.
     """
@@ -134,7 +134,7 @@ def certify_all(problems: Sequence[GentleProblem], improve: Sequence[Improve], *
         if not all(one.levels and one.upper < np.inf for one in searches):
             raise Cancelled from stop
         stopped = True
-    return [Certificate(one.lower, one.upper, one.levels, one.problem.field_error, one.to_go,
+    return [Certificate(one.lower, one.upper, one.levels, one.problem.field_error, one.to_go(),
                         stopped) for one in searches]
 
 
@@ -192,7 +192,8 @@ class _Search:
     lower: float = 0.0
     upper: float = np.inf
     levels: list[dict[str, float]] = field(default_factory=list)
-    to_go: CostToGo | None = None
+    axes: np.ndarray = field(default_factory=lambda: np.eye(3))
+    bounds: list[BoundGrid] = field(default_factory=list)
     began: float = field(default_factory=perf_counter)
 
     @property
@@ -201,8 +202,8 @@ class _Search:
 
     def take(self, found: "_Bounds", grid: Grid, *, is_first: bool) -> None:
         """Keep the bound on a grid, and refine the path that it shows."""
-        if self.to_go is None:
-            self.to_go = found.to_go(grid)
+        self.axes = grid.axes
+        self.bounds.append(found.to_go(grid))
         if is_first:
             self.upper = self.improve(None)  # after a bound that may prove that there is no path
         self.upper = min(self.upper, self.improve(found.rough_path))
@@ -217,6 +218,9 @@ class _Search:
         if not np.isfinite(gap):
             return FINEST
         return float(np.clip(_RESERVE * np.sqrt(self.enough / gap), FINEST, COARSEST))
+
+    def to_go(self) -> CostToGo | None:
+        return CostToGo(self.axes, tuple(self.bounds)) if self.bounds else None
 
     def note(self, grid: Grid, open_cells: int) -> None:
         self.levels.append({"spacing_m": grid.spacing, "open_cells": open_cells,
@@ -254,11 +258,15 @@ class _Bounds:
     def open_cells(self) -> np.ndarray:
         return self.ground.open_cells
 
-    def to_go(self, grid: Grid) -> CostToGo:
-        """Return the bound at the centres of open cells."""
-        reached = self.open_cells & np.isfinite(self.to_goal)
-        costs = np.where(reached, np.maximum(self.to_goal - self.slack, 0.0), np.nan)
-        return CostToGo(grid.origin, grid.axes, grid.spacing, costs)  # of cubes: the first grid
+    def to_go(self, grid: Grid) -> BoundGrid:
+        """Return the bound in open cells, in the smallest box with their coefficients."""
+        cells = np.argwhere(self.open_cells)
+        low, high = cells.min(axis=0) - 1, cells.max(axis=0) + 2
+        box = tuple(map(slice, low, high))
+        has_cost = np.isfinite(self.to_goal[box])
+        known = self.open_cells[box] & scipy.ndimage.binary_erosion(has_cost, _NEAR)
+        costs = np.where(has_cost, self.to_goal[box] - self.slack, np.nan).astype(np.float32)
+        return BoundGrid(grid.points(low[None])[0], grid.edges, costs, known)
 
     def keep(self, upper: float) -> np.ndarray:
         """Return the cells through which a path could still be cheaper than ``upper``."""

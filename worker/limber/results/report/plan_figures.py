@@ -51,9 +51,13 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
             bound = CostToGo.read(branch.path(f"plans/{name}-bound.npz"))
             if (drawn := paths_over_bound(field, bound, plan)) is not None:
                 figures.append((drawn,
-                                "Both paths over the lower bound on the cost of any path from "
-                                "there to the goal, in the same plane. The gentlest path follows "
-                                "its steepest descent."))
+                                "Both paths over the lower bound on the cost from there to the "
+                                "goal, in the same plane. Where a path could still be cheaper than "
+                                "the gentle one, the bound is of such paths; elsewhere it is of "
+                                "all paths, on coarser grids. The gentlest path follows its "
+                                "steepest descent." + (
+                                    " A metre costs as much as the limit on the length makes it."
+                                    if plan.summary.get("detour") else "")))
         what = "Energy" if plan.summary.get("detour") else "Cost"
         within = " within the allowed length" if plan.summary.get("detour") else ""
         figures.append((certificate(plan),
