@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import platform
 import subprocess
 import sys
 import warnings
@@ -55,6 +56,46 @@ def test_a_moved_type_is_compiled_anew(tmp_path):
     assert run("before") == ["3.0", "0"]
     assert run("after") == ["3.0", "0"]
     assert run("after") == ["3.0", "1"]
+
+
+INNER = """
+from limber.core.numerics.compiled import compiled
+
+FACTOR = {factor}
+
+@compiled
+def inner(value):
+    return FACTOR * value + {added}
+"""
+OUTER = """
+from limber.core.numerics.compiled import compiled
+from inner import inner
+
+@compiled
+def outer(value):
+    return inner(value)
+
+print(outer(1.0), len(outer._cache_hits))
+"""
+
+
+@pytest.mark.slow
+def test_another_files_change_is_noticed_and_a_new_date_is_not(tmp_path):
+    """A kernel that is inlined from another file, and a constant of that file; numba alone looks at
+    the date of the kernel's own file."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+                                "PYTHONDONTWRITEBYTECODE": "1"}
+    (tmp_path / "outer.py").write_text(OUTER)
+
+    def run(factor, added):
+        (tmp_path / "inner.py").write_text(INNER.format(factor=factor, added=added))
+        os.utime(tmp_path / "outer.py")
+        return subprocess.run([sys.executable, str(tmp_path / "outer.py")], check=True, text=True,
+                              env=environment, capture_output=True).stdout.split()
+    assert run(2.0, 1.0) == ["3.0", "0"]
+    assert run(2.0, 1.0) == ["3.0", "1"]
+    assert run(2.0, 5.0) == ["7.0", "0"]
+    assert run(3.0, 5.0) == ["8.0", "0"]
 
 
 @pytest.mark.slow
@@ -130,6 +171,36 @@ def test_a_damaged_file_is_renewed_and_told_once(kept, suffix, damage):
     assert results == (3.0, 4) and compiled_count == 2
     assert len(told) == 1 and str(files[0].parent) in told[0] and "compiled again" in told[0]
     assert run() == ((3.0, 4), 0, [])
+
+
+def test_shipped_kernels_are_used_and_never_changed(kept, monkeypatch, tmp_path):
+    """Compiled elsewhere; a type that they lack is compiled into the user's folder."""
+    run, folder = kept
+    shipped = tmp_path / "shipped"
+    (folder / "numba").rename(shipped)
+    next(shipped.glob("*.2.nbc")).unlink()
+    before = {path.name: path.read_bytes() for path in shipped.iterdir()}
+    compiled.cache_folder().mkdir()
+    monkeypatch.setattr(compiled, "SHIPPED", shipped)
+    assert run() == ((3.0, 4), 1, [])
+    assert len(list(folder.rglob("*.nbc"))) == 1
+    assert run() == ((3.0, 4), 0, [])
+    assert {path.name: path.read_bytes() for path in shipped.iterdir()} == before
+
+
+@pytest.mark.slow
+def test_all_processors_of_a_kind_get_the_same_instructions():
+    """As the kernels' files say, which may come from another machine; a user's choice stands."""
+    code = ("import limber.core.numerics.compiled, numba.core.registry as registry;"
+            "print(*registry.cpu_target.target_context.codegen().magic_tuple()[1:])")
+
+    def said(**extra):
+        known = {name: value for name, value in os.environ.items() if "NUMBA_CPU" not in name}
+        return subprocess.run([sys.executable, "-c", code], check=True, text=True,
+                              env=known | extra, capture_output=True).stdout.strip()
+    if platform.machine().lower() in ("x86_64", "amd64"):
+        assert said() == "x86-64-v3"
+    assert said(NUMBA_CPU_NAME="generic") == "generic"
 
 
 def test_a_missing_data_file_is_made_again(kept):

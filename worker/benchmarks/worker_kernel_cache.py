@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.table import Asked, Row, Setting
-from limber.core.numerics.compiled import cache_folder
+from limber.core.numerics.compiled import KernelCache, cache_folder
 
 KERNELS_ROW = Asked("kernel cache files cut, emptied, of noise or another version (100 asked): "
                     "commands that fail", "0")
@@ -64,12 +64,13 @@ def kernels(setting: Setting, template: Path) -> list[Row]:
     failed, warned, damaged = [], 0, 0
     with tempfile.TemporaryDirectory(prefix="limber-kernels-") as place:
         kept = Path(place, "numba")
-        for name in _own_folders(source):
-            if (source / name).is_dir():
-                shutil.copytree(source / name, kept / name)
+        kept.mkdir()
+        for name in _own_names():
+            for path in source.glob(f"{name}.*"):
+                shutil.copy(path, kept)
         folder = Path(shutil.copytree(template, Path(place, "a.branch")))
         wanted, _ = _predicted(folder, kept)
-        files = sorted(kept.rglob("*.nb[ic]"))
+        files = sorted(kept.glob("*.nb[ic]"))
         for number in setting.budget.seeds(0, setting.at_most(100, 10) // _AT_ONCE):
             rng = setting.generator(number)
             setting.progress(damaged / 100, f"{damaged} files")
@@ -100,13 +101,12 @@ def _predicted(folder: Path, kept: Path) -> tuple[dict, str]:
             if name not in ("seconds", "warnings")}, done.stderr
 
 
-def _own_folders(source: Path) -> set[str]:
-    """Names of the folders of the kernels that `limber predict` imports, of this Limber."""
+def _own_names() -> set[str]:
+    """Names of the files of the kernels that `limber predict` imports, of this Limber."""
     import limber.stages.moduli.predict
     import limber.store.loading  # noqa: F401
 
     kernels = (value for name, module in list(sys.modules.items()) if name.startswith("limber.")
                for value in vars(module).values())
-    places = (getattr(getattr(kernel, "_cache", None), "cache_path", None) for kernel in kernels)
-    return {Path(place).relative_to(source).parts[0] for place in places
-            if isinstance(place, str) and Path(place).is_relative_to(source)}
+    caches = (getattr(kernel, "_cache", None) for kernel in kernels)
+    return {cache.name for cache in caches if isinstance(cache, KernelCache)}

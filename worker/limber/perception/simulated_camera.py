@@ -1,8 +1,8 @@
 """A depth camera in software: what a D455 would see of a surface, with its noise."""
 
 import numpy as np
-from numba import njit
 
+from limber.core.numerics.compiled import compiled_exactly
 from limber.geometry.cloud.camera import Camera, project
 
 
@@ -52,7 +52,7 @@ def with_noise(camera: Camera, depth: np.ndarray, rng: np.random.Generator, *,
     return np.round(noisy * camera.depth_scale) / camera.depth_scale
 
 
-@njit(cache=True)
+@compiled_exactly
 def _rasterise(image: np.ndarray, pixels: np.ndarray, depth: np.ndarray, faces: np.ndarray) -> None:
     height, width = image.shape
     for face in range(len(faces)):

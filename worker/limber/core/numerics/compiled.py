@@ -1,9 +1,12 @@
-"""Compilation of the kernels: once, into the user's cache folder.
+"""Compilation of the kernels: once, into the user's cache folder, or before the installation.
 
 By default numba stores compiled code beside the source. An installed Limber may be read-only, and
 Blender's Python differs from the user's, so the user's cache folder is used instead; an explicit
 NUMBA_CACHE_DIR takes precedence. If no folder is writable, the kernels are compiled for the
-process.
+process. The extension's zip brings compiled kernels (:data:`SHIPPED`).
+
+All x86-64 processors with AVX2 get the same instructions, so that kernels compiled on one machine
+run on another, and give the same digits on all. Wider vectors gained nothing.
 """
 
 import contextlib
@@ -11,19 +14,33 @@ import functools
 import hashlib
 import io
 import os
+import platform
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import llvmlite.binding
 import numba
 import numpy as np
 import platformdirs
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    _CacheLocator,
+)
+from numba.core.dispatcher import Dispatcher
 from numba.core.event import Event, Listener, register
 
 from limber.core.errors import DamagedCacheWarning
+
+SHIPPED = Path(__file__).parents[3] / "limber_kernels"
+"""Folder beside the installed package with kernels compiled for this system and Python, if any."""
+_PROCESSOR = "x86-64-v3"
+_NEEDED = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
+"""Features that the processor needs for this instruction set, by LLVM's names."""
 
 
 def cache_folder() -> Path | None:
@@ -53,21 +70,38 @@ def _layout() -> str:
 
 
 def compiled(function: Callable) -> Callable:
-    """Compile ``function`` with numba; the result is stored in :func:`cache_folder`."""
-    folder = cache_folder()
+    """Compile ``function`` with numba, with sums in any order; it is kept in :func:`cache_folder`.
+    """
     # Always inlined: otherwise a kernel that another calls would exist twice, optimised in two
     # ways. Which one runs (and thus the last digits) would depend on whether it was compiled in
     # this process or loaded.
-    options = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"},
-               "forceinline": True}
-    if folder is None:
-        return numba.njit(**options)(function)
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(folder)
-    try:
-        return _forgiving(numba.njit(cache=True, **options)(function))
-    finally:
-        numba.config.CACHE_DIR = before
+    return _kept(numba.njit(error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"},
+                            forceinline=True)(function))
+
+
+def compiled_exactly(function: Callable) -> Callable:
+    """As :func:`compiled`, with all operations rounded in the order in which they are written."""
+    return _kept(numba.njit(function))
+
+
+def _kept(kernel: Any) -> Any:
+    """Let a kernel be stored, where there is a folder and numba compiles at all."""
+    if isinstance(kernel, Dispatcher) and cache_folder() is not None:
+        kernel._cache = KernelCache(kernel.py_func)
+    return kernel
+
+
+def _choose_instructions() -> None:
+    """Compile for the instruction set of :data:`_PROCESSOR`, unless the user has chosen one."""
+    features = llvmlite.binding.get_host_cpu_features()
+    if (numba.config.CPU_NAME is None and platform.machine().lower() in ("x86_64", "amd64")
+            and all(features.get(name) for name in _NEEDED)):
+        # In the environment, which numba reads again when it changes, and child processes too.
+        os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = _PROCESSOR, ""
+        numba.config.reload_config()
+
+
+_choose_instructions()
 
 
 def when_compiling(tell: Callable[[], None]) -> None:
@@ -145,35 +179,96 @@ def _tell_damage(message: str) -> None:
         warnings.warn(message, DamagedCacheWarning, stacklevel=2)
 
 
-def _forgiving(kernel: Any) -> Any:
-    """Compile a kernel again if its cached form is unusable, or do not cache it.
+@functools.cache
+def _digest_of(path: str) -> bytes:
+    return hashlib.sha256(Path(path).read_bytes()).digest()
 
-    Argument types are cached by module and name. After an update that moves one, numba reads the
-    old entry before it notices the changed source, and fails.
+
+def _stamp(function: Any) -> str:
+    """Return a digest of a kernel's file and of what it takes from others: kernels and constants.
+
+    numba alone would use a kernel's old code after a change in another file's kernel, which was
+    inlined, and compile it again after each installation, as it compares the file's date.
     """
-    cache = getattr(kernel, "_cache", None)  # missing where numba is told not to compile
-    if cache is None:
-        return kernel
-    cache._cache_file = _CheckedFile(cache.cache_path, cache._impl.filename_base,
-                                     cache._impl.locator.get_source_stamp())
-    load, save = cache.load_overload, cache.save_overload
+    digest = hashlib.sha256(_digest_of(function.__code__.co_filename))
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    used = [function.__globals__.get(name) for name in function.__code__.co_names]
+    for value in (*cells, *used):
+        if isinstance(value, Dispatcher):
+            digest.update(getattr(value._cache, "stamp", "").encode())
+        elif isinstance(value, np.ndarray):
+            digest.update(value.tobytes())
+        elif isinstance(value, int | float | str | tuple):
+            digest.update(repr(value).encode())
+    return digest.hexdigest()[:16]
 
-    def load_or_forget(signature: Any, target: Any) -> Any:
-        try:
-            return load(signature, target)
-        except (ImportError, AttributeError):
-            cache.flush()
-            return None
 
-    def save_or_tell(signature: Any, data: Any) -> None:
+class _Place(_CacheLocator):
+    """Says where numba stores a kernel: in one folder, by its name and stamp."""
+
+    def __init__(self, function: Any, path: str):
+        self._py_file = path
+        self._line = function.__code__.co_firstlineno
+        self._stamp, self._folder = _stamp(function), cache_folder()
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> "_Place":
+        return cls(py_func, py_file)
+
+    def get_cache_path(self) -> str:
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        return self._stamp
+
+    def get_disambiguator(self) -> str:
+        return f"{self._line}-{self._stamp}"
+
+
+class _Stored(CompileResultCacheImpl):
+    _locator_classes = (_Place,)
+
+
+class KernelCache(FunctionCache):
+    """A kernel's compiled code: shipped, or else the user's.
+
+    It is compiled again if it is unusable, and not stored if that fails. Argument types are
+    stored by module and name: after an update that moves one, they cannot be read.
+
+    Attributes:
+        name: Beginning of the names of its files.
+        stamp: Digest of what it was compiled from.
+    """
+
+    _impl_class = _Stored
+
+    def __init__(self, function: Any):
+        super().__init__(function)
+        self.stamp = self._impl.locator.get_source_stamp()
+        self.name = self._impl.filename_base
+        self._files = [_CheckedFile(folder, self.name, self.stamp)
+                       for folder in (str(SHIPPED), self.cache_path)]
+        self._cache_file = self._files[-1]
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        for files in self._files:
+            # The last one, the user's, is also where numba stores.
+            self._cache_file = files
+            try:
+                if (found := super().load_overload(sig, target_context)) is not None:
+                    return found
+            except (ImportError, AttributeError):
+                if files is self._files[-1]:
+                    self.flush()
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
         try:
-            save(signature, data)
+            super().save_overload(sig, data)
         except OSError as error:
             # The kernel is compiled; without caching it only costs time.
-            _tell_damage(f"Compiled code cannot be stored in {cache.cache_path} "
+            _tell_damage(f"Compiled code cannot be stored in {self.cache_path} "
                          f"({error.strerror}). Every run compiles it again.")
-    cache.load_overload, cache.save_overload = load_or_forget, save_or_tell
-    return kernel
 
 
 def for_kernels(array: np.ndarray) -> np.ndarray:

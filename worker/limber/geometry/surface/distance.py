@@ -1,9 +1,9 @@
 """Distance of points from a triangle surface: exact, by a grid of cells."""
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 
+from limber.core.numerics.compiled import compiled_exactly
 from limber.geometry.surface.face_crossings import by_cell
 from limber.geometry.surface.surface import Surface
 
@@ -27,7 +27,7 @@ def distance_to_surface(points: np.ndarray, surface: Surface) -> np.ndarray:
                       owner[order])
 
 
-@njit(cache=True)
+@compiled_exactly
 def _distances(points: np.ndarray, bound: np.ndarray, corner: np.ndarray, origin: np.ndarray,
                cell: float, counts: np.ndarray, keys: np.ndarray, owner: np.ndarray) -> np.ndarray:
     found = np.empty(len(points))
@@ -49,7 +49,7 @@ def _distances(points: np.ndarray, bound: np.ndarray, corner: np.ndarray, origin
     return found
 
 
-@njit(cache=True)
+@compiled_exactly
 def _square(p: np.ndarray, corner: np.ndarray) -> float:
     """Square of the distance of a point from a triangle (Ericson, Real-Time Collision Detection,
     5.1.5)."""

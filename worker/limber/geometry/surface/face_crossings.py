@@ -1,12 +1,13 @@
 """Crossings of a surface's faces: a grid of cells, and Moeller and Trumbore's test within them."""
 
 import numpy as np
-from numba import njit
+
+from limber.core.numerics.compiled import compiled_exactly
 
 _EDGE = 1e-7  # touching is not crossing: faces of a union meet at rounding distance
 
 
-@njit(cache=True)
+@compiled_exactly
 def by_cell(first: np.ndarray, last: np.ndarray, counts: np.ndarray,
             ) -> tuple[np.ndarray, np.ndarray]:
     """Grid cells that the boxes of faces overlap.
@@ -35,7 +36,7 @@ def by_cell(first: np.ndarray, last: np.ndarray, counts: np.ndarray,
     return keys, owner
 
 
-@njit(cache=True)
+@compiled_exactly
 def pierced(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray,
             first: np.ndarray, counts: np.ndarray, keys: np.ndarray, owner: np.ndarray,
             ) -> np.ndarray:
@@ -80,7 +81,7 @@ def pierced(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.n
     return points
 
 
-@njit(cache=True)
+@compiled_exactly
 def _compare(vertices: np.ndarray, faces: np.ndarray, one: int, other: int, found: list) -> None:
     """Add the points where edges of ``one`` pass through ``other`` (Moeller and Trumbore 1997)."""
     o, p, q = faces[other, 0], faces[other, 1], faces[other, 2]

@@ -1,7 +1,8 @@
 """Distances from round cylinders, and the level function of a fillet between them."""
 
 import numpy as np
-from numba import njit
+
+from limber.core.numerics.compiled import compiled_exactly
 
 
 def segments(points: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -26,7 +27,7 @@ def near_box(cones: np.ndarray, low: np.ndarray, high: np.ndarray, reach: float)
     return cones[distance <= max(reach, float(distance.min()))]
 
 
-@njit(cache=True)
+@compiled_exactly
 def nearest(cones: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Distance [m] of a point from cones, negative inside; radius and position along there [m]."""
     best, radius, along = np.inf, 0.0, 0.0
@@ -45,7 +46,7 @@ def nearest(cones: np.ndarray, x: float, y: float, z: float) -> tuple[float, flo
     return best, radius, along
 
 
-@njit(cache=True)
+@compiled_exactly
 def distances(cones: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances [m] of points [n, 3] from cones, negative inside, and the radii there [m]."""
     distance, radius = np.empty(len(points)), np.empty(len(points))
@@ -54,7 +55,7 @@ def distances(cones: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
     return distance, radius
 
 
-@njit(cache=True)
+@compiled_exactly
 def fillet_level(points: np.ndarray, twig: np.ndarray, others: np.ndarray, first: np.ndarray,
                  excess: np.ndarray, base: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Level of the solid around the crease between a twig and others, shape [n].

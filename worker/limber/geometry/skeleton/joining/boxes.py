@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from limber.core.numerics.compiled import compiled_exactly
 
 Boxes = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """What :func:`boxes` returns."""
@@ -11,7 +12,7 @@ Boxes = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 _LEAF = 8  # most points of the last boxes
 
 
-@njit(cache=True)
+@compiled_exactly
 def boxes(points: np.ndarray, label: np.ndarray) -> Boxes:
     """Halve the points along their longest side, again and again.
 
@@ -53,7 +54,7 @@ def boxes(points: np.ndarray, label: np.ndarray) -> Boxes:
     return order, span, low, high, only
 
 
-@njit(cache=True)
+@compiled_exactly
 def nearest_in_box(point: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
     """Distance [m] of a point, shape [3], from a box with these corners; infinite if empty."""
     square = 0.0

@@ -4,8 +4,8 @@ import heapq
 import math
 
 import numpy as np
-from numba import njit
 
+from limber.core.numerics.compiled import compiled_exactly
 from limber.geometry.skeleton.joining.boxes import Boxes, nearest_in_box
 
 _TURN = math.radians(35.0)  # turn that doubles the price
@@ -23,7 +23,7 @@ _KEPT, _KEPT_OF_PIECE, _KEPT_OF_ALL = 256, 32, 50_000
 _ROUNDING = 1e-9  # relative error of a bound
 
 
-@njit(cache=True)
+@compiled_exactly
 def _turned(direction: np.ndarray, vector: np.ndarray, radius: float) -> float:
     """Angle [rad] from a direction to a path; an offset of up to a radius is no turn."""
     along = vector[0] * direction[0] + vector[1] * direction[1] + vector[2] * direction[2]
@@ -32,7 +32,7 @@ def _turned(direction: np.ndarray, vector: np.ndarray, radius: float) -> float:
     return math.atan2(max(math.sqrt(x * x + y * y + z * z) - radius, 0.0), along)
 
 
-@njit(cache=True)
+@compiled_exactly
 def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: np.ndarray,
            label: np.ndarray, end_node: np.ndarray, end_direction: np.ndarray,
            end_radius: np.ndarray, end_of: np.ndarray, limit: float, tree: Boxes,
@@ -106,7 +106,7 @@ def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: n
             meets[:count])
 
 
-@njit(cache=True)
+@compiled_exactly
 def _path(vector: np.ndarray, out: np.ndarray, radius: float, limit: float, thick: float,
           axis: np.ndarray, single: bool, end: int, end_direction: np.ndarray,
           end_radius: np.ndarray) -> tuple[float, float, float, float]:
@@ -136,7 +136,7 @@ def _path(vector: np.ndarray, out: np.ndarray, radius: float, limit: float, thic
             1.0 if comes < side else 0.0)
 
 
-@njit(cache=True)
+@compiled_exactly
 def _least_price(here: np.ndarray, out: np.ndarray, radius: float, limit: float, low: np.ndarray,
                  high: np.ndarray) -> float:
     """A lower bound of the price [m] of paths from an end into a box; infinite: none is allowed.
@@ -162,14 +162,14 @@ def _least_price(here: np.ndarray, out: np.ndarray, radius: float, limit: float,
     return (1 - _ROUNDING) * far * (1 + (turned / _TURN)**2)
 
 
-@njit(cache=True)
+@compiled_exactly
 def _kept_to(price: np.ndarray, label: np.ndarray, of_piece: np.ndarray, most: int) -> float:
     """The largest price [m] that an end keeps; infinite while it may keep more paths."""
     kept = _cheapest(price, label, of_piece, most)
     return price[kept].max() if len(kept) == most else np.inf
 
 
-@njit(cache=True)
+@compiled_exactly
 def _cheapest(price: np.ndarray, label: np.ndarray, of_piece: np.ndarray, most: int) -> np.ndarray:
     """Indices of an end's paths to keep, ascending; ``of_piece`` is a counter of zeros."""
     order = np.argsort(price, kind="mergesort")
@@ -187,7 +187,7 @@ def _cheapest(price: np.ndarray, label: np.ndarray, of_piece: np.ndarray, most: 
     return np.flatnonzero(kept)
 
 
-@njit(cache=True)
+@compiled_exactly
 def nearest_others(nodes: np.ndarray, label: np.ndarray, own: np.ndarray, limit: float,
                    count: int, tree: Boxes) -> tuple[np.ndarray, np.ndarray]:
     """Find the nodes of other pieces nearest to each of some nodes, nearest first.
@@ -239,7 +239,7 @@ def nearest_others(nodes: np.ndarray, label: np.ndarray, own: np.ndarray, limit:
     return near, distance
 
 
-@njit(cache=True)
+@compiled_exactly
 def far_sides(nodes: np.ndarray, spread: np.ndarray, label: np.ndarray, own: np.ndarray,
               ) -> np.ndarray:
     """Largest distance of the points of a node's piece from it [m], for each of ``own``, shape [m].

@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from limber.core.numerics.compiled import compiled_exactly
 
 _EVEN = 1e-9  # of a radius
 _WIDE, _FINE = 60.0, 150  # concentration (7 degrees); positions on the circle
@@ -11,7 +12,7 @@ _NORMAL, _TERMS = 30.0, 30  # concentration of the normal approximation; terms o
 _TOLD = 14.0  # log weight below the best position's at which a position still counts
 
 
-@njit(cache=True)
+@compiled_exactly
 def nearest_of(points: np.ndarray, near: np.ndarray, parent: np.ndarray, own_radius: np.ndarray,
                nodes: np.ndarray, radius: np.ndarray,
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -56,7 +57,7 @@ def nearest_of(points: np.ndarray, near: np.ndarray, parent: np.ndarray, own_rad
     return segment, share, normal, residual, thick
 
 
-@njit(cache=True)
+@compiled_exactly
 def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high: np.ndarray,
                   normal: np.ndarray, across: np.ndarray, gradient: np.ndarray,
                   weight: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +101,7 @@ def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high:
     return block, right
 
 
-@njit(cache=True)
+@compiled_exactly
 def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
                    density: np.ndarray) -> np.ndarray:
     """Mean of (cos, sin) over positions on a circle, each weighted by its likelihood for a point.
@@ -149,7 +150,7 @@ def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
     return mean
 
 
-@njit(cache=True)
+@compiled_exactly
 def reach_on_circle(angle: np.ndarray, sharpness: np.ndarray, bessel: np.ndarray, limit: float,
                     least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log-likelihood of points on a side seen up to a limit, and its derivatives.
@@ -179,7 +180,7 @@ def reach_on_circle(angle: np.ndarray, sharpness: np.ndarray, bessel: np.ndarray
     return log, by_angle, by_limit
 
 
-@njit(cache=True)
+@compiled_exactly
 def _below(angle: float, sharpness: float, bessel: float) -> float:
     """Fraction of a von Mises distribution around 0 below an angle, counting whole turns.
 
