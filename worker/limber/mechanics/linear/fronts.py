@@ -80,8 +80,9 @@ def make_fronts(starts: np.ndarray, rows: np.ndarray) -> Fronts:
     parent = _elimination_tree(by_rows.indptr.astype(np.int64), by_rows.indices.astype(np.int64))
     starts, rows = starts.astype(np.int64), rows.astype(np.int64)
     column_start, below = _column_structure(starts, rows, parent)
-    first = _supernodes(parent, np.diff(column_start), np.array([r[0] for r in _RELAX]),
-                        np.array([r[1] for r in _RELAX]))
+    below = _sorted_in_columns(column_start, below)
+    first = np.append(_supernodes(parent, np.diff(column_start), np.array([r[0] for r in _RELAX]),
+                                  np.array([r[1] for r in _RELAX])), count)
     last = first[1:] - 1
     widths = np.diff(first)
     lengths = np.diff(column_start)[last]
@@ -116,6 +117,15 @@ def _runs(begins: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Return the numbers of several runs, concatenated."""
     shift = np.repeat(begins - np.concatenate([[0], np.cumsum(lengths)[:-1]]), lengths)
     return np.arange(lengths.sum()) + shift
+
+
+def _sorted_in_columns(starts: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return the rows of each column, ascending."""
+    # Not in the kernel: to compile a sort takes a second.
+    count = len(starts) - 1
+    pattern = sp.csc_matrix((np.ones(len(rows), np.int8), rows, starts), (count, count))
+    pattern.sort_indices()
+    return pattern.indices.astype(np.int64)
 
 
 @compiled
@@ -165,7 +175,7 @@ def _postorder(parent):
 
 @compiled
 def _column_structure(starts, rows, parent):
-    """Return the factor's rows strictly below each column, sorted."""
+    """Return the factor's rows strictly below each column, in any order."""
     count = len(parent)
     head, following = np.full(count, -1), np.full(count, -1)
     mark = np.full(count, -1)
@@ -176,7 +186,8 @@ def _column_structure(starts, rows, parent):
         end = begin[j]
         if end + count > len(below):
             larger = np.empty(2 * len(below) + count, np.int64)
-            larger[:end] = below[:end]
+            for p in range(end):
+                larger[p] = below[p]
             below = larger
         for p in range(starts[j], starts[j + 1]):
             if mark[rows[p]] != j:
@@ -191,7 +202,6 @@ def _column_structure(starts, rows, parent):
                     below[end] = below[p]
                     end += 1
             child = following[child]
-        below[begin[j]:end] = np.sort(below[begin[j]:end])
         begin[j + 1] = end
         if parent[j] >= 0:
             following[j] = head[parent[j]]
@@ -201,7 +211,7 @@ def _column_structure(starts, rows, parent):
 
 @compiled
 def _supernodes(parent, lengths, widest, zeros_allowed):
-    """Return the first node of each supernode, and the node count."""
+    """Return the first node of each supernode."""
     count = len(parent)
     # A stack of supernodes: first node, last node, number of zero entries.
     first, last = np.empty(count, np.int64), np.empty(count, np.int64)
@@ -233,10 +243,7 @@ def _supernodes(parent, lengths, widest, zeros_allowed):
             last[top - 1] = last[top]
             zeros[top - 1] = total
             top -= 1
-    result = np.empty(top + 2, np.int64)
-    result[:top + 1] = first[:top + 1]
-    result[top + 1] = count
-    return result
+    return first[:top + 1].copy()
 
 
 @compiled
