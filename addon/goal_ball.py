@@ -20,7 +20,7 @@ TARGET_KEY = "limber_target"
 COLOUR = (0.02, 0.42, 0.08)
 _FIELDS = {"grasp": "goal", "tip": "tip_goal", "target": "tip_goal"}
 """Field of the plan for each kind of goal."""
-_OTHERS = ("goal", "tip_goal", "target_box", "goal_seed")
+_KINDS = ("goal", "tip_goal", "target_box", "goal_seed")
 """A plan takes one of these."""
 _KEYS = (_PLACE_KEY, _FIELD_KEY, TARGET_KEY)
 
@@ -73,10 +73,30 @@ def follow(scene: bpy.types.Scene) -> None:
     ball = None if surface is None else of(branches.branch_of(surface))
     if ball is None or list(ball[_PLACE_KEY]) == list(ball.location):
         return
+    _tell(scene.limber.plan, ball)
+
+
+def put(scene: bpy.types.Scene, surface: bpy.types.Object, field: str, place: Vector) -> None:
+    """Set the plan's goal, of the grasp (``goal``) or of a target (``tip_goal``), to ``place`` in
+    the branch's frame [m]: its ball goes there, made where there is none.
+    """
+    ball = of(branches.branch_of(surface)) or add_by_hand(surface, list(place))
+    ball.location, ball[_FIELD_KEY], ball.hide_viewport = place, field, False
+    if TARGET_KEY in ball:
+        del ball[TARGET_KEY]
+    _tell(scene.limber.plan, ball)
+
+
+def choose(plan: bpy.types.PropertyGroup, field: str) -> None:
+    """Switch one kind of goal on and the others off."""
+    for name in _KINDS:
+        setattr(plan, OPEN + name, name == field)
+
+
+def _tell(plan: bpy.types.PropertyGroup, ball: bpy.types.Object) -> None:
+    """Make the ball the plan's only goal."""
     ball[_PLACE_KEY] = list(ball.location)
-    plan = scene.limber.plan
-    for name in _OTHERS:
-        setattr(plan, OPEN + name, name == ball[_FIELD_KEY])
+    choose(plan, ball[_FIELD_KEY])
     setattr(plan, ball[_FIELD_KEY], ball.location)
     if TARGET_KEY in ball:
         plan.target = ball[TARGET_KEY]
@@ -93,7 +113,7 @@ class Before:
     @classmethod
     def of(cls, scene: bpy.types.Scene, branch: bpy.types.Collection) -> "Before":
         ball, plan = of(branch), scene.limber.plan
-        names = [*_OTHERS, *(OPEN + name for name in _OTHERS), "target"]
+        names = [*_KINDS, *(OPEN + name for name in _KINDS), "target"]
         return cls(None if ball is None else Vector(ball.location),
                    {} if ball is None else {key: _plain(ball[key]) for key in _KEYS if key in ball},
                    {name: _plain(getattr(plan, name)) for name in names})

@@ -39,6 +39,10 @@ class LIMBER_OT_from_cursor(bpy.types.Operator):
             one = field.shown([[*place, *PLACES[field.name]]])
             setattr(group, field.name, f"{given}; {one}" if given.strip() else one)
             return {"FINISHED"}
+        surface = branches.find_surface(context.scene)
+        if stage.name == "plan" and self.field in _BALLS and surface is not None:
+            goal_ball.put(context.scene, surface, self.field, place)
+            return {"FINISHED"}
         setattr(group, self.field, place)
         if field.is_optional:
             setattr(group, properties.OPEN + self.field, True)
@@ -77,6 +81,7 @@ class LIMBER_OT_from_object(bpy.types.Operator):
         low, high = (tuple(bound(corner[axis] for corner in corners) for axis in range(3))
                      for bound in (min, max))
         if self.region == "target_box":
+            goal_ball.choose(plan, "target_box")
             given = {"target_box": low + high}
         elif self.region == "workspace_low":
             given = {"workspace_low": low, "workspace_high": high}
@@ -85,6 +90,10 @@ class LIMBER_OT_from_object(bpy.types.Operator):
             # An empty gives a point: the tolerance stays.
             plan.goal_tolerance = max(b - a for a, b in zip(low, high, strict=True)) / 2 or (
                 plan.goal_tolerance)
+        surface = branches.find_surface(context.scene)
+        if self.region in _BALLS and surface is not None:
+            goal_ball.put(context.scene, surface, self.region, given[self.region])
+            return {"FINISHED"}
         for name, value in given.items():
             setattr(plan, name, value)
             setattr(plan, properties.OPEN + name, True)

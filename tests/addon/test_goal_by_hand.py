@@ -75,6 +75,27 @@ def test_the_ball_is_an_active_object_that_gives_the_goal(bpy, ball):
 
 
 @pytest.mark.slow
+def test_a_goal_from_elsewhere_is_shown_by_the_ball(bpy, ball):
+    """From the cursor and from another object: one goal, and it is where the ball is. A box is a
+    goal instead of it."""
+    plan, scene = bpy.context.scene.limber.plan, bpy.context.scene
+    scene.cursor.location = (0.1, 0.0, 0.4)
+    bpy.ops.limber.from_cursor(stage="plan", field="tip_goal")
+    assert list(ball.location) == pytest.approx([0.1, 0.0, 0.4])
+    assert plan.use_tip_goal and not plan.use_goal
+    bpy.ops.mesh.primitive_cube_add(size=0.1, location=(0.0, 0.2, 0.3))
+    assert bpy.ops.limber.from_object(region="goal") == {"FINISHED"}
+    assert list(ball.location) == pytest.approx([0.0, 0.2, 0.3])
+    assert plan.use_goal and not plan.use_tip_goal
+    assert plan.goal_tolerance == pytest.approx(0.05)
+    ball.location = (0.3, 0.2, 0.3)
+    bpy.context.view_layer.update()
+    assert list(plan.goal) == pytest.approx([0.3, 0.2, 0.3]), "moving it still moves the goal"
+    bpy.ops.limber.from_object(region="target_box")
+    assert plan.use_target_box and not plan.use_goal
+
+
+@pytest.mark.slow
 def test_a_branch_without_a_plan_gets_a_ball(bpy, registered, bare_beam):
     """At the plan's goal; selected, so that G moves it. Pressed again, it is the same one."""
     bpy.ops.limber.open_result(directory=str(bare_beam.folder))
