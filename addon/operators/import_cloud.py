@@ -5,7 +5,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import branch_folder, branches, scans
+from .. import branch_folder, branches, deleted_points, scans
 from ..branches import FOLDER_KEY, OFFSET_KEY, SCAN_KEY, add_object
 from ..bridge import meshes
 from ..overlays.cloud import COLOUR
@@ -79,6 +79,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
             return {"CANCELLED"}
         cloud = add_object(context.scene.collection, f"{path.stem} scan", mesh)
         cloud[SCAN_KEY] = scan.sha256
+        deleted_points.number_points(cloud)
         if scan.offset.any():
             cloud[OFFSET_KEY] = [float(value) for value in scan.offset]
         guessed = scan.extent > _LONGEST_PLANT_M and scan.unit is None and (

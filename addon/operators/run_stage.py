@@ -4,7 +4,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import branch_folder, branches, properties, trouble_mark
+from .. import branch_folder, branches, deleted_points, properties, trouble_mark
 from ..stages import SettingError, Stage, stages
 from ..steps import FIRST
 from .needs_result import branch_property, check_identity, needed_folder
@@ -56,6 +56,8 @@ class StageOperator(WorkerOperator):
         self._take_keywords(context)
         stage, scene = self.stage, context.scene
         if stage.makes_branch:
+            if "without" in stage.fields:
+                self._leave_out(context)
             values = properties.values_of(properties.group_of(context.scene, stage), stage)
             trouble = self._foreign(context)
             if trouble and not self.replace:
@@ -144,6 +146,15 @@ class StageOperator(WorkerOperator):
             setattr(group, name, getattr(self, name))
             if hasattr(group, properties.OPEN + name):
                 setattr(group, properties.OPEN + name, True)
+
+    def _leave_out(self, context) -> None:
+        """Give the points that the user deleted from the scan, as they are now."""
+        group = properties.group_of(context.scene, self.stage)
+        deleted = deleted_points.write(context.scene, self._source(context))
+        if deleted is not None:
+            group.without = str(deleted)
+        elif deleted_points.is_ours(group.without):
+            group.without = ""
 
     def _source(self, context) -> Path:
         """Return the scan or surface from which a new branch is made."""

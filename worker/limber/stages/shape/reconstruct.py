@@ -46,8 +46,9 @@ EDITS = "edits.json"
 class ReconstructInputs(Settings):
     """A scan, its known properties, and the branch folder to make."""
 
-    groups: ClassVar[Groups] = {"input": ("cloud", "skeleton", "edits", "camera", "mask"),
-                               "output": ("output",)}
+    groups: ClassVar[Groups] = {
+        "input": ("cloud", "without", "skeleton", "edits", "camera", "mask"),
+        "output": ("output",)}
     common = ("camera",)
 
     cloud: Path = argument(
@@ -58,6 +59,9 @@ class ReconstructInputs(Settings):
         description="The branch folder to make. With a folder of scans: where to make the branch "
                     "folders.",
         json_schema_extra={"short": "-o", "example": "{stem}.branch"})
+    without: Path | None = Field(
+        None, description="A point cloud file of the points to leave out, in the cloud's "
+        "coordinates, such as those that were deleted in Blender.")
     skeleton: Path | None = Field(
         None, description="Your own skeleton in the cloud's coordinates: "
         f"{listed(SKELETONS.readers())}.")
@@ -73,7 +77,8 @@ class ReconstructInputs(Settings):
 def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | None = None, *,
                 skeleton_path: Path | None = None, edits_path: Path | None = None,
                 camera_path: Path | None = None, mask_path: Path | None = None,
-                force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+                without_path: Path | None = None, force: bool = False,
+                progress: Progress = SILENT) -> dict[str, Any]:
     """Make a branch folder from a scan: skeleton, surface and tetrahedra.
 
     The skeleton is stored in the scan's own coordinates as soon as it is found
@@ -89,6 +94,7 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
             the user's own.
         camera_path: ``camera.toml``, if ``cloud_path`` is a depth image.
         mask_path: The depth image's mask of the branch.
+        without_path: Points of the scan to leave out, in its coordinates.
         force: Run even if nothing has changed.
         progress: Called during the work; receives warnings for the user.
 
@@ -110,9 +116,12 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
     unit, unit_notes = unit_of(raw, settings.unit)
     settings = settings.model_copy(update={"unit": unit})
     digests = {"cloud": file_digest(cloud_path)}
-    for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path)):
+    for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path),
+                       ("without", without_path)):
         if path is not None:
             digests[name] = file_digest(require_file(path, f"A {name} file"))
+    if without_path is not None:
+        raw = _without(raw, without_path)
     entered = None if edits_path is None else read_edits(edits_path)
     branch = Branch.create(folder)
     if entered is not None:
@@ -219,6 +228,27 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
     return {"done": done, "failed": failed, "done_count": len(done), "failed_count": len(failed)}
 
 
+def _without(cloud: Cloud, path: Path) -> Cloud:
+    """Return a cloud without the points of a file; InputError if it has none of them, or all.
+
+    Points count as the same that single precision cannot distinguish.
+    """
+    from scipy.spatial import cKDTree
+
+    gone = read_points(path).points
+    same = float(np.spacing(np.float32(np.abs(cloud.points).max())))
+    far, _ = cKDTree(gone).query(cloud.points, distance_upper_bound=2.0 * same)
+    keep = ~np.isfinite(far)
+    if keep.all():
+        raise InputError(f"None of the {len(gone)} points of {path} is in the cloud.",
+                         "Points to leave out are given in the cloud's coordinates and unit.",
+                         "Take them from that cloud file, or omit --without.")
+    if not keep.any():
+        raise InputError(f"All {len(cloud)} points of the cloud are in {path}.",
+                         "Nothing would be left.", "Leave out fewer points, or omit --without.")
+    return cloud.subset(keep)
+
+
 def _keep_skeleton(stage: Stage, alignment: Alignment, skeleton: Skeleton, unit: str) -> None:
     """Write a skeleton in the coordinates and the unit of the scan's file."""
     in_file = skeleton.in_file(alignment)
@@ -320,7 +350,8 @@ def run(inputs: ReconstructInputs, settings: ReconstructSettings, options: RunOp
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
     if inputs.cloud.is_dir():
-        one = [name for name in ("skeleton", "edits", "camera", "mask") if getattr(inputs, name)]
+        one = [name for name in ("without", "skeleton", "edits", "camera", "mask")
+               if getattr(inputs, name)]
         if one:
             raise InputError(f"{inputs.cloud} is a folder, and --{one[0]} was given.",
                              "That option applies to a single "
@@ -329,7 +360,7 @@ def run(inputs: ReconstructInputs, settings: ReconstructSettings, options: RunOp
                                   progress=progress)
     return reconstruct(inputs.cloud, inputs.output, settings, skeleton_path=inputs.skeleton,
                        edits_path=inputs.edits, camera_path=inputs.camera, mask_path=inputs.mask,
-                       force=options.force, progress=progress)
+                       without_path=inputs.without, force=options.force, progress=progress)
 
 
 STAGE = StageDescription(
