@@ -9,13 +9,14 @@ import bpy
 from bpy_extras import view3d_utils
 from mathutils import Vector
 
-from .. import branches, preferences, properties, session
+from .. import branches, goal_ball, preferences, properties, session
 from ..bridge import animation, meshes
 from ..frame_rate import FrameRate
 from ..session import HeldFrame, Session
 from ..stages import stages
 from ..worker import WorkerNotFound
 from . import limits, live_loads
+from .carried_marks import CarriedMarks
 from .hold import Hold, Kept
 from .lighter_view import LighterView
 from .live_loads import LiveLoads
@@ -27,6 +28,7 @@ delay is half of this.
 """
 _KEYS = ("Drag: bend | F: add a fruit | C: cut here | Enter: keep for a simulation | S, G: keep "
          "as the plan's start, goal | Esc: release and exit")
+_READY = "press on the branch and drag"
 _LOADING = "The branch is being loaded | Esc: exit"
 _PLACED = {"F": "fruit", "C": "cut"}
 _PANEL_SECONDS = 0.2
@@ -96,7 +98,8 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         self._tint, self._reached = limits.Tint(self._surface), []
         self._panel_drawn = 0.0
         self._rest = meshes.positions(mesh)
-        self._is_ready, self._rate = False, FrameRate()
+        self._marks = CarriedMarks(self._surface, self._rest)
+        self._is_ready, self._waits_for, self._rate = False, "", FrameRate()
         self._lighter = LighterView(context.preferences)
         self._mouse = self._waiting = None
         motion = self._surface.modifiers.get(animation.MODIFIER)
@@ -163,14 +166,14 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             self._end(context)
             self.report({"ERROR"}, error)
             return {"CANCELLED"}
-        if self._session.hello and not self._is_ready:
-            self._is_ready = True
-            context.workspace.status_text_set(_KEYS)
+        if not self._is_ready:
+            self._wait(context)
         frame = self._session.frame(self._frame.sequence if self._frame else 0)
         if frame is not None:
             self._frame = frame
             self._rate.tick()
             meshes.set_positions(self._surface.data, frame.positions)
+            self._marks.show(frame.positions)
             self._loads.tell(frame)
             self._show_limits(context, frame)
             self._region.tag_redraw()
@@ -182,6 +185,16 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             self._waiting = None
         self._send()
         return {"RUNNING_MODAL"}
+
+    def _wait(self, context) -> None:
+        """State at the mouse and in the header what the session does before it can answer."""
+        if self._session.hello:
+            self._is_ready = True
+            context.workspace.status_text_set(_KEYS)
+        if (words := self._session.message or _READY) != self._waits_for:
+            self._waits_for = words
+            self._area.header_text_set(f"{words} ..." if words != _READY else words)
+            self._region.tag_redraw()
 
     def _show_limits(self, context, frame: HeldFrame) -> None:
         """The branch is red while it is held beyond a limit of the plan."""
@@ -275,10 +288,12 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             group = properties.group_of(context.scene, stages()["simulate"])
             group.grasp_radius, group.grasp_mode = self.radius, "pinned"
             self.report({"INFO"}, "Kept for Simulate a Motion in Material.")
+        elif kept is Kept.START:
+            self._give(context, "plan", start=target)
+            self.report({"INFO"}, "Kept as the plan's start.")
         else:
-            name = "start" if kept is Kept.START else "goal"
-            self._give(context, "plan", **{name: target})
-            self.report({"INFO"}, f"Kept as the plan's {name}.")
+            goal_ball.put(context.scene, self._surface, "goal", Vector(target))
+            self.report({"INFO"}, "Kept as the plan's goal.")
         return {"FINISHED"}
 
     def _give(self, context, stage: str, **places: tuple[float, float, float]) -> None:
@@ -304,6 +319,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             self._loads.end(is_kept=is_kept)
             self._tint.show(False)
             meshes.set_positions(self._surface.data, self._rest)
+            self._marks.end()
             if self._had_motion:
                 self._surface.modifiers[animation.MODIFIER].show_viewport = True
         self._area.tag_redraw()
@@ -339,11 +355,10 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
 
     def _lines(self) -> tuple[list[str], tuple[float, float, float, float]]:
         if self._session is None or not self._session.hello:
-            words = "" if self._session is None else self._session.message
-            return [f"{words or 'loading the branch'} ..."], _NORMAL
+            return [f"{self._waits_for or 'loading the branch'} ..."], _NORMAL
         if self._frame is None or self._hold is None:
             told = [] if self._frame is None or not self._loads.acts else live_loads.lines[:2]
-            return [*told, "press on the branch and drag"], _NORMAL
+            return [*told, _READY], _NORMAL
         force = Vector(self._frame.force).length
         words = _WORDS[self._frame.who]
         if self._frame.who == "learning" and self._session.message:

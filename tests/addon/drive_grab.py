@@ -28,6 +28,14 @@ def tip():
     return max(points, key=lambda point: point.z), points
 
 
+def marks():
+    """Return where the highest control point and the grasp are in the world."""
+    bpy.context.view_layer.update()
+    things = [thing for thing in bpy.data.collections["beam"].objects
+              if thing.get("limber_shows") in ("control_points", "grasp")]
+    return {thing.name: thing.matrix_world.translation.copy() for thing in things}
+
+
 def pixels(place):
     _, area, region = view()
     return view3d_utils.location_3d_to_region_2d(region, area.spaces.active.region_3d, place)
@@ -62,19 +70,23 @@ def begin():
         if "before" not in state:
             bpy.ops.wm.tool_set_by_id(name="limber.grab_tool")
     draw()
-    state["before"] = tip()[1]
+    state["before"], state["marks"] = tip()[1], marks()
     with override():
         seen["began"] = list(bpy.ops.limber.grab("INVOKE_DEFAULT"))
     return True
 
 
-def is_loaded():
+def is_loaded(height=0.57):
+    """Point at the middle of the beam; without a height, a little below the tip."""
     if not sessions()[0].hello:
         return False
     seen["session"] = sessions()[0].pid
-    # A little below the tip, in the middle of the beam.
-    state["place"] = pixels(Vector((0.0, 0.0, 0.57)))
+    state["place"] = pixels(Vector((0.0, 0.0, height)))
     return True
+
+
+def is_loaded_at_grasp():
+    return is_loaded(0.4)
 
 
 def hover():
@@ -93,6 +105,7 @@ def is_bent():
     """The tip has come along by most of the way that the mouse has gone."""
     bent = max((now - then).length for now, then in zip(tip()[1], state["before"], strict=True))
     seen["bent_m"] = bent
+    seen["carried_m"] = max((now - state["marks"][name]).length for name, now in marks().items())
     return bent > 0.02
 
 
@@ -128,9 +141,38 @@ def is_kept():
     seen["kept"] = [group.use_move, list(group.move), list(group.grasp_point), group.grasp_mode]
     seen["restored"] = max((now - then).length for now, then in zip(
         tip()[1], state["before"], strict=True))
+    seen["marks_after"] = max((now - state["marks"][name]).length
+                              for name, now in marks().items())
     seen["colour_after"] = colour()
     seen["motion_shown"] = surface().modifiers["Limber motion"].show_viewport
     return True
+
+
+def press_s():
+    return event("S", "PRESS", move=(60, -4))
+
+
+def press_g():
+    return event("G", "PRESS", move=(60, -4))
+
+
+def is_refused():
+    """A plan moves the marked grasp, which is not where the beam is held: it stays held."""
+    seen["refused"] = bool(sessions()) and not bpy.context.scene.limber.plan.use_start
+    return waited(0.3)
+
+
+def is_kept_as(name):
+    """Return the step that waits until the grab is the plan's start or goal."""
+    def step():
+        if sessions():
+            return False
+        plan = bpy.context.scene.limber.plan
+        seen[name] = [getattr(plan, f"use_{name}"), list(getattr(plan, name))]
+        ball = sys.modules[f"{KEY}.goal_ball"].of(bpy.data.collections["beam"])
+        seen["ball"] = list(ball.location)
+        return True
+    return step
 
 
 def undo():
@@ -187,5 +229,8 @@ def is_whole():
 
 
 drive([open_result, begin, is_loaded, hover, press, drag, is_bent, limit, is_over, picture("grab"),
-       let_go, keep, is_kept, undo, begin, is_loaded, key("F", 0.3), key("C", 0.45), blow,
+       let_go, press_s, is_refused, keep, is_kept, undo,
+       begin, is_loaded_at_grasp, hover, press, drag, is_bent, let_go, press_s, is_kept_as("start"),
+       begin, is_loaded_at_grasp, hover, press, drag, is_bent, let_go, press_g, is_kept_as("goal"),
+       picture("goal"), begin, is_loaded, key("F", 0.3), key("C", 0.45), blow,
        is_loaded_down, picture("loads"), escape, is_whole, is_left], longest=180)

@@ -200,6 +200,12 @@ def test_grab(run, blender, environment, beam, tmp_path):
     assert seen["restored"] < 1e-6 and seen["motion_shown"]
     assert (seen["colour_over"], seen["colour_after"]) == ("limber_limit", seen["colour"])
     assert not seen["after_undo"]
+    assert seen["carried_m"] > 0.005 and seen["marks_after"] < 1e-6
+    assert seen["refused"], "S where no plan moves the branch"
+    for name in ("start", "goal"):
+        is_given, place = seen[name]
+        assert is_given and place[0] > 0.02 and abs(place[2] - 0.4) < 0.06
+    assert seen["ball"] == pytest.approx(seen["goal"][1], abs=1e-6), "the goal is shown there"
     assert seen["sessions_left"] == 0 and not Path(f"/proc/{seen['session']}").exists()
     live = seen["live"]
     assert live["hidden"] > 5 and live["bent_m"] > 1e-3
@@ -207,7 +213,7 @@ def test_grab(run, blender, environment, beam, tmp_path):
         0.45, abs=0.04)
     assert live["lines"][0].startswith("Sag") and "added 0.02 kg" in live["lines"][2]
     assert seen["after_live"] == ["", "", False]
-    for name in ("grab", "loads"):
+    for name in ("grab", "goal", "loads"):
         assert colour_count(tmp_path / f"{name}.png") > 50
 
 
