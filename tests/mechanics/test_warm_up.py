@@ -33,6 +33,7 @@ for material in ("st_venant_kirchhoff", "stable_neo_hookean", "linear"):
                               times=np.array([0, 0.02]), sensitivities=ParameterSet())
         found.displacement.flags.writeable = False
         strain_state(model, found.displacement)
+        model.largest_principal_strains(found.displacement)
         model.tangent_times(found.displacement, found.displacement)
         solve_static(model, grasp=grasp, pose=pose, start=found)
 after = compiled()

@@ -25,6 +25,7 @@ def warm_up(progress: Progress = SILENT) -> None:
                             fixed=np.array([0, 1, 2]))
         simulate_dynamics(model, times=np.array([0.0, 0.01]), sensitivities=ParameterSet())
     rest = np.zeros_like(mesh.nodes)
+    model.largest_principal_strains(rest)
     # Zero forces are not solved for.
     model.equations().tangent(model, rest).solve_all(3 * [rest + 1.0])
     progress(1.0, "compiling kernels")

@@ -250,6 +250,12 @@ class KernelCache(FunctionCache):
                        for folder in (str(SHIPPED), self.cache_path)]
         self._cache_file = self._files[-1]
 
+    def _index_key(self, sig: Any, codegen: Any) -> Any:
+        # Without the bytecode, in which patch versions of one Python differ: the stamp is of the
+        # source.
+        types, target, (_, closure) = super()._index_key(sig, codegen)
+        return types, target, closure
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         for files in self._files:
             # The last one, the user's, is also where numba stores.
