@@ -1,5 +1,6 @@
 """The add-on's preferences: the Python that has the worker."""
 
+import importlib.util
 import json
 import textwrap
 import time
@@ -11,6 +12,7 @@ from . import compat, worker
 KEY = __package__
 """The add-on's name among Blender's."""
 _LOOK_AGAIN_SECONDS = 5.0
+_ROBOT_CLIENT = "rtde_control"
 _looked: dict[str, float | bool] = {}
 
 
@@ -68,6 +70,17 @@ def has_worker() -> bool:
     return bool(_looked["found"])
 
 
+def lacks_robot() -> bool:
+    """Whether the worker is known to have no client for robots, as in the zips with wheels."""
+    chosen = get()
+    told = "" if chosen is None else _parts_of(chosen.worker_parts).get(_ROBOT_CLIENT, "")
+    if told:
+        return _lacks(told)
+    bundled = worker.bundled_command()
+    return has_worker() and bool(bundled) and worker_command() == bundled and (
+        importlib.util.find_spec(_ROBOT_CLIENT) is None)
+
+
 def worker_trouble() -> str:
     """Return why there is no worker and what to do, or an empty text."""
     try:
@@ -83,16 +96,20 @@ def draw_parts(layout: bpy.types.UILayout, parts: str) -> None:
     Args:
         parts: JSON; by name a version, or ``missing: `` and what then does not work.
     """
-    try:
-        known = json.loads(parts or "{}")
-    except ValueError:
-        return
+    known = _parts_of(parts)
     column = layout.column(align=True)
     # Missing parts come first.
     for name, told in sorted(known.items(), key=lambda part: not _lacks(part[1])):
         row = column.split(factor=0.25)
         row.label(text=name, icon="ERROR" if _lacks(told) else "CHECKMARK")
         row.label(text=told)
+
+
+def _parts_of(parts: str) -> dict[str, str]:
+    try:
+        return json.loads(parts or "{}")
+    except ValueError:
+        return {}
 
 
 def _lacks(told: str) -> bool:

@@ -5,7 +5,7 @@ from typing import Any
 
 import bpy
 
-from .. import branch_folder, branches, guide, jobs, properties, trouble_mark
+from .. import branch_folder, branches, guide, jobs, preferences, properties, trouble_mark
 from ..branch_folder import BranchRecord, StageRecord
 from ..lines import draw_text, has_room_beside
 from ..operators.presets import sensor_menu
@@ -30,6 +30,10 @@ class StepPanel(SidebarPanel):
     """Mix-in: the panel of ``step``."""
 
     step: Step
+
+    @classmethod
+    def poll(cls, context):
+        return cls.step.name != "robot" or not preferences.lacks_robot()
 
     def draw_header_preset(self, context):
         """Show its state and the way to its help, at the right end of the header."""
@@ -70,13 +74,20 @@ class StepPanel(SidebarPanel):
             layout.operator("limber.open_report", icon="URL")
         _draw_groups(layout, context, view, but=step.fields)
         for other in step.others:
+            if stages()[other.stage].moves_robot and preferences.lacks_robot():
+                continue
             header, body = layout.panel(f"limber_{step.name}_{other.stage}", default_closed=True)
             header.label(text=stages()[other.stage].label,
                          icon=state_of(context.scene, other.stage)[0].icon)
             if body is not None:
                 _draw_stage(body, context, other, is_primary=False)
                 _draw_groups(body, context, other)
+        if step.name == "plan" and preferences.lacks_robot():
+            draw_text(layout, context, "Moving a robot, and recording, need a Python that has "
+                      "Limber and ur-rtde: choose it in the extension's preferences", "INFO")
         after = step_after(step)
+        if after is not None and after.name == "robot" and preferences.lacks_robot():
+            after = step_after(after)
         if after is not None and step_state(context.scene, step) is StepState.DONE:
             layout.label(text=f"Next: {after.title}", icon="FORWARD")
 

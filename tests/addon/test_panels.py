@@ -261,6 +261,27 @@ def test_a_path_that_breaks_the_wood_is_never_ticked(bpy, worker_here, over, str
 
 
 @pytest.mark.slow
+def test_without_a_client_for_robots_there_is_no_robot(bpy, panels, whole_texts, monkeypatch):
+    """As in the zips: neither the step nor Record, and one line that says why."""
+    preferences = importlib.import_module("limber_addon.preferences")
+    preferences._looked.clear()
+
+    def shown():
+        return _step(bpy, "robot").poll(bpy.context), [
+            text for name in STEPS if _step(bpy, name).poll(bpy.context)
+            for text in _draw_step(bpy, name).names("label")]
+    is_there, before = shown()
+    assert is_there and "Record a Pull" in before and not any("ur-rtde" in text for text in before)
+    worker = importlib.import_module("limber_addon.worker")
+    monkeypatch.setattr(preferences, "worker_command", worker.bundled_command)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, found=importlib.util.find_spec: (
+        None if name == "rtde_control" else found(name)))
+    is_there, after = shown()
+    assert not is_there and "Record a Pull" not in after
+    assert sum("ur-rtde" in text for text in after) == 1
+
+
+@pytest.mark.slow
 def test_where_to_start(bpy, panels, beam):
     """An empty scene offers the example, a scan, a folder; with a branch it makes way."""
     drawn = _draw(panels("start"), bpy.context)
