@@ -1,6 +1,6 @@
 """Three branches and random operators: nothing is written to another branch than the tab names.
 
-``LIMBER_RANDOM_OPERATORS=500`` tries as many; the seed is printed where one fails.
+``LIMBER_RANDOM_OPERATORS=500`` tries as many, with the seed ``LIMBER_RANDOM_SEED``.
 """
 
 import importlib
@@ -94,25 +94,32 @@ class Run:
         if self.bpy.ops.ed.redo.poll():
             self.bpy.ops.ed.redo()
 
-    def target(self, *, late=False):
-        """Press the button as it was drawn; ``late``: after another branch became current."""
+    def write(self, operator, *, late=False, **given):
+        """Press a button as it was drawn; ``late``: after another branch became current."""
         scene = self.bpy.context.scene
         named = part("branches").current_uuid(scene)
         if not named:
             return
         if late:
             self.choose()
-        name = f"t{len(self.written)}"
+        name = f"{operator}{len(self.written)}"
         try:
-            self.bpy.ops.limber.target(branch_uuid=named, name=name, at=(0.0, 0.0, 0.3))
+            getattr(self.bpy.ops.limber, operator)(branch_uuid=named, name=name, **given)
         except RuntimeError as refused:
             assert any(words in str(refused) for words in
                        ("another branch now", "no longer in the scene")), refused
         else:
             self.written[name] = named
 
+    def target(self):
+        self.write("target", at=(0.0, 0.0, 0.3))
+
     def late_target(self):
-        self.target(late=True)
+        self.write("target", late=True, at=(0.0, 0.0, 0.3))
+
+    def plan(self):
+        """It samples the energy first, as the branch has none."""
+        self.write("plan", late=self.chance.random() < 0.5, goal=(0.0, 0.1, 0.3))
 
     def check(self):
         """Each target is in the branch that was named as it was written, and nowhere else."""
@@ -138,18 +145,21 @@ def three(bpy, registered, tmp_path, bare_beam, monkeypatch):
 
 @pytest.fixture()
 def quick_worker(worker_here, monkeypatch):
-    """``target`` writes its name into the folder that it is given; all else is the real worker."""
+    """``target`` and ``plan`` write their name into the folder that they are given, ``energy``
+    writes nothing; all else is the real worker."""
     jobs = importlib.import_module("limber_addon.jobs")
     launch = jobs.Job.launch
 
     def launch_here(job):
         arguments = job.command[job.command.index("limber") + 1:]
-        if arguments[0] != "target":
+        if arguments[0] not in ("target", "plan", "energy"):
             return launch(job)
-        folder, name = arguments[arguments.index("--") + 1:]
+        folder, *names = arguments[arguments.index("--") + 1:]
+        if arguments[0] == "plan":
+            names = [arguments[arguments.index("--name") + 1]]
         path = Path(folder) / WRITTEN
-        names = json.loads(path.read_text()) if path.is_file() else []
-        path.write_text(json.dumps([*names, name]))
+        written = json.loads(path.read_text()) if path.is_file() else []
+        path.write_text(json.dumps([*written, *names]))
         job._lines.put(("out", json.dumps({"status": "done", "seconds": 0.0})))
         job._process, job._readers = type("Ended", (), {
             "stdin": io.StringIO(), "poll": lambda self: 0})(), []
@@ -159,13 +169,12 @@ def quick_worker(worker_here, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1])
+@pytest.mark.parametrize("seed", [int(os.environ.get("LIMBER_RANDOM_SEED", "1"))])
 def test_random_operators_write_to_the_named_branch_alone(bpy, three, quick_worker, seed):
     """Opened, clicked, chosen, appended, renamed, deleted, undone, swapped on the disk, written."""
     run = Run(bpy, three, seed)
     kinds = ["open", "switch", "switch", "choose", "append", "rename", "delete", "swap",
-             "target",
-             "target", "late_target", "undo", "redo"]
+             "target", "target", "late_target", "plan", "undo", "redo"]
     for _ in range(COUNT):
         kind = run.chance.choice(kinds)
         getattr(run, kind)()
