@@ -9,7 +9,7 @@ import bpy
 from bpy_extras import view3d_utils
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import KEY, drive, picture, seen, started, view, waited
+from driving import KEY, drive, picture, processor_seconds, seen, started, view, waited
 from mouse import (
     at,
     click,
@@ -66,6 +66,8 @@ def drag():
     event("MOUSEMOVE")
     seen["clicks_to_bent"] = seen["clicks"]
     seen["bent_m"] = max(abs(a - b) for a, b in zip(places(), at["before"], strict=True))
+    if seen["bent_m"] > 0.0 and "answer_s" not in seen:
+        seen["answer_s"] = processor_seconds(sys.modules[f"{KEY}.session"]._open[0].pid)
     return seen["bent_m"] > 0.01
 
 
@@ -111,4 +113,4 @@ drive([open_sidebar, is_sidebar_open, point_at_tab, click, is_ours, picture("tab
        find("open_example"), click, is_open, picture("example"),
        find("grab"), click, is_held, point_at_branch, press, drag, picture("bent"), let_go, leave,
        point_at_goal, press, drag_goal, picture("goal"), let_go, is_goal_planned],
-      longest=60)
+      longest=120)
