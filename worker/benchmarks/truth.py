@@ -7,6 +7,7 @@ import numpy as np
 from benchmarks import (
     truth_beam,
     truth_branch,
+    truth_reduced,
     truth_scans,
     truth_starts,
     truth_states,
@@ -124,5 +125,5 @@ PARTS = {
     "sag": Part(truth_beam.sag_row, 20, (truth_beam.SAG_ROW,), grows=True),
     "swing": Part(truth_states.swing_row, 30, (truth_states.SWING_ROW,)),
     "second-pull": Part(truth_states.quick_rows, 120, truth_states.QUICK_ROWS),
-    "reduced": Part(truth_states.doubt_rows, 240, truth_states.DOUBT_ROWS)}
+    "reduced": Part(truth_reduced.doubt_rows, 60, truth_reduced.DOUBT_ROWS, grows=True)}
 """The table, in order of importance."""

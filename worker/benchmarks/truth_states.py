@@ -1,6 +1,4 @@
-"""Validity of states: swings keep their energy, bad states are flagged, and reduced models and live
-updates agree with the full fit.
-"""
+"""Swings keep their energy; reduced models and live updates agree with the full fit."""
 
 import tempfile
 import time
@@ -10,7 +8,6 @@ import numpy as np
 
 from benchmarks.estimation import SETTINGS, followed
 from benchmarks.mechanics_exact import DENSITY, short_beam
-from benchmarks.mechanics_reduced import CHANGED, LENGTH, GraspBench, bench_branch
 from benchmarks.paper_branches import BRANCHES, Bench, exact_pull, measured
 from benchmarks.table import Asked, Row, Setting
 from limber.mechanics import (
@@ -21,8 +18,6 @@ from limber.mechanics import (
     simulate_dynamics,
     solve_static,
 )
-from limber.reduced.refresh import checked, estimate_error
-from limber.reduced.training import TrainingSettings, sample_poses
 
 _AMPLITUDES = (0.01, 0.25, 0.6)
 _STEPS = 1000
@@ -30,10 +25,6 @@ _YOUNG = 1e7
 
 SWING_ROW = Asked("free swing at 1, 25, 60 % amplitude, 1,000 steps of 1/60 s: energy drift",
                   "1 %")
-DOUBT_ROWS = (
-    Asked("reduced model after E changed by up to 3: worst error among the unflagged",
-          "0.5 % of the length, 1 % energy"),
-    Asked("bad states flagged / good ones flagged", "95 % / under 10 %"))
 QUICK_ROWS = (
     Asked("a second, different pull with --forward reduced", "10 s"),
     Asked("online: last live update against the batch fit; every frame's time, worst",
@@ -79,51 +70,6 @@ def _pulled_aside(model: BranchModel, tip: Grasp, direction: np.ndarray,
     while missing(most) < 0:
         most *= 2
     return pulled(brentq(missing, 0.0, most, rtol=1e-3))
-
-
-def doubt_rows(setting: Setting) -> list[Row]:
-    """Grasps of a reduced model after E changed by up to 3 at each control point, checked."""
-    progress, rng = setting.progress, setting.generator(12)
-    bench = GraspBench(bench_branch(), "pinned", setting.seed)
-    branch = bench.branch
-    known = bench.train(setting.at_most(120, 50), 1.0, None, progress.part(0.0, 0.2))
-    both = known.joined(bench.train(
-        setting.at_most(160, 100), 4.0, known, progress.part(0.2, 0.4)))
-    wide = bench.reduce(both, CHANGED)
-    count = setting.at_most(300, 30)
-    poses = sample_poses(branch.model, bench.grasp, count, rng, TrainingSettings())
-    young = branch.young * 3.0 ** rng.uniform(-1, 1, (count, len(branch.young)))
-    truth = bench.trainer.take(poses, young, known, progress=progress.part(0.5, 0.9))
-    off, energy, flagged, seconds = [], [], [], []
-    for pose, moduli, exact, exact_energy in zip(
-            truth.poses, truth.young, truth.displacement, truth.energy, strict=True):
-        model = wide.with_young(moduli)
-        began = time.process_time()
-        state = model.solve_static(pose)
-        state = checked(state, estimate_error(branch.model, branch.weights, model, state))
-        seconds.append(time.process_time() - began)
-        away = np.linalg.norm(model.displacement(state) - exact, axis=1).max()
-        off.append(100 * away / LENGTH)
-        energy.append(100 * abs(state.strain_energy / exact_energy - 1))
-        flagged.append(not state.trusted)
-    return _doubted(np.array(off), np.array(energy), np.array(flagged),
-                    1e3 * float(np.median(seconds)))
-
-
-def _doubted(off: np.ndarray, energy: np.ndarray, flagged: np.ndarray, milliseconds: float,
-             ) -> list[Row]:
-    bad = (off > 0.5) | (energy > 1)
-    worst, worst_energy = off[~flagged].max(initial=0), energy[~flagged].max(initial=0)
-    caught = 100 * flagged[bad].mean() if bad.any() else np.nan
-    false = 100 * flagged[~bad].mean() if (~bad).any() else np.nan
-    return [
-        Row(*DOUBT_ROWS[0],
-            f"{worst:.2f} %, {worst_energy:.2f} % (among all {off.max():.1f}, {energy.max():.1f} "
-            f"%; {milliseconds:.0f} ms a checked grasp)", bool(worst <= 0.5 and worst_energy <= 1),
-            len(off)),
-        Row(*DOUBT_ROWS[1],
-            f"{caught:.0f} % of {bad.sum()} / {false:.1f} % of {(~bad).sum()}",
-            bool(caught >= 95 and false < 10) if bad.any() else None, len(off))]
 
 
 def quick_rows(setting: Setting) -> list[Row]:

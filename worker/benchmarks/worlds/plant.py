@@ -56,6 +56,35 @@ class Plant:
             found.append(np.array(own))
         return [own for own in found if len(own) > 1]
 
+    def branch(self, limb: float = 1 / 3) -> "Plant":
+        """The longest axis with its side limbs, as cut from a tree for a robot's cell.
+
+        Limbs bear no twigs, and are cut at ``limb`` of what the axis has left there.
+        """
+        arc = np.zeros(len(self.nodes))
+        for node in range(1, len(arc)):
+            above = self.parent[node]
+            arc[node] = arc[above] + np.linalg.norm(self.nodes[node] - self.nodes[above])
+        path = [int(arc.argmax())]
+        while self.parent[path[-1]] >= 0:
+            path.append(int(self.parent[path[-1]]))
+        kept, end, limit = set(path), float(arc.max()), arc.copy()
+        goes_on = {(int(own[k]), int(own[k + 1])) for own in self.chains()
+                   for k in range(1, len(own) - 1)}
+        for node in range(1, len(arc)):
+            above = int(self.parent[node])
+            if node in kept or above not in kept:
+                continue
+            begins = above in path
+            limit[node] = arc[above] + limb * (end - arc[above]) if begins else limit[above]
+            if arc[node] <= limit[node] and (begins or (above, node) in goes_on):
+                kept.add(node)
+        chosen = np.array(sorted(kept))
+        place = np.full(len(arc) + 1, -1)
+        place[chosen] = np.arange(len(chosen))
+        return Plant(self.nodes[chosen], place[self.parent[chosen]], self.radius[chosen],
+                     self.oval[chosen], self.knob[chosen])
+
     def volume(self) -> float:
         """Volume [m^3] of the tapered runs, less what lies inside their carriers."""
         total = 0.0

@@ -37,6 +37,15 @@ def bare_case(seed: int, source: str, view: str) -> ScanCase:
                  sensor(Scene.bare(plant), rng, noise), {"leave_out": True})
 
 
+def branch_case(seed: int, source: str, view: str, noise: float) -> ScanCase:
+    """A branch cut from a bare plant, as it hangs in a robot's cell; ``noise`` in metres."""
+    rng = _generator(seed, source, view, "branch")
+    plant = SOURCES[source](rng).branch()
+    sensor = rng.choice(ONE_SIDED if view == "one-sided" else ALL_AROUND)
+    return _case(f"{source}_{view}_{seed}", seed, plant,
+                 sensor(Scene.bare(plant), rng, noise), {"leave_out": True})
+
+
 def leafy_case(seed: int, source: str) -> ScanCase:
     """A plant in leaf from all around; its user asks to cut leaves."""
     rng = _generator(seed, source, "leafy")

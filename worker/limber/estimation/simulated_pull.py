@@ -80,6 +80,12 @@ class TrueBranch:
     is_assumed: bool = False
     is_meshed: bool = False
 
+    def young_at(self, positions: np.ndarray) -> np.ndarray:
+        """Return Young's modulus [Pa], shape [n], at positions [m], shape [n, 3]."""
+        away = np.linalg.norm(positions[:, None] - self.control_points, axis=2)
+        shares = 1 / np.maximum(away, 1e-9)**2
+        return shares @ self.young / shares.sum(axis=1)
+
 
 def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
                 body: TetMesh | None = None, scan: np.ndarray | None = None,
@@ -197,13 +203,8 @@ def _rod(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool) 
             "--camera." if settings.camera else "a branch that was meshed directly."),
             "The rod is a round branch at rest, without a surface.", "Omit --model rod.")
 
-    def young_at(positions: np.ndarray) -> np.ndarray:
-        away = np.linalg.norm(positions[:, None] - truth.control_points, axis=2)
-        shares = 1 / np.maximum(away, 1e-9)**2
-        return shares @ truth.young / shares.sum(axis=1)
-
     gravity = np.zeros(3) if is_weightless else np.array(truth.gravity)
-    return Rod.of(truth.skeleton, young_at, settings.poisson, settings.density, gravity,
+    return Rod.of(truth.skeleton, truth.young_at, settings.poisson, settings.density, gravity,
                   settings.grasp_fraction, as_scanned=not settings.own_weight)
 
 
