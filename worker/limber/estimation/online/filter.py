@@ -109,8 +109,8 @@ class OnlineEstimator:
         self._widths: list[np.ndarray] = []
         self._turn = self.frame_count = self.refresh_count = 0
         self._last: ReducedState | None = None
-        # Compilation at the first call must not delay the first frame.
-        reduced.solve_static(reduced.poses[0], settings=QUICK)
+        # Loading compiled code at the first call must not delay the first frame.
+        reduced.sensitivities(reduced.solve_static(reduced.poses[0], settings=QUICK))
         self._exact = exact
         self._corrections = Corrections(self._sigmas)
         self._asked: tuple[Kept, Future] | None = None

@@ -1,5 +1,6 @@
 """``limber estimate --follow``: read a pull while it is recorded, or replay it at its own pace."""
 
+import gc
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -169,6 +170,9 @@ class Begun:
 
     def estimator(self, exact: Beside | Here | None) -> OnlineEstimator:
         """Return the estimator that processes the frames."""
+        # A full collection would visit all objects of all imported libraries during a frame.
+        gc.collect()
+        gc.freeze()
         sensor = self.pull.entry.sensor
         return OnlineEstimator(
             self.reduced, self.pull.entry.grasp, self.branch.mesh, self.branch.rest_points,
