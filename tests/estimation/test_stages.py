@@ -19,7 +19,7 @@ from limber.results.report.estimate_figures import report_figures
 from limber.stages.moduli.estimate import EVALUATIONS, estimate, follow
 from limber.stages.pulls.virtual_pull import virtual_pull
 from limber.store import Branch
-from limber.store.loading import load_estimated_subject
+from limber.store.loading import load_estimated_subject, stiffness_deviation
 
 QUICK = EstimateSettings(key_frames=6)
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
@@ -70,6 +70,23 @@ def test_estimate_from_the_command_line(branch_folder, capsys):
     parts = stored["young_deviation"]
     assert parts["geometry"] is None and max(parts["mesh"]) < 0.2
     assert "have no stated deviation" in captions[0]
+
+
+def test_forces_are_as_well_known_as_the_bending_stiffness(branch_folder):
+    """A radius of the scan cancels: half width .2 in log E I where E has .6; without it E's."""
+    known = {"method": "gauss-newton", "poisson": 0.35, "loss_m2": 1e-5, "forward_count": 9,
+             "converged": True, "groups": [0, 1], "parameters": ["E1", "E2"], "history": [],
+             "covariance": [[0.1, 0.0], [0.0, 0.1]], "deviations_before_fit": [], "pulls": [],
+             "fractions": [0.3, 0.6], "young_pa": [1e8, 1e8], "control_points_m": [[0, 0, 0.1]] * 2,
+             "young_interval_pa": [[1e8 * np.exp(-0.6), 1e8 * np.exp(0.6)]] * 2}
+    of_bending = [[0.3 * np.exp(-0.2), 0.3 * np.exp(0.2)], [None, None]]
+    for content, width in ((known, 0.6), (known | {"bending_stiffness_nm2": [0.3, 0.3],
+                                                   "bending_stiffness_interval_nm2": of_bending},
+                                          0.2)):
+        branch = Branch.open(branch_folder)
+        with branch.stage("estimate") as stage:
+            stage.path("estimate.json").write_text(json.dumps(content))
+        assert stiffness_deviation(branch) == pytest.approx(width / 1.96)
 
 
 @pytest.mark.slow

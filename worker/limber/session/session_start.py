@@ -8,7 +8,7 @@ from limber.reduced.training import TrainingSettings
 from limber.session.session_branch import HeldBranch
 from limber.session.settings import SessionSettings
 from limber.store import Branch
-from limber.store.loading import load_branch, load_skeleton, young_deviation
+from limber.store.loading import load_branch, load_skeleton, stiffness_deviation
 
 
 def reduced_settings(settings: SessionSettings) -> ReducedSettings:
@@ -28,4 +28,4 @@ def load_held(folder: Path, settings: SessionSettings,
     branch = Branch.read(folder)
     axes = load_skeleton(branch) if branch.has("skeleton.swc") else None
     return HeldBranch(load_branch(branch, gravity=settings.gravity, progress=progress), axes,
-                      young_deviation(branch))
+                      stiffness_deviation(branch))

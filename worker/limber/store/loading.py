@@ -195,9 +195,12 @@ def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDampin
     return DEFAULT_DAMPING
 
 
-def young_deviation(branch: Branch) -> float | None:
-    """Return the standard deviation of log E from the last estimate, swing or ringing, assumed
-    equal for all moduli; None if there is none.
+def stiffness_deviation(branch: Branch) -> float | None:
+    """Return the relative standard deviation of the branch's bending stiffness, assumed equal all
+    along it, by the last estimate, swing or ringing; None if there is none.
+
+    A force or motion predicted on the branch's own mesh depends on E I: an error of the scanned
+    radius cancels with that of E. Swing and ringing state only the interval of E.
 
     Raises:
         InputError: ``estimate.json`` is damaged.
@@ -215,9 +218,11 @@ def young_deviation(branch: Branch) -> float | None:
     from limber.estimation.estimate_file import read_estimate
 
     known = read_estimate(branch.path("estimate.json"))
-    total = [value for value in (known.get("young_deviation") or {}).get("total") or []
-             if value is not None]
-    return float(np.mean(total)) if total else None
+    intervals = np.array(known.get("bending_stiffness_interval_nm2")
+                         or known.get("young_interval_pa") or np.zeros((0, 2)), float)
+    known_ones = intervals[np.isfinite(intervals).all(axis=1) & (intervals > 0).all(axis=1)]
+    return (float(np.mean(np.log(known_ones[:, 1] / known_ones[:, 0]))) / (2 * 1.96)
+            if len(known_ones) else None)
 
 
 def load_model(branch: Branch, *, gravity: bool = True, young: float | np.ndarray | None = None,

@@ -115,7 +115,7 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
     from limber.mechanics.loads.gust_loads import blown, with_peak
     from limber.mechanics.loads.load_effects import load_effects
     from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
-    from limber.store.loading import known_damping, load_branch, load_skeleton, young_deviation
+    from limber.store.loading import known_damping, load_branch, load_skeleton, stiffness_deviation
 
     gusts = _gusts(settings)
     wind = blown(settings.wind or (0.0, 0.0, 0.0), gusts)
@@ -142,7 +142,7 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
         progress(0.1, "gusts")
         outdoors, peak = with_peak(outdoors, gusts, known_damping(branch, progress))
     bent, result = load_effects(
-        outdoors, strain_limit=settings.strain_limit, deviation=young_deviation(branch),
+        outdoors, strain_limit=settings.strain_limit, deviation=stiffness_deviation(branch),
         most=_MOST_MULTIPLE if settings.limit_load else None, progress=progress.part(0.2, 1.0))
     result |= {"frequencies_before_hz": lowest_modes(prestress, len(bent.frequencies)).frequencies,
                "gusts": peak}

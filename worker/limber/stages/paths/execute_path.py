@@ -26,7 +26,7 @@ from limber.stages.pulls.record_nudge import Nudge, checked_nudge
 from limber.stages.pulls.record_path import GRASP_RADIUS_M
 from limber.stages.pulls.record_prediction import PullModel
 from limber.store import Branch
-from limber.store.loading import young_deviation
+from limber.store.loading import stiffness_deviation
 
 _SPACING = 0.0025  # m between poses that are solved: a chord of it on a bend of 0.3 m stretches
 # a branch by 3 micrometres
@@ -128,7 +128,7 @@ def path_nudge(branch: Branch, model: GraspModel, cell: Cell, motion: RobotMotio
     path = motion.path
     assert path.joints is not None
     base = matrices(np.array(cell.base.pose))
-    held = PullModel(model.model, young_deviation(branch), cell, model.rest_position)
+    held = PullModel(model.model, stiffness_deviation(branch), cell, model.rest_position)
     return checked_nudge(cell, held, pose_vectors(base @ matrices(path.poses[0])), path.joints[0],
                          path, blocked, progress)
 

@@ -61,9 +61,9 @@ class PullModel:
         Raises:
             LimberError: there is no usable model.
         """
-        from limber.store.loading import load_branch, young_deviation
+        from limber.store.loading import load_branch, stiffness_deviation
 
-        return cls(load_branch(branch, progress=progress).model, young_deviation(branch), cell,
+        return cls(load_branch(branch, progress=progress).model, stiffness_deviation(branch), cell,
                    point)
 
     def _stiffness(self) -> np.ndarray:
