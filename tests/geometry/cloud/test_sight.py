@@ -10,7 +10,7 @@ from limber.geometry.cloud import preparation
 from limber.geometry.cloud.camera import D455, Camera, depth_to_cloud
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
-from limber.geometry.cloud.single_view import find_sight, flying_pixels
+from limber.geometry.cloud.single_view import Sight, find_sight, flying_pixels
 from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.io.clouds import read_points
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -42,10 +42,22 @@ def test_flying_pixels_are_found_and_the_branch_stays() -> None:
     sight = find_sight(in_camera_axes(camera, depth))
     assert sight is not None
     assert sight.pitch == pytest.approx(1 / camera.fx, rel=1e-3)
-    found = flying_pixels(sight, 78.0, 20)
+    found = flying_pixels(sight, 78.0, 3)
     truth = flies[depth > 0]
     assert found[truth].mean() > 0.95
     assert found[~truth].mean() < 0.01
+
+
+def test_thin_twigs_in_pieces_stay() -> None:
+    """A twig one pixel wide, with steps of 30 mm between its pieces of three pixels, and a pixel
+    by itself stay; a pixel behind a stem's edge flies.
+    """
+    row, column = (grid.ravel() for grid in np.mgrid[0:100, 0:6])
+    twig = np.stack([np.full(90, 50), np.arange(7, 97)], axis=1)
+    pixels = np.vstack([np.stack([row, column], axis=1), twig, [[80, 60], [20, 6]]]).astype(float)
+    depth = np.concatenate([np.ones(len(row)), 1 + 0.03 * (np.arange(90) // 3 % 2), [1.2, 1.1]])
+    flies = flying_pixels(Sight(pixels, depth, 1e-3), 78.0, 3)
+    assert np.flatnonzero(flies).tolist() == [len(pixels) - 1]
 
 
 def test_a_thinned_image_says_how_many_of_its_pixels_are_left() -> None:
@@ -56,7 +68,7 @@ def test_a_thinned_image_says_how_many_of_its_pixels_are_left() -> None:
     half = np.random.default_rng(2).uniform(size=len(points)) < 0.5
     sight = find_sight(points[half])
     assert sight.fill == pytest.approx(0.5, abs=0.03)
-    found = flying_pixels(sight, 78.0, 20)
+    found = flying_pixels(sight, 78.0, 3)
     assert found[truth[half]].mean() > 0.9
     assert found[~truth[half]].mean() < 0.01
 

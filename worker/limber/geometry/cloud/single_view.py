@@ -105,13 +105,12 @@ def flying_pixels(sight: Sight, grazing: float, speck: int) -> np.ndarray:
 
     Two pixels are connected if noise and a surface seen at the angle ``grazing`` can explain the
     difference of their depths. Noise is measured with a stereo camera's model: it grows with the
-    square of the depth.
+    square of the depth. A group with no pixel beside it does not fly: there is no edge.
 
     Args:
         sight: The image.
         grazing: Steepest surface that counts, between its normal and the line of sight [deg].
-        speck: Groups of fewer pixels are flying; in a thinned image, the number is reduced
-        accordingly.
+        speck: Fewest connected pixels that fly by no coincidence.
 
     Returns:
         True where a pixel flies, shape [n].
@@ -127,7 +126,9 @@ def flying_pixels(sight: Sight, grazing: float, speck: int) -> np.ndarray:
     held = np.abs(depth[one] - depth[other]) <= allowed
     graph = sparse.coo_matrix((np.ones(held.sum()), (one[held], other[held])), (count, count))
     group = connected_components(graph, directed=False)[1]
-    return np.bincount(group)[group] < speck * sight.fill
+    beside = group[pairs[~held]]
+    has_edge = np.isin(group, beside[beside[:, 0] != beside[:, 1]])
+    return has_edge & (np.bincount(group)[group] < speck)
 
 
 def _noise(depth: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
