@@ -110,7 +110,7 @@ def test_the_workers_numpy_is_found_by_the_worker_alone(build, tmp_path):
 def test_kernels_are_compiled_where_the_zip_is_to_run(build, tmp_path, monkeypatch, capsys):
     """By the worker, with a Python of the zip's version, on the zip's system; else not at all."""
     monkeypatch.setenv("LIMBER_TEST_PYTHON", "no-such-python")
-    own = "%d.%d" % sys.version_info[:2]
+    own = ".".join(map(str, sys.version_info[:2]))
     assert build.python_of(own) == sys.executable and build.python_of("2.0") is None
     system = next((name for name, about in build.MARKERS.items()
                    if about[2:] == (platform.system(), platform.machine())), None)

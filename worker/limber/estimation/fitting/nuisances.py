@@ -352,7 +352,8 @@ def in_words(listed: Sequence[dict]) -> str | None:
                    key=lambda each: -abs(each["value"] / each["prior_sigma"]))
     if not named:
         return None
-    more = f"; {len(named) - _MOST_NAMED} more stand in estimate.json" if len(named) > _MOST_NAMED else ""
+    rest = len(named) - _MOST_NAMED
+    more = f"; {rest} more stand in estimate.json" if rest > 0 else ""
     return ("The fit found these errors of the measurement and corrected for them; the intervals "
             f"include them: {'; '.join(map(_shown, named[:_MOST_NAMED]))}{more}.")
 
