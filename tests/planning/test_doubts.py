@@ -81,7 +81,7 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
     there = baseline_and_plan.plan_pair(rough_field, START, GraspGoal(tuple(START), 0.01), settings)
 
     def plan_pair(_field, _start, _goal, _settings, tried_limits, *, beyond, **_options):
-        tried.append(tried_limits.max_loads[0])
+        tried.append(2.4 - tried_limits.slack.most.sum())
         assert beyond.max_loads[0] == pytest.approx(2.4 + uncertainty)
         if tried[-1] <= 2.4:
             raise BlockedError(seen, "On a grid.", "Raise the limit.")
@@ -89,13 +89,14 @@ def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch,
 
     uncertainty = limits.doubts(rough_field)["strain"]
     monkeypatch.setattr(baseline_and_plan, "plan_pair", plan_pair)
-    monkeypatch.setattr(baseline_and_plan, "_closed_by_field", lambda *_: None)
+    monkeypatch.setattr(baseline_and_plan, "_closed_by_field", lambda *_: (None, True))
     arguments = rough_field, START, GOAL, settings, limits
     progress = Progress(on_warning=told.append)
     if UNPROVEN in seen:
         found = baseline_and_plan.plan_within(*arguments, progress=progress)
         assert not any(found.margins.values()) and tried[-1] == pytest.approx(2.4 + uncertainty)
-        assert any("extended by the field's error (strain 0." in words for words in told)
+        assert found.in_doubt is not None
+        assert any("field's error, at most strain 0." in words for words in told)
     else:
         with pytest.raises(BlockedError, match="No path exists"):
             baseline_and_plan.plan_within(*arguments, progress=progress)
@@ -108,7 +109,7 @@ def test_where_cells_close_the_way_by_the_field_only_its_error_is_tried(rough_fi
     limits, tried = Limits(strain=2.4), []
 
     def plan_pair(_field, _start, _goal, _settings, tried_limits, *, is_bounded=True, **_options):
-        tried.append((float(tried_limits.max_loads[0]), is_bounded))
+        tried.append((2.4 - tried_limits.slack.most.sum(), is_bounded))
         raise BlockedError(f"None was found, {UNPROVEN}.", "On a grid.", "Raise the limit.")
 
     monkeypatch.setattr(baseline_and_plan, "plan_pair", plan_pair)

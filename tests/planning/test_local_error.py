@@ -11,7 +11,7 @@ from limber.planning.closed_passages import checked_wall, confirmed, not_confirm
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.field.interpolation.local_error import LocalError
+from limber.planning.field.interpolation.local_error import LocalError, slack_slopes, slacks_at
 from limber.planning.goals.allowed_poses import allowed_points
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.goals.regions import Ball
@@ -76,6 +76,34 @@ def test_cells_close_by_the_error_of_their_place(half_rough):
     smooth = points[:, 1] < -0.05
     assert spare[smooth].mean() > 2.0 * spare[points[:, 1] > 0.05].mean() >= 0.0
     assert (replace(problem, errors={}).spare("strain", points) == 0.0).all()
+
+
+def test_a_limit_in_doubt_is_extended_by_the_error_of_its_place(half_rough):
+    """Poses over the limit by less than the field's error there are allowed, others are not."""
+    limits = Limits(strain=2.2)
+    points = half_rough.region.draw(3000, np.random.default_rng(0))
+    over = np.abs(half_rough.load(points, "strain")) - 2.2
+    error = limits.errors(half_rough)["strain"].at(half_rough.region.chart.plain.map(points))
+    allowed = allowed_points(points, limits.in_doubt(half_rough))
+    trusted = half_rough.region.contains(points)
+    assert np.array_equal(allowed, trusted & (over <= error))
+    assert (allowed & (over > 0.0)).sum() > 20 < (trusted & ~allowed).sum()
+
+
+def test_the_slope_of_a_slack_is_its_growth(half_rough):
+    """Along each axis, on both sides of a limit, by differences; none where it is cut off."""
+    points = half_rough.region.chart.plain.map(
+        half_rough.region.draw(200, np.random.default_rng(0)))
+    limits = Limits(strain=2.2)
+    for arrays in (limits.within(half_rough, 0.5), limits.in_doubt(half_rough)):
+        slope = slack_slopes(points, 2, arrays.slack)
+        steps = 1e-6 * np.eye(3)
+        growth = np.stack([slacks_at(points + step, 2, arrays.slack)
+                           - slacks_at(points - step, 2, arrays.slack) for step in steps], axis=1)
+        below = np.abs(arrays.slack.most[2]) - np.abs(slacks_at(points, 2, arrays.slack))
+        inner = below > 1e-4
+        assert inner.any() and (slope[below == 0.0] == 0.0).all()
+        assert np.allclose(slope[inner], growth[inner] / 2e-6, rtol=1e-4, atol=1e-5)
 
 
 @pytest.fixture(scope="module")

@@ -50,7 +50,8 @@ class PathPair:
     found paths, by name. ``margins`` is by how much the limits were tighter than requested;
     ``detour`` the effect of a limit on the length. ``trees`` has the results of the planners that
     grow a tree, by the planner's name. ``unbounded`` is the problem of a plan that the full model
-    probably refuses, of which no close bound was computed (:func:`with_bound`).
+    probably refuses, of which no close bound was computed (:func:`with_bound`). ``in_doubt``: no
+    path was found that keeps the limits on the field; these may keep them on the branch.
     """
 
     baseline: FoundPath
@@ -63,6 +64,7 @@ class PathPair:
     detour: DetourPath | None = None
     trees: dict[str, FoundPath] = field(default_factory=dict)
     unbounded: GentleProblem | None = None
+    in_doubt: BlockedError | None = None
 
     @property
     def stays(self) -> bool:
@@ -82,9 +84,10 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     grown again if their paths still hold, and its plan is one of the paths to start from. Without
     ``is_bounded`` the bound is left to :func:`with_bound`.
 
-    If no path keeps the margins, one that keeps the limits on the field alone is planned. If none
+    If no path keeps the margins, or cells show none that keeps the limits even without, one that
+    keeps the limits on the field alone is planned. If none
     does either, and that proves nothing, one is planned that may keep them on the branch
-    (:meth:`~.limits.Limits.beyond`). The full model decides whether it holds.
+    (:meth:`~.limits.Limits.in_doubt`). The full model decides whether it holds.
 
     Raises:
         InputError: the start is not allowed.
@@ -92,7 +95,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     """
     margins = limits.margins(field)
     check_start(field, start, limits.on(field))
-    closed = _closed_by_field(field, start, goal, limits, asked or limits)
+    closed, is_open = _closed_by_field(field, start, goal, limits, asked or limits)
     none = dict.fromkeys(margins, 0.0)
     surely = (asked or limits).beyond(field)
     errors = (asked or limits).errors(field)
@@ -102,7 +105,7 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
         return replace(_in_doubt(closed, field, start, goal, settings, limits, surely, **options,
                                  progress=progress), margins=none)
     # A start near its limit leaves room for only a part of the margins.
-    shares = [share for share in _SHARES if any(margins.values())
+    shares = [share for share in _SHARES if is_open and any(margins.values())
               and allowed_points(start[None], limits.within(field, share))[0]]
     if shares:
         part = {name: shares[0] * value for name, value in margins.items()}
@@ -126,21 +129,22 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
 
 
 def _closed_by_field(field: EnergyField, start: np.ndarray, goal: Goal, limits: Limits,
-                     asked: Limits) -> BlockedError | None:
+                     asked: Limits) -> tuple[BlockedError | None, bool]:
     """Return the error if cells show, before any search, that no path keeps the limits by the field
-    without its error; None if they do not.
+    without its error, None if they do not; and whether they show a path.
 
     Raises:
-        BlockedError: they prove it with the field's error as well.
+        BlockedError: they prove that there is none with the field's error as well.
     """
     if not limits.asked():
-        return None
+        return None, True
     problem = GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
                             beyond=asked.beyond(field), errors=asked.errors(field))
     verdict = judge(problem, _FEW_CELLS)
     if not verdict.proven:
-        return not_found(problem, "By the energy field there is none, but its error leaves the "
-                         "question open.") if verdict.closed_by_field else None
+        closed = not_found(problem, "By the energy field there is none, but its error leaves the "
+                           "question open.") if verdict.closed_by_field else None
+        return closed, verdict.path is not None
     none = separated(problem, verdict)
     try:
         goal_points(goal, field, problem.limits)
@@ -163,11 +167,11 @@ def _in_doubt(none: BlockedError, field: EnergyField, start: np.ndarray, goal: G
         raise none
     options["progress"].warn(
         "No path keeps the limits on the energy field, but one may exist. The path is planned "
-        f"with limits extended by the field's error ({_margin_text(doubts)}). The full model "
-        "decides whether it is allowed.")
+        f"with limits extended by the field's error, at most {_margin_text(doubts)}. The full "
+        "model decides whether it is allowed.")
     try:
-        return plan_pair(field, start, goal, settings, limits.beyond(field), beyond=surely,
-                         **options)
+        return replace(plan_pair(field, start, goal, settings, limits.in_doubt(field),
+                                 beyond=surely, **options), in_doubt=none)
     except NoPathError:
         raise none from None
 

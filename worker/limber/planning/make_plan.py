@@ -33,6 +33,7 @@ from limber.planning.path_problem import BlockedError
 from limber.planning.path_start import start_of
 from limber.planning.plan_summary import doubts_of, summary_of
 from limber.planning.planners.least_violation import easiest_path
+from limber.planning.planners.refine import is_along
 from limber.planning.planners.tree_search import SearchTree
 from limber.planning.search_files import CostToGo
 from limber.planning.settings import PlanSettings
@@ -186,7 +187,7 @@ class _Rounds:
             BlockedError: none was found, or none exists and the full model confirms it.
         """
         try:
-            return self._within_goal(ahead.part(0.0, 0.3))
+            pair = self._within_goal(ahead.part(0.0, 0.3))
         except BlockedError as none:
             found = None if is_last else solved_if_undecided(
                 self.field, self.grasp_model, self.start, self.aim, self.planned_limits,
@@ -199,6 +200,17 @@ class _Rounds:
                 f"{found.summary}.")
             self.field = refit(self.field, found.learnt)
             return None
+        if pair.in_doubt is not None and self._was_refused(pair):
+            raise pair.in_doubt
+        return pair
+
+    def _was_refused(self, pair: PathPair) -> bool:
+        """Return whether the full model refused such a path before, and the field, which knows its
+        states since, still finds none that keeps the limits.
+        """
+        before = self.pair
+        return before is not None and None not in (pair.in_doubt, before.in_doubt) and is_along(
+            pair.plan.points, before.plan.points)
 
     def _within_goal(self, ahead: Progress) -> PathPair:
         """Return paths on the field that end as deep in the goal as the field's error asks for; if

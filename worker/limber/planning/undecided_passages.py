@@ -39,6 +39,10 @@ def solved_if_undecided(field: EnergyField, grasp_model: GraspModel, start: np.n
     reserve = max((margins[name] / limit for name, limit in asked.items()), default=0.0)
     if path is None or path.worst > 1.0 + reserve:
         return None
+    if path.worst > 1.0:  # the error there may be less
+        open_way = easiest_path(field, limits.in_doubt(field), start, goal)
+        if open_way is None or open_way.worst > 1.0:
+            return None
     approach = field.rest[None]
     if np.linalg.norm(start - field.rest) >= STEP:
         to_start = easiest_path(field, limits.on(field), field.rest.copy(),

@@ -204,10 +204,20 @@ class Limits:
         """Return the field with these limits, tighter at each position by a ``share`` of the
         field's possible underestimate there, which 95 % of the left-out samples keep.
         """
-        errors = self._local(known, -1.0, _COVERED, {name: _MOST * limit for name, limit
-                                                     in self.asked().items()})
+        return self._slackened(known, self._local(known, -1.0, _COVERED, {
+            name: _MOST * limit for name, limit in self.asked().items()}), share)
+
+    def in_doubt(self, known: EnergyField) -> FieldArrays:
+        """Return the field with limits that it may exceed at a position where the branch keeps
+        these: extended by the field's possible overestimate there; infinite if not known.
+        """
+        return self._slackened(known, self.errors(known), -1.0)
+
+    def _slackened(self, known: EnergyField, errors: dict[str, LocalError], share: float,
+                   ) -> FieldArrays:
+        """Return the field with the limits that have errors, tighter by a ``share`` of these."""
         names = ("energy", "force", *known.load_names)
-        limits = self.asked()
+        limits = {name: limit for name, limit in self.asked().items() if name in errors}
         return known.limited(limits.pop("energy", np.inf), limits.pop("force", np.inf),
                              low=self.low, high=self.high,
                              slack=slack_of(names, errors, share), **limits)

@@ -368,7 +368,7 @@ def energy_at(point, field):
 def allowed_at(point, energy, field):
     """Return whether ``point``, whose energy is known, is trusted and within the limits."""
     # The slack's chart is the plain one, which is the region's.
-    if energy > field.max_energy or energy > field.max_energy - _slack(point, 0, field):
+    if energy > field.max_energy - _slack(point, 0, field):
         return False
     for k in range(3):
         if not field.low[k] <= point[k] <= field.high[k]:

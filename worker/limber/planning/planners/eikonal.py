@@ -1,9 +1,9 @@
 """The gentlest path with its certificate: eikonal descent, refinement, bound.
 
 Each grid of the certificate gives its cheapest path; refined, it becomes a path on the field. The
-first paths tried are the straight line and those of other planners. If none of them keeps the
-limits, next come a path through cells that do, if there is one
-(:mod:`limber.planning.certificate.feasibility`), else the path that exceeds the limits least.
+first paths tried are the straight line and those of other planners that keep the limits; if none
+does, the path that exceeds them least. If that fails, next comes a path through cells that keep
+them, if there is one (:mod:`limber.planning.certificate.feasibility`).
 """
 
 from collections.abc import Sequence
@@ -66,7 +66,7 @@ class _Gentlest:
         self.problem, self._others = problem, others
         self.points: np.ndarray | None = None
         self.cost = np.inf
-        self._verdict: Verdict | None = None
+        self._tried: list[np.ndarray] = []
         self._is_in_vain = False
 
     def __call__(self, rough: np.ndarray | None) -> float:
@@ -75,29 +75,37 @@ class _Gentlest:
         along = rough is not None and self.points is not None and is_along(rough, self.points)
         if along and self._is_in_vain:
             return before  # leads to the same optimum
-        # Those of planners first: mostly the straight line then leads to the same optimum.
-        if self._found_from([*self._others[::-1], _straight(problem)] if rough is None else [rough],
-                            rough is None):
+        if self._found_from(self._starts() if rough is None else [rough], rough is None):
             self._is_in_vain |= along and self.cost > (1.0 - _GAIN) * before
             return self.cost
-        if self._verdict is not None:
-            # Coarser cells than those that left it open will not decide it.
-            raise not_found(problem, f"The question is undecided on {_grid(self._verdict)}.")
-        verdict = self._verdict = judge(problem)
+        if problem.limits.slack.factors.any():
+            # Cells are asked about the limits as requested, not about extended or tighter ones.
+            raise not_found(problem, "The easiest path does not keep them.")
+        verdict = judge(problem)
         # A path that keeps the limits is a better proof than cells that separate.
-        path = verdict.path
-        known = (path is not None and self._found_from([path])) or self._found_from(
-            _easiest(problem))
-        if not known and verdict.proven:
-            raise separated(problem, verdict)
+        if verdict.path is None or not self._found_from([verdict.path]):
+            raise separated(problem, verdict) if verdict.proven else not_found(
+                problem, f"The question is undecided on {_grid(verdict)}.")
         return self.cost
+
+    def _starts(self) -> list[np.ndarray]:
+        """Return the known paths that keep the limits; if none does, the path that exceeds them
+        least.
+        """
+        # Those of planners first: mostly the straight line then leads to the same optimum.
+        known = [path for path in [*self._others[::-1], _straight(self.problem)]
+                 if len(path) > 1 and np.isfinite(self.problem.cost(path))]
+        return known or _easiest(self.problem)
 
     def _found_from(self, paths: list[np.ndarray], skips_same: bool = False) -> bool:
         for path in paths:
             if len(path) < 2 or not arc_lengths(path)[-1] > 0.0:
                 continue
-            if skips_same and self.points is not None and is_along(path, self.points):
-                continue
+            same = self._tried if self.points is None or not skips_same else [
+                *self._tried, self.points]
+            if any(is_along(path, other) for other in same):
+                continue  # leads to the same optimum
+            self._tried.append(path)
             points, cost = refine(path, self.problem)
             if cost < self.cost:
                 self.points, self.cost = points, cost

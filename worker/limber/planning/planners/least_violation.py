@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from limber.planning.cost import resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.field.interpolation.local_error import slacks_at
 from limber.planning.field.limited_quantities import limited
 from limber.planning.goals.goal import Goal
 
@@ -75,16 +76,19 @@ def _grid(field: EnergyField) -> tuple:
 
 
 def _shares(field: EnergyField, limits: FieldArrays, points: np.ndarray) -> np.ndarray:
-    """Return the largest ratio of a quantity to its limit at ``points`` [n, 3], shape [n]; infinite
-    outside the samples' hull and the workspace.
+    """Return the largest ratio of a quantity, its slack added, to its limit at ``points`` [n, 3],
+    shape [n]; infinite outside the samples' hull and the workspace.
     """
     out = np.full(len(points), np.inf)
     within = field.region.height(points) <= 0.0
     within &= ((points >= limits.low) & (points <= limits.high)).all(axis=1)
     inside = points[within]
     shares = np.where(field.region.contains(inside), 0.0, _REFUSED)
+    places = field.region.chart.plain.map(inside)
+    names = ("energy", "force", *field.load_names)
     for one in limited(field, limits):
-        shares = np.maximum(shares, one.size(inside) / one.limit)
+        size = one.size(inside) + slacks_at(places, names.index(one.name), limits.slack)
+        shares = np.maximum(shares, size / one.limit)
     out[within] = shares
     return out
 

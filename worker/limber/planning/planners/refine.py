@@ -20,7 +20,7 @@ import scipy
 from scipy.spatial import cKDTree
 
 from limber.planning.cost import arc_lengths, resample
-from limber.planning.field.interpolation.local_error import slacks_at
+from limber.planning.field.interpolation.local_error import slack_slopes, slacks_at
 from limber.planning.field.interpolation.valid_region import nearest_of
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.smoothing import smooth_cost
@@ -33,7 +33,7 @@ _ITERATIONS = 80  # in a round
 _WEIGHTS = (1e3, 1.0)  # of squared excesses at first: of position and length, and of loads
 _HOPELESS = 1e5  # factor on the weights above which violated limits stay violated
 _FAR = 10.0  # relative excess above which heavier weights change nothing
-_HEAVIER = 5.0  # from round to round, where limits are not kept much better than before
+_HEAVIER = 25.0  # from round to round, where limits are not kept much better than before
 _BETTER = 0.25
 _SETTLED = 3e-4  # change of the cost in a round, relative
 _MARGINS = (2e-5, 3e-4, 2e-3)  # [m] distance kept from the limits; the next if one was not enough
@@ -51,13 +51,15 @@ def refine(path: np.ndarray, problem: GentleProblem) -> tuple[np.ndarray, float]
     near; then the given path is returned.
     """
     best, least, moved = path, problem.cost(path), path
-    for margin in _MARGINS:
-        moved, over = _moved(moved, problem, margin)
+    limits = Limited(problem, 0.0)
+    for margin, following in zip(_MARGINS, (*_MARGINS[1:], 0.0), strict=True):
+        limits.margin = margin
+        moved, over = _moved(moved, limits)
         cost = problem.cost(moved)
         if cost < least:
             best, least = moved, cost
-        # A margin mends an excess between two points of a path, not a path that is far over.
-        if np.isfinite(cost) or over > _FAR:
+        # A margin mends an excess between two points of a path, not one that is larger than it.
+        if np.isfinite(cost) or over * limits.scale > following:
             break
     return best, least
 
@@ -79,16 +81,15 @@ def distinct(paths: Sequence[np.ndarray]) -> list[np.ndarray]:
     return found
 
 
-def _moved(path: np.ndarray, problem: GentleProblem, margin: float) -> tuple[np.ndarray, float]:
-    """Move a path [n, 3] to keep ``margin`` [m] from the limits.
+def _moved(path: np.ndarray, limits: "Limited") -> tuple[np.ndarray, float]:
+    """Move a path [n, 3] to keep the margin from ``limits``, whose multipliers go on.
 
     Returns:
         The path, and its largest excess over a limit, relative to that limit.
     """
-    line = _Line(problem)
-    limits = Limited(problem, margin)
+    line = _Line(limits.problem)
     flat = line.chart.map(path)
-    flat[0] = line.chart.map(problem.start)[0]
+    flat[0] = line.chart.map(limits.problem.start)[0]
     before, worst, over = np.inf, np.inf, np.inf
     for _ in range(_ROUNDS):
         flat = resample(flat, max(np.linalg.norm(np.diff(flat, axis=0), axis=1).sum(), 1e-6)
@@ -288,9 +289,9 @@ class Limited:
     def _slack_slope(self, points: np.ndarray, row: int) -> np.ndarray:
         if self.problem.limits.slack.factors[row] == 0.0:
             return np.zeros((len(points), 3))
-        shifts = _STEP * np.eye(3)
-        return np.stack([self._slack(points + shift, row) - self._slack(points - shift, row)
-                         for shift in shifts], axis=1) / (2.0 * _STEP)
+        chart = self.problem.energy_field.region.chart.plain
+        return chart.pull_back(points, slack_slopes(
+            chart.map(points), row, self.problem.limits.slack))
 
     def _at_end(self, points: np.ndarray, push: np.ndarray) -> np.ndarray:
         shifts = _STEP * np.concatenate([np.eye(3), -np.eye(3)])

@@ -74,7 +74,8 @@ class LocalError:
 
 
 class Slack(NamedTuple):
-    """Tightening of limits by position, for compiled loops; see :func:`slack_at`.
+    """Tightening of limits by position, for compiled loops; see :func:`slack_at`. Below 0: they are
+    extended.
 
     Attributes:
         points: Positions of samples in the plain chart, shape [m, 3].
@@ -91,7 +92,9 @@ class Slack(NamedTuple):
 
 
 def slack_of(names: Sequence[str], errors: Mapping[str, LocalError], share: float) -> Slack:
-    """Return a ``share`` of ``errors`` as slack of the limits ``names``; none for the others."""
+    """Return a ``share`` of ``errors``, -1 to 1, as slack of the limits ``names``; none for the
+    others.
+    """
     known = {name: error for name, error in errors.items() if np.isfinite(error.factor)}
     first = next(iter(known.values()), None)
     points = np.empty((0, 3)) if first is None else first.points
@@ -111,7 +114,7 @@ def slack_at(point: np.ndarray, row: int, slack: Slack) -> float:
     """Return the tightening of the limit of a ``row`` at ``point`` [3] of the chart."""
     factor = slack.factors[row]
     if factor == 0.0 or factor == np.inf:
-        return slack.most[row] if factor > 0.0 else 0.0
+        return slack.most[row] if factor == np.inf else 0.0
     total, weights = 0.0, 0.0
     for i in range(len(slack.points)):
         distance = slack.near
@@ -120,7 +123,8 @@ def slack_at(point: np.ndarray, row: int, slack: Slack) -> float:
         weight = 1.0 / (distance * distance * distance)
         total += weight * slack.squares[row, i]
         weights += weight
-    return min(factor * np.sqrt(total / weights), slack.most[row])
+    tighter = factor * np.sqrt(total / weights)
+    return min(tighter, slack.most[row]) if factor > 0.0 else max(tighter, slack.most[row])
 
 
 @compiled
@@ -129,6 +133,36 @@ def slacks_at(points: np.ndarray, row: int, slack: Slack) -> np.ndarray:
     out = np.empty(len(points))
     for n in range(len(points)):
         out[n] = slack_at(points[n], row, slack)
+    return out
+
+
+@compiled
+def slack_slopes(points: np.ndarray, row: int, slack: Slack) -> np.ndarray:
+    """Return its gradients at ``points`` [n, 3] of the chart, shape [n, 3]."""
+    out = np.zeros((len(points), 3))
+    factor = slack.factors[row]
+    if factor == 0.0 or factor == np.inf:
+        return out
+    along, of_weights = np.empty(3), np.empty(3)
+    for n in range(len(points)):
+        total, weights = 0.0, 0.0
+        along[:], of_weights[:] = 0.0, 0.0
+        for i in range(len(slack.points)):
+            distance = slack.near
+            for k in range(3):
+                distance += (points[n, k] - slack.points[i, k]) ** 2
+            weight = 1.0 / (distance * distance * distance)
+            total += weight * slack.squares[row, i]
+            weights += weight
+            for k in range(3):
+                change = -6.0 * weight / distance * (points[n, k] - slack.points[i, k])
+                along[k] += change * slack.squares[row, i]
+                of_weights[k] += change
+        mean = total / weights
+        if abs(factor * np.sqrt(mean)) < abs(slack.most[row]):
+            for k in range(3):
+                out[n, k] = 0.5 * factor / np.sqrt(mean) * (
+                    along[k] - mean * of_weights[k]) / weights
     return out
 
 
