@@ -382,6 +382,25 @@ def test_no_point_of_a_targets_goal_costs_more_than_the_slack(well_field):
         grid, cell = refined(grid, ground.open_cells, goal_cells.near, cell, 0.6)
 
 
+class Jump(GraspGoal):
+    """A goal whose distance grows six times as fast in a layer far from it as near it."""
+
+    def distance(self, field, points):
+        near = super().distance(field, points)
+        return near * (1.0 + 1.0 / (1.0 + np.exp(-(near - 0.08) / 0.004)))
+
+
+def test_where_the_target_moves_fast_far_from_the_goal_nothing_counts_as_near_it(well_field):
+    """As at a snap of the branch: cells there were sources of the bound, of hardly any cost."""
+    problem = problem_on(well_field, goal=Jump((0.1, 0.06, 0.02), 0.01))
+    grid, cell = first_grid(problem)
+    grid, cell = refined(grid, grid.open_cells, grid.about_goal, cell, 0.5)
+    ground = lower_bound._terrain(problem, lower_bound._land(problem, grid, cell), grid)
+    known = grid.points(np.argwhere(about_goal(problem, grid, ground).known) + 0.5)
+    away = np.linalg.norm(known - problem.goal.position, axis=1)
+    assert 0.01 < away.max() < 0.05
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_plan_is_bounded_closely_once_it_holds(ridge_field):
