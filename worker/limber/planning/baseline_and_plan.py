@@ -27,7 +27,7 @@ from limber.planning.path_problem import UNPROVEN, BlockedError, GentleProblem, 
 from limber.planning.path_start import check_start
 from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.eikonal import GentlePath, plan_gentle, separated
-from limber.planning.planners.refine import refine
+from limber.planning.planners.refine import is_along, refine
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, chosen_engine, found_again, plan_path
 from limber.planning.settings import PlanSettings
@@ -70,6 +70,12 @@ class PathPair:
     def stays(self) -> bool:
         """Whether the start is in the goal, so that the paths have no length."""
         return self.plan.engine == NOTHING_ASKED
+
+    def repeats(self, before: "PathPair | None") -> bool:
+        """Return whether the plan in doubt ``before`` was along this one, and the field, which
+        knows the states along it since, still finds none that keeps the limits."""
+        return before is not None and before.in_doubt is not None and is_along(
+            self.plan.points, before.plan.points)
 
 
 def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,

@@ -16,15 +16,21 @@ from limber.core.errors import Cancelled, NoPathError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.baseline_and_plan import PathPair, plan_within, with_bound
+from limber.planning.certificate.lower_bound import ENOUGH
 from limber.planning.closed_passages import checked_wall, confirmed, not_confirmed
 from limber.planning.constraints.chance import Risk, YoungUncertainty
-from limber.planning.constraints.full_model_check import broken_on_full_model, field_error, learnt
+from limber.planning.constraints.full_model_check import (
+    as_samples,
+    broken_on_full_model,
+    field_error,
+    learnt,
+    with_constraints,
+)
 from limber.planning.constraints.limits import Limits
 from limber.planning.constraints.motion_check import MotionCheck, check_motion
-from limber.planning.cost import STEP, resample
-from limber.planning.field.energy_field import EnergyField, knowing, refit
+from limber.planning.cost import STEP, arc_lengths, resample
+from limber.planning.field.energy_field import EnergyField, refit
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.field.sampling import displacements_at
 from limber.planning.goals.goal import CellPlace, Goal, GoalRequest
 from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.goals.target_goal import TargetGoal
@@ -33,7 +39,6 @@ from limber.planning.path_problem import BlockedError
 from limber.planning.path_start import start_of
 from limber.planning.plan_summary import doubts_of, summary_of
 from limber.planning.planners.least_violation import easiest_path
-from limber.planning.planners.refine import is_along
 from limber.planning.planners.tree_search import SearchTree
 from limber.planning.search_files import CostToGo
 from limber.planning.settings import PlanSettings
@@ -42,6 +47,7 @@ from limber.planning.undecided_passages import Passages, solved_if_undecided, wi
 
 _REPLANS = 3  # of the same plan at most: each takes as long as the first
 _SLOWINGS = 4  # of the motion at most, until it keeps the limits
+_LAST, _LAST_EVERY = 4, 2  # states at a path's end that become samples; every second one
 _RESERVE = 1.01  # factor on the tightening of limits: the risk changes a little with the path
 
 
@@ -99,7 +105,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     goal = goal_of(GoalRequest(field, grasp_model, settings, own.on(field), cell or {}))
     start, limits = start_of(field, goal, settings), limits or own
     if limits.constraints:
-        field = _knowing(field, grasp_model, limits, workers, progress)
+        field = with_constraints(field, grasp_model, limits, workers, progress)
     aim = goal
     if isinstance(goal, TargetGoal):
         aim = goal.with_margin(field, limits.on(field), start)
@@ -126,6 +132,8 @@ class _Rounds:
             of ``baseline_points``.
         risks, moving: Of the plans so far: their risks, and the last one's motion in time.
         round_records: One row per round.
+        holding: The last plan that may be passed on, while one that ends less deep in the goal is
+            tried.
     """
 
     grasp_model: GraspModel
@@ -148,9 +156,22 @@ class _Rounds:
     passages: list[Passages] = fresh(default_factory=list)
     moving: MotionCheck | None = None
     round_records: list[dict[str, Any]] = fresh(default_factory=list)
+    holding: dict[str, Any] | None = None
 
     def plan_once(self, ahead: Progress, is_last: bool) -> bool:
         """Plan and check; return whether the plan may be passed on. If not, samples were added."""
+        if self.holding is None:
+            return self._tried(ahead, is_last)
+        try:
+            done = self._tried(ahead, is_last=True)
+        except NoPathError:
+            done = False
+        if not done:
+            vars(self).update(self.holding)
+            self._completed(present(self.pair, "paths on the field"), ahead.part(0.95, 1.0))
+        return True
+
+    def _tried(self, ahead: Progress, is_last: bool) -> bool:
         began = perf_counter()
         pair = self._planned(ahead, is_last)
         if pair is None:
@@ -169,6 +190,8 @@ class _Rounds:
             "margins": pair.margins, "field_energy_error": off,
             "plan_seconds": planned - began, "check_seconds": perf_counter() - planned})
         if not broken and is_near:
+            if not is_last and self._is_too_deep(pair, plan):
+                return False
             self._completed(pair, ahead.part(0.95, 1.0))
             return True
         if stopped:
@@ -179,6 +202,22 @@ class _Rounds:
             raise _refused(broken)
         self.field = refit(self.field, learnt(self.field, self.grasp_model, plan, self.limits))
         return False
+
+    def _is_too_deep(self, pair: PathPair, plan: ResolvedPath) -> bool:
+        """Return whether the field's error, not the goal, decides how deep in the goal the plan
+        ends. If so, its last states have become samples, and the plan is kept for the case that no
+        better one holds.
+        """
+        end = pair.plan.points[-1:]
+        if pair.stays or not isinstance(self.aim, TargetGoal) or (
+                self.aim.margin_at(self.field, end) < ENOUGH * arc_lengths(pair.plan.points)[-1]):
+            return False
+        self.holding = {name: getattr(self, name) for name in (
+            "pair", "plan", "moving", "risks")} | {"risks": self.risks[:]}
+        states = plan.solved.take(np.arange(len(plan.solved.poses))[::-_LAST_EVERY][:_LAST])
+        self.field = refit(self.field, as_samples(self.grasp_model, states, self.field.samples,
+                                                  self.limits))
+        return True
 
     def _planned(self, ahead: Progress, is_last: bool) -> PathPair | None:
         """Return paths on the field; None if poses were added instead.
@@ -200,17 +239,9 @@ class _Rounds:
                 f"{found.summary}.")
             self.field = refit(self.field, found.learnt)
             return None
-        if pair.in_doubt is not None and self._was_refused(pair):
+        if pair.in_doubt is not None and pair.repeats(self.pair):
             raise pair.in_doubt
         return pair
-
-    def _was_refused(self, pair: PathPair) -> bool:
-        """Return whether the full model refused such a path before, and the field, which knows its
-        states since, still finds none that keeps the limits.
-        """
-        before = self.pair
-        return before is not None and None not in (pair.in_doubt, before.in_doubt) and is_along(
-            pair.plan.points, before.plan.points)
 
     def _within_goal(self, ahead: Progress) -> PathPair:
         """Return paths on the field that end as deep in the goal as the field's error asks for; if
@@ -219,10 +250,14 @@ class _Rounds:
         Raises:
             NoPathError: neither was found.
         """
+        # Probably the first plan to a region ends too deep in it, and a later one is refused.
+        is_deep = isinstance(self.aim, TargetGoal) and self.aim.margin > 0.0
+        is_bounded = self.holding is not None or (self.pair is None and not is_deep)
+
         def paths(aim: Goal, ahead: Progress) -> PathPair:
             return plan_within(self.field, self.start, aim, self.settings, self.planned_limits,
                                asked=self.limits, asked_goal=self.goal, before=self.pair,
-                               is_bounded=self.pair is None, progress=ahead)
+                               is_bounded=is_bounded, progress=ahead)
         try:
             return paths(self.aim, ahead.part(0.0, 0.5))
         except NoPathError as none:
@@ -353,24 +388,6 @@ class _Rounds:
         trees = {name: path.tree for name, path in pair.trees.items() if path.tree is not None}
         return PlannedMotion(summary, baseline, plan, self.field, trees, self.pace,
                              pair.certificate.to_go)
-
-
-def _knowing(field: EnergyField, grasp_model: GraspModel, limits: Limits, workers: int | None,
-             progress: Progress) -> EnergyField:
-    """Return the field with the constraints' quantities as loads.
-
-    Raises:
-        NoPathError: one is broken where the branch hangs.
-    """
-    nodes, rest = grasp_model.mesh.nodes, grasp_model.rest.displacement
-    if met := limits.met(field.rest[None], nodes + rest[None]):
-        raise NoPathError(f"The branch breaks a limit at its rest pose: {'; '.join(met)}.",
-                          "No path can start there.",
-                          "Correct the obstacles in the cell file, or the limit.")
-    grasps = field.samples.positions
-    displacements = displacements_at(grasp_model, grasps, workers=workers,
-                                     progress=progress.part(0.0, 0.1))
-    return knowing(field, limits.values(grasps, nodes + displacements))
 
 
 def _refused(broken: list[str]) -> NoPathError:

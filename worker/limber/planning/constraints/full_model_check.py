@@ -1,18 +1,20 @@
 """Check of a planned motion on the full model, and the samples gained if it fails."""
 
-from dataclasses import replace
-
 import numpy as np
 
+from limber.core.errors import NoPathError
+from limber.core.progress import Progress
 from limber.planning.constraints.limits import Limits
-from limber.planning.field.energy_field import EnergyField
+from limber.planning.field.energy_field import EnergyField, knowing
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.grasp_samples import GraspSamples
+from limber.planning.field.sampling import displacements_at
 from limber.planning.goals.goal import Goal
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 
 _APART = 0.01  # [m] between states of a path that become samples
 _MOST_LEARNT = 12  # most of them in a round
+_NONE = np.empty((0, 3))
 _ROUND_OFF = 1e-12  # fraction of the samples' largest energy
 _SLACK = 1e-3  # fraction of the goal's tolerance that is rounding
 
@@ -73,18 +75,39 @@ def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limi
         if len(chosen) < _MOST_LEARNT and (
                 np.linalg.norm(others - position, axis=1).min() > 0.5 * _APART):
             chosen.append(int(index))
-    found = _as_samples(grasp_model, whole.take(np.array(chosen, int)), path.unsolved,
-                        field.samples)
-    return replace(found, added={name: values[chosen] for name, values in added.items()})
+    return as_samples(grasp_model, whole.take(np.array(chosen, int)), field.samples, limits,
+                      path.unsolved)
 
 
-def _as_samples(grasp_model: GraspModel, states: SolvedPoses, unsolved: np.ndarray,
-                like: GraspSamples) -> GraspSamples:
+def as_samples(grasp_model: GraspModel, states: SolvedPoses, like: GraspSamples, limits: Limits,
+               unsolved: np.ndarray = _NONE) -> GraspSamples:
+    """Return states as samples with what those ``like`` them have, and the quantities of the
+    ``limits``' constraints; ``unsolved`` grasp positions [q, 3] as rejected ones.
+    """
     names = ("targets", "torques", "strain_places", "stresses", "axial_forces")
     optional = {name: getattr(states, name) for name in names if getattr(like, name) is not None}
     if like.shape_slopes is not None:
         slopes = [grasp_model.shape_slopes(moved) for moved in states.displacements]
         optional["shape_slopes"] = np.reshape(slopes, (-1, *like.shape_slopes.shape[1:]))
+    added = limits.values(states.poses[:, :3], grasp_model.mesh.nodes + states.displacements)
     return GraspSamples(states.poses, states.energies, states.forces, states.tips,
                         states.min_det_f, np.hstack([unsolved, np.zeros_like(unsolved)]),
-                        states.strains, **optional)
+                        states.strains, added=added, **optional)
+
+
+def with_constraints(field: EnergyField, grasp_model: GraspModel, limits: Limits,
+                     workers: int | None, progress: Progress) -> EnergyField:
+    """Return the field with the constraints' quantities as loads.
+
+    Raises:
+        NoPathError: one is broken where the branch hangs.
+    """
+    nodes, rest = grasp_model.mesh.nodes, grasp_model.rest.displacement
+    if met := limits.met(field.rest[None], nodes + rest[None]):
+        raise NoPathError(f"The branch breaks a limit at its rest pose: {'; '.join(met)}.",
+                          "No path can start there.",
+                          "Correct the obstacles in the cell file, or the limit.")
+    grasps = field.samples.positions
+    displacements = displacements_at(grasp_model, grasps, workers=workers,
+                                     progress=progress.part(0.0, 0.1))
+    return knowing(field, limits.values(grasps, nodes + displacements))

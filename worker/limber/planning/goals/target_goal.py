@@ -64,11 +64,15 @@ class TargetGoal:
 
     def _kept_off(self, field: EnergyField, points: np.ndarray) -> np.ndarray | float:
         """Return the distance from the region's outside that plans keep at ``points`` [m], [n]."""
+        return self.inset + self.margin_at(field, points)
+
+    def margin_at(self, field: EnergyField, points: np.ndarray) -> np.ndarray | float:
+        """Return the part of it due to the field's error [m], shape [n]."""
         if self.margin == 0.0:
-            return self.inset
+            return 0.0
         stated = field.place_errors(self.target, points, _COVERED)
         stated = np.where(np.isfinite(stated), stated, 0.0)  # not known: the full model decides
-        return self.inset + self.margin * np.minimum(stated, _MOST * self.tolerance)
+        return self.margin * np.minimum(stated, _MOST * self.tolerance)
 
     def with_margin(self, field: EnergyField, limits: FieldArrays, start: np.ndarray) -> Self:
         """Return the goal less the field's error in the target's position, or the largest of a few
