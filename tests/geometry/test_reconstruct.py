@@ -204,6 +204,20 @@ def test_mesh_a_box_in_millimetres(tmp_path):
     assert mesh.nodes[mesh.point_data["fixed"] == 1][:, 2].max() < 0.005
 
 
+def test_points_to_leave_out_must_be_the_scans(tmp_path):
+    """None of them in the scan, and all of them, are refused before any work; single precision is
+    enough to recognise them."""
+    points = np.random.default_rng(3).random((60, 3)) + [0.0, 0.0, 1000.0]
+    scan, others = tmp_path / "scan.ply", tmp_path / "others.ply"
+    Cloud(points).write_ply(scan)
+    for given, told in ((points + 0.01, "None of the 60"), (points, "All 60"),
+                        (points.astype(np.float32).astype(float), "All 60")):
+        Cloud(given).write_ply(others)
+        with pytest.raises(InputError, match=told):
+            reconstruct(scan, tmp_path / "b.branch", without_path=others)
+    assert not (tmp_path / "b.branch").exists()
+
+
 STEPS = ("laplacian", "contracting", "connecting", "fitting axes", "skeleton", "surface",
          "reconstructed")
 
