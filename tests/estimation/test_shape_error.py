@@ -40,13 +40,15 @@ def _with(monkeypatch, fitted, skeletons):
                        len(skeletons))
 
 
-def test_thicker_all_along_is_softer_by_the_fourth_power(monkeypatch, fitted, small):
-    """Radii 1 % off, up or down: each modulus 4 %, as in bending stiffness E r^4."""
+@pytest.mark.parametrize("size", [0.01, 0.2])
+def test_thicker_all_along_is_softer_by_the_fourth_power(monkeypatch, fitted, small, size):
+    """Radii 1 or 20 % off, up or down: each modulus four times as much in the logarithm, as in
+    bending stiffness E r^4, which stays what it was."""
     skeleton = small.skeleton
     found = _with(monkeypatch, fitted, [
-        replace(skeleton, radius=skeleton.radius * (1 + sign * 0.01)) for sign in 4 * (1, -1)])
-    assert found[0] == pytest.approx(0.04 * QUANTILE, rel=0.1)
-    assert found[1].max() < 0.003  # bending stiffness is what it was
+        replace(skeleton, radius=skeleton.radius * np.exp(sign * size)) for sign in 4 * (1, -1)])
+    assert found[0] == pytest.approx(4 * size * QUANTILE, rel=0.1)
+    assert found[1].max() < 0.06 * 4 * size
 
 
 @pytest.mark.slow
