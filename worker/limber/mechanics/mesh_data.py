@@ -42,7 +42,7 @@ class MeshData:
         """Return the data of the mesh with other node positions; patterns are shared."""
         other = copy.copy(self)
         other._set_mesh(replace(self.mesh, nodes=nodes))
-        other.equations = {key: equations.placed(other.tets, other.gradients, other.weights)
+        other.equations = {key: equations.placed(other.gradients, other.weights)
                            for key, equations in self.equations.items()}
         return other
 

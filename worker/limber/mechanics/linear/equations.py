@@ -181,10 +181,10 @@ class Equations:
             for axis in range(3):
                 self.pin_rows[rows + axis, 3 * number + axis] = grasp.weights
 
-    def placed(self, tets: np.ndarray, gradients: np.ndarray, weights: np.ndarray) -> "Equations":
+    def placed(self, gradients: np.ndarray, weights: np.ndarray) -> "Equations":
         """Return the equations of the same tetrahedra at other positions, with shared pattern."""
         other = copy.copy(self)
-        other.layout = LaneLayout(self.pattern, tets, gradients, weights)
+        other.layout = self.layout.moved(gradients, weights)
         other._axes, other._known = {}, None
         return other
 

@@ -1,5 +1,6 @@
 """Elimination order, sparsity pattern and vector layout of the elements' stiffness."""
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -106,18 +107,27 @@ class LaneLayout:
         padding = -len(order) % LANES
         self._order = np.concatenate([order, np.repeat(order[-1:], padding)])
         self._real = len(order)
-        turn = turn[self._order]
+        self._turn = turn = turn[self._order]
         nodes = np.take_along_axis(tets[self._order], turn, axis=1)
         self.nodes = lanes_last(nodes.astype(np.int32))
-        weights = weights[self._order].copy()
-        weights[self._real:] = 0.0
-        self.weights = lanes_last(weights)
-        self.gradients = lanes_last(np.swapaxes(np.take_along_axis(
-            gradients[self._order], turn[:, None, None, :], axis=3), 2, 3))
+        self._place(gradients, weights)
         later, earlier = np.tril_indices(tets.shape[1])
         slots, lengths = pattern.slots(nodes[:, later], nodes[:, earlier])
         self.slots = lanes_last(slots.astype(np.int32))
         self.lengths = lanes_last(lengths.astype(np.int32))
+
+    def moved(self, gradients: np.ndarray, weights: np.ndarray) -> "LaneLayout":
+        """Return the layout of the same tetrahedra at other positions."""
+        other = copy.copy(self)
+        other._place(gradients, weights)
+        return other
+
+    def _place(self, gradients: np.ndarray, weights: np.ndarray) -> None:
+        weights = weights[self._order].copy()
+        weights[self._real:] = 0.0
+        self.weights = lanes_last(weights)
+        self.gradients = lanes_last(np.swapaxes(np.take_along_axis(
+            gradients[self._order], self._turn[:, None, None, :], axis=3), 2, 3))
 
     def per_element(self, values: np.ndarray) -> np.ndarray:
         """Return one number per tetrahedron in this layout, shape [batch, LANES]."""
