@@ -100,6 +100,50 @@ def test_a_branch_that_folds_up_is_given_up_early(small_bench, bad_cell, monkeyp
     assert objective.evaluate(free).objective == pytest.approx(before.objective, rel=0.05)
 
 
+def test_slopes_by_adjoints_are_those_of_the_pull(small_bench, bad_cell):
+    """Points and gripper under one force, against a difference of two simulations."""
+    forward = objective_of(small_bench, bad_cell).forwards[0]
+    values, step = Values(TRUTH, 0.36, 900.0), 1e-3
+    found = forward.simulate(values, ("poisson",), True)
+    assert found.d_positions.shape[-1] == 5
+    for column, changed in ((1, replace(values, young=TRUTH * np.exp([0, step, 0, 0]))),
+                            (4, replace(values, poisson=0.36 + step))):
+        forward._drives_for = changed  # at the same force
+        moved = forward.simulate(changed, ("poisson",), False)
+        for name in ("positions", "grasps"):
+            change = (getattr(moved, name) - getattr(found, name)) / step
+            slope = getattr(found, f"d_{name}")[..., column]
+            assert np.abs(change - slope).max() < 0.01 * np.abs(slope).max()
+        forward._drives_for = values
+        forward.simulate(values, ("poisson",), False)
+
+
+def test_a_force_is_foreseen_after_small_steps(small_bench, bad_cell):
+    """One simulation instead of several, at the same objective; a large step scales the force."""
+    objective, plain = (objective_of(small_bench, bad_cell) for _ in range(2))
+    free = objective.space.pack(Values(TRUTH, 0.36, 900.0))
+    counts = {"foreseen": 0, "scaled": 0}
+
+    def counted(name, each):
+        compared = each._compared
+
+        def count(*arguments):
+            counts[name] += 1
+            return compared(*arguments)
+
+        return count
+
+    for name, each in (("foreseen", objective), ("scaled", plain)):
+        each.evaluate(free, jacobian=True)
+        each._compared = counted(name, each)
+    plain._linear = None
+    step = np.array([0.1, -0.1, 0.15, 0.1])
+    near, same = (each.evaluate(free + step, jacobian=True) for each in (objective, plain))
+    assert counts["foreseen"] < counts["scaled"]
+    assert near.objective == pytest.approx(same.objective, rel=1e-3)
+    assert objective._foreseen(free + 1.0, {}) == {}
+
+
 def test_elimination_is_the_joint_least_squares_problem():
     """Steps and covariance of the free values, and the errors, as of all unknowns together."""
     rng = np.random.default_rng(0)

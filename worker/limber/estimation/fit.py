@@ -27,7 +27,13 @@ from limber.estimation.fit_preparation import (
     require_scale_in_principle,
 )
 from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.initial_modulus import prescribed_start, scaled_start, standing_start
+from limber.estimation.fitting.initial_modulus import (
+    prescribed_start,
+    scaled_start,
+    set_all_keys,
+    set_rough_keys,
+    standing_start,
+)
 from limber.estimation.fitting.large_errors import (
     ROUNDS,
     SMALL_RAD,
@@ -54,6 +60,7 @@ from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.creep import with_creep
 from limber.estimation.uncertainty.identifiability import (
+    force_is_measured,
     identifiability,
     link_unresolved,
     require_scale,
@@ -205,14 +212,17 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     if near is not None and first is not None:
         start = near
     else:
+        if far is not None and reduction is None and settings.method == "gauss-newton":
+            set_rough_keys(objective)
         start, first = _standing(objective, start, settings, progress, reduction)
         _require_stable(objective, start)
     judged = identifiability(first, objective.space)
-    if not _force_is_measured(objective):
+    if not force_is_measured(objective):
         require_scale(judged)
     # Whether to warn is decided at the end: the data determine a modulus better once it is soft.
     space, _ = link_unresolved(first, objective.space)
-    objective = objective.with_space(space)
+    if space.links:
+        objective = objective.with_space(space)
     try:
         fit, objective = _fitted(objective, space.pack(start), settings, progress, reduction,
                                  far, is_near=near is not None and start is near)
@@ -279,19 +289,6 @@ def _require_stable(objective: Objective, values: Values) -> None:
             "Pull outwards or sideways rather than towards the base.")
 
 
-def _force_is_measured(objective: Objective) -> bool:
-    """Whether the measured force is well above its noise: it determines the scale wherever a fit
-    starts.
-
-    Sensitivities at a start that is far too soft would not show that.
-    """
-    for forward, sigma in zip(objective.forwards, objective.force_sigma, strict=True):
-        force = forward.frames.wrenches[:, :3]
-        if forward.uses_force and np.nanmax(np.abs(force), initial=0.0) > 5 * sigma:
-            return True
-    return False
-
-
 def _without_equilibrium(objective: Objective) -> WorkError:
     seen = "The simulation finds no equilibrium for any of the tested Young's moduli."
     by_force = [forward for forward in objective.forwards if forward.watches_pose]
@@ -326,6 +323,7 @@ def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
                                  force_rounds=0, evaluation_limit=EVALUATION_LIMIT).evaluation
             start, is_near = rough.free, True
             far.look(rough, objective)
+            set_all_keys(objective, settings.key_frames)
     if reduction is not None:
         return fit_reduced(objective, start, optimise, _rough, reduction, progress)
     return _refined(optimise(objective, start, is_near), objective, settings, progress), objective

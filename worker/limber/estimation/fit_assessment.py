@@ -10,8 +10,9 @@ from limber.core.errors import WorkError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit_preparation import forwards_of
+from limber.estimation.fitting.left_out import held_out, without
 from limber.estimation.fitting.nuisances import CREEP, in_words, nuisance_records, unlikely
-from limber.estimation.fitting.objective import Objective, held_out, without
+from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton
 from limber.estimation.forward.forward_model import Forward
 from limber.estimation.parameters import Values

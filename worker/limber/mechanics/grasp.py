@@ -217,6 +217,25 @@ class Grasp:
             mean = mean - turned @ (self.weights @ arm)
         return np.concatenate([mean, rotation_vector(turned)])
 
+    def position_rows(self, rest: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+        """Return the derivative of the pose's position to the patch's displacements, [3, k, 3].
+
+        Args:
+            rest, displacement: Values for all nodes [m], shape [node_count, 3].
+        """
+        rows = np.einsum("k,ij->ikj", self.weights, np.eye(3))
+        if self.held is None:
+            return rows
+        positions = rest[self.nodes] + displacement[self.nodes]
+        middle = self.weights @ positions
+        arms = positions - middle
+        squares = np.einsum("k,ki,kj->ij", self.weights, arms, arms)
+        turning = np.linalg.pinv(np.trace(squares) * np.eye(3) - squares, rcond=1e-9)
+        # Row i of the first is e_i x lever, so that turns x lever = -(lever x turns).
+        lever = np.cross(np.eye(3), self.pose_of(rest, displacement)[:3] - middle)
+        spins = np.einsum("k,kij->kij", self.weights, np.cross(arms[:, None], np.eye(3)))
+        return rows + np.einsum("ai,ab,kjb->ikj", lever, turning, spins)
+
     def position_slopes(self, rest: np.ndarray, displacement: np.ndarray, changes: np.ndarray,
                         ) -> np.ndarray:
         """Return the change of the pose's position with p changes of the displacement, shape [3,
@@ -226,17 +245,8 @@ class Grasp:
             rest, displacement: Values for all nodes [m], shape [node_count, 3].
             changes: Shape [node_count, 3, p].
         """
-        patch = changes[self.nodes]
-        moved = np.einsum("k,kip->ip", self.weights, patch)
-        if self.held is None:
-            return moved
-        positions = rest[self.nodes] + displacement[self.nodes]
-        arms = positions - self.weights @ positions
-        squares = np.einsum("k,ki,kj->ij", self.weights, arms, arms)
-        spin = np.einsum("k,kip->ip", self.weights, np.cross(arms[..., None], patch, axis=1))
-        turns = np.linalg.pinv(np.trace(squares) * np.eye(3) - squares, rcond=1e-9) @ spin
-        lever = self.pose_of(rest, displacement)[:3] - self.weights @ positions
-        return moved + np.cross(turns, lever[:, None], axis=0)
+        return np.einsum("ikj,kjp->ip", self.position_rows(rest, displacement),
+                         changes[self.nodes])
 
 
 def check_pose(pose: np.ndarray) -> np.ndarray:

@@ -17,6 +17,8 @@ a whole period off. The fractions between are chosen, not measured.
 """
 ROUGH_KEYS = 5
 """Simulated frames of a first fit by force alone. Chosen: it only has to come near."""
+ROUGH_STEP = 0.3
+"""Standard deviations from its solution at which such a fit ends."""
 FEWEST_FRAMES = 6
 """Fewest frames that describe a motion."""
 FALL = 0.9
@@ -48,6 +50,21 @@ def scaled_start(objective: Objective, values: Values) -> Values:
     return _scaled(objective, values)
 
 
+def set_rough_keys(objective: Objective) -> None:
+    """Simulate few frames of pulls with an observed path, until a fit is near its solution."""
+    for forward in objective.forwards:
+        if is_path_observed(forward):
+            forward.set_key_count(min(ROUGH_KEYS, forward.key_count))
+
+
+def set_all_keys(objective: Objective, count: int) -> None:
+    """Simulate at most ``count`` frames of these pulls, from the states found so far."""
+    for forward in objective.forwards:
+        if is_path_observed(forward):
+            forward.set_key_count(count)
+    objective.forget()
+
+
 def prescribed_start(objective: Objective, values: Values) -> tuple[Values, bool]:
     """Fit pulls with an observed path by their force alone first, without the path.
 
@@ -69,7 +86,7 @@ def prescribed_start(objective: Objective, values: Values) -> tuple[Values, bool
     try:
         rough = objective.with_forwards(objective.forwards).with_space(likely)
         found = gauss_newton(rough, likely.pack(values), evaluation_limit=12, tolerance=3e-2,
-                             force_rounds=0).evaluation
+                             force_rounds=0, shortest=ROUGH_STEP).evaluation
         explains = found.mean_square < RAN_OFF
         for forward in observed:
             forward.keep()
@@ -96,7 +113,7 @@ def _followed(
             forward.step_back()
         return found
     fit = gauss_newton(rough, found.free, evaluation_limit=12, tolerance=3e-2, is_near=True,
-                       force_rounds=0)
+                       force_rounds=0, shortest=ROUGH_STEP)
     for forward in observed:
         forward.keep()
     return fit.evaluation

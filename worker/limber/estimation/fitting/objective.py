@@ -13,7 +13,7 @@ from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.nuisances import CellErrors, Eliminated, ErrorSlopes, eliminated
 from limber.estimation.fitting.residuals import Residuals, seen_in
 from limber.estimation.forward.forward_model import Forward, Simulated
-from limber.estimation.forward.observed_path import is_path_observed
+from limber.estimation.forward.observed_path import ObservedPathForward, is_path_observed
 from limber.estimation.parameters import ParameterSpace, Values
 
 FAILED_OBJECTIVE = 1e12
@@ -26,6 +26,10 @@ larger linear step overshoots.
 STILL_SETTLING = 0.6
 """A change of the force diverges if it moves the gripper by more than this fraction of the last
 one.
+"""
+FORESEEN_STEP = 0.5
+"""Largest change of a log E over which the force is foreseen by derivatives. Chosen: beyond it the
+force is scaled with the stiffness.
 """
 SETTLED_FORCE_M = 5e-4
 """Motion of the gripper by a change of its force below which the force has converged."""
@@ -119,6 +123,7 @@ class Objective:
         self._progress = progress
         self._expected = expected_count
         self._last: Evaluation | None = None
+        self._linear: tuple[np.ndarray, list[Simulated]] | None = None
         self._residuals = [Residuals(*each) for each in zip(forwards, self.force_sigma,
                                                             strict=True)]
         self.cell_errors = CellErrors(forwards)
@@ -213,8 +218,12 @@ class Objective:
         last, part, longest = np.inf, 1.0, LONGEST_MOVE * max(
             float(np.linalg.norm(np.ptp(forward.mesh.nodes, axis=0)))
             for forward in settling.values())
-        for _ in range(SETTLING_ROUNDS):
-            found = self._compared(free, values, False)
+        foreseen = self._foreseen(free, settling)
+        for index, change in foreseen.items():
+            settling[index].foresee(change, values)
+        for number in range(SETTLING_ROUNDS):
+            # A foreseen force has usually settled: derivatives then reuse the states' factors.
+            found = self._compared(free, values, jacobian and not number and bool(foreseen))
             if found is None:
                 break
             # The comparison already includes the linear effect of the remaining change.
@@ -223,7 +232,8 @@ class Objective:
             moved = max(forward.moved_by(change)
                         for forward, change in zip(settling.values(), changes, strict=True))
             if moved < SETTLED_FORCE_M:
-                found = self._compared(free, values, True) if jacobian else found
+                if jacobian and found.jacobian is None:
+                    found = self._compared(free, values, True)
                 self.keep_forces()
                 return found
             left -= sum(forward.iteration_count for forward in settling.values())
@@ -235,6 +245,22 @@ class Objective:
         # Parameters for which the force does not converge are too far away: no step there.
         self.step_back()
         return None
+
+    def _foreseen(self, free: np.ndarray, settling: dict[int, ObservedPathForward],
+                  ) -> dict[int, np.ndarray]:
+        """Changes of settling forces from the last derivatives to ``free``; empty: too far."""
+        if self._linear is None:
+            return {}
+        at, pulls = self._linear
+        step, count = free - at, self.space.group_count
+        known = self.space.unpack(at)
+        if np.abs(step[:count]).max() > FORESEEN_STEP or not all(
+                forward.is_settled_for(known) for forward in settling.values()):
+            return {}
+        step = np.r_[self.space.membership @ step[:count], step[count:]]
+        found = self._compare(free, [pull.moved(step) for pull in pulls])
+        return {index: self._residuals[index].force_change(found.pulls[index])
+                for index in settling}
 
     def keep_forces(self) -> None:
         """Store the forces of settling pulls; :meth:`step_back` returns to them."""
@@ -252,7 +278,11 @@ class Objective:
     def _compared(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
         found = [forward.simulate(values, self.space.extra, jacobian) for forward in self.forwards]
         pulls = [pull for pull in found if pull is not None]
-        return None if len(pulls) < len(found) else self._compare(free, pulls)
+        if len(pulls) < len(found):
+            return None
+        if jacobian:
+            self._linear = free, pulls
+        return self._compare(free, pulls)
 
     def _compare(self, free: np.ndarray, pulls: list[Simulated]) -> Evaluation:
         residuals, jacobians, columns, slopes, unknown_count = [], [], [], [], 0
@@ -360,25 +390,3 @@ def _known_so_far(found: Evaluation | None, space: ParameterSpace) -> dict[str, 
     deviations = found.deviations[list(space.groups)]
     return {"young_factor": " ".join(f"{np.exp(min(1.96 * each, 35.0)):.3g}"
                                      for each in deviations)}
-
-
-def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float, float]:
-    """RMS distance [m] of points and RMS force error [N] of one pull that was not used in a fit."""
-    forward = objective.forwards[index]
-    simulated = forward.simulate(objective.space.unpack(free), (), False)
-    if simulated is None:
-        return np.inf, np.inf
-    simulated = forward.under_readings(simulated)
-    off = (simulated.positions - forward.frames.positions)[seen_in(forward.frames)]
-    force = simulated.forces - forward.frames.wrenches[:, :3]
-    force = force[np.isfinite(force).all(axis=1)]
-    return (float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(off) else np.nan,
-            float(np.sqrt(np.mean(np.sum(force**2, axis=1)))) if len(force) else np.nan)
-
-
-def without(objective: Objective, index: int) -> Objective:
-    """Return the objective on all pulls but one; it keeps no log."""
-    kept = [k for k in range(len(objective.forwards)) if k != index]
-    return Objective([objective.forwards[k] for k in kept], objective.space,
-                     force_sigma=[objective.force_sigma[k] for k in kept])
-

@@ -78,7 +78,7 @@ class Fit:
 
 def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True,
                  evaluation_limit: int = 40, tolerance: float = 3e-5, is_near: bool = False,
-                 force_rounds: int = FORCE_ROUNDS) -> Fit:
+                 force_rounds: int = FORCE_ROUNDS, shortest: float = SETTLED_STEP) -> Fit:
     """Levenberg-Marquardt in a trust region (scipy's ``least_squares``) on the free vector.
 
     Args:
@@ -90,6 +90,7 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
         tolerance: Relative change of the cost at which the fit ends.
         is_near: Whether the start is close to the solution.
         force_rounds: Largest number of linearisations of a measured input force.
+        shortest: Length of the remaining step, in standard deviations, at which it ends.
 
     Raises:
         WorkError: the start has no equilibrium.
@@ -100,7 +101,7 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
         phases = [("linear", tolerance)]
     elif is_near:
         phases = phases[1:]
-    search = _Search(objective, start, evaluation_limit)
+    search = _Search(objective, start, evaluation_limit, shortest)
     moved = search.begin
     for phase in phases:
         found = search.minimised(moved, *phase)
@@ -125,7 +126,8 @@ class _Search:
     would allow any.
     """
 
-    def __init__(self, objective: Objective, start: np.ndarray, evaluation_limit: int):
+    def __init__(self, objective: Objective, start: np.ndarray, evaluation_limit: int,
+                 shortest: float):
         self._objective, self._limit = objective, evaluation_limit
         self._lower, self._upper = objective.space.bounds()
         start = np.clip(start, self._lower + 1e-6, self._upper - 1e-6)
@@ -133,7 +135,7 @@ class _Search:
         self._shift = start - FIRST_STEP / np.sqrt(len(start))
         self.begin = start - self._shift
         settles = any(forward.watches_pose for forward in objective.forwards)
-        self._shortest = WANDERING_STEP if settles else SETTLED_STEP
+        self._shortest = max(WANDERING_STEP if settles else 0.0, shortest)
 
     def at(self, moved: np.ndarray) -> Evaluation:
         """Evaluate with derivatives."""

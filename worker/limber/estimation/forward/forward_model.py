@@ -51,6 +51,17 @@ class Simulated:
                    np.empty((frames, 3, parameters)) if torque and parameters else None)
 
 
+    def moved(self, step: np.ndarray) -> "Simulated":
+        """Return the pull after a small change of its P parameters, shape [P], to first order."""
+        def changed(name: str) -> np.ndarray | None:
+            value, slope = getattr(self, name), getattr(self, f"d_{name}")
+            return None if value is None else value + slope @ step
+
+        return Simulated(self.positions + self.d_positions @ step,
+                         self.forces + self.d_forces @ step,
+                         torques=changed("torques"), grasps=changed("grasps"))
+
+
 def under_its_weight(model: BranchModel, entry: PullEntry) -> BranchModel:
     """Return the model with the weight that acted in a pull.
 

@@ -11,7 +11,7 @@ has more weight.
 """
 
 from dataclasses import replace
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -20,7 +20,10 @@ from limber.core.numerics.rigid import principal_axes
 from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.forward.input_force import Response
 from limber.estimation.forward.quasi_static import FEW_KEYS, QuasiStaticForward
-from limber.estimation.parameters import Values, equal_values
+from limber.estimation.parameters import Values, equal_values, mechanics_names
+from limber.mechanics.model import BranchModel
+from limber.mechanics.sensitivities import ParameterSet, explicit_forces
+from limber.mechanics.statics.result import StaticResult
 
 AT_REST_M = 5e-3
 """Distance of a first pose from the grasp point below which the branch is at rest; the sensor's
@@ -60,6 +63,10 @@ class ObservedPathForward(QuasiStaticForward):
     @property
     def pose_sigma(self) -> float:
         return super().pose_sigma if self.is_watching else ROUGH_POSE_M
+
+    def __init__(self, *arguments: Any, **options: Any):
+        self._grasp_slopes: dict[int, np.ndarray] = {}
+        super().__init__(*arguments, **options)
 
     def set_key_count(self, count: int) -> None:
         """As in the base class; a stored force is kept on the new key frames."""
@@ -140,6 +147,15 @@ class ObservedPathForward(QuasiStaticForward):
         if is_small:
             self.response = response
 
+    def is_settled_for(self, values: Values) -> bool:
+        """Whether force and states are those of these values."""
+        return equal_values(self._drives_for, values) and equal_values(self._values, values)
+
+    def foresee(self, change: np.ndarray, values: Values) -> None:
+        """Move the force by an expected change, for the next simulation with these values."""
+        self.shift_force(change)
+        self._drives_for = values
+
     def under_readings(self, simulated: Simulated) -> Simulated:
         return simulated
 
@@ -150,9 +166,29 @@ class ObservedPathForward(QuasiStaticForward):
             [self._tangent(state.displacement) for state in states])
         if not sensitivities:
             return positions, None
-        return positions, np.array([self.grasp.position_slopes(
-            self.mesh.nodes, state.displacement,
-            present(state.slope, "derivative of a key frame")) for state in states])
+        return positions, np.array([self._grasp_slopes[key] for key in range(len(states))])
+
+    def _enter_slopes(self, found: Simulated, key: int, model: BranchModel, values: Values,
+                      extra: tuple[str, ...], result: StaticResult) -> None:
+        """Enter the derivatives by adjoints.
+
+        Few coordinates are observed, and a load on one of them is zero at most nodes: the branch's
+        response to it is cheaper than that to a parameter, and serves all parameters.
+        """
+        state, count = result.displacement, self._operator.shape[0]
+        loads = np.zeros((count + 3, *state.shape))
+        loads[:count] = self._operator.toarray().reshape(count, -1, 3)
+        loads[count:, self.grasp.nodes] = self.grasp.position_rows(self.mesh.nodes, state)
+        responses = model.equations(()).exact_tangent(model, state).solve_all(list(loads))
+        changes = explicit_forces(model, ParameterSet(
+            mechanics_names(extra), shares=self.field.shares(values, extra)), state)
+        slopes = -np.reshape(responses, (count + 3, -1)) @ np.reshape(
+            changes, (len(changes), -1)).T
+        present(found.d_positions, "slopes")[key] = slopes[:count].reshape(-1, 3, len(changes))
+        present(found.d_forces, "slopes")[key] = 0.0
+        if found.d_torques is not None:
+            found.d_torques[key] = 0.0
+        self._grasp_slopes[key] = slopes[count:]
 
     def _response(self, compliances: list[np.ndarray]) -> Response:
         found = super()._response(compliances)

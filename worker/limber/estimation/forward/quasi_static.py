@@ -34,7 +34,7 @@ from limber.recordings.recorded_grasp import grasp_on, point_of, pose_on
 from limber.recordings.recording import PullEntry
 from limber.recordings.synchronisation import Frames
 
-SETTINGS = StaticSettings(tolerance=1e-6, total_iterations=200, way_back=False)
+SETTINGS = StaticSettings(tolerance=1e-8, total_iterations=200, way_back=False, keeps_factor=True)
 """From the previous state, an equilibrium takes 3 to 10 iterations, from rest some tens. A branch
 with far too soft moduli folds up: no useful step of a fit, and minutes of solving."""
 ITERATIONS_A_KEY = 20
@@ -207,8 +207,8 @@ class QuasiStaticForward(Forward):
             found.torques[key] = result.reaction_torque + np.cross(arm, result.reaction_force)
 
     def _enter_slopes(self, found: Simulated, key: int, model: BranchModel, values: Values,
-                      extra: tuple[str, ...], result: StaticResult) -> np.ndarray:
-        """Enter the derivatives; return that of the displacement [n, 3, p]."""
+                      extra: tuple[str, ...], result: StaticResult) -> np.ndarray | None:
+        """Enter the derivatives; return that of the displacement [n, 3, p], if it is known."""
         points, forces = present(found.d_positions, "slopes"), present(found.d_forces, "slopes")
         slope, forces[key] = self._slopes(model, values, extra, result)
         for column in range(slope.shape[-1]):
@@ -338,12 +338,13 @@ class QuasiStaticForward(Forward):
         if known is None:
             return np.inf
         model, worst = self.model_with(values), 0.0
+        states = [state.displacement for state in self.states()]
         for first, second in zip(self.keys[:-1], self.keys[1:], strict=True):
             middle = (first + second) // 2
             if middle in (first, second):
                 continue
-            start = self.states()[int(np.flatnonzero(self.keys == first)[0])]
-            result = self._solve(model, self._load_between(middle), start.displacement)
+            between = np.tensordot(self.spread[middle], states, axes=1)
+            result = self._solve(model, self._load_between(middle), between)
             if result is not None:
                 exact = self.rest_points + self._observed(result.displacement)
                 off = np.linalg.norm(exact - known.positions[middle], axis=1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.estimation.fitting.objective import Evaluation
+from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.parameters import ParameterSpace
 
 UNRESOLVED_DEVIATION = 0.5
@@ -96,6 +96,19 @@ def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
             f"it is within a factor of ten of {space.names[partner]}. To determine it, pull at a "
             "point farther out, prescribe the pose, or let gravity bend the tip.")
     return space.linked(tuple(links)), messages
+
+
+def force_is_measured(objective: Objective) -> bool:
+    """Whether the measured force is well above its noise: it determines the scale wherever a fit
+    starts.
+
+    Sensitivities at a start that is far too soft would not show that.
+    """
+    for forward, sigma in zip(objective.forwards, objective.force_sigma, strict=True):
+        force = forward.frames.wrenches[:, :3]
+        if forward.uses_force and np.nanmax(np.abs(force), initial=0.0) > 5 * sigma:
+            return True
+    return False
 
 
 def _deviations(jacobian: np.ndarray) -> np.ndarray:
