@@ -29,11 +29,15 @@ def test_points_off_all_axes_are_named_with_their_place() -> None:
     points[30:, 0] = 0.1
     result = SimpleNamespace(skeleton=skeleton, node_of_point=np.arange(40), noise=0.001,
                              residual=points[:, 0] - 0.01, leafy=False)
-    check_explained(result, 0.3, points, lambda place: place)
+    check_explained(result, 0.3, points, lambda place: place, np.any)
+    check_explained(result, 0.2, points, lambda place: place, lambda off: False)
     with pytest.raises(InputError, match=r"^25 % of the points.*--crop-low.*--unexplained 1") as no:
-        check_explained(result, 0.2, points, lambda place: 1000 * place + 7)
+        check_explained(result, 0.2, points, lambda place: 1000 * place + 7, np.any)
     where = (np.array(no.value.place) - 7) / 1000
     assert where[0] == pytest.approx(0.1) and 0.38 < where[2] <= 0.5
+    result.residual = np.where(np.arange(40) < 18, 0.0, 0.09)
+    with pytest.raises(InputError, match=r"^55 %"):
+        check_explained(result, 0.3, points, lambda place: place, lambda off: False)
 
 
 @pytest.mark.slow

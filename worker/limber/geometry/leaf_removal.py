@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
-from limber.geometry.cloud.leaves import Leaf, find_leaves
+from limber.geometry.cloud.leaves import Leaf, find_leaves, leaf_like
 from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
 from limber.geometry.cloud.thinning import thinned
 from limber.geometry.skeleton.search_result import SkeletonResult
@@ -22,7 +22,7 @@ _LEAST = 0.05  # smallest fraction of points that is removed as leaves
 # Distance in radii up to which a point is on a round axis; a filled blade to which a rod was fitted
 # has a third of its points there.
 _ON_AXIS = 0.15
-_MOST = 0.5  # fraction of a piece's points that decides
+_MOST = 0.5  # fraction of points that decides
 # Mean of the unit vectors from the axis, for an evenly seen arc of 120 degrees. One view of a stem
 # gives pi/4, since a sensor's points thin out towards the rim; a rod through a blade 0.83 to 0.97.
 _ARC = np.sin(np.pi / 3) / (np.pi / 3)
@@ -74,6 +74,13 @@ def _leaves_of(points: np.ndarray) -> list[Leaf]:
         leaf_of[leaf.points] = number
     own = leaf_of[cKDTree(points[some]).query(points)[1]]
     return [Leaf(np.flatnonzero(own == number), leaf.area) for number, leaf in enumerate(leaves)]
+
+
+def show_leaves(prepared: Prepared, off: np.ndarray) -> bool:
+    """Whether most of a scan's points off all axes, of mask ``off`` [n], look like leaves."""
+    some = thinned(prepared.cloud.points, FIT_POINT_LIMIT)
+    like = leaf_like(prepared.cloud.points[some])[off[some]]
+    return like.size > 0 and float(like.mean()) > _MOST
 
 
 def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:

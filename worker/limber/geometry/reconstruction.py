@@ -25,6 +25,7 @@ from limber.geometry.leaf_removal import (
     leaf_mask,
     leaf_masses,
     leaves_text,
+    show_leaves,
     without_leaves,
 )
 from limber.geometry.point_classes import Show, shown_if_refused
@@ -165,7 +166,9 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         with named_if_refused(named), shown_if_refused(show, prepared, leaves, supports,
                                                        off_axes(whole)):
             check_explained(whole, settings.unexplained, wood.cloud.points,
-                            lambda place: (place + wood.origin) / scale)
+                            lambda place: (place + wood.origin) / scale,
+                            lambda off: bool(supports) or (
+                                settings.leaves != "keep" and show_leaves(wood, off)))
     # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.
     warnings = list(prepared.warnings)
     if named:

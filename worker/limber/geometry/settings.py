@@ -100,7 +100,8 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
         "wood.")
     unexplained: float = Field(
         0.3, ge=0, le=1, description="Refuse a scan if a larger fraction of its points belongs "
-        "to no round axis (leaves). 1 accepts all.")
+        "to no round axis and shows leaves or supports. Points that show neither may be half of "
+        "the scan. 1 accepts all.")
     leave_out: bool = Field(
         False, description="Accept a mesh without twigs that hold more than 3 % of the mass. "
         "Their mass is kept.")

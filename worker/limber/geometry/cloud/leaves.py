@@ -42,6 +42,16 @@ def find_leaves(points: np.ndarray) -> list[Leaf]:
     return [Leaf(own.order[leaf.points], leaf.area) for leaf in _found(own.coordinates)]
 
 
+def leaf_like(points: np.ndarray) -> np.ndarray:
+    """Which points are likelier on a leaf than on wood, by their surroundings alone, shape [n]."""
+    own = OwnFrame.of(points)
+    spacing = point_spacing(own.coordinates)
+    like = np.zeros(len(points), bool)
+    if len(points) >= _SMALLEST and spacing > 0:
+        like[own.order] = leaf_log_odds(surroundings(own.coordinates, spacing)) > 0
+    return like
+
+
 def point_spacing(points: np.ndarray) -> float:
     """Median distance between neighbouring points [m]; 0 where most coincide with another."""
     some = points[::max(1, len(points) // 5000)]

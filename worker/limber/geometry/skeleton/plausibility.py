@@ -16,6 +16,7 @@ Where = Callable[[np.ndarray], np.ndarray]
 
 _STOUT = 0.13  # median distance from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
 _ROUND = 0.3  # fraction of the radius by which points of a round branch may scatter
+_MOST_OFF = 0.5  # fraction of points off all axes above which these do not describe the scan
 _NAMED = 3  # gaps and loops named one by one
 _FIX = ("Crop the scan to one branch (--crop-low, --crop-high), or provide a skeleton "
         "(--skeleton).")
@@ -118,8 +119,11 @@ def warnings(result: Any, where: Where) -> list[str]:
     texts += _joining_texts(result, where) + _doubt_texts(result, where)
     misfit = unexplained_share(result)
     if misfit > 0.15:
+        most = int(np.argmax(np.bincount(result.node_of_point[_unexplained(result)])))
         texts.append(f"{100 * misfit:.0f} % of the points do not belong to any round axis "
-                     "(leaves, flying pixels or a second plant?). The radii there are unreliable.")
+                     "(leaves, flying pixels or a second plant?), most of them around "
+                     f"{_position_text(where(result.skeleton.nodes[most]))}. The radii there are "
+                     "unreliable.")
     elif not shows_round(result):
         texts.append(f"The points scatter by {1000 * result.noise:.2g} mm, more than {_ROUND:.0%} "
                      "of the radius of their axes. Leaves among them would therefore not be "
@@ -194,21 +198,26 @@ def off_axes(result: Any) -> np.ndarray:
     return result.residual > np.maximum(radius, 3 * result.noise)
 
 
-def check_explained(result: Any, limit: float, points: np.ndarray, where: Where) -> None:
+def check_explained(result: Any, limit: float, points: np.ndarray, where: Where,
+                    not_wood: Callable[[np.ndarray], bool]) -> None:
     """Refuse a scan with too many points that belong to no round axis.
+
+    Noise alone takes up to half of the points off the axes of thin branches: these are accepted,
+    with the warning and the probabilities of the skeleton, unless the points show something else.
 
     Args:
         result: The skeleton with the residuals of its points.
         limit: Largest accepted fraction of such points.
         points: The points [m], shape [m, 3].
         where: Transforms positions to the user's coordinates.
+        not_wood: Whether points, of which it takes the mask [m], show leaves or supports.
 
     Raises:
         InputError: the fraction exceeds ``limit``.
     """
     off = off_axes(result)
     share = float(np.mean(off))
-    if share <= limit:
+    if share <= limit or (share <= _MOST_OFF and not not_wood(off)):
         return
     # The point nearest to the middle of these: the middle itself may be empty.
     stray = points[off]
