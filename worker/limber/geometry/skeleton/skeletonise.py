@@ -143,7 +143,9 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     check_one_plant(graph, len(thin), search.diagonal, settings.plants,
                     lambda place: where(own.outside(place)))
     start, other_root, certainty = search.root(graph, thin, root)
-    if is_sparse(thin, contraction.drawn):
+    # Levels use more of the points. Contraction of all points finds more of a sparse crown: 93 to
+    # 99 % of the length of three generated ones, levels 86 to 99 %.
+    if len(thin) < len(points) and is_sparse(thin, contraction.drawn):
         thin, loops = points[thinned(points, POINT_LIMIT)], graph.loops
         graph, start = search.in_levels(thin, graph.nodes[start])
         graph.loops = loops
