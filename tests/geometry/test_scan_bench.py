@@ -9,9 +9,11 @@ from benchmarks.budget import Budget
 from benchmarks.same_tree import _CHANGED, SameTreeRun
 from benchmarks.scan_probabilities import SIGNS, fitted
 from benchmarks.scan_runs import CaseRun
+from benchmarks.scan_scores import fork_matches
 from benchmarks.table import Row, Setting
 from limber.core.progress import SILENT
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.skeleton.skeleton import Skeleton
 
 _SCORES = {"forks": 2, "forks_found": 2, "forks_false": 0, "centre_radii": 0.1, "centre_m": 1e-4,
            "radius_error": 0.01, "radius_bias": 0.01, "covered": 0.95, "volume": 0.01, "shown": 1.0,
@@ -58,6 +60,24 @@ def test_a_case_that_fails_is_counted(monkeypatch, tmp_path) -> None:
     assert "ZeroDivisionError" in run.failure and not run.scores
     row, = scans.gap_rows(scan_runs.Outcomes([dict(_SCORES)], [run.failure]))
     assert row.met is False and "1 not reconstructed" in row.measured
+
+
+def test_both_forks_of_a_pair_are_true_wherever_they_are_found() -> None:
+    """A pair of side branches at one node, found at two nodes, has no false fork, and a third
+    side branch there is false; a pair found at one node is found whole.
+    """
+    def tree(*feet: int) -> Skeleton:
+        axis = np.column_stack([np.zeros((21, 2)), np.linspace(0, 0.2, 21)])
+        tips = [axis[foot] + [0.05 * np.cos(2 * k), 0.05 * np.sin(2 * k), 0]
+                for k, foot in enumerate(feet)]
+        return Skeleton.from_edges(np.vstack([axis, *tips]), np.concatenate([
+            np.arange(21) - 1, feet]), np.full(21 + len(feet), 0.005))
+    pair = tree(10, 10)
+    for found, hits, right in ((tree(10, 11), 2, [1, 1]), (tree(10, 10), 2, [1, 1]),
+                               (tree(9, 10, 11), 2, [0, 1, 1]), (tree(10), 1, [1])):
+        got, true = fork_matches(pair, found)
+        assert got == hits and sorted(true) == right
+    assert fork_matches(tree(10, 11), pair)[0] == 2
 
 
 def test_the_fit_of_probabilities_finds_the_odds_that_made_them() -> None:

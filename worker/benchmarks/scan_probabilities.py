@@ -145,12 +145,7 @@ def outcomes(done: list[Skeletonised], out: Path) -> dict[str, Outcomes]:
 
 def _there(truth: Skeleton, found: Skeleton) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Which runs are there; for places on the axes, whether they are in true wood, and where."""
-    _, right = fork_matches(truth, found)
-    true_forks = found.forks()[right]
-    runs = found.runs()
-    there = np.ones(len(runs), bool)
-    for run, members in enumerate(runs[1:], start=1):
-        there[run] = members[0] in true_forks
+    there = np.concatenate([[True], fork_matches(truth, found)[1]])
     places, here = Dense.of(truth), Dense.of(found)
     away, near = cKDTree(places.points).query(here.points)
     inside = (away < np.maximum(places.radius[near], 0.001)) & ~doubled(found, here, near)

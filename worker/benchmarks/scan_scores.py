@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
@@ -80,19 +82,17 @@ def cylinder_volume(skeleton: Skeleton) -> float:
 
 
 def fork_matches(truth: Skeleton, found: Skeleton) -> tuple[int, np.ndarray]:
-    """Number of forks found, and whether each found fork is a true one, shape [forks].
+    """Number of true side branches whose fork was found, and whether that of each found one is
+    true, shape [side branches].
 
-    A fork counts as found within three radii of the true one, each only once.
+    A fork counts as found within three radii of the true one. Side branches are matched one to
+    one, as many as possible: of a pair at one node each counts, found at one node or at two.
     """
-    got = found.forks()
+    wanted, got = (np.array([run[0] for run in tree.runs()[1:]], int) for tree in (truth, found))
+    away = cdist(truth.nodes[wanted], found.nodes[got]) / (3 * truth.radius[wanted])[:, None]
+    one, other = linear_sum_assignment(np.where(away < 1, away, len(wanted) + 1.0))
     right = np.zeros(len(got), bool)
-    for fork in truth.forks():
-        free = np.flatnonzero(~right)
-        if len(free) == 0:
-            break
-        distance = np.linalg.norm(found.nodes[got[free]] - truth.nodes[fork], axis=1)
-        if distance.min() < 3 * truth.radius[fork]:
-            right[free[int(np.argmin(distance))]] = True
+    right[other[away[one, other] < 1]] = True
     return int(right.sum()), right
 
 
@@ -110,10 +110,7 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
     covered = np.abs(here.radius - there.radius[near]) < 1.96 * sigma
     resolved = on_axis & (found.radius_state[here.high] == MEASURED)
     main_off = main_axis_error(truth, found)
-    forks = found.forks()
-    stated = [float(found.probability[(found.parent == fork)
-                                      & (found.branch != found.branch[fork])].min())
-              for fork in forks]
+    stated = [float(found.probability[run[1]]) for run in found.runs()[1:]]
     return {
         "centre_m": float(np.concatenate([away, back]).mean()),
         "centre_radii": float(in_radii.mean()), "centre_worst_radii": float(in_radii.max()),
@@ -121,7 +118,8 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
         "sigma_m": float(np.median(sigma)), "covered": float(covered[on_axis].mean()),
         **twig_lengths(there, back, truth, here, right, found),
         "measured": float((found.radius_state[here.high] == MEASURED).mean()),
-        "forks": len(truth.forks()), "forks_found": hits, "forks_false": int((~true_fork).sum()),
+        "forks": truth.branch_count - 1, "forks_found": hits,
+        "forks_false": int((~true_fork).sum()),
         "root_diameters": float(np.linalg.norm(found.nodes[0] - truth.nodes[0])
                                 / (2 * truth.radius[0])),
         "main_axis_radii": main_off, "length_error": found.length / truth.length - 1,
