@@ -22,7 +22,9 @@ SCANS = {"coffeetree_branch/branch.xyz": {}, "aRchi_tree_1/Tree_1.ply": {},
          "apple_rgbd/frame_00025.ply": {"unit": "mm", "up": (0.0, -1.0, 0.0)},
          "apple_rgbd/frame_00125.ply": {"unit": "mm", "up": (0.0, -1.0, 0.0)},
          "tomato_maize/tomato_03-05.xyz": {"unit": "mm"},
-         "tomato_maize/maize_03-13.ply": {"unit": "mm"}}
+         "tomato_maize/maize_03-13.ply": {"unit": "mm"},
+         "reports/09-puu933-bare-branch/puu_933.xyz": {
+             "unit": "mm", "root": (-900.0, 793.0, 2060.0)}}
 AS_IT_IS = "as it is"
 _LEAFY = {"unexplained": 1.0, "leave_out": True, "leaves": "cut"}
 

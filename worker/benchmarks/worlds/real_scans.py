@@ -65,7 +65,7 @@ def _tree_length(name: str) -> float:
 _PUU = "reports/09-puu933-bare-branch/"
 _KEEP = {"leaves": "keep"}  # the others' skeletons go through leaves
 REAL_SCANS = {
-    "puu": Scan(_PUU + "puu_933.xyz", {"unit": "mm", "root": (-900.0, 793.0, 2060.0)}, True,
+    "puu": Scan(_PUU + "puu_933.xyz", SCANS[_PUU + "puu_933.xyz"], True,
                 partial(_tree_length, _PUU + "reference_skeleton.npz")),
     "tomato": Scan("tomato_maize/tomato_03-05.xyz", SCANS["tomato_maize/tomato_03-05.xyz"] | _KEEP,
                    False, partial(_graph_length, "tomato_maize/tomato_03-05.graph.txt")),
