@@ -73,6 +73,10 @@ from inner import inner
 
 @compiled
 def outer(value):
+    return middle(value)
+
+@compiled
+def middle(value):
     return inner(value)
 
 print(outer(1.0), len(outer._cache_hits))

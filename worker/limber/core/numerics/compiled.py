@@ -192,8 +192,10 @@ def _stamp(function: Any) -> str:
     """
     digest = hashlib.sha256(_digest_of(function.__code__.co_filename))
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    used = [function.__globals__.get(name) for name in function.__code__.co_names]
-    for value in (*cells, *used):
+    # All that its module has so far, and thus has imported: what it calls may stand below it.
+    known = [value for name, value in sorted(function.__globals__.items())
+             if not name.startswith("__")]
+    for value in (*cells, *known):
         if isinstance(value, Dispatcher):
             digest.update(getattr(value._cache, "stamp", "").encode())
         elif isinstance(value, np.ndarray):
