@@ -1,5 +1,7 @@
 """Derivatives against central differences, static and dynamic, and the rest shape."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
@@ -131,6 +133,18 @@ def test_derivatives_want_matching_weights(mesh, weights):
         static_sensitivities(model, result, None, weights)
     with pytest.raises(InputError, match="no parameter"):
         static_sensitivities(model, result, None, None, ("colour",))
+
+
+def test_moved_nodes_have_the_equations_of_a_mesh_made_there(mesh, weights):
+    """Bit by bit, though pattern and layout are those of the first mesh; its own stay."""
+    model, state = base_model(mesh, weights), np.zeros_like(mesh.nodes)
+    load = np.random.default_rng(2).standard_normal(mesh.nodes.shape)
+    before = model.equations().exact_tangent(model, state).solve(load)
+    nodes = mesh.nodes + 1e-4 * np.random.default_rng(1).standard_normal(mesh.nodes.shape)
+    found, fresh = (each.equations().exact_tangent(each, state).solve(load) for each in (
+        model.with_rest_nodes(nodes), base_model(replace(mesh, nodes=nodes), weights)))
+    assert np.array_equal(found, fresh) and not np.array_equal(found, before)
+    assert np.array_equal(before, model.equations().tangent(model, state).solve(load))
 
 
 def test_rest_shape_sags_to_the_scan():
