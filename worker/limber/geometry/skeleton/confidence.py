@@ -12,10 +12,12 @@ from limber.geometry.skeleton.radii.likeliest_shape import (
     ShapeEvidence,
     likeliest_shape,
     point_spacing,
+    typical_radius,
 )
 from limber.geometry.skeleton.radii.normal_equations import fit_covariance
 from limber.geometry.skeleton.radii.projected_widths import sight_field, width_covariance
 from limber.geometry.skeleton.radii.shared_errors import shared_error
+from limber.geometry.skeleton.radii.smoothing_sensors import sensor_smoothing
 from limber.geometry.skeleton.repair.run_radii import tapered
 from limber.geometry.skeleton.skeleton import BRIDGED, LIMITED, STATES, UNRESOLVED, Skeleton
 from limber.geometry.skeleton.sweep import stretches
@@ -52,8 +54,13 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool
         pixel = spacing
     covariance = width_covariance(skeleton, sight_field(skeleton, points, view), noise) if (
         rays) else fit_covariance(skeleton, points)
+    smoothing = None
+    if not rays:
+        smoothing = sensor_smoothing(skeleton, typical_radius(skeleton, skeleton.radius), count,
+                                     float(np.median(spacing)))
+        skeleton, covariance = smoothing.undone(skeleton, covariance)
     shown = ShapeEvidence(covariance, spacing, 0.0 if rays else noise, shared, rays or one_sided,
-                          pixel)
+                          pixel, smoothing)
     likeliest = likeliest_shape(skeleton, shown)
     # Wood hardly thickens outwards. What does so nevertheless, beyond its interval, is a bunch of
     # twigs or two limbs in one: it counts for nothing.

@@ -18,6 +18,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial import cKDTree
 
+from limber.geometry.skeleton.radii.smoothing_sensors import Smoothing
 from limber.geometry.skeleton.radii.smoothness import second_differences
 from limber.geometry.skeleton.skeleton import MEASURED, UNRESOLVED, Skeleton
 
@@ -79,6 +80,7 @@ class ShapeEvidence:
     shared: float = 0.0
     one_sided: bool = False
     pixel: np.ndarray | None = None
+    smoothing: Smoothing | None = None
 
 
 def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
@@ -277,20 +279,22 @@ def _of_runs(skeleton: Skeleton, evidence: ShapeEvidence, radius: np.ndarray,
     Each has a standard deviation of 1. It is of the radii; how an axis bends must not decide it.
     """
     # Their sum must not depend on single fits, or it would level their scatter.
-    radius = _typical(skeleton, radius)
+    radius = typical_radius(skeleton, radius)
     oval = _OVAL_SIDE if evidence.one_sided else _OVAL
     noise = _BIAS * np.minimum(evidence.noise / radius, 1.0)**2
     coarse = np.minimum(_COARSE * evidence.spacing / radius, 1.0)
+    if evidence.smoothing is not None:
+        coarse = np.hypot(coarse, evidence.smoothing.uncertainty(radius))
     off = np.sqrt(oval**2 + noise**2 + coarse**2 + (evidence.shared / radius)**2)
     return sparse.coo_matrix((off, (4 * np.arange(len(off)) + 3, skeleton.branch)),
                              (4 * len(off), skeleton.branch_count)).tocsr()
 
 
-def _typical(skeleton: Skeleton, radius: np.ndarray) -> np.ndarray:
+def typical_radius(skeleton: Skeleton, radius: np.ndarray) -> np.ndarray:
     """Radii [m] that change by one rate along each run, shape [n]."""
-    typical = np.log(radius)
+    typical, arc_length = np.log(radius), skeleton.arc_length
     for own in skeleton.own_runs():
-        along = skeleton.arc_length[own] - skeleton.arc_length[own].mean()
+        along = arc_length[own] - arc_length[own].mean()
         rate = float(along @ typical[own]) / max(float(along @ along), 1e-300)
         typical[own] = typical[own].mean() + rate * along
     return np.exp(typical)

@@ -1,0 +1,71 @@
+"""A sensor that smooths thins twigs without losing their points; one that does not stays as is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.geometry.skeleton.radii.smoothing_sensors import sensor_smoothing
+from limber.geometry.skeleton.skeleton import Skeleton
+
+SPACING = 0.003
+
+
+def tree() -> Skeleton:
+    """A stem of 9 to 6 mm radius and eight twigs of 2.5 to 1.6 mm."""
+    nodes, parent, radius = [np.zeros(3)], [-1], [0.009]
+    for k in range(1, 101):
+        nodes.append(np.array([0, 0, 0.008 * k]))
+        parent.append(k - 1)
+        radius.append(0.009 - 0.00003 * k)
+    for twig in range(8):
+        at, angle = 10 + 11 * twig, 2.4 * twig
+        for k in range(1, 61):
+            nodes.append(nodes[at] + 0.004 * k * np.array([np.cos(angle), np.sin(angle), 0.3]))
+            parent.append(at if k == 1 else len(nodes) - 2)
+            radius.append(0.0025 - 0.000015 * k)
+    return Skeleton.from_edges(np.array(nodes), np.array(parent), np.array(radius))
+
+
+def counts(skeleton: Skeleton, seed: int, power: float = 1.0) -> np.ndarray:
+    """Points at random over the skin; on each length in proportion to a power of the radius."""
+    skin = 2 * np.pi * skeleton.steps * (skeleton.radius / 0.008)**power * 0.008
+    return np.random.default_rng(seed).poisson(skin / SPACING**2)
+
+
+def smoothed(skeleton: Skeleton, shrink: float) -> Skeleton:
+    return replace(skeleton, radius=skeleton.radius * np.exp(
+        -shrink * (SPACING / skeleton.radius)**2))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_radii_before_smoothing_follow_from_the_number_of_points(seed: int) -> None:
+    true = tree()
+    seen = smoothed(true, 0.25)
+    assert np.quantile(seen.radius / true.radius, 0.1) < 0.55
+    found = sensor_smoothing(seen, seen.radius, counts(true, seed), SPACING)
+    covariance = np.tile(np.eye(4) * 1e-8, (seen.node_count, 1, 1))
+    mended, spread = found.undone(seen, covariance)
+    off = np.log(mended.radius / true.radius)
+    assert abs(found.shrink - 0.25) < 0.1
+    assert (np.abs(off) < 3 * found.uncertainty(mended.radius) + 0.01).all()
+    assert np.abs(off).max() < 0.2
+    assert (spread[:, 3, 3] > 0).all()
+    assert np.allclose(spread[:, :3, :3], covariance[:, :3, :3])
+
+
+@pytest.mark.parametrize("power", [1.0, 1.15])
+def test_a_sensor_that_does_not_smooth_leaves_radii_as_they_are(power: float) -> None:
+    """Also one that sees fewer points on the skin of thin twigs, as most do."""
+    true = tree()
+    found = sensor_smoothing(true, true.radius, counts(true, 5, power), SPACING)
+    assert found.shrink < 0.02
+    mended, _ = found.undone(true, np.tile(np.eye(4), (true.node_count, 1, 1)))
+    assert np.abs(mended.radius / true.radius - 1).max() < 0.05
+
+
+def test_few_points_show_no_smoothing() -> None:
+    true = tree()
+    few = counts(true, 0) // 40
+    found = sensor_smoothing(true, true.radius, few, SPACING)
+    assert found.shrink == 0 and found.sigma == 0
