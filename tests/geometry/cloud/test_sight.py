@@ -107,6 +107,9 @@ def test_flying_pixels_are_counted() -> None:
     assert any("flying" in text for text in prepared.warnings)
     kept = prepare(Cloud(points), 1.0, PreparationSettings(keep_flying=True))
     assert "flying" not in kept.counts and len(kept.cloud.points) > len(prepared.cloud.points)
+    twice = prepare(Cloud(np.concatenate([points, points[::5]])), 1.0)
+    assert twice.counts["flying"] == prepared.counts["flying"]
+    assert np.array_equal(twice.cloud.points, prepared.cloud.points)
     moved = PreparationSettings(camera_at=(500.0, 100.0, 20.0))
     away = prepare(Cloud(1000 * points + np.array(moved.camera_at)), 1e-3, moved)
     assert away.counts["flying"] == prepared.counts["flying"]

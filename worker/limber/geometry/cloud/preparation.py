@@ -50,7 +50,7 @@ class Prepared:
 
 def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = None, *,
             eye: np.ndarray | None = None, up: np.ndarray | None = None) -> Prepared:
-    """Crop, convert to metres, recentre, and drop flying pixels, duplicates and outliers.
+    """Crop, convert to metres, recentre, and drop duplicates, flying pixels and outliers.
 
     Args:
         cloud: The cloud as read from the file.
@@ -70,13 +70,18 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     cloud = _cropped(cloud, settings)
     counts["cropped"] -= len(cloud)
     _enough(cloud, "The cloud")
+    count = len(cloud)
+    # Before the cloud is viewed as an image, which has one point per pixel.
+    single = _first_of_each(cloud.points)
+    counts["duplicates"] = int((~single).sum())
+    cloud = cloud.subset(single)
     cloud, view = _without_flying(cloud, scale, settings, eye, counts)
     # Subtracted in float64 before anything else: with map coordinates, float32 has no digits left.
     scaled = cloud.points * scale
     origin = np.round(scaled.mean(axis=0), 3)
     points = scaled - origin
     if np.ptp(points, axis=0).max() <= 1e-9 * max(float(np.abs(scaled).max()), 1e-9):
-        raise InputError(f"All {len(points)} points are at the same position.",
+        raise InputError(f"All {count} points are at the same position.",
                          "The points of a branch spread out in space.",
                          "Check the columns and the number of digits of the export.")
     _enough_digits(cloud.points)
@@ -86,9 +91,6 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
                          "A branch has a thickness.",
                          "Check the columns and the number of digits of the export.")
     cloud = cloud.with_points(points)
-    single = _first_of_each(points)
-    counts["duplicates"] = int((~single).sum())
-    cloud = cloud.subset(single)
     keep = _without_outliers(cloud.points)
     counts["outliers"] = int((~keep).sum())
     cloud = cloud.subset(keep)
