@@ -7,15 +7,21 @@ import numpy as np
 import pytest
 
 from benchmarks.scan_cases import one_sided_case
+from benchmarks.scan_plants import leafy_case
 from limber.core.errors import InputError
 from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf, find_leaves, leaves_by_odds
-from limber.geometry.cloud.preparation import prepare
+from limber.geometry.cloud.preparation import Prepared, prepare
 from limber.geometry.cloud.supports import Support
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_cloud
-from limber.geometry.leaf_removal import _on_round_axes, check_agreed, without_leaves
+from limber.geometry.leaf_removal import (
+    _on_round_axes,
+    check_agreed,
+    show_leaves,
+    without_leaves,
+)
 from limber.geometry.point_classes import COLOURS, shown_if_refused
 from limber.geometry.reconstruction import _MOSTLY, reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings
@@ -261,3 +267,15 @@ def test_doubtful_leaves_are_judged_by_the_sure_ones() -> None:
 
     assert found(7) == [900 + 100 * k for k in range(8)]
     assert found(1) == [1000]
+
+
+def test_points_off_all_axes_are_asked_whether_they_are_leaves() -> None:
+    """Those of a seedling's leaves show leaves, those of its stems and of noise do not."""
+    case = leafy_case(3)
+    prepared = Prepared(Cloud(case.points), np.zeros(3))
+    assert show_leaves(prepared, case.leaf)
+    assert not show_leaves(prepared, ~case.leaf)
+    assert not show_leaves(prepared, np.zeros(len(case.points), bool))
+    rng = np.random.default_rng(4)
+    noise = np.column_stack([rng.normal(0, 0.005, (400, 2)), rng.uniform(0, 0.5, 400)])
+    assert not show_leaves(Prepared(Cloud(noise), np.zeros(3)), np.ones(400, bool))
