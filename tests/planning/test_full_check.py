@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.core.errors import NoPathError
+from limber.core.errors import Cancelled, NoPathError
 from limber.planning import make_plan as planning
 from limber.planning.constraints.full_model_check import learnt
 from limber.planning.constraints.limits import Limits
@@ -37,22 +37,26 @@ def to_region(planned_branch, small_model):
 @pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_plan_to_a_region_ends_less_deep_once_the_field_knows_its_end(to_region, monkeypatch):
-    """It is cheaper, and still in the region on the full model. If none such holds, the one before
-    is kept."""
+    """It is cheaper, and still in the region on the full model. If none such holds, or it is
+    cancelled, the one before is kept."""
     again = to_region()
     assert len(again.summary["rounds"]) == 2
     tried = planning._Rounds._tried
 
-    def fails(self, *arguments, **options):
-        if self.holding is not None:
-            raise NoPathError("No path.", "", "")
-        return tried(self, *arguments, **options)
-    monkeypatch.setattr(planning._Rounds, "_tried", fails)
-    deep = to_region()
+    def ends_with(error):
+        def fails(self, *arguments, **options):
+            if self.holding is not None:
+                raise error("No path.", "", "")
+            return tried(self, *arguments, **options)
+        monkeypatch.setattr(planning._Rounds, "_tried", fails)
+        return to_region()
+    deep, cancelled = ends_with(NoPathError), ends_with(Cancelled)
     assert len(deep.summary["rounds"]) == 1
     assert again.summary["certificate"]["upper_bound"] < (
         0.99 * deep.summary["certificate"]["upper_bound"])
-    for found in (again, deep):
+    assert cancelled.summary["stopped"] and not deep.summary["stopped"]
+    np.testing.assert_array_equal(cancelled.plan.solved.poses, deep.plan.solved.poses)
+    for found in (again, deep, cancelled):
         centre = np.array(found.summary["goal"]["position_m"])
         assert np.linalg.norm(found.plan.solved.tips[-1] - centre) <= 0.02
         assert found.baseline.is_whole and found.summary["certificate"]["lower_bound"] > 0.0

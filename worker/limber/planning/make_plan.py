@@ -132,8 +132,7 @@ class _Rounds:
             of ``baseline_points``.
         risks, moving: Of the plans so far: their risks, and the last one's motion in time.
         round_records: One row per round.
-        holding: The last plan that may be passed on, while one that ends less deep in the goal is
-            tried.
+        holding: The plan that is passed on if one that ends less deep in the goal does not hold.
     """
 
     grasp_model: GraspModel
@@ -162,13 +161,16 @@ class _Rounds:
         """Plan and check; return whether the plan may be passed on. If not, samples were added."""
         if self.holding is None:
             return self._tried(ahead, is_last)
+        pair = self.holding["pair"]
         try:
-            done = self._tried(ahead, is_last=True)
-        except NoPathError:
-            done = False
-        if not done:
-            vars(self).update(self.holding)
-            self._completed(present(self.pair, "paths on the field"), ahead.part(0.95, 1.0))
+            return self._tried(ahead, is_last=True)
+        except (NoPathError, Cancelled, KeyboardInterrupt) as end:
+            if not isinstance(end, NoPathError):
+                ahead, self.progress = ahead.to_the_end(), self.progress.to_the_end()
+                pair = replace(pair, unbounded=None,
+                               certificate=replace(pair.certificate, stopped=True))
+        vars(self).update(self.holding)
+        self._completed(pair, ahead.part(0.95, 1.0))
         return True
 
     def _tried(self, ahead: Progress, is_last: bool) -> bool:
@@ -212,8 +214,7 @@ class _Rounds:
         if pair.stays or not isinstance(self.aim, TargetGoal) or (
                 self.aim.margin_at(self.field, end) < ENOUGH * arc_lengths(pair.plan.points)[-1]):
             return False
-        self.holding = {name: getattr(self, name) for name in (
-            "pair", "plan", "moving", "risks")} | {"risks": self.risks[:]}
+        self.holding = {"pair": pair, "plan": plan, "moving": self.moving, "risks": self.risks[:]}
         states = plan.solved.take(np.arange(len(plan.solved.poses))[::-_LAST_EVERY][:_LAST])
         self.field = refit(self.field, as_samples(self.grasp_model, states, self.field.samples,
                                                   self.limits))
