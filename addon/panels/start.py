@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import branches, guide, warming
+from .. import branches, guide
 from ..lines import draw_text
 from .sidebar import SidebarPanel
 
@@ -19,7 +19,6 @@ class LIMBER_PT_start(SidebarPanel, bpy.types.Panel):
             branches.find_surface(context.scene) is None)
 
     def draw_header_preset(self, context):
-        warming.draw(self.layout)
         guide.draw(self.layout, "start")
 
     def draw(self, context):
