@@ -11,7 +11,7 @@ from benchmarks.paper_branches import measured
 from benchmarks.table import Setting
 from benchmarks.truth import _efficient
 from benchmarks.truth_branch import drawn_truth, exact_pull
-from benchmarks.truth_scans import ScanTrial, width_row
+from benchmarks.truth_scans import ScanTrial, bending_row, width_row
 from benchmarks.truth_trials import FIRST_PULL, FIRST_TURN, SETTINGS, bounds, fitting_subject
 from benchmarks.worlds.plant import Plant
 from limber.core.progress import SILENT
@@ -47,7 +47,7 @@ def _loop(view: str, noise: float, ratios: tuple[float, ...], refusal: str = "")
     count = len(ratios)
     return ScanTrial((1, 3, 0), "monopodial", view, noise, count * (0.0,), count * (True,),
                      count * (0.3,), count * (True,), tuple(0.1 * each for each in ratios),
-                     count * (0.1,), refusal, 1.0, "now")
+                     count * (0.0,), count * (0.1,), refusal, 1.0, "now")
 
 
 def test_the_width_of_the_loops_is_that_of_their_fits():
@@ -59,6 +59,8 @@ def test_the_width_of_the_loops_is_that_of_their_fits():
     assert row.measured == "1.40 (worst 3.0; round 1 mm 1.30; one-sided 2 mm 2.00)"
     assert width_row([_loop("round", 1e-3, (1.6, 1.7))]).met is False
     assert width_row(loops[2:]).measured == "no estimate"
+    assert bending_row(loops).measured == (
+        "100.0 % of 5 (median error 0 %, half width 14 %, of E 30 %)")
 
 
 def test_a_branch_is_the_longest_axis_with_short_limbs():

@@ -75,6 +75,7 @@ class ScanTrial:
         widths: Half widths of the intervals in log E.
         bending_covered: Whether each interval of E I contains the truth.
         bending_widths: Half widths of the intervals in log E I.
+        bending_errors: Errors of log E I.
         bounds: Half widths of intervals by the Cramer-Rao bound if the shape were known: those of
             log E are then those of log E I. NaN: there is none.
         refusal: Why there is no estimate.
@@ -91,6 +92,7 @@ class ScanTrial:
     widths: tuple[float, ...]
     bending_covered: tuple[bool, ...]
     bending_widths: tuple[float, ...]
+    bending_errors: tuple[float, ...]
     bounds: tuple[float, ...]
     refusal: str
     seconds: float
@@ -145,8 +147,9 @@ def bending_row(trials: list[ScanTrial]) -> Row:
     held = np.concatenate([each.bending_covered for each in fitted])
     width, of_young = (100 * np.median(np.concatenate(parts)) for parts in (
         [each.bending_widths for each in fitted], [each.widths for each in fitted]))
-    return Row(*BENDING_ROW, f"{100 * held.mean():.1f} % of {len(held)} (median half width "
-               f"{width:.0f} %, of E {of_young:.0f} %)",
+    size = 100 * np.median(np.abs(np.concatenate([each.bending_errors for each in fitted])))
+    return Row(*BENDING_ROW, f"{100 * held.mean():.1f} % of {len(held)} (median error "
+               f"{size:.0f} %, half width {width:.0f} %, of E {of_young:.0f} %)",
                share_met(float(held.mean()), len(held), 0.88, 0.99), len(trials))
 
 
@@ -185,13 +188,15 @@ def scan_trial(seed: tuple[int, ...], source: str = "") -> ScanTrial:
             refusal = str(error)
     seconds = round(time.perf_counter() - started, 1)
     if found is None:
-        return ScanTrial(seed, plant, view, noise, (), (), (), (), (), (), refusal, seconds, source)
+        return ScanTrial(seed, plant, view, noise, (), (), (), (), (), (), (), refusal,
+                         seconds, source)
     written = found.written
     errors = np.array(written["young_pa"]) / found.young - 1
     return ScanTrial(
         seed, plant, view, noise, tuple(errors.tolist()),
         *_compared(written["young_interval_pa"], found.young),
         *_compared(written["bending_stiffness_interval_nm2"], found.bending),
+        tuple(np.log(np.array(written["bending_stiffness_nm2"]) / found.bending).tolist()),
         tuple(found.bounds.tolist()), "", seconds, source)
 
 
