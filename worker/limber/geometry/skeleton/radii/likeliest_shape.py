@@ -219,10 +219,11 @@ class _Bends:
     @classmethod
     def of(cls, skeleton: Skeleton) -> "_Bends":
         # Between nodes at one place there is no direction.
-        apart = skeleton.steps > _DISTINCT * skeleton.radius
+        long = skeleton.steps
+        apart = long > _DISTINCT * skeleton.radius
         chains = [np.append(own[:1], own[1:][apart[own[1:]]]) for own in skeleton.own_runs()]
         chains = [chain for chain in chains if len(chain) > 2]
-        steps = [skeleton.steps[chain[1:]] for chain in chains]
+        steps = [long[chain[1:]] for chain in chains]
         length = np.concatenate([np.empty(0), *((step[:-1] + step[1:]) / 2 for step in steps)])
         inner = np.concatenate([np.empty(0, np.int64), *(chain[1:-1] for chain in chains)])
         second = second_differences(chains, steps, skeleton.node_count) if chains else (
