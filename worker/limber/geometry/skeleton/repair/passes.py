@@ -154,6 +154,8 @@ DROP_BARE_ENDS = Pass("drop bare ends",
                       lambda now: now.of(without_bare_ends(now.skeleton, now.points)))
 DROP_STRANDS = Pass("drop strands", "Where a scan has holes, one branch has two parallel axes.",
                     _drop_strands)
+LIMIT = Pass("limit radii", "A radius is outside the range for a cloud of this size.",
+             lambda now: now.of(limited(now.skeleton, *now.radius_limits)))
 
 PASSES = (
     STEADY,
@@ -174,6 +176,7 @@ PASSES = (
     STEADY,
     Pass("unpinch radii", "Where only a strip of a stem is visible, the radius is far too small.",
          lambda now: now if now.pinched is None else now.of(unpinched(now.skeleton, now.points))),
+    LIMIT,
     Pass("follow feet down", "Two limbs side by side have one axis, up to a fork too far out.",
          lambda now: now.of(with_feet(now.skeleton, now.points, now.noise)[0])),
     Pass("fit finely",
@@ -185,8 +188,7 @@ PASSES = (
     DROP_BARE_ENDS,
     Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
          lambda now: now.of(ends_within(now.skeleton, now.points))),
-    Pass("limit radii", "A radius is outside the range for a cloud of this size.",
-         lambda now: now.of(limited(now.skeleton, *now.radius_limits))),
+    LIMIT,
     Pass("find the likeliest axes and radii",
          "A radius that few points, the spacing or the noise determine, or that no wood has, is "
          "treated as measured.",
