@@ -69,11 +69,12 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
         out = np.zeros(shape, part.dtype)
         out[box] = part
         return out
+    # A grasp's distance is exact, and used farther than the next cells. A target's is not: where
+    # the target moves far with the grasp, cells far from the goal would count as near it.
+    known = filled <= 3.0 * half if growth.max() <= 1.0 else (
+        scipy.ndimage.binary_dilation(touching, np.ones((3, 3, 3))) & np.isfinite(distance))
     # A cell of the next grid queries up to 4 of its edges away, 7 times half its diagonal; its
     # centre is within ``half`` of this one's.
-    # By neighbours, not by distance: where the target moves far with the grasp, cells far from the
-    # goal would count as near it.
-    known = scipy.ndimage.binary_dilation(touching, np.ones((3, 3, 3))) & np.isfinite(distance)
     return AboutGoal(whole(known), whole(np.nan_to_num(cost)),
                       whole(inside), slack, bool(touching.any()),
                       whole(filled <= growth * 8.0 * half))
