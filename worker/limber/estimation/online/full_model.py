@@ -125,8 +125,6 @@ class Beside:
     def __init__(self, branch: FullBranch):
         self._pool = Pool(1, begin=_begin, begin_arguments=(branch,),
                           name="the full model beside an online estimate")
-        # Its start must not delay a frame.
-        self._pool.submit(_is_ready).exception()
 
     def frame(self, *arguments: np.ndarray) -> "Future[ExactFrame | None]":
         return self._pool.submit(_frame, *arguments)
@@ -171,10 +169,6 @@ _solver: list[ExactSolver] = []
 
 def _begin(branch: FullBranch) -> None:
     _solver[:] = [ExactSolver(branch)]
-
-
-def _is_ready() -> bool:
-    return bool(_solver)
 
 
 def _frame(*arguments: np.ndarray) -> ExactFrame | None:
