@@ -17,6 +17,7 @@ _SMOOTHED = 0.1  # prior probability that a sensor smooths
 _MOST, _STEPS = 0.4, 41  # largest c, and values of it
 _POWER_SIGMA = 0.1  # deviation of the power of the radius by which density on the skin may differ
 _POINTS, _LEAST = 12, 12  # points of a stretch; thick stretches that tell
+_STOUT = 1 / 3  # fraction of the points on these, at least
 _ALIKE = 3.0  # stretches whose density is alike, so that they count as one
 _FREEDOM, _ROUNDS = 4.0, 12  # Student's distribution of a stretch's density, and its fit
 _TURNS = 8  # of Newton's method
@@ -73,8 +74,9 @@ def sensor_smoothing(skeleton: Skeleton, radius: np.ndarray, count: np.ndarray, 
     points, length = np.bincount(stretch, count), np.bincount(stretch, skeleton.steps)
     thick = np.exp(np.bincount(stretch, np.log(radius)) / np.maximum(np.bincount(stretch), 1))
     told = (points >= _POINTS) & (length > 0)
-    # The density on the skin is that of branches that hardly shrink.
-    if (told & (thick > spacing)).sum() < _LEAST:
+    # The density on the skin is that of branches that hardly shrink; without them it is not known.
+    stout = told & (thick > spacing)
+    if stout.sum() < _LEAST or points[stout].sum() < _STOUT * points[told].sum():
         return Smoothing(0.0, 0.0, spacing)
     dense = np.log(points[told] / length[told])
     shrink = np.linspace(0.0, _MOST, _STEPS)
