@@ -22,7 +22,7 @@ from limber.mechanics.pull_simulation import SimulateSettings
 from limber.stages.motion.simulate import simulate
 from limber.stages.shape.generate import write_generated
 from limber.stages.shape.mesh import mesh_surface
-from limber.stages.shape.reconstruct import reconstruct, reconstruct_folder
+from limber.stages.shape.reconstruct import _without, reconstruct, reconstruct_folder
 from limber.store import Branch
 from limber.store.loading import load_model
 
@@ -216,6 +216,15 @@ def test_points_to_leave_out_must_be_the_scans(tmp_path):
         with pytest.raises(InputError, match=told):
             reconstruct(scan, tmp_path / "b.branch", without_path=others)
     assert not (tmp_path / "b.branch").exists()
+
+
+def test_points_to_leave_out_are_these_alone_in_map_coordinates(tmp_path):
+    """There single precision has steps of half a metre, but the points of the file are exact."""
+    points = np.random.default_rng(0).uniform(0, 1, (60, 3)) + [4e5, 5.6e6, 100.0]
+    points[-1] = points[0]
+    Cloud(points[:7]).write_ply(tmp_path / "stake.ply")
+    left = _without(Cloud(points), tmp_path / "stake.ply").points
+    np.testing.assert_array_equal(left, points[7:-1])
 
 
 STEPS = ("laplacian", "contracting", "connecting", "fitting axes", "skeleton", "surface",

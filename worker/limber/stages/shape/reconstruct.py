@@ -231,14 +231,19 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
 def _without(cloud: Cloud, path: Path) -> Cloud:
     """Return a cloud without the points of a file; InputError if it has none of them, or all.
 
-    Points count as the same that single precision cannot distinguish.
+    Each of the file's points leaves out the nearest one of the cloud that single precision cannot
+    distinguish from it, and all at that very place: no others, as map coordinates are so large that
+    single precision cannot distinguish a whole plant's points.
     """
     from scipy.spatial import cKDTree
 
     gone = read_points(path).points
     same = float(np.spacing(np.float32(np.abs(cloud.points).max())))
-    far, _ = cKDTree(gone).query(cloud.points, distance_upper_bound=2.0 * same)
-    keep = ~np.isfinite(far)
+    far, nearest = cKDTree(cloud.points).query(gone, distance_upper_bound=2.0 * same)
+    found = np.unique(nearest[np.isfinite(far)])
+    keep = np.ones(len(cloud), bool)
+    if len(found):
+        keep = cKDTree(cloud.points[found]).query(cloud.points)[0] > 0
     if keep.all():
         raise InputError(f"None of the {len(gone)} points of {path} is in the cloud.",
                          "Points to leave out are given in the cloud's coordinates and unit.",
