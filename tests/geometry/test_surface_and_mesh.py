@@ -252,6 +252,26 @@ def test_sweep_joins_twigs_all_around():
     assert dihedral_angles(meshed.mesh).min() > 2
 
 
+def test_sweep_joins_the_whorls_of_a_conifer():
+    """Twigs of a whorl share a slice; one after the other they would not fit on the stem."""
+    stem = np.column_stack([np.zeros(49), np.zeros(49), np.linspace(0, 0.6, 49)])
+    nodes, parent = [stem], [np.arange(49) - 1]
+    radius, count = [np.linspace(0.008, 0.003, 49)], 49
+    for whorl, at in enumerate(range(4, 46, 3)):
+        for k in range(5):
+            turn = 2 * np.pi * k / 5 + 0.4 * whorl
+            direction = np.array([np.cos(turn), np.sin(turn), 0.5]) / np.sqrt(1.25)
+            nodes.append(stem[at] + np.linspace(0.01, 0.1, 8)[:, None] * direction)
+            parent.append(np.concatenate([[at], count + np.arange(7)]))
+            radius.append(np.linspace(0.0022, 0.0008, 8))
+            count += 8
+    skeleton = Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent),
+                                   np.concatenate(radius))
+    meshed = mesh_branch(skeleton, MeshSettings(mesher="sweep"))
+    assert skeleton.branch_count == 71 and not meshed.left_out
+    assert dihedral_angles(meshed.mesh).min() > 2
+
+
 @pytest.mark.slow
 def test_tetwild_fills_a_branch_and_is_cached(y_skeleton, tmp_path, monkeypatch):
     """fTetWild keeps the volume, comes out oriented, and the second time from the cache."""

@@ -50,20 +50,24 @@ def frames(points: np.ndarray, tangent: np.ndarray, normal: np.ndarray | None = 
     first = any_normal(tangent[0]) if normal is None else normal - tangent[0] * (
         normal @ tangent[0])
     normals[0] = first / np.linalg.norm(first)
-    for i in range(len(points) - 1):
-        across = points[i + 1] - points[i]
-        square = across @ across
-        if square < _SAME**2 * max(float(points[i] @ points[i]), 1e-300):
-            across, square = tangent[i], 1.0  # two nodes coincide: continue along the tangent
-        reflected = normals[i] - (2 / square) * (across @ normals[i]) * across
-        turned = tangent[i] - (2 / square) * (across @ tangent[i]) * across
-        second = tangent[i + 1] - turned
-        size = second @ second
-        if size > 1e-30:
-            reflected = reflected - (2 / size) * (second @ reflected) * second
-        reflected = reflected - tangent[i + 1] * (reflected @ tangent[i + 1])
-        normals[i + 1] = reflected / np.linalg.norm(reflected)
+    across = np.diff(points, axis=0)
+    size = (points[:-1]**2).sum(axis=1)
+    same = (across**2).sum(axis=1) < _SAME**2 * np.maximum(size, 1e-300)
+    across[same] = tangent[:-1][same]  # two nodes coincide: continue along the tangent
+    one = _reflections(across)
+    second = tangent[1:] - np.einsum("nij,nj->ni", one, tangent[:-1])
+    onto = np.eye(3) - tangent[1:, :, None] * tangent[1:, None]
+    for i, turn in enumerate(onto @ _reflections(second) @ one):
+        following = turn @ normals[i]
+        normals[i + 1] = following / np.sqrt(following @ following)
     return normals, np.cross(tangent, normals)
+
+
+def _reflections(across: np.ndarray) -> np.ndarray:
+    """Reflections along vectors [n, 3], shape [n, 3, 3]; the identity for a zero vector."""
+    square = (across**2).sum(axis=1)
+    scale = np.where(square > 1e-30, 2 / np.maximum(square, 1e-30), 0.0)
+    return np.eye(3) - scale[:, None, None] * across[:, :, None] * across[:, None]
 
 
 def polygon_factor(sides: int) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from limber.geometry.tets.run_axis import RunAxis
 
 _CLAMP_SLICES = (1.0, 3.0)  # ends of the first slices, in root radii
+_SHARED = 0.5  # cosine between twigs of one slice below which they leave through different sides
 _TAPERED, _THINNEST = 2.5, 0.06  # radius ratio above which rings are graded; smallest ratio
 
 
@@ -44,30 +45,28 @@ class Window:
 
 
 def without_overlap(windows: Iterable[Window], axis: RunAxis, start: float) -> list[Window]:
-    """Move slices along an axis from ``start`` [m] so that none overlap.
+    """Move slices along an axis from ``start`` [m] so that none overlap, as little as possible.
 
-    Twigs that leave at the same height to different sides share a slice.
+    Twigs that leave through different sides may share a slice, as those of a whorl do.
     """
     end = axis.length + 1e-12
-    placed: list[Window] = []
+    slices: list[list[Window]] = []
     free = start + 0.3 * float(axis.radius_at(start))
     for window in sorted(windows, key=lambda w: w.low + w.high):
-        length = window.high - window.low
-        low = window.low
-        if placed:
-            last = placed[-1]
-            near = abs(low + length / 2 - (last.low + last.high) / 2) < 0.6 * (
-                last.high - last.low)
-            if near and window.outward @ last.outward < 0.3:
-                placed.append(Window(window.run, last.low, last.high, window.outward))
-                continue
-        low = max(min(low, axis.length - length), free)
-        if low + 0.5 * length > end:
-            continue
+        length, middle = window.high - window.low, (window.low + window.high) / 2
+        low = max(min(window.low, axis.length - length), free)
         high = min(low + length, end)
-        placed.append(Window(window.run, low, high, window.outward))
-        free = high + 0.25 * length
-    return placed
+        own = abs((low + high) / 2 - middle) if low + 0.5 * length <= end else np.inf
+        moves = {k: abs((one[0].low + one[0].high) / 2 - middle) for k, one in enumerate(slices)
+                 if all(window.outward @ other.outward < _SHARED for other in one)}
+        best = min(moves, key=moves.__getitem__, default=None)
+        if best is not None and moves[best] < own:
+            one = slices[best]
+            one.append(Window(window.run, one[0].low, one[0].high, window.outward))
+        elif np.isfinite(own):
+            slices.append([Window(window.run, low, high, window.outward)])
+            free = high + 0.25 * length
+    return [window for one in slices for window in one]
 
 
 def ring_positions(axis: RunAxis, start: float, windows: list[Window],

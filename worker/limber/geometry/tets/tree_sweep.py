@@ -13,7 +13,6 @@ import numpy as np
 
 from limber.core.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.sweep import any_normal
 from limber.geometry.tets.fork_joints import Patch, joints
 from limber.geometry.tets.quality import FLAT, shapes
 from limber.geometry.tets.run_axis import RunAxis
@@ -24,9 +23,7 @@ from limber.geometry.tets.unfolded_tube import unfolded
 _STARTS, _LEANS = 60, (0.3, 0.8, 1.6)  # positions tried for a twig's first ring; its lean
 _NEAR = 2.5  # radii beyond the first possible position within which the best one is used
 _STRAIGHTENED = (0.0, 3.0, 6.0, 12.0)  # radii of a twig's start that may be straightened
-# Angles of the main run's corners, tried in turn while a twig cannot be joined. In large trees,
-# where some twig always fails, only one is tried.
-_TURNS, _TURNED_MOST = tuple(np.deg2rad([0.0, 30.0, 15.0, 45.0])), 60
+_OTHERS = 4  # slices nearest to a twig's foot, tried where its own has no room
 _THICK_TWIG = 0.5  # fraction of its carrier; such a twig uses two side faces and has six sides
 
 
@@ -53,17 +50,10 @@ def sweep_tree(skeleton: Skeleton, *, spacing: float = 2.5) -> SweptTree:
     Raises:
         MeshingError: the main run cannot be swept because its bend is too sharp for its thickness.
     """
-    tried: list[tuple[float, SweptTree]] = []
-    for turn in _TURNS if skeleton.branch_count <= _TURNED_MOST else _TURNS[:1]:
-        sweep = _TreeSweep(skeleton, spacing, turn)
-        for run in range(skeleton.branch_count):
-            sweep.add_run(run)
-        found = sweep.result()
-        lost = float(skeleton.radius[np.isin(skeleton.branch, found.left_out)].sum())
-        tried.append((lost, found))
-        if not found.left_out:
-            break
-    return min(tried, key=lambda one: one[0])[1]
+    sweep = _TreeSweep(skeleton, spacing)
+    for run in range(skeleton.branch_count):
+        sweep.add_run(run)
+    return sweep.result()
 
 
 @dataclass
@@ -77,10 +67,9 @@ class _Swept:
 
 
 class _TreeSweep:
-    def __init__(self, skeleton: Skeleton, spacing: float, turn: float = 0.0):
+    def __init__(self, skeleton: Skeleton, spacing: float):
         self._skeleton = skeleton
         self._spacing = spacing
-        self._turn = turn
         self._axes = [RunAxis.of(skeleton, run) for run in range(skeleton.branch_count)]
         starts = [members[0] for members in skeleton.runs()]
         self._carrier = [-1] + [int(skeleton.branch[start]) for start in starts[1:]]
@@ -94,32 +83,31 @@ class _TreeSweep:
 
     def add_run(self, run: int) -> None:
         if run == 0:
-            self._sweep(run, 0.0, 6, self._first_normal())
+            self._sweep(run, 0.0, 6, None)
             return
-        carrier = self._swept.get(self._carrier[run])
-        if carrier is None or run not in carrier.windows:
-            self._left_out.append(run)
-            return
-        axis = self._axes[run]
-        for reach in _STRAIGHTENED:
-            # A twig that starts along its carrier's side, or in a hook, leaves it on a straight
-            # line instead.
-            self._axes[run] = axis.straight_until(reach * float(axis.radius[0]))
-            for patch in self._patches(carrier, run):
-                if self._grow(carrier, run, patch):
-                    carrier.taken |= {(patch.slice, side) for side in patch.faces}
-                    return
+        carrier, axis = self._swept.get(self._carrier[run]), self._axes[run]
+        for at in self._slices(carrier, run) if carrier else []:
+            for reach in _STRAIGHTENED:
+                # A twig that starts along its carrier's side, or in a hook, leaves it on a straight
+                # line instead.
+                self._axes[run] = axis.straight_until(reach * float(axis.radius[0]))
+                for patch in self._patches(carrier, run, at):
+                    if self._grow(carrier, run, patch):
+                        carrier.taken |= {(patch.slice, side) for side in patch.faces}
+                        return
         self._axes[run] = axis
         self._left_out.append(run)
 
-    def _first_normal(self) -> np.ndarray | None:
-        """Direction of the main run's first corner; None: any."""
-        if self._turn == 0:
-            return None
-        vector = self._axes[0].points[1] - self._axes[0].points[0]
-        normal = any_normal(vector)
-        other = np.cross(vector / np.linalg.norm(vector), normal)
-        return np.cos(self._turn) * normal + np.sin(self._turn) * other
+    def _slices(self, carrier: _Swept, run: int) -> list[int]:
+        """Slices of the carrier that a twig may grow out of: its own, then those near it."""
+        window = Window.of(carrier.axis, self._axes[run], run)
+        if window is None:
+            return []
+        middle = (carrier.where[1:] + carrier.where[:-1]) / 2
+        away = np.abs(middle - (window.low + window.high) / 2)
+        near = [int(at) for at in np.argsort(away, kind="stable")[:_OTHERS]]
+        own = [carrier.windows[run]] if run in carrier.windows else []
+        return own + [at for at in near if at not in own]
 
     def _sweep(self, run: int, start: float, sides: int, first_normal: np.ndarray | None,
                first_tangent: np.ndarray | None = None) -> bool:
@@ -144,9 +132,8 @@ class _TreeSweep:
                                   slices)
         return True
 
-    def _patches(self, carrier: _Swept, run: int) -> list[Patch]:
+    def _patches(self, carrier: _Swept, run: int, at: int) -> list[Patch]:
         """Side faces of the carrier's slice that the twig may start from, best first."""
-        at = carrier.windows[run]
         low, high = carrier.node[at], carrier.node[at + 1]
         sides = carrier.sides
         radius = float(self._axes[run].radius[1 if len(self._axes[run].radius) > 1 else 0])

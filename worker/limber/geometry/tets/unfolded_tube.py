@@ -34,24 +34,34 @@ def unfolded(axis: RunAxis, start: float, windows: list[Window], sides: int, spa
     moves = dict.fromkeys((window.run for window in windows), 0)
     first_low = {window.run: window.low for window in windows}
     where, ends = ring_positions(axis, start, windows, spacing), [start, axis.length]
-    for _ in range(4 * len(where) + 20):
+    for _ in range(len(where) + 20):
         mesh = _tube_mesh(axis, where, sides, first_normal, first_tangent)
         flat = shapes(mesh.nodes[mesh.tets]) < FLAT
         if not flat.any():
             break
-        wrong = int(np.argmax(flat)) // (3 * sides)
-        low, high = where[wrong:wrong + 2]
-        touching = [w for w in windows if w.low < high + 1e-9 and w.high > low - 1e-9]
+        folded = np.unique(np.flatnonzero(flat) // (3 * sides))
         kept = np.array([v for w in windows for v in (w.low, w.high)] + ends)
-        loose = [r for r in (wrong, wrong + 1) if np.abs(where[r] - kept).min() > 1e-9]
+        loose = _loose(where, folded, kept)
+        low, high = where[folded[0]:folded[0] + 2]
+        touching = [w for w in windows if w.low < high + 1e-9 and w.high > low - 1e-9]
         if loose:
-            where = np.delete(where, loose[-1])
+            where = np.delete(where, loose)
         elif touching:
             _move_on(touching[0], windows, moves, first_low[touching[0].run], *ends)
             where = ring_positions(axis, start, windows, spacing)
         else:
             break
     return where, mesh
+
+
+def _loose(where: np.ndarray, folded: np.ndarray, kept: np.ndarray) -> list[int]:
+    """One ring of each folded slice that need not be kept; none of two slices side by side."""
+    found: list[int] = []
+    for slice_ in folded:
+        rings_ = [r for r in (slice_ + 1, slice_) if np.abs(where[r] - kept).min() > 1e-9]
+        if rings_ and not (found and slice_ - found[-1] < 1):
+            found.append(int(rings_[0]))
+    return found
 
 
 def _move_on(window: Window, windows: list[Window], moves: dict[int, int], first_low: float,
