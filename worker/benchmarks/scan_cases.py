@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
+from benchmarks.worlds.ray_casting import Hits, cast
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.skeleton.skeleton import Skeleton
+
+_PITCH = 1 / 900  # width of a pixel at a depth of 1
 
 
 @dataclass(frozen=True)
@@ -93,42 +95,31 @@ def single_view_case(seed: int) -> ScanCase:
     their readings are between the branch and a background behind it.
     """
     rng = np.random.default_rng([seed, 3])
-    branch = branch_of(seed, gap_count=0, occlusion=0.0, unevenness=0.0, noise=0.0,
-                       point_spacing=0.0008)
+    branch = branch_of(seed, gap_count=0)
     centre = branch.skeleton.nodes.mean(axis=0)
     turn = rng.uniform(0, 2 * np.pi)
     forward = np.array([np.cos(turn), np.sin(turn), rng.uniform(-0.2, 0.2)])
     forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(forward, right), forward])
     eye = centre - forward * rng.uniform(0.7, 1.2)
-
-    def seen(points: np.ndarray) -> np.ndarray:
-        return (points - eye) @ axes.T
-
-    pixels = _depth_image(seen(branch.cloud.points), pitch=1 / 900, rng=rng)
-    truth = branch.skeleton.moved(seen(branch.skeleton.nodes))
-    return ScanCase(f"single_view_{seed}", seed, truth, pixels, branch.surface.volume,
-                    {"up": tuple((axes @ [0.0, 0.0, 1.0]).tolist())})
+    # A camera has a depth for a pixel that the branch covers by half or more: that of its middle.
+    hits = cast(branch.surface.vertices[branch.surface.faces], eye, centre, _PITCH)
+    truth = branch.skeleton.moved((branch.skeleton.nodes - eye) @ hits.axes.T)
+    return ScanCase(f"single_view_{seed}", seed, truth, _depth_image(hits, rng),
+                    branch.surface.volume, {"up": tuple((hits.axes @ [0.0, 0.0, 1.0]).tolist())})
 
 
-def _depth_image(points: np.ndarray, pitch: float, rng: np.random.Generator) -> np.ndarray:
-    """Nearest point of each pixel as its reading [m], with noise and flying pixels."""
-    pixel = np.round(points[:, :2] / points[:, 2:] / pitch).astype(np.int64)
-    order = np.argsort(points[:, 2], kind="stable")
-    _, first = np.unique(pixel[order], axis=0, return_index=True)
-    which = order[first]
-    depth, pixel = points[which, 2], pixel[which]
+def _depth_image(hits: Hits, rng: np.random.Generator) -> np.ndarray:
+    """Readings [m] in the camera's frame, with noise and flying pixels."""
+    rays = hits.way @ hits.axes.T
+    depth, flat = hits.distance * rays[:, 2], rays[:, :2] / rays[:, 2:]
     # As with a stereo camera: errors grow with the square of the depth, jointly over patches.
     patch = rng.normal(size=(40, 3)) * 60.0
-    waves = np.sin(np.column_stack([pixel * pitch, depth]) @ patch.T
+    waves = np.sin(np.column_stack([flat, depth]) @ patch.T
                    + rng.uniform(0, 2 * np.pi, 40)).mean(axis=1) * np.sqrt(2 * 40)
     depth = depth + depth**2 * (0.001 * rng.normal(size=len(depth)) + 0.0007 * waves)
-    beside = cKDTree(pixel).query_ball_point(pixel, 1.5, return_length=True) < 8
-    flying = beside & (rng.uniform(size=len(depth)) < 0.08)
+    flying = hits.edge & (rng.uniform(size=len(depth)) < 0.08)
     depth = np.where(flying, depth + rng.exponential(0.03, len(depth)), depth)
-    return np.column_stack([pixel * pitch, np.ones(len(depth))]) * depth[:, None]
+    return np.column_stack([flat, np.ones(len(depth))]) * depth[:, None]
 
 
 def _case(branch: GeneratedBranch, name: str) -> ScanCase:
