@@ -159,3 +159,15 @@ def test_errors_that_all_fits_share_widen_all_intervals() -> None:
                          (_told(_plant(), 0.0005, 0.0, shared=0.0008), 1.5),
                          (_told(_plant(), 0.0005, 0.0, one_sided=True), 1.15)):
         assert (told.radius_sigma > factor * plain.radius_sigma)[5:_STEM - 5].all()
+
+
+@pytest.mark.parametrize("twig", [0.003, 0.006])
+def test_beyond_a_fork_the_stem_is_thinner_by_the_wood_of_its_twig(twig: float) -> None:
+    """Where no point shows it: the thicker the twig, the deeper the step."""
+    plant = _plant(twig=twig, sigma=0.01)
+    hidden = (plant.branch == 0) & (plant.nodes[:, 2] > 0.201)
+    told = _told(replace(plant, radius_state=np.where(hidden, INTERPOLATED, MEASURED).astype(
+        np.int8)), 0.0003, 0.0001)
+    step = told.radius[41] / told.radius[40]
+    assert step == pytest.approx((1 - (twig / 0.008)**2.5)**0.4, abs=0.06)
+    assert told.radius_sigma[41] / told.radius[41] > 2 * told.radius_sigma[38] / told.radius[38]

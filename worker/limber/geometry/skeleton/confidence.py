@@ -14,7 +14,7 @@ from limber.geometry.skeleton.radii.likeliest_shape import (
     point_spacing,
     typical_radius,
 )
-from limber.geometry.skeleton.radii.normal_equations import fit_covariance
+from limber.geometry.skeleton.radii.normal_equations import fit_with_steps
 from limber.geometry.skeleton.radii.projected_widths import sight_field, width_covariance
 from limber.geometry.skeleton.radii.shared_errors import shared_error
 from limber.geometry.skeleton.radii.smoothing_sensors import sensor_smoothing
@@ -52,8 +52,10 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool
     pixel = None if view is None else view.pitch * np.linalg.norm(skeleton.nodes - view.eye, axis=1)
     if rays and view is None:
         pixel = spacing
-    covariance = width_covariance(skeleton, sight_field(skeleton, points, view), noise) if (
-        rays) else fit_covariance(skeleton, points)
+    if rays:
+        covariance = width_covariance(skeleton, sight_field(skeleton, points, view), noise)
+    else:
+        skeleton, covariance = fit_with_steps(skeleton, points)
     smoothing = None
     if not rays:
         smoothing = sensor_smoothing(skeleton, typical_radius(skeleton, skeleton.radius), count,

@@ -5,7 +5,8 @@ from enum import StrEnum
 
 import numpy as np
 
-from limber.geometry.skeleton.radii.likeliest_shape import FORK, WANDER
+from limber.geometry.skeleton.radii.smoothness import FORK
+from limber.geometry.skeleton.radii.wood import WANDER
 from limber.geometry.skeleton.skeleton import BRIDGED, LIMITED, UNRESOLVED, Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths, stretches
 

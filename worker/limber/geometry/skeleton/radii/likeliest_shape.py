@@ -5,10 +5,10 @@ at each node is one observation of both, with its own covariance and with errors
 what a sensor smooths or widens at the scale of its points (the whole scan), the effect of noise and
 of sections that are not round (a run). A shared error moves axis and radius together, as far as
 the points leave both open: from one side they show the sum of depth and radius, not each. The prior
-is how wood grows: an axis bends little; a radius changes slowly along a run and falls towards its
-tip, falls at a fork, and a side branch starts thinner than its carrier. Where points determine a
-radius, it is theirs. Where they hardly do, it follows from the carrier and the resolved part, with
-a wide interval.
+is how wood grows (:mod:`wood`): an axis bends little; a radius changes slowly along a run and falls
+towards its tip, at a fork by the wood of the side branches. Where points determine a radius, it is
+theirs. Where they hardly do, it follows from the carrier and the resolved part, with a wide
+interval.
 """
 
 from dataclasses import dataclass, replace
@@ -19,22 +19,13 @@ from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.radii.smoothing_sensors import Smoothing
-from limber.geometry.skeleton.radii.smoothness import second_differences
+from limber.geometry.skeleton.radii.wood import DISTINCT, FREEDOM, Bends, Wood
 from limber.geometry.skeleton.skeleton import MEASURED, UNRESOLVED, Skeleton
 
 SPACINGS = 1.0
 """Diameter in point spacings, under which a radius is not resolved: too few points around it."""
 _BESIDE = 4  # nodes on each side whose points show the spacing
 _NOISES = 1.0  # radius in standard deviations of the noise, under which it is not resolved
-# Wood, in logarithms of radii: a side branch against its carrier and the fall along a whole run
-# (mean and deviation each); deviation of a root from any radius.
-_SIDE, _SIDE_SIGMA = -1.0, 0.8
-_TAPER, _TAPER_SIGMA, _ROOT = -0.5, 0.7, 3.0
-WANDER, FORK = 5e-3, 0.3
-"""Variance of a radius's logarithm per radius of length, and its deviation at a fork."""
-# Its axis: variance of the direction per radius of length [rad^2], deviation at a fork [rad].
-_BEND, _KINK = 1e-3, 0.25
-_DISTINCT = 1e-3  # radii between nodes at different places
 _ALONG = 0.01  # radii that nodes may move along their axis, where no point holds them
 _APART = 8.0  # radii along a run from which fits are independent
 # Fraction of the radius by which fits scatter about the steady radius of wood: least, most, first.
@@ -55,7 +46,6 @@ _BIAS = 0.15
 _OVAL, _OVAL_SIDE = 0.012, 0.04
 _VAGUE = 1.0  # the same, of fits that the points do not resolve
 _LINEAR = 0.3  # the largest for which a change of the axis is one of the logarithm, in proportion
-_FREEDOM = 4.0  # of Student's distribution of a fit's error: some fits fail
 _ROUNDS = 5
 _AT_ONCE, _EACH = 256, 4  # columns of an inverse; nodes of a run between them
 
@@ -96,9 +86,9 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
         _EDGE * evidence.pixel)
     measured = skeleton.radius_state == MEASURED
     evidence = replace(evidence, covariance=_coupled(evidence.covariance, first, measured))
-    independent = np.clip(skeleton.steps / first, _DISTINCT, _APART) / _APART
+    independent = np.clip(skeleton.steps / first, DISTINCT, _APART) / _APART
     vague = np.where(_is_coarse(first, evidence), _VAGUE**2, 0.0)
-    trust, local, bends = np.ones(len(radius)), _LOCAL[2], _Bends.of(skeleton)
+    trust, local, bends = np.ones(len(radius)), _LOCAL[2], Bends.of(skeleton)
     for _ in range(_ROUNDS):
         own = evidence.covariance[:, 3, 3] / first**2 + local**2 + vague
         # A fit that came out too thin or too thick is as unsure as the thinner one.
@@ -106,10 +96,11 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
         errors = _of_runs(skeleton, evidence, thin)
         known = _information(skeleton, evidence, own / trust - evidence.covariance[:, 3, 3]
                              / first**2, measured, independent)
-        posterior = _Posterior.of(_wood(skeleton, radius, bends), known, fitted, errors)
+        posterior = _Posterior.of(Wood.of(skeleton, radius), bends, known, fitted,
+                                  errors)
         radius = np.exp(posterior.mean[:, 3])
         miss = np.abs(posterior.miss(fitted)[:, 3])
-        trust = (_FREEDOM + 1) / (_FREEDOM + independent * miss**2 / own)
+        trust = (FREEDOM + 1) / (FREEDOM + independent * miss**2 / own)
         bends = bends.after(posterior.mean[:, :3])
         if measured.any():
             local = float(np.clip(1.4826 * np.median(miss[measured]), *_LOCAL[:2]))
@@ -158,89 +149,6 @@ def point_spacing(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray, n
         known = points_near > 0
         near[own[known]] = np.convolve(total[own], around, "same")[known] / points_near[known]
     return np.sqrt(np.maximum(near**2 - noise**2, (0.5 * near)**2))
-
-
-@dataclass(frozen=True)
-class _Wood:
-    """The prior of n nodes (x, y, z [m], logarithm of the radius) and of the runs' taper.
-
-    Attributes:
-        precision: Of the nodes, shape [4 n, 4 n].
-        cross: Of nodes with tapers, shape [4 n, runs].
-        taper: Of the tapers, shape [runs, runs].
-        pull: Precision times mean of the nodes, shape [4 n], and of the tapers, shape [runs].
-    """
-
-    precision: sparse.csc_matrix
-    cross: sparse.csc_matrix
-    taper: sparse.csc_matrix
-    pull: tuple[np.ndarray, np.ndarray]
-
-
-def _wood(skeleton: Skeleton, radius: np.ndarray, bends: "_Bends") -> _Wood:
-    """The prior, with its lengths counted in current radii [m], shape [n]."""
-    node, parent, step = np.arange(1, len(radius)), skeleton.parent[1:], skeleton.steps[1:]
-    run, runs = skeleton.branch[1:], skeleton.branch_count
-    length = np.bincount(run, step, runs)
-    side = run != skeleton.branch[parent]
-    variance = WANDER * step / radius[parent] + np.where(
-        skeleton.child_counts()[parent] > 1, FORK**2, 0.0)
-    weight = sparse.diags(1 / np.where(side, _SIDE_SIGMA**2, np.maximum(variance, 1e-12)))
-    row = np.arange(len(node))
-    steps = sparse.coo_matrix((np.repeat([1.0, -1.0], len(node)), (
-        np.tile(row, 2), np.concatenate([4 * node + 3, 4 * parent + 3]))),
-        (len(node), 4 * len(radius))).tocsr()
-    share = sparse.coo_matrix((np.where(side, 0.0, step / np.maximum(length[run], 1e-300)),
-                               (row, run)), (len(node), runs)).tocsr()
-    start = np.where(side, _SIDE, 0.0)
-    root = np.zeros(4 * len(radius))
-    root[3] = _ROOT**-2
-    precision = steps.T @ weight @ steps + sparse.diags(root) + bends.precision()
-    return _Wood(precision.tocsc(), (-(steps.T @ weight @ share)).tocsc(),
-                 (share.T @ weight @ share + _TAPER_SIGMA**-2 * sparse.identity(runs)).tocsc(),
-                 (steps.T @ (weight @ start) + root * np.log(radius[0]),
-                  _TAPER_SIGMA**-2 * np.full(runs, _TAPER) - share.T @ (weight @ start)))
-
-
-@dataclass(frozen=True)
-class _Bends:
-    """The prior of the axes: directions change slowly along a run, with a few sharp bends.
-
-    Attributes:
-        turns: Change of direction at the inner nodes of runs, as a matrix over nodes, [k, n].
-        variance: Its variance in each component [rad^2], shape [k].
-        trust: Weight of each, by Student's distribution, shape [k].
-    """
-
-    turns: sparse.csr_matrix
-    variance: np.ndarray
-    trust: np.ndarray
-
-    @classmethod
-    def of(cls, skeleton: Skeleton) -> "_Bends":
-        # Between nodes at one place there is no direction.
-        long = skeleton.steps
-        apart = long > _DISTINCT * skeleton.radius
-        chains = [np.append(own[:1], own[1:][apart[own[1:]]]) for own in skeleton.own_runs()]
-        chains = [chain for chain in chains if len(chain) > 2]
-        steps = [long[chain[1:]] for chain in chains]
-        length = np.concatenate([np.empty(0), *((step[:-1] + step[1:]) / 2 for step in steps)])
-        inner = np.concatenate([np.empty(0, np.int64), *(chain[1:-1] for chain in chains)])
-        second = second_differences(chains, steps, skeleton.node_count) if chains else (
-            sparse.csr_matrix((0, skeleton.node_count)))
-        variance = _BEND * length / skeleton.radius[inner] + np.where(
-            skeleton.child_counts()[inner] > 1, _KINK**2, 0.0)
-        return cls(sparse.diags(length) @ second, variance, np.ones(len(inner)))
-
-    def after(self, nodes: np.ndarray) -> "_Bends":
-        """The same with the weights that axes [m], shape [n, 3], give."""
-        square = np.sum((self.turns @ nodes)**2, axis=1) / self.variance
-        return replace(self, trust=(_FREEDOM + 2) / (_FREEDOM + square))
-
-    def precision(self) -> sparse.csr_matrix:
-        """Of nodes (x, y, z [m], logarithm of the radius), shape [4 n, 4 n]."""
-        bend = self.turns.T @ sparse.diags(self.trust / self.variance) @ self.turns
-        return sparse.kron(bend, sparse.diags([1.0, 1.0, 1.0, 0.0])).tocsr()
 
 
 def _information(skeleton: Skeleton, evidence: ShapeEvidence, local: np.ndarray,
@@ -304,7 +212,7 @@ def typical_radius(skeleton: Skeleton, radius: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class _Posterior:
     """Means of the nodes, shape [n, 4], and of the shared errors, shape [runs]; the factorised
-    precision of nodes, shared errors and tapers."""
+    precision of nodes, shared errors and trends of wood."""
 
     mean: np.ndarray
     errors: np.ndarray
@@ -313,17 +221,21 @@ class _Posterior:
     together: sparse.csr_matrix
 
     @classmethod
-    def of(cls, wood: _Wood, known: sparse.bsr_matrix, fitted: np.ndarray,
+    def of(cls, wood: Wood, bends: Bends, known: sparse.bsr_matrix, fitted: np.ndarray,
            together: sparse.csr_matrix) -> "_Posterior":
-        cross = (known @ together).tocsc()
+        cross, flat, count = (known @ together).tocsc(), fitted.ravel(), len(fitted)
         own = sparse.identity(together.shape[1]) + together.T @ cross
-        matrix = sparse.bmat([[wood.precision + known, cross, wood.cross],
-                              [cross.T, own, None],
-                              [wood.cross.T, None, wood.taper]]).tocsc()
+        last = sparse.coo_matrix((np.ones(count), (4 * np.arange(count) + 3, np.arange(count))),
+                                 (4 * count, count)).tocsr()
+        of_wood, pull = wood.precision, wood.pull
+        with_trends = last @ of_wood[:count, count:]
+        matrix = sparse.bmat([
+            [last @ of_wood[:count, :count] @ last.T + bends.precision() + known, cross,
+             with_trends], [cross.T, own, None],
+            [with_trends.T, None, of_wood[count:, count:]]]).tocsc()
         factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        flat = fitted.ravel()
-        solved = factor.solve(np.concatenate([wood.pull[0] + known @ flat, cross.T @ flat,
-                                              wood.pull[1]]))
+        solved = factor.solve(np.concatenate([last @ pull[:count] + known @ flat, cross.T @ flat,
+                                              pull[count:]]))
         return cls(solved[:len(flat)].reshape(-1, 4),
                    solved[len(flat):len(flat) + together.shape[1]], factor, known, together)
 
@@ -335,9 +247,9 @@ class _Posterior:
         """How far errors of all fits, which the prior must not decide, move the radii's means, [n].
         """
         pull = self.known @ error.ravel()
-        runs = self.together.shape[1]
-        return self.factor.solve(np.concatenate([pull, self.together.T @ pull, np.zeros(runs)])
-                                 )[3:len(pull):4]
+        shared = self.together.T @ pull
+        trends = np.zeros(self.factor.shape[0] - len(pull) - len(shared))
+        return self.factor.solve(np.concatenate([pull, shared, trends]))[3:len(pull):4]
 
     def deviations(self, skeleton: Skeleton) -> np.ndarray:
         """Standard deviation of each radius's logarithm, shape [n]."""

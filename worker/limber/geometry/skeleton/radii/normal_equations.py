@@ -1,6 +1,6 @@
 """The least-squares problem of a fit: terms of points, axes, radii and smoothness."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
@@ -14,6 +14,7 @@ from limber.geometry.skeleton.radii.smoothness import smoothness
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _SURE = (1e-4, 3.0)  # radii: least and largest deviation of a fitted node
+_STEP = 0.5  # radii that steps at forks may change
 _PROBE = 128  # distance in nodes at which radii count as independent
 
 
@@ -59,7 +60,7 @@ class NormalEquations:
 def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
                      weight: np.ndarray, noise: float, positions: np.ndarray | None = None,
                      aims: Aims | None = None, across: np.ndarray | None = None,
-                     ) -> NormalEquations:
+                     stepped: bool = False) -> NormalEquations:
     """Set up a round: terms of the points, smoothness of runs, and constraints on bare nodes.
 
     Args:
@@ -74,16 +75,18 @@ def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, 
         aims: Distances at which the points should lie; None: at the radius.
         across: How firmly points hold the axis across their own direction, shape [m, 3]; None: not
         at all.
+        stepped: Whether radii may fall in a step at each fork.
     """
     data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, positions, aims,
                                         across)
-    smooth = smoothness(skeleton, nodes, radius, per_node, noise)
+    smooth = smoothness(skeleton, nodes, radius, per_node, noise, stepped)
     state = np.column_stack([nodes, radius]).ravel()
     matrix = (data + smooth + _anchor(skeleton, nodes, per_node)).tocsc()
     return NormalEquations(matrix, right - smooth @ state, per_node)
 
 
-def fitted_system(skeleton: Skeleton, points: np.ndarray) -> tuple[NormalEquations, float]:
+def fitted_system(skeleton: Skeleton, points: np.ndarray, stepped: bool = False,
+                  ) -> tuple[NormalEquations, float]:
     """The normal equations at the end of a fit to points, and their noise [m].
 
     The covariance of (x, y, z, radius) of all nodes is noise^2 times the inverse of the matrix,
@@ -98,7 +101,7 @@ def fitted_system(skeleton: Skeleton, points: np.ndarray) -> tuple[NormalEquatio
     noise = max(robust_sigma(match.residual, match.thick), 1e-12)
     weight = settled_weights(match.residual, noise)
     return normal_equations(skeleton, skeleton.nodes, skeleton.radius, match, weight,
-                            noise), noise
+                            noise, stepped=stepped), noise
 
 
 def radius_deviations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
@@ -124,16 +127,26 @@ def noise_covariance(system: NormalEquations, noise: float, radius: np.ndarray) 
     return np.einsum("nik,nk,njk->nij", vectors, np.clip(values, least, most), vectors)
 
 
-def fit_covariance(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
-    """Covariance of each node's position and radius by a fit to points [m^2], shape [n, 4, 4].
+def fit_with_steps(skeleton: Skeleton, points: np.ndarray) -> tuple[Skeleton, np.ndarray]:
+    """Return the skeleton with what steps of the radius at forks change in its fit to points, and
+    the covariance of each node's position and radius [m^2], shape [n, 4, 4].
 
+    The rounds of a fit have no steps: before the side branches are found, they would follow noise.
     Where the skeleton states a larger deviation of the radius than noise with known positions on
     the circle gives, the axis goes with the difference as it goes with the noise.
     """
-    covariance = noise_covariance(*fitted_system(skeleton, points), skeleton.radius)
+    (smooth, _), (stepped, noise) = (fitted_system(skeleton, points, each)
+                                     for each in (False, True))
+    covariance = noise_covariance(stepped, noise, skeleton.radius)
     way = covariance[:, :, 3] / covariance[:, 3, 3, None]
     more = np.maximum(skeleton.radius_sigma**2 - covariance[:, 3, 3], 0.0)
-    return covariance + more[:, None, None] * way[:, :, None] * way[:, None, :]
+    change = stepped.solve() - smooth.solve()
+    limit = _STEP * skeleton.radius
+    size = np.linalg.norm(change, axis=1)
+    change *= np.minimum(1.0, limit / np.maximum(size, 1e-300))[:, None]
+    return (replace(skeleton.moved(skeleton.nodes + change[:, :3]),
+                    radius=skeleton.radius + change[:, 3]),
+            covariance + more[:, None, None] * way[:, :, None] * way[:, None, :])
 
 
 def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,

@@ -5,12 +5,14 @@ import scipy.sparse as sparse
 
 from limber.geometry.skeleton.skeleton import Skeleton
 
+FORK = 0.3
+"""Deviation of a radius's logarithm from that before a fork."""
 _SLOPE = 1.0  # smoothing length of the radius against slopes, in local radii
 _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 
 
 def smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_node: np.ndarray,
-               noise: float) -> sparse.csc_matrix:
+               noise: float, stepped: bool = False) -> sparse.csc_matrix:
     """Second differences along each run, weighted as a smoothing spline of a given bandwidth.
 
     A spline with penalty lambda on the squared second derivative and rho data per length averages
@@ -22,6 +24,7 @@ def smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_no
         radius: Current radii [m], shape [n].
         per_node: Weight of the points at each node, shape [n].
         noise: Standard deviation of the points [m].
+        stepped: Let the radius of a run that goes on from a fork fall in a step there.
     """
     size = len(nodes)
     chains = [own for own in skeleton.own_runs() if len(own) > 2]
@@ -35,10 +38,19 @@ def smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_no
     band = np.concatenate([_bandwidth(skeleton, chain, forks, noise) for chain in chains])
     second = second_differences(chains, steps, size)
     along = second.T @ sparse.diags(0.5 * density * band**4 * mean) @ second
-    thick = (second.T @ sparse.diags(density * (2.0 * band)**4 * mean) @ second
-             + _slope_terms(chains, steps, radius, density))
+    jumps = [np.where(forks[chain[:-1]] & stepped, FORK * radius[chain[:-1]], 0.0) / step
+             for chain, step in zip(chains, steps, strict=True)]
+    bends = np.concatenate([jump[:-1]**2 + jump[1:]**2 for jump in jumps]) / mean**2
+    firm = _despite(bends, density * (2.0 * band)**4 * mean, noise)
+    thick = (second.T @ sparse.diags(firm) @ second
+             + _slope_terms(chains, steps, radius, density, np.concatenate(jumps)**2, noise))
     return (sparse.kron(along, sparse.diags([1.0, 1, 1, 0]))
             + sparse.kron(thick, sparse.diags([0.0, 0, 0, 1]))).tocsc()
+
+
+def _despite(jumps: np.ndarray, weight: np.ndarray, noise: float) -> np.ndarray:
+    """Weights of terms to which steps at forks add variances ``jumps``, all of one shape."""
+    return weight / (1 + weight * jumps / max(noise, 1e-12)**2)
 
 
 def _bandwidth(skeleton: Skeleton, chain: np.ndarray, forks: np.ndarray, noise: float,
@@ -81,7 +93,7 @@ def _straightness(nodes: np.ndarray) -> np.ndarray:
 
 
 def _slope_terms(chains: list[np.ndarray], steps: list[np.ndarray], radius: np.ndarray,
-                 density: float) -> sparse.csr_matrix:
+                 density: float, jumps: np.ndarray, noise: float) -> sparse.csr_matrix:
     """Weak penalty on a radius's slope: branches are not cones, whatever stray points suggest."""
     low = np.concatenate([chain[:-1] for chain in chains])
     high = np.concatenate([chain[1:] for chain in chains])
@@ -91,4 +103,5 @@ def _slope_terms(chains: list[np.ndarray], steps: list[np.ndarray], radius: np.n
         (np.concatenate([-1 / step, 1 / step]), (np.tile(index, 2), np.concatenate([low, high]))),
         (len(step), len(radius))).tocsr()
     thick = (radius[high] + radius[low]) / 2
-    return first.T @ sparse.diags(density * (_SLOPE * thick)**2 * step) @ first
+    firm = _despite(jumps, density * (_SLOPE * thick)**2 * step, noise)
+    return first.T @ sparse.diags(firm) @ first
