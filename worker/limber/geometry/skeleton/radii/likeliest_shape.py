@@ -62,6 +62,7 @@ class ShapeEvidence:
         one_sided: Whether one side was seen.
         pixel: Distance of neighbouring rays at each node [m], shape [n], if the edges of branches
             determine the radii, as in one sensor's scan; None: they do not.
+        smoothing: What the sensor's smoothing did, which the radii are without; None: nothing.
     """
 
     covariance: np.ndarray
@@ -106,7 +107,10 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
             local = float(np.clip(1.4826 * np.median(miss[measured]), *_LOCAL[:2]))
     # A fit that collapsed resolves nothing; one that does not count is no evidence of thin wood.
     coarse = _is_coarse(np.where(measured, first, radius), evidence)
-    scan = np.minimum(resolution / thin, 1.0)
+    scan = resolution / thin
+    if evidence.smoothing is not None:
+        scan = np.hypot(scan, evidence.smoothing.uncertainty(thin))
+    scan = np.minimum(scan, 1.0)
     sigma = np.hypot(posterior.deviations(skeleton), posterior.moved_by(np.column_stack(
         [_of_axes(evidence.covariance, first * scan), scan])))
     moves, along = posterior.mean[:, :3] - skeleton.nodes, skeleton.axes()
@@ -192,8 +196,6 @@ def _of_runs(skeleton: Skeleton, evidence: ShapeEvidence, radius: np.ndarray,
     oval = _OVAL_SIDE if evidence.one_sided else _OVAL
     noise = _BIAS * np.minimum(evidence.noise / radius, 1.0)**2
     coarse = np.minimum(_COARSE * evidence.spacing / radius, 1.0)
-    if evidence.smoothing is not None:
-        coarse = np.hypot(coarse, evidence.smoothing.uncertainty(radius))
     off = np.sqrt(oval**2 + noise**2 + coarse**2 + (evidence.shared / radius)**2)
     return sparse.coo_matrix((off, (4 * np.arange(len(off)) + 3, skeleton.branch)),
                              (4 * len(off), skeleton.branch_count)).tocsr()

@@ -5,6 +5,10 @@ moves a curved surface towards its axis: a radius R is measured as R exp(-c (s /
 spacing s of the points. Positions alone do not show this: the points of a smoothed twig lie on a
 thinner twig. But smoothing loses no point. Points are about evenly spread over the skin, so where
 thin branches have more points on an area than thick ones, their skin has shrunk.
+
+Often they hardly tell. Then a part is undone, and what is left open is an error of all radii of the
+scan together. How wood grows does not tell: over forks, where the pipe model foresees radii, the
+likelihoods of no and of most smoothing differed by less than two times on 16 of 19 scans.
 """
 
 from dataclasses import dataclass, replace
@@ -13,7 +17,9 @@ import numpy as np
 
 from limber.geometry.skeleton.skeleton import Skeleton
 
-_SMOOTHED = 0.1  # prior probability that a sensor smooths
+# Prior probability that a sensor smooths: of those that see a plant from all around (stations, hand
+# scanners, photogrammetry), one in three does.
+_SMOOTHED = 1 / 3
 _MOST, _STEPS = 0.4, 41  # largest c, and values of it
 _POWER_SIGMA = 0.1  # deviation of the power of the radius by which density on the skin may differ
 _POINTS, _LEAST = 12, 12  # points of a stretch; thick stretches that tell
