@@ -85,8 +85,7 @@ def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, 
     return NormalEquations(matrix, right - smooth @ state, per_node)
 
 
-def fitted_system(skeleton: Skeleton, points: np.ndarray, stepped: bool = False,
-                  ) -> tuple[NormalEquations, float]:
+def fitted_system(skeleton: Skeleton, points: np.ndarray) -> tuple[NormalEquations, float]:
     """The normal equations at the end of a fit to points, and their noise [m].
 
     The covariance of (x, y, z, radius) of all nodes is noise^2 times the inverse of the matrix,
@@ -96,12 +95,19 @@ def fitted_system(skeleton: Skeleton, points: np.ndarray, stepped: bool = False,
     1.4 on 6 more of one side only. Where the axis ran into a twig and back, at a fork that one side
     hides, they were far larger.
     """
+    (system,), noise = _systems(skeleton, points, (False,))
+    return system, noise
+
+
+def _systems(skeleton: Skeleton, points: np.ndarray, stepped: tuple[bool, ...],
+             ) -> tuple[list[NormalEquations], float]:
+    """The normal equations at the end of a fit, without or with steps at forks; their noise [m]."""
     match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
                             points)
     noise = max(robust_sigma(match.residual, match.thick), 1e-12)
     weight = settled_weights(match.residual, noise)
-    return normal_equations(skeleton, skeleton.nodes, skeleton.radius, match, weight,
-                            noise, stepped=stepped), noise
+    return [normal_equations(skeleton, skeleton.nodes, skeleton.radius, match, weight, noise,
+                             stepped=each) for each in stepped], noise
 
 
 def radius_deviations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
@@ -135,15 +141,13 @@ def fit_with_steps(skeleton: Skeleton, points: np.ndarray) -> tuple[Skeleton, np
     Where the skeleton states a larger deviation of the radius than noise with known positions on
     the circle gives, the axis goes with the difference as it goes with the noise.
     """
-    (smooth, _), (stepped, noise) = (fitted_system(skeleton, points, each)
-                                     for each in (False, True))
+    (smooth, stepped), noise = _systems(skeleton, points, (False, True))
     covariance = noise_covariance(stepped, noise, skeleton.radius)
     way = covariance[:, :, 3] / covariance[:, 3, 3, None]
     more = np.maximum(skeleton.radius_sigma**2 - covariance[:, 3, 3], 0.0)
     change = stepped.solve() - smooth.solve()
-    limit = _STEP * skeleton.radius
     size = np.linalg.norm(change, axis=1)
-    change *= np.minimum(1.0, limit / np.maximum(size, 1e-300))[:, None]
+    change *= np.minimum(1.0, _STEP * skeleton.radius / np.maximum(size, 1e-300))[:, None]
     return (replace(skeleton.moved(skeleton.nodes + change[:, :3]),
                     radius=skeleton.radius + change[:, 3]),
             covariance + more[:, None, None] * way[:, :, None] * way[:, None, :])
