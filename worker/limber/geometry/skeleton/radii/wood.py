@@ -21,9 +21,9 @@ WANDER = 5e-3
 """Variance of a radius's logarithm per radius of length."""
 # Power of the pipe model, and deviations from it as logarithms of a radius: of all forks of a plant
 # together, and of each. Over 1,350 forks of seven sources, whose powers are 1.9 to 3.0 and two of
-# which have no steps, they are 0.08 and 0.03; with each source left out in turn 0.07 to 0.08, and
-# 0.02 to 0.04.
-_POWER, _PIPE_SIGMA, _FORK_SIGMA = 2.5, 0.08, 0.04
+# which have no steps, they are 0.07 and 0.03; with each source left out in turn 0.06 to 0.07, and
+# 0.02 to 0.03.
+_POWER, _PIPE_SIGMA, _FORK_SIGMA = 2.7, 0.08, 0.04
 # An axis: variance of the direction per radius of length [rad^2], deviation at a fork [rad].
 _BEND, _KINK = 1e-3, 0.25
 DISTINCT = 1e-3
