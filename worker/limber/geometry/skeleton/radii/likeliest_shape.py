@@ -2,13 +2,13 @@
 
 One Gaussian posterior of all positions across the axes and of the logarithms of all radii. The fit
 at each node is one observation of both, with its own covariance and with errors that it shares:
-what a sensor smooths or widens at the scale of its points (the whole scan), the effect of noise and
-of sections that are not round (a run). A shared error moves axis and radius together, as far as
-the points leave both open: from one side they show the sum of depth and radius, not each. The prior
-is how wood grows (:mod:`wood`): an axis bends little; a radius changes slowly along a run and falls
-towards its tip, at a fork by the wood of the side branches. Where points determine a radius, it is
-theirs. Where they hardly do, it follows from the carrier and the resolved part, with a wide
-interval.
+what a sensor smooths or widens at the scale of its points and which diameter one side shows (the
+whole scan), the effect of noise and of sections that are not round (a run). A shared error moves
+axis and radius together, as far as the points leave both open: from one side they show the sum of
+depth and radius, not each. The prior is how wood grows (:mod:`wood`): an axis bends little; a radius
+changes slowly along a run and falls towards its tip, at a fork by the wood of the side branches.
+Where points determine a radius, it is theirs. Where they hardly do, it follows from the carrier and
+the resolved part, with a wide interval.
 """
 
 from dataclasses import dataclass, replace
@@ -41,9 +41,9 @@ _RESOLUTION, _COARSE = 0.1, 0.05
 # of one side changes by 3.7 times that (of half a circle, the scatter is twice the square of the
 # noise and 0.54 of the radius's).
 _BIAS = 0.15
-# Fraction of the radius by which a section that is not round differs: seen from all around, and
-# from one side, which shows one of its diameters. Those of ovals 1.1 to 1.35 times as long as wide
-# are 0.035 to 0.1 off their mean; most wood is rounder.
+# Fraction of the radius by which a section that is not round differs: that of a run seen from all
+# around; of all branches from one side, which shows one diameter of sections whose weight makes
+# them oval in one way. Those 1.1 to 1.35 times as long as wide are 0.035 to 0.1 off their mean.
 _OVAL, _OVAL_SIDE = 0.012, 0.06
 _VAGUE = 1.0  # the same, of fits that the points do not resolve
 _LINEAR = 0.3  # the largest for which a change of the axis is one of the logarithm, in proportion
@@ -108,7 +108,7 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
             local = float(np.clip(1.4826 * np.median(miss[measured]), *_LOCAL[:2]))
     # A fit that collapsed resolves nothing; one that does not count is no evidence of thin wood.
     coarse = _is_coarse(np.where(measured, first, radius), evidence)
-    scan = resolution / thin
+    scan = np.hypot(resolution / thin, _OVAL_SIDE if evidence.one_sided else 0.0)
     if evidence.smoothing is not None:
         scan = np.hypot(scan, evidence.smoothing.uncertainty(thin))
     scan = np.minimum(scan, 1.0)
@@ -194,10 +194,9 @@ def _of_runs(skeleton: Skeleton, evidence: ShapeEvidence, radius: np.ndarray,
     """
     # Their sum must not depend on single fits, or it would level their scatter.
     radius = typical_radius(skeleton, radius)
-    oval = _OVAL_SIDE if evidence.one_sided else _OVAL
     noise = _BIAS * np.minimum(evidence.noise / radius, 1.0)**2
     coarse = np.minimum(_COARSE * evidence.spacing / radius, 1.0)
-    off = np.sqrt(oval**2 + noise**2 + coarse**2 + (evidence.shared / radius)**2)
+    off = np.sqrt(_OVAL**2 + noise**2 + coarse**2 + (evidence.shared / radius)**2)
     return sparse.coo_matrix((off, (4 * np.arange(len(off)) + 3, skeleton.branch)),
                              (4 * len(off), skeleton.branch_count)).tocsr()
 
