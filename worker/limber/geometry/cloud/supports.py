@@ -128,34 +128,58 @@ def _in_sample(points: np.ndarray, up: np.ndarray) -> list[Support]:
         points[own] - np.median(points[own], axis=0), axis=1))]) for kind, own in found]
 
 
-def _circle(flat: np.ndarray) -> tuple[np.ndarray, float, float] | None:
-    """Middle [m], radius [m] and fraction of points on the circle that fits most of them."""
-    if len(flat) < _LEAST:
-        return None
-    weight = np.ones(len(flat))
+def _circles(flat: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Circles that fit most points of each of the :data:`_SLICES` slices.
+
+    Args:
+        flat: Points from above [m], shape [n, 2].
+        layer: Slice of each, shape [n].
+
+    Returns:
+        Middles [m], shape [slices, 2], radii [m] and fractions of the points on the circle, shape
+        [slices] each; the fraction is 0 for slices of too few points.
+    """
+    count = np.bincount(layer, minlength=_SLICES)
+    start = np.stack([np.bincount(layer, values, _SLICES) for values in flat.T], axis=1)
+    start /= np.maximum(count, 1)[:, None]
+    own = flat - start[layer]
+    row = np.column_stack([2 * own, np.ones(len(own)), (own**2).sum(axis=1)])
+    one, other = np.triu_indices(4)
+    products, weight = row[:, one] * row[:, other], np.ones(len(own))
+    ends = np.cumsum(count)
     for _ in range(8):
-        matrix = np.column_stack([2 * flat, np.ones(len(flat))]) * weight[:, None]
-        (x, y, c), *_ = np.linalg.lstsq(matrix, (flat**2).sum(axis=1) * weight, rcond=None)
-        radius = float(np.sqrt(max(c + x**2 + y**2, 1e-18)))
-        off = np.abs(np.hypot(flat[:, 0] - x, flat[:, 1] - y) - radius)
-        weight = 1 / (1 + (off / max(float(np.median(off)), 0.02 * radius))**2)
-    return np.array([x, y]), radius, float(np.mean(off < 3 * _ROUND * radius))
+        system = np.zeros((_SLICES, 4, 4))
+        for k in range(len(one)):
+            system[:, one[k], other[k]] = system[:, other[k], one[k]] = np.bincount(
+                layer, products[:, k] * weight**2, _SLICES)
+        # A slice of points on a line has no circle.
+        system[:, [0, 1, 2], [0, 1, 2]] += 1e-12 * system[:, [0, 1, 2], [0, 1, 2]] + 1e-300
+        x, y, c = np.linalg.solve(system[:, :3, :3], system[:, :3, 3:])[:, :, 0].T
+        radius = np.sqrt(np.maximum(c + x**2 + y**2, 1e-18))
+        off = np.abs(np.hypot(own[:, 0] - x[layer], own[:, 1] - y[layer]) - radius[layer])
+        ordered = np.append(off[np.lexsort((off, layer))], [np.inf, np.inf])
+        middle = ends - count + np.maximum(count - 1, 0) // 2
+        usual = (ordered[middle] + ordered[middle + (count % 2 == 0)]) / 2
+        weight = 1 / (1 + (off / np.maximum(usual, 0.02 * radius)[layer])**2)
+    on = np.bincount(layer[off < 3 * _ROUND * radius[layer]], minlength=_SLICES)
+    return start + np.stack([x, y], axis=1), radius, np.where(
+        count < _LEAST, 0.0, on / np.maximum(count, 1))
 
 
 def _pot(flat: np.ndarray, layer: np.ndarray, thick: float) -> np.ndarray | None:
     """Indices of the points of a pot at the foot of the scan; None if there is none."""
     circles: list[tuple[np.ndarray, float]] = []
-    for number in range(_SLICES // 2):
-        own = flat[layer == number]
-        told = _circle(own)
+    low = layer <= _SLICES // 2
+    for number, (middle, radius, share) in enumerate(zip(*_circles(flat[low], layer[low]),
+                                                         strict=True)):
         # Its soil fills the last slice; the scan's first slice may be a part of one.
-        if told is None or told[2] < _ON_CIRCLE or (circles and (
-                abs(told[1] / circles[-1][1] - 1) > _STEADY
-                or np.linalg.norm(told[0] - circles[-1][0]) > _STEADY * told[1])):
+        if number >= _SLICES // 2 or share < _ON_CIRCLE or (circles and (
+                abs(radius / circles[-1][1] - 1) > _STEADY
+                or np.linalg.norm(middle - circles[-1][0]) > _STEADY * radius)):
             if circles or number > 1:
                 break
             continue
-        circles.append(told[:2])
+        circles.append((middle, radius))
     if len(circles) < _POT_SLICES:
         return None
     top = number - 1
@@ -193,15 +217,13 @@ def _rod(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, rest: np.ndarr
     for _ in range(4):
         aside = np.linalg.norm(flat[rest] - line[:, 0] - height[rest, None] * line[:, 1], axis=1)
         near = rest[aside < reach]
-        rows = []
-        for number in np.unique(layer[near]):
-            own = near[layer[near] == number]
-            told = _circle(flat[own])
-            if told is not None and told[2] > _ON_CIRCLE and told[1] < reach:
-                rows.append((float(height[own].mean()), *told[0], told[1]))
-        if len(rows) < _LONG:
+        middle, radius, share = _circles(flat[near], layer[near])
+        used = (share > _ON_CIRCLE) & (radius < reach)
+        if used.sum() < _LONG:
             return None
-        level, x, y, radius = np.array(rows).T
+        level = (np.bincount(layer[near], height[near], _SLICES)[used]
+                 / np.bincount(layer[near], minlength=_SLICES)[used])
+        (x, y), radius = middle[used].T, radius[used]
         line = np.array([_line(level, x), _line(level, y)])
         reach = 1.5 * float(np.median(radius))
     size = float(np.median(radius))
