@@ -60,8 +60,8 @@ def test_pieces_are_bridged_to_one_tree() -> None:
 def test_sparse_scans_are_told_from_others(crown) -> None:
     """A well scanned branch is contracted as ever; a crown whose twigs are lines is not."""
     branch = generate_branch(31, length=0.4, point_spacing=0.003).cloud.points
-    assert not is_sparse(branch, contract(branch).drawn)
-    assert is_sparse(crown[1], contract(crown[1]).drawn)
+    assert not is_sparse(branch, contract(branch).points)
+    assert is_sparse(crown[1], contract(crown[1]).points)
 
 
 @pytest.mark.slow

@@ -69,9 +69,9 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                         None if root is None else own.inside(root), up @ own.axes,
                         None if view is None else replace(view, eye=own.inside(view.eye)),
                         where or (lambda original_order: original_order), progress)
-    original_order, drawn = np.argsort(own.order), found.contraction
+    original_order, contraction = np.argsort(own.order), found.contraction
     return replace(found.moved(own.outside), contraction=replace(
-        drawn, points=own.outside(drawn.points), drawn=own.outside(drawn.drawn)),
+        contraction, points=own.outside(contraction.points)),
         node_of_point=found.node_of_point[original_order], residual=found.residual[original_order])
 
 
@@ -91,13 +91,9 @@ class _Search:
     up: np.ndarray
     diagonal: float
 
-    def connected(self, points: np.ndarray, drawn: np.ndarray) -> CurveGraph:
-        """The tree of points contracted to their axes.
-
-        Not recentred: measured on 20 branches, recentred points lose two forks of 46, since circles
-        mix the branches there, and the fit centres the axes anyway.
-        """
-        return curve_graph(points, drawn, **self._joining())
+    def connected(self, points: np.ndarray, contracted: np.ndarray) -> CurveGraph:
+        """The tree of points contracted to their axes."""
+        return curve_graph(points, contracted, **self._joining())
 
     def root(self, graph: CurveGraph, points: np.ndarray, near: np.ndarray | None,
              ) -> RootChoice:
@@ -144,11 +140,11 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     check_no_sheet(thin)
     contraction = contract(thin, progress=progress.part(0.0, 0.6))
     progress(0.6, "connecting")
-    graph = search.connected(thin, contraction.drawn)
+    graph = search.connected(thin, contraction.points)
     check_one_plant(graph, len(thin), search.diagonal, settings.plants,
                     lambda place: where(own.outside(place)))
     start, other_root, certainty = search.root(graph, thin, root)
-    if len(points) > _FEW and is_sparse(thin, contraction.drawn):
+    if len(points) > _FEW and is_sparse(thin, contraction.points):
         thin, loops = points[thinned(points, POINT_LIMIT)], graph.loops
         graph, start = search.in_levels(thin, graph.nodes[start])
         graph.loops = loops

@@ -26,7 +26,6 @@ from limber.core.numerics.sparse import (
     general_factor,
 )
 from limber.core.progress import SILENT, Progress
-from limber.geometry.skeleton.contraction.recentring import recentred
 
 NEIGHBOURS = 12
 """Neighbours that the point-cloud Laplacian triangulates; 12 is as good as 30 and faster."""
@@ -58,16 +57,13 @@ class Contraction:
     """Result of the contraction.
 
     Attributes:
-        points: Contracted points [m], recentred against the scan, shape [n, 3], in the order of
-            the input.
+        points: Contracted points [m], shape [n, 3], in the order of the input.
         linearity: Fraction of the variance around each point that lies along one line, 1/3 to 1,
             shape [n]; 1 where the cloud has become a curve.
         iterations: Number of linear solves.
         status: Status at the end.
         history: One dict an iteration: ``moved`` [m], ``active`` (fraction of points not yet on a
             curve), ``seconds``.
-        drawn: Contracted points [m] before recentring, shape [n, 3]. They are less accurate, but
-            separate branches up to the fork, where circles mix them.
     """
 
     points: np.ndarray
@@ -75,7 +71,6 @@ class Contraction:
     iterations: int
     status: ContractionStatus
     history: list[dict[str, float]] = field(default_factory=list)
-    drawn: np.ndarray = field(default=None)
 
 
 def contract(points: np.ndarray, *, progress: Progress = SILENT) -> Contraction:
@@ -124,9 +119,7 @@ def contract(points: np.ndarray, *, progress: Progress = SILENT) -> Contraction:
         if iteration > 3 and moved * scale < 0.1 * max(done["moved"] for done in history):
             status = ContractionStatus.stalled
             break
-    axes = recentred((points - centre) / scale, positions)
-    return Contraction(axes * scale + centre, linearity, len(history), status, history,
-                       drawn=positions * scale + centre)
+    return Contraction(positions * scale + centre, linearity, len(history), status, history)
 
 
 def cloud_laplacian(points: np.ndarray) -> sparse.csc_matrix:
@@ -150,8 +143,20 @@ def local_linearity(points: np.ndarray) -> np.ndarray:
     count = min(_LINE_NEIGHBOURS, len(points))
     _, near = cKDTree(points).query(points, k=count)
     offset = points[near] - points[near].mean(axis=1, keepdims=True)
-    values = np.linalg.eigvalsh(offset.transpose(0, 2, 1) @ offset)
-    return values[:, 2] / np.maximum(values.sum(axis=1), 1e-300)
+    variance = offset.transpose(0, 2, 1) @ offset
+    total = np.trace(variance, axis1=1, axis2=2)
+    return _largest_eigenvalues(variance, total / 3) / np.maximum(total, 1e-300)
+
+
+def _largest_eigenvalues(matrix: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Largest eigenvalues of symmetric matrices [n, 3, 3] with mean eigenvalues ``mean`` [n], by
+    Smith's closed form (1961, doi:10.1145/355578.366316): a tenth of LAPACK's time.
+    """
+    rest = matrix - mean[:, None, None] * np.eye(3)
+    spread = np.sqrt((rest**2).sum(axis=(1, 2)) / 6)
+    unit = rest / np.maximum(spread, 1e-300)[:, None, None]
+    half = np.einsum("ni,ni->n", unit[:, 0], np.cross(unit[:, 1], unit[:, 2])) / 2
+    return mean + 2 * spread * np.cos(np.arccos(np.clip(half, -1.0, 1.0)) / 3)
 
 
 class _NormalEquations:
