@@ -16,7 +16,7 @@ from limber.geometry.skeleton.repair.backward_twigs import without_backward_star
 from limber.geometry.skeleton.repair.double_strands import without_strands
 from limber.geometry.skeleton.repair.feet import with_feet
 from limber.geometry.skeleton.repair.kinks import without_kinks
-from limber.geometry.skeleton.repair.resampling import resampled
+from limber.geometry.skeleton.repair.resampling import PointSpacing, resampled
 from limber.geometry.skeleton.repair.run_ends import ends_within, with_full_tips, without_bare_ends
 from limber.geometry.skeleton.repair.run_radii import (
     limited,
@@ -43,6 +43,7 @@ class Repaired:
         skeleton: Its current state.
         points: The scan, thinned [m], shape [m, 3].
         radius_limits: Least and largest radius [m].
+        apart: How far apart the points are.
         view: The depth camera's view of the points, if they are one's.
         rays: The points are one sensor's, evenly spaced across its sight and scattered along it.
         fit: The last fit.
@@ -56,6 +57,7 @@ class Repaired:
     skeleton: Skeleton
     points: np.ndarray
     radius_limits: tuple[float, float]
+    apart: PointSpacing
     view: View | None = None
     rays: bool = False
     fit: AxisFit | None = None
@@ -75,6 +77,10 @@ class Repaired:
         if self.rays:
             fit = fit_of_rays(fit, self.points, certain=True, view=self.view) or fit
         return replace(self, fit=fit, skeleton=fit.skeleton)
+
+    def sampled(self, skeleton: Skeleton, spacing: float = 1.0) -> Skeleton:
+        """A skeleton with nodes ``spacing`` local radii apart, where there are points for each."""
+        return resampled(skeleton, spacing, self.apart.at(skeleton.nodes))
 
     @property
     def noise(self) -> float:
@@ -112,7 +118,7 @@ class Pass:
 
 
 def _fit_coarsely(now: Repaired) -> Repaired:
-    after = now.fitted(resampled(now.skeleton, _COARSE), uncertainty=False)
+    after = now.fitted(now.sampled(now.skeleton, _COARSE), uncertainty=False)
     by_rays = fit_of_rays(after.last_fit, now.points, now.view is not None, now.view)
     if by_rays is not None:
         return replace(after, rays=True, fit=by_rays, skeleton=by_rays.skeleton)
@@ -124,7 +130,7 @@ def _fit_coarsely(now: Repaired) -> Repaired:
 def _fit_unpinched(now: Repaired) -> Repaired:
     if now.pinched is None:
         return now
-    return now.fitted(resampled(unpinched(now.pinched, now.points), _COARSE), uncertainty=False)
+    return now.fitted(now.sampled(unpinched(now.pinched, now.points), _COARSE), uncertainty=False)
 
 
 def _prune_spurs(now: Repaired) -> Repaired:
@@ -181,7 +187,7 @@ PASSES = (
          lambda now: now.of(with_feet(now.skeleton, now.points, now.noise)[0])),
     Pass("fit finely",
          "Axes and radii come from too few nodes, and from forks that have moved since.",
-         lambda now: now.fitted(resampled(now.skeleton), uncertainty=False), until=0.8),
+         lambda now: now.fitted(now.sampled(now.skeleton), uncertainty=False), until=0.8),
     DROP_STRANDS,
     Pass("settle", "The fit is unfinished because of noise or a strand that was just dropped.",
          _settle, until=1.0),
@@ -212,7 +218,8 @@ def repaired(skeleton: Skeleton, points: np.ndarray, diagonal: float, view: View
         view: The depth camera's view of the points, if they are one's.
         progress: Called during fits.
     """
-    now = Repaired(skeleton, points, (_LEAST_RADIUS * diagonal, _MOST_RADIUS * diagonal), view)
+    now = Repaired(skeleton, points, (_LEAST_RADIUS * diagonal, _MOST_RADIUS * diagonal),
+                   PointSpacing.of(points), view)
     done = 0.0
     for each in PASSES:
         until = done if each.until is None else each.until
