@@ -42,6 +42,31 @@ def test_duplicates_and_strays_go():
     assert counts["outliers"] == 2
 
 
+def test_the_background_shows_its_strays():
+    """Stray points near a rod go too if its background has as many; without one, nothing goes."""
+    rod = _rod(4000) + RNG.normal(0, 5e-4, (4000, 3))
+    strays = RNG.uniform([-0.05, -0.05, 0.0], [0.05, 0.05, 1.0], (200, 3))
+    assert prepare(Cloud(rod), 1.0).counts["outliers"] == 0
+    kept = prepare(Cloud(np.vstack([rod, strays]), {"index": np.arange(4200.0)}),
+                   1.0).cloud.attributes["index"]
+    assert (kept >= 4000).sum() < 40  # on and in the rod, or nearly
+    assert (kept < 4000).sum() >= 3990
+
+
+def test_ground_leaves_the_plant_its_outliers():
+    """How isolated a plant's points are does not depend on denser ground under it."""
+    points, up = generate_branch(73, noise=5e-4).cloud.points, np.array([0.0, 0.0, 1.0])
+    sparse = points[:, 2] >= 0.3
+    points = np.vstack([points[~sparse], points[sparse][::20]])
+    ground = np.column_stack([RNG.uniform(-0.4, 0.4, (20_000, 2)), RNG.normal(
+        points[:, 2].min() - 0.005, 0.001, 20_000)])
+    bare, both = (prepare(Cloud(cloud), 1.0, up=up)
+                  for cloud in (points, np.vstack([points, ground])))
+    high, same = (prepared.cloud.points + prepared.origin for prepared in (bare, both))
+    assert both.counts["sheets"] + both.counts.get("ground", 0) > 19_900
+    np.testing.assert_allclose(high[high[:, 2] > 0.02], same[same[:, 2] > 0.02])
+
+
 def test_crop_box():
     """The crop box is in the file's coordinates."""
     settings = PreparationSettings(crop_low=(-1, -1, 0), crop_high=(1, 1, 500.0))

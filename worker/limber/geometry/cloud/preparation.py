@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
+from limber.geometry.cloud.canonical_frame import own_axes
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.flat_sheets import find_sheet
 from limber.geometry.cloud.ground import find_ground
@@ -26,6 +27,9 @@ _AT_ONCE = 200_000  # points whose neighbours are held in memory at a time
 _FLYING_ANGLE, _FLYING_SPECK = 78.0, 3
 # A point is an outlier if its neighbours are this many times farther than is usual around them.
 _OUTLIER_NEIGHBOURS, _OUTLIER_RATIO = 8, 5.0
+# Places that show how isolated a point anywhere would be. As far as the scan's background
+# explains at least half of the points so isolated, the ratio falls to one of these.
+_ANYWHERE, _STRAY_RATIOS = 5000, (4.0, 3.2, 2.56, 2.05)
 _COARSEST_STEP = 5e-3  # fraction of the cloud's size: the thickness of its twigs
 
 
@@ -91,12 +95,17 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
                          "A branch has a thickness.",
                          "Check the columns and the number of digits of the export.")
     cloud = cloud.with_points(points)
-    keep = _without_outliers(cloud.points)
-    counts["outliers"] = int((~keep).sum())
-    cloud = cloud.subset(keep)
+    keep = _without_outliers(points)
     if not settings.keep_sheets:
-        cloud = _without_sheets(cloud, counts)
-        cloud = cloud if up is None else _without_ground(cloud, up, counts)
+        beside = np.flatnonzero(keep)[_beside_plant(points[keep], up, counts)]
+        if len(beside):
+            # What is usual for a plant does not depend on the ground around it.
+            rest = np.setdiff1d(np.arange(len(points)), beside)
+            keep[:] = False
+            keep[rest] = _without_outliers(points[rest])
+    counts["outliers"] = len(points) - int(keep.sum()) - sum(
+        counts.get(name, 0) for name in ("sheets", "ground"))
+    cloud = cloud.subset(keep)
     _enough(cloud, "After cropping and cleaning, the cloud")
     if view is not None:
         view = replace(view, eye=view.eye - origin)
@@ -129,27 +138,26 @@ def _cropped(cloud: Cloud, settings: PreparationSettings) -> Cloud:
     return cloud if keep.all() else cloud.subset(keep)
 
 
-def _without_sheets(cloud: Cloud, counts: dict[str, int]) -> Cloud:
-    """Remove walls and ground, unless little else remains: that is refused later."""
-    count = len(cloud)
-    rest = cloud
+def _beside_plant(points: np.ndarray, up: np.ndarray | None, counts: dict[str, int],
+                  ) -> np.ndarray:
+    """Mask of walls and ground, unless little else remains: that is refused later."""
+    on, least = np.zeros(len(points), bool), max(0.1 * len(points), POINT_MINIMUM)
+    rest = np.arange(len(points))
     for _ in range(_SHEETS_MOST):
-        sheet = find_sheet(rest.points, _SHEET_LEAST * count)
+        sheet = find_sheet(points[rest], _SHEET_LEAST * len(points))
         if sheet is None:
             break
-        rest = rest.subset(~sheet)
-    if len(rest) < max(0.1 * count, POINT_MINIMUM):
-        return cloud
-    counts["sheets"] = count - len(rest)
-    return rest
-
-
-def _without_ground(cloud: Cloud, up: np.ndarray, counts: dict[str, int]) -> Cloud:
-    ground = find_ground(cloud.points, up, _SHEET_LEAST * len(cloud))
-    if ground is None or (~ground).sum() < max(0.1 * len(cloud), POINT_MINIMUM):
-        return cloud
-    counts["ground"] = int(ground.sum())
-    return cloud.subset(~ground)
+        rest = rest[~sheet]
+    counts["sheets"] = 0
+    if len(rest) >= least:
+        on[np.setdiff1d(np.arange(len(points)), rest)] = True
+        counts["sheets"] = int(on.sum())
+    rest = np.flatnonzero(~on)
+    ground = None if up is None else find_ground(points[rest], up, _SHEET_LEAST * len(rest))
+    if ground is not None and (~ground).sum() >= max(0.1 * len(rest), POINT_MINIMUM):
+        on[rest[ground]] = True
+        counts["ground"] = int(ground.sum())
+    return on
 
 
 def _enough_digits(points: np.ndarray) -> None:
@@ -218,27 +226,54 @@ def _first_of_each(points: np.ndarray) -> np.ndarray:
 
 
 def _without_outliers(points: np.ndarray) -> np.ndarray:
-    """Mask of the points to keep; typical values are local, since scans are uneven."""
-    keep = np.ones(len(points), bool)
-    own, near = _neighbourhoods(points, min(_OUTLIER_NEIGHBOURS + 1, len(points)))
-    # The median over the neighbours is itself large for a lone point among lone points, so the
-    # statistics of the whole cloud count too.
-    overall = np.median(own)
-    for part in _parts(len(points)):
-        usual = np.maximum(np.median(own[near[part]], axis=1), overall)
-        keep[part] = own[part] <= _OUTLIER_RATIO * np.minimum(usual, 3 * overall)
-    return keep
+    """Mask of the points to keep, shape [n].
 
-
-def _neighbourhoods(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean distance [m] of each point's ``count`` - 1 nearest, shape [n], and all of these with
-    the point itself, shape [n, count]."""
+    A point is an outlier if it is far more isolated than is usual around it, or as isolated as most
+    places of a background are that the scan shows: stray points anywhere in its box.
+    """
     tree = cKDTree(points)
+    count = min(_OUTLIER_NEIGHBOURS + 1, len(points))
     own, near = np.empty(len(points)), np.empty((len(points), count), np.int32)
     for part in _parts(len(points)):
         distance, near[part] = tree.query(points[part], k=count)
         own[part] = distance[:, 1:].mean(axis=1)
-    return own, near
+    # The median over the neighbours is itself large for a lone point among lone points, so the
+    # statistics of the whole cloud count too.
+    overall = max(float(np.median(own)), 1e-300)
+
+    def isolation(mean: np.ndarray, around: np.ndarray) -> np.ndarray:
+        usual = np.maximum(np.median(around, axis=1), overall)
+        return mean / np.minimum(usual, 3 * overall)
+
+    isolated = np.concatenate([isolation(own[part], own[near[part]])
+                               for part in _parts(len(points))])
+    axes = own_axes(points)
+    placed = points @ axes
+    anywhere = np.random.default_rng(0).uniform(
+        placed.min(axis=0), placed.max(axis=0), (_ANYWHERE, 3)) @ axes.T
+    distance, around = tree.query(anywhere, k=max(count - 1, 1))
+    mean = distance.reshape(_ANYWHERE, -1).mean(axis=1)
+    stray = isolation(mean, np.column_stack([mean, own[around.reshape(_ANYWHERE, -1)]]))
+    return isolated <= _stray_from(isolated, stray)
+
+
+def _stray_from(isolated: np.ndarray, stray: np.ndarray) -> float:
+    """The isolation above which points are outliers.
+
+    Args:
+        isolated: Isolation of each point of a scan, shape [n].
+        stray: Isolation at places anywhere in its box, shape [k].
+    """
+    far = max(float(np.median(stray)), _OUTLIER_RATIO)
+    count = float((isolated > far).sum()) / max(float((stray > far).mean()), 1 / len(stray))
+    limit = _OUTLIER_RATIO
+    for lower in _STRAY_RATIOS:
+        expected = count * float(((stray > lower) & (stray <= _OUTLIER_RATIO)).mean())
+        between = int(((isolated > lower) & (isolated <= _OUTLIER_RATIO)).sum())
+        # Half of them and more are stray, as far as so few points can tell.
+        if between <= 2 * expected + np.sqrt(expected):
+            limit = lower
+    return limit
 
 
 def _parts(count: int) -> Iterator[slice]:
