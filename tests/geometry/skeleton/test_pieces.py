@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.point_classes import COLOURS
 from limber.geometry.reconstruction import reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings, SkeletonSettings
 from limber.geometry.skeleton.joining.join_pieces import join_pieces
@@ -64,10 +66,16 @@ def test_two_plants_are_refused_however_near(distance):
 @pytest.mark.slow
 @pytest.mark.parametrize("second", [_plant(0.1, seed=5), _plant(0.9, seed=5) + [0, 0, 0.4]])
 def test_places_are_told_in_the_coordinates_of_the_file(second):
-    """Two plants, near or far apart, in millimetres far from the origin."""
-    cloud = 1000 * (np.vstack([_plant(0), second]) + [5000.0, 300.0, 20.0])
+    """Two plants, near or far apart, in millimetres far from the origin; shown in two colours."""
+    first, shown = _plant(0), []
+    cloud = 1000 * (np.vstack([first, second]) + [5000.0, 300.0, 20.0])
     with pytest.raises(InputError, match="in the scan's coordinates") as refusal:
-        reconstruct_cloud(Cloud(cloud), ReconstructSettings(unit="mm"))
+        reconstruct_cloud(Cloud(cloud), ReconstructSettings(unit="mm"), show=shown.append)
+    nearest = cKDTree(cloud / 1000).query(shown[0].points)[1]
+    apart = shown[0].attributes["class"] == list(COLOURS).index("another plant")
+    assert 0.3 < apart.mean() < 0.7
+    for plant in (nearest < len(first), nearest >= len(first)):
+        assert apart[plant].mean() < 0.01 or apart[plant].mean() > 0.99
     place = [float(part) for part in
              re.search(r"at \(([^)]*)\)", str(refusal.value))[1].split(",")]
     assert (cloud.min(axis=0) <= place).all() and (place <= cloud.max(axis=0)).all()

@@ -28,7 +28,7 @@ from limber.geometry.leaf_removal import (
     show_leaves,
     without_leaves,
 )
-from limber.geometry.point_classes import Show, shown_if_refused
+from limber.geometry.point_classes import Show, classified, shown_if_refused
 from limber.geometry.pruned_twigs import (
     leave_out_twigs,
     tell_left_out,
@@ -52,7 +52,7 @@ from limber.geometry.skeleton.radii.silhouette import (
 )
 from limber.geometry.skeleton.search_result import SkeletonResult, result_of_skeleton
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
-from limber.geometry.skeleton.skeletonise import skeletonise
+from limber.geometry.skeleton.skeletonise import Apart, skeletonise
 from limber.geometry.skeleton.upright import upright_rotation
 from limber.geometry.surface.forks import smooth_forks
 from limber.geometry.surface.surface import Surface
@@ -203,7 +203,11 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
               supports: list[Support], show: Show | None, progress: Progress,
               ) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
     """The skeleton, the part of the scan in which it was found, and the leaves removed from it."""
-    found = _skeleton(prepared, settings, own, progress)
+    def show_apart(apart: np.ndarray) -> None:
+        if show is not None:
+            show(classified(prepared, [], supports, apart=apart))
+
+    found = _skeleton(prepared, settings, own, progress, show_apart)
     if own is not None or settings.leaves == "keep":
         return found, prepared, []
     if _may_be_leafy(found, prepared, settings):
@@ -353,7 +357,7 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared) -> tuple[SkeletonRe
 
 
 def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton | None,
-              progress: Progress) -> SkeletonResult:
+              progress: Progress, show_apart: Apart | None = None) -> SkeletonResult:
     if own is not None:
         if (own.radius <= 0).any():
             raise InputError(
@@ -371,7 +375,7 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     scale = UNIT_METRES[settings.unit]
     root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin
     return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),
-                       view=prepared.view, progress=progress,
+                       view=prepared.view, progress=progress, show_apart=show_apart,
                        where=lambda place: (place + prepared.origin) / scale)
 
 

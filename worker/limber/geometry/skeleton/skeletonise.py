@@ -1,11 +1,13 @@
 """A scan's skeleton: thin, contract, connect, root, prune, fit."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.canonical_frame import OwnFrame
 from limber.geometry.cloud.single_view import View
@@ -30,6 +32,9 @@ from limber.geometry.skeleton.repair.spurs import SPUR_REACH, prune_spurs
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
 
+Apart = Callable[[np.ndarray], None]
+"""Receives which points of a cloud belong to another plant or cluster, shape [n]."""
+
 FIT_POINT_LIMIT = 60_000
 """More points do not improve the fit; they only slow it down."""
 _CONTRACTED_POINTS = 12_000  # more are thinned evenly: the fit, not contraction, is precise
@@ -44,7 +49,7 @@ _GAP_FACTOR = 3.0  # the paper's gamma: a step of more than this many median ste
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                 root: np.ndarray | None = None, up: np.ndarray | None = None,
                 view: View | None = None, where: Where | None = None,
-                progress: Progress = SILENT) -> SkeletonResult:
+                show_apart: Apart | None = None, progress: Progress = SILENT) -> SkeletonResult:
     """Find the rooted skeleton of a cloud.
 
     Args:
@@ -56,6 +61,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
             sight.
         where: Transforms positions of the cloud to its file's coordinates, for errors; None: the
             same.
+        show_apart: Receives the points of another plant, if the cloud is refused for it.
         progress: Called during the work.
 
     Raises:
@@ -65,11 +71,14 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     # rotated one.
     own = OwnFrame.of(points)
     up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
+    original_order = np.argsort(own.order)
     found = _of_ordered(own, settings or SkeletonSettings(),
                         None if root is None else own.inside(root), up @ own.axes,
                         None if view is None else replace(view, eye=own.inside(view.eye)),
-                        where or (lambda original_order: original_order), progress)
-    original_order, contraction = np.argsort(own.order), found.contraction
+                        where or (lambda place: place),
+                        None if show_apart is None else (
+                            lambda apart: show_apart(apart[original_order])), progress)
+    contraction = found.contraction
     return replace(found.moved(own.outside), contraction=replace(
         contraction, points=own.outside(contraction.points)),
         node_of_point=found.node_of_point[original_order], residual=found.residual[original_order])
@@ -131,8 +140,8 @@ class _Search:
 
 
 def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | None,
-                up: np.ndarray, view: View | None, where: Where, progress: Progress,
-                ) -> SkeletonResult:
+                up: np.ndarray, view: View | None, where: Where,
+                show_apart: Apart | None, progress: Progress) -> SkeletonResult:
     """The skeleton of points in the cloud's own frame, as are ``root`` and ``up``."""
     points = own.coordinates
     search = _Search(points, settings, up, float(np.linalg.norm(np.ptp(points, axis=0))))
@@ -141,8 +150,13 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     contraction = contract(thin, progress=progress.part(0.0, 0.6))
     progress(0.6, "connecting")
     graph = search.connected(thin, contraction.points)
-    check_one_plant(graph, len(thin), search.diagonal, settings.plants,
-                    lambda place: where(own.outside(place)))
+    try:
+        check_one_plant(graph, len(thin), search.diagonal, settings.plants,
+                        lambda place: where(own.outside(place)))
+    except InputError:
+        if show_apart is not None and (graph.plants or graph.split_off):
+            show_apart(graph.owner[cKDTree(thin).query(points)[1]] < 0)
+        raise
     start, other_root, certainty = search.root(graph, thin, root)
     if len(points) > _FEW and is_sparse(thin, contraction.points):
         thin, loops = points[thinned(points, POINT_LIMIT)], graph.loops

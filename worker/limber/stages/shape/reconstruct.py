@@ -155,7 +155,7 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
             classes.write_ply(file)
         progress.warn(f"The points are coloured by class in {place}, in metres: wood brown, leaves "
                       "green, points on no round axis red, a pot grey, stakes, posts "
-                      "and wires blue.")
+                      "and wires blue, another plant violet.")
     with branch.dropped_if_empty(), branch.stage(
             "reconstruct", settings, digests=digests) as stage:
         own = None if skeleton_path is None else read_skeleton(
