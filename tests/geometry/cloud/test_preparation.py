@@ -126,6 +126,13 @@ def test_branches_are_no_sheets():
         assert prepare(Cloud(flat), 1.0).counts.get("sheets", 0) == 0, spec
 
 
+def test_two_flat_neighbourhoods_are_no_plane():
+    """Clumps of six points strewn in a box: once a crash, where only two lay in one plane."""
+    rng = np.random.default_rng([91, 1])
+    clumps = rng.uniform(-0.5, 0.5, (2000, 1, 3)) + rng.normal(scale=1e-3, size=(2000, 6, 3))
+    assert find_sheet(clumps.reshape(-1, 3), 960) is None
+
+
 def test_lost_digits_are_told():
     """Map coordinates in single precision are refused; coarse rounding is told."""
     points = generate_branch(73).cloud.points

@@ -11,6 +11,7 @@ _ENOUGH = 150  # fewest points that define a plane
 _REACH = 0.05  # neighbourhood of a point, as a fraction of the cloud's diagonal
 _FLAT, _WIDE = 0.01, 0.3  # variance across and along a sheet, over the next larger
 _TRIES = 200
+_IN_PLANE = 3  # fewest flat neighbourhoods that span a plane
 _BROAD = 0.11  # smallest standard deviation across a sheet, over the diagonal; leaves have 0.08
 _FILLED = 0.25  # smallest fraction of its bounding box that a sheet fills
 
@@ -52,6 +53,8 @@ def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
         on &= np.abs(normals @ normals[start]) > 0.9
         if on.sum() > share:
             best, share = on, int(on.sum())
+    if share < _IN_PLANE:
+        return None
     middle = centres[best].mean(axis=0)
     axes = principal_axes(centres[best])
     offset = (points - middle) @ axes.T

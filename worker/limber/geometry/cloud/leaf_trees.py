@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.core.files.reading import read_arrays
+from limber.core.numerics.compiled import compiled_exactly
 from limber.geometry.cloud.preparation import voxel_thinned
 
 _CELL = 0.25  # cell size, as a fraction of the scale
@@ -62,15 +63,23 @@ def _variances(points: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray
 def leaf_log_odds(features: np.ndarray) -> np.ndarray:
     """Logarithm of the odds that each point is on a leaf, shape [n], from its surroundings."""
     trees = _trees()
-    total = np.full(len(features), float(trees["start"]))
-    rows = np.arange(len(features))
-    for first, depth in zip(trees["first"], trees["depth"], strict=True):
-        node = np.full(len(features), first)
-        for _ in range(depth):
-            # An end of the tree leads to itself.
-            low = features[rows, trees["feature"][node]] <= trees["threshold"][node]
-            node = first + np.where(low, trees["low"][node], trees["high"][node])
-        total += trees["value"][node]
+    return _voted(features, float(trees["start"]), *(trees[name] for name in (
+        "first", "depth", "feature", "threshold", "low", "high", "value")))
+
+
+@compiled_exactly
+def _voted(features: np.ndarray, start: float, first: np.ndarray, depth: np.ndarray,
+           feature: np.ndarray, threshold: np.ndarray, low: np.ndarray, high: np.ndarray,
+           value: np.ndarray) -> np.ndarray:
+    total = np.full(len(features), start)
+    for row in range(len(features)):
+        for tree in range(len(first)):
+            node = first[tree]
+            for _ in range(depth[tree]):
+                # An end of the tree leads to itself.
+                is_low = features[row, feature[node]] <= threshold[node]
+                node = first[tree] + (low[node] if is_low else high[node])
+            total[row] += value[node]
     return total
 
 

@@ -30,6 +30,7 @@ _LONG = 14  # slices that a stake crosses at least
 # over its length; slope against the upright.
 _STRAIGHT, _EVEN, _FALL, _SLOPE = 0.15, 0.12, 0.08, 0.27
 _STAKES_MOST = 3
+_ROD_POINTS = 8000  # points that show a stake's circles, 200 a slice
 _WIDE = (0.5, 2.0)  # thicknesses of a slice around its first middle in which a stake is looked for
 _THICK_POST = 0.02  # radius of a post [m]; thinner ones are stakes
 # A wire is looked for among so many points, from so many places that are on thin lines at this
@@ -217,12 +218,13 @@ def _rod(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, rest: np.ndarr
     for _ in range(4):
         aside = np.linalg.norm(flat[rest] - line[:, 0] - height[rest, None] * line[:, 1], axis=1)
         near = rest[aside < reach]
-        middle, radius, share = _circles(flat[near], layer[near])
+        some = near[own_order(flat[near])[:_ROD_POINTS]] if len(near) else near
+        middle, radius, share = _circles(flat[some], layer[some])
         used = (share > _ON_CIRCLE) & (radius < reach)
         if used.sum() < _LONG:
             return None
-        level = (np.bincount(layer[near], height[near], _SLICES)[used]
-                 / np.bincount(layer[near], minlength=_SLICES)[used])
+        level = (np.bincount(layer[some], height[some], _SLICES)[used]
+                 / np.bincount(layer[some], minlength=_SLICES)[used])
         (x, y), radius = middle[used].T, radius[used]
         line = np.array([_line(level, x), _line(level, y)])
         reach = 1.5 * float(np.median(radius))
