@@ -16,6 +16,7 @@ from limber.estimation.interpolation_prior import open_field
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty import shape_error as module
+from limber.estimation.uncertainty.bending_stiffness import SectionMean, strain_energy
 from limber.estimation.uncertainty.shape_error import hung_error, shape_error
 from limber.mechanics.added_masses import HungTwig
 from limber.mechanics.model import BranchModel
@@ -37,7 +38,12 @@ def _with(monkeypatch, fitted, skeletons):
     found, subject = fitted
     monkeypatch.setattr(module, "sample_skeletons", lambda *_: skeletons)
     return shape_error(found.fit.evaluation, found.objective, subject, np.empty((0, 3)),
-                       len(skeletons))
+                       len(skeletons), _sections(found.objective, found.values, subject))
+
+
+def _sections(objective, values, subject):
+    return SectionMean.of(subject.skeleton, subject.mesh, subject.weights,
+                          strain_energy(objective, values))
 
 
 @pytest.mark.parametrize("size", [0.01, 0.2])
@@ -68,7 +74,22 @@ def test_an_axis_that_is_off_is_not_exact(monkeypatch, fitted, small):
 def test_too_few_shapes_say_nothing(fitted):
     """Under 8 there is no answer, and the radii's deviation is taken instead."""
     found, subject = fitted
-    assert shape_error(found.fit.evaluation, found.objective, subject, np.empty((0, 3)), 4) is None
+    assert shape_error(found.fit.evaluation, found.objective, subject, np.empty((0, 3)), 4,
+                       _sections(found.objective, found.values, subject)) is None
+
+
+def test_a_mean_is_over_what_the_pull_bends(fitted, small):
+    """Its parts add up, lie around their control point, and none is beyond the grasp."""
+    found, subject = fitted
+    sections = _sections(found.objective, found.values, subject)
+    along = small.skeleton.arc_length / small.skeleton.arc_length.max()
+    assert sections.share.sum(axis=1) == pytest.approx(1.0)
+    assert sections.share[:, along > 0.94].sum(axis=1).max() < 0.01
+    # By length, the last control point would stand for all of the tip.
+    assert sections.share @ along == pytest.approx(FRACTIONS, abs=0.15)
+    moment = np.pi / 4 * small.skeleton.radius**4
+    assert np.all(np.diff(sections.log_second_moment(small.skeleton.radius)) < 0)
+    assert np.log(moment.min()) < sections.log_second_moment(small.skeleton.radius).min()
 
 
 def test_the_largest_part_of_a_wide_interval_is_named():
@@ -120,7 +141,8 @@ def test_a_watched_path_and_an_open_field_are_no_exception(monkeypatch, small, s
     evaluation = objective.evaluate(objective.space.pack(start), jacobian=True)
     shapes = [replace(skeleton, radius=skeleton.radius * (1 + sign * 0.01)) for sign in 4 * (1, -1)]
     monkeypatch.setattr(module, "sample_skeletons", lambda *_: shapes)
-    found = shape_error(evaluation, objective, subject, np.empty((0, 3)), len(shapes))
+    found = shape_error(evaluation, objective, subject, np.empty((0, 3)), len(shapes),
+                        _sections(objective, start, subject))
     assert found[0] == pytest.approx(0.04 * QUANTILE, rel=0.1)
     assert found[1].max() < 0.003
 

@@ -34,7 +34,6 @@ from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.mechanics.materials.young_field import young_weights
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import Pull, write_pull
 from limber.recordings.settings import ImportSettings
@@ -42,7 +41,7 @@ from limber.stages.moduli.estimate import estimate
 from limber.stages.pulls.import_pull import import_pull
 from limber.stages.shape.reconstruct import reconstruct
 from limber.store import Branch
-from limber.store.loading import hung_masses, load_mesh, load_skeleton
+from limber.store.loading import hung_masses, load_skeleton
 
 PLANTS = tuple(sorted(LEFT_OUT - {"opposite"}))
 """Sources in turn. Sections of the one left out are oval: no E I of theirs holds for all
@@ -268,11 +267,10 @@ def _imported(folder: Path, pull: Pull, branch: Path) -> None:
 
 def _true_bending(branch: Branch, true: Skeleton, young: np.ndarray, written: dict) -> np.ndarray:
     """True E times the second moment of area of the true branch, over the same parts, shape [K]."""
-    skeleton, mesh = load_skeleton(branch), load_mesh(branch)
-    low, high, fraction, _ = on_cylinders(true, skeleton.nodes)
+    skeleton = load_skeleton(branch)
+    low, high, fraction, _ = on_cylinders(true, skeleton.nodes[skeleton.main_path()])
     radius = (1 - fraction) * true.radius[low] + fraction * true.radius[high]
-    mean = SectionMean.of(skeleton, mesh, young_weights(
-        mesh, np.array(written["control_points_m"])))
+    mean = SectionMean(np.array(written["bending_stiffness_share"]))
     return young * np.exp(mean.log_second_moment(radius))
 
 

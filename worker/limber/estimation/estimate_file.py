@@ -122,6 +122,7 @@ class _Estimate(_Told):
     young_interval_sensor_pa: list[tuple[_Maybe, _Maybe]] | None = None
     bending_stiffness_nm2: list[_Positive] | None = None
     bending_stiffness_interval_nm2: list[tuple[_Maybe, _Maybe]] | None = None
+    bending_stiffness_share: list[list[_Share]] | None = None
     young_deviation: _Deviation | None = None
     poisson: float = Field(gt=-1, lt=0.5)
     density: _Positive | None = None
@@ -161,6 +162,7 @@ class _Estimate(_Told):
             "young_interval_sensor_pa": self.young_interval_sensor_pa,
             "bending_stiffness_nm2": self.bending_stiffness_nm2,
             "bending_stiffness_interval_nm2": self.bending_stiffness_interval_nm2,
+            "bending_stiffness_share": self.bending_stiffness_share,
             "control_points_m": self.control_points_m, "fractions": self.fractions,
             "groups": self.groups,
             **{f"young_deviation.{name}": getattr(deviation, name)

@@ -97,6 +97,9 @@ def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, A
     first = content["pulls"][0]
     content |= {"times_s": first["times_s"], "observed_m": first["observed_m"],
                 "simulated_m": first["simulated_m"]}
+    if found.sections is not None:
+        content["bending_stiffness_share"] = found.sections.share[
+            :, subject.skeleton.main_path()]
     truth = next((pull.entry.truth for pull in pulls if pull.entry.truth), None)
     if truth:
         content["truth"] = truth

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import WorkError
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit_preparation import forwards_of
@@ -17,7 +18,7 @@ from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton
 from limber.estimation.forward.forward_model import Forward
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.uncertainty.bending_stiffness import SectionMean
+from limber.estimation.uncertainty.bending_stiffness import SectionMean, strain_energy
 from limber.estimation.uncertainty.covariance import Uncertainty, outliers
 from limber.estimation.uncertainty.creep import creep_sentence
 from limber.estimation.uncertainty.identifiability import (
@@ -76,6 +77,7 @@ class Estimate:
         model_error: Errors of shape and mesh, which residuals do not show.
         second_moment: Mean second moment of area of each control point's section of the branch
             [m^4], shape [K]; None before the shape was judged.
+        sections: The means that it is made of.
         is_weightless: Whether the estimate ignores the weight because the branch cannot carry it.
     """
 
@@ -87,6 +89,7 @@ class Estimate:
     held_out: dict[str, dict[str, Any]] = field(default_factory=dict)
     model_error: ModelError = field(default_factory=ModelError)
     second_moment: np.ndarray | None = None
+    sections: SectionMean | None = None
     is_weightless: bool = False
 
     @property
@@ -307,9 +310,10 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
         cloud: The scan's points [m], shape [n, 3], or None.
     """
     subject = subject.without_weight() if found.is_weightless else subject
-    found.second_moment = np.exp(SectionMean.of(
-        subject.skeleton, subject.mesh, subject.weights).log_second_moment(
-            subject.skeleton.radius, LayeredSection(**settings.section)))
+    found.sections = SectionMean.of(subject.skeleton, subject.mesh, subject.weights,
+                                    strain_energy(found.objective, found.values))
+    found.second_moment = np.exp(found.sections.log_second_moment(
+        subject.skeleton.radius, LayeredSection(**settings.section)))
     error = _geometry_error(subject, found, settings, axes, cloud, progress)
     if settings.mesh_check:
         progress(1.0, "measuring the excess stiffness of the mesh")
@@ -360,7 +364,7 @@ def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSetting
     if radii is None or cloud is None:
         return ModelError(radii)
     drawn = shape_error(found.fit.evaluation, found.objective, subject, cloud, settings.shapes,
-                        progress=progress)
+                        present(found.sections, "sections of the branch"), progress=progress)
     return (ModelError(radii) if drawn is None else
             ModelError(drawn[0], bending=drawn[1], axis_is_exact=False))
 

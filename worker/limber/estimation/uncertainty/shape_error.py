@@ -32,7 +32,7 @@ logarithm, as E I is. Over the whole way, radii off by a fifth would seem to cha
 
 
 def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
-                points: np.ndarray, count: int, *, seed: int = 0,
+                points: np.ndarray, count: int, mean: SectionMean, *, seed: int = 0,
                 progress: Progress = SILENT) -> tuple[np.ndarray, np.ndarray] | None:
     """Relative standard deviations of E and of E I at the control points from axis and radii.
 
@@ -46,6 +46,7 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
         subject: The branch that was fitted.
         points: Its scan [m], shape [m, 3].
         count: Number of shapes.
+        mean: Takes the means that E I is made of.
         seed: Seed of the shapes.
         progress: Called during the work.
 
@@ -64,10 +65,8 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
     if near is None:
         return None
     steps = near / NEARER
-    # The second moment goes with the squared area of a section, and that with the volume.
-    thicker = SectionMean.of(subject.skeleton, subject.mesh, subject.weights).weights @ (
-        2 * np.log(np.column_stack([mesh.volumes for mesh in meshes])
-                   / subject.mesh.volumes[:, None])) / NEARER
+    thicker = 4 * mean.share @ np.log(np.column_stack(
+        [shape.radius / subject.skeleton.radius for shape in shapes]))
     student, normal = scipy.special.stdtrit(count, 0.975), scipy.special.ndtri(0.975)
     of_young, of_bending = (np.minimum(np.sqrt(np.mean(change**2, axis=1)) * student / normal,
                                        WIDEST) for change in (steps, steps + thicker))
