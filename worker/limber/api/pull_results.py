@@ -108,8 +108,9 @@ class Estimate(Result):
     Attributes:
         young: At the control points [Pa], shape [K].
         interval: Its 95 % interval [Pa], shape [K, 2]; NaN if an end is open.
-        bending_stiffness: E times the second moment of area, mean over each control point's section
-            of the branch [N m^2], shape [K]; NaN in a folder of an earlier version.
+        bending_stiffness: E times the second moment of area [N m^2], the latter a mean over each
+            control point's section by strain energy, shape [K]; NaN in a folder of an earlier
+            version.
         bending_interval: Its 95 % interval [N m^2], shape [K, 2]: narrower than that of E if the
             scan leaves the radius uncertain.
         fractions: Positions of the control points on the main path, 0 base to 1 tip, shape [K].

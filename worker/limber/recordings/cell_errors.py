@@ -45,7 +45,8 @@ class CalibrationEntry(BaseModel):
         1e-3, ge=0, description="Rotation of the observer's frame about the branch, each axis.")
     point_sigma_m: float = Field(
         5e-3, ge=0, description="Position of each observed point along the branch, relative to "
-        "its place on the scanned one. Scanned tips were up to 16 mm short.")
+        "its place on the scanned one, and across it unless rest_points_m states it. Scanned tips "
+        "were up to 16 mm short.")
     clock_sigma_s: float = Field(
         2e-3, ge=0,
         description="Offset of the observer's clock from the robot's that remains after alignment.")

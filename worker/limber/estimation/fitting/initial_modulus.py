@@ -9,7 +9,7 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.forward.forward_model import Forward
 from limber.estimation.forward.observed_path import ObservedPathForward, is_path_observed
-from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
+from limber.estimation.parameters import YOUNG_BOUNDS_PA, ParameterSpace, Values
 
 PARTS = (0.25, 0.45, 0.7)
 """Fractions of a fast pull's frames that are fitted first: over a quarter the simulation cannot be
@@ -31,11 +31,6 @@ fiftyfold wrong, under which a branch folds up and each simulation takes long.
 WORSE = 2.0
 """Increase of the objective by which following the force counts as misled by its linearisation: 20
 times in the one fit seen, where a branch folded up; otherwise it decreases.
-"""
-STIFFER = (1.6, 2.5, 4.0)
-"""Factors by which moduli without an equilibrium are raised. A fit by a drifting force ended with
-the right profile along the branch and a tip half as stiff as one with an equilibrium. Chosen, not
-tuned.
 """
 
 
@@ -87,7 +82,7 @@ def prescribed_start(objective: Objective, values: Values) -> tuple[Values, bool
         rough = objective.with_forwards(objective.forwards).with_space(likely)
         found = gauss_newton(rough, likely.pack(values), evaluation_limit=12, tolerance=3e-2,
                              force_rounds=0, shortest=ROUGH_STEP).evaluation
-        explains = found.mean_square < RAN_OFF
+        explains = found.mean_square < RAN_OFF and not _is_unbounded(found, likely)
         for forward in observed:
             forward.keep()
         if explains:
@@ -100,6 +95,11 @@ def prescribed_start(objective: Objective, values: Values) -> tuple[Values, bool
             forward.set_key_count(count)
     objective.forward_count = rough.forward_count
     return likely.unpack(found.free), explains
+
+
+def _is_unbounded(found: Evaluation, space: ParameterSpace) -> bool:
+    """Whether no modulus is too stiff, or too soft, for the pulls: their force may be all zero."""
+    return bool(set(space.on_bound(found.free)) - {name for name, _, _ in space.priors})
 
 
 def _followed(
@@ -213,32 +213,39 @@ def standing_start(objective: Objective, start: Values, uniform: Values, *, expl
                    ) -> tuple[Values, Evaluation] | None:
     """Return the start, or values near it that have an equilibrium, and their evaluation.
 
-    A fit by force alone can end at moduli that carry no force at all. Then stiffer ones are tried.
-    If they explain the pulls no better than others might, so are the uniform modulus and one that
-    decreases outwards, softer and stiffer; the better result is returned. None: none of them has an
-    equilibrium.
+    A fit by force alone can end at moduli that carry no force at all, or far from the path. Then
+    these moduli, and the uniform one, are led along the recorded path; the better result is
+    returned. If no force leads them there, the uniform modulus and one that decreases outwards,
+    softer and stiffer, are tried under the measured force. None: none of them has an equilibrium.
 
     Args:
-        explains: Whether the start explains the pulls; otherwise the other starts come first.
+        explains: Whether the start explains the pulls; otherwise it is led at once.
     """
+    if explains:
+        found = objective.evaluate(objective.space.pack(start), jacobian=True)
+        if found is not None:
+            return start, found
+    led = [each for values in (uniform, start) if (each := _led(objective, values)) is not None]
+    if led:
+        best = min(led, key=lambda each: each[1].objective)
+        # Simulations continue from their last state.
+        return best if best is led[-1] else _led(objective, best[0])
     index = np.arange(len(uniform.young))
     falling = np.exp(FALL * (index.mean() - index))
-    likely = [replace(uniform, young=uniform.young * factor * course)
-              for factor in (1.0, 3.0, 0.3, 10.0, 0.1) for course in (falling, 1.0)]
-    if not explains and (first := _first_standing(objective, likely)) is not None:
-        return first
-    found = objective.evaluate(objective.space.pack(start), jacobian=True)
-    if found is not None:
-        return start, found
-    stiffer = _first_standing(objective, [replace(start, young=start.young * factor)
-                                          for factor in STIFFER])
-    if not explains or (stiffer is not None and stiffer[1].mean_square < RAN_OFF):
-        return stiffer
-    other = _first_standing(objective, likely)
-    if stiffer is None or other is None or other[1].objective <= stiffer[1].objective:
-        return other or stiffer
-    # Simulations continue from their last state.
-    return _first_standing(objective, [stiffer[0]]) or other
+    return _first_standing(objective, [
+        replace(uniform, young=uniform.young * factor * course)
+        for factor in (1.0, 3.0, 0.3, 10.0, 0.1) for course in (falling, 1.0)])
+
+
+def _led(objective: Objective, values: Values) -> tuple[Values, Evaluation] | None:
+    """Evaluate with pulls led along their recorded paths; None: there is none, or no equilibrium.
+    """
+    observed = [forward for forward in objective.forwards if is_path_observed(forward)]
+    if not observed or not all(forward.lead_along_path(values) for forward in observed):
+        return None
+    objective.forget()
+    found = objective.evaluate(objective.space.pack(values), jacobian=True)
+    return None if found is None else (values, found)
 
 
 def _first_standing(objective: Objective, trials: list[Values],

@@ -4,6 +4,7 @@ The errors of a fit are linear. A frame of the observed points that is turned by
 turned back, and a point that is a centimetre off along a bent branch is moved there.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -39,7 +40,7 @@ def far_points(cell_errors: Sequence[dict], known: Mapping[str, np.ndarray],
     """
     found: dict[str, list[float]] = {}
     for each in cell_errors:
-        if each["name"].startswith("position of point"):
+        if re.fullmatch("position of point [0-9]+ along the branch", each["name"]):
             found.setdefault(each["pull"], []).append(each["value"])
     fitted = {name: np.array(values) for name, values in found.items()}
     is_far = any(np.abs(values - known.get(name, 0.0)).max() > FAR_M

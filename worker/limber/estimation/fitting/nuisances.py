@@ -37,9 +37,7 @@ off, with moduli five times too high and narrow intervals.
 _MOST_NAMED = 4
 CREEP = "creep of the branch"
 CREEP_SIGMA = 0.1
-"""Prior deviation of the share by which the force under a lasting bend falls: of green wood within
-minutes some percent.
-"""
+"""Prior deviation of the force's fall under a lasting bend: some percent in green wood."""
 
 
 @dataclass(frozen=True)
@@ -234,10 +232,14 @@ def _sources(forward: Forward, known: CalibrationEntry) -> list[_Source]:
         add([f"camera position {axis}" for axis in AXES], "m", known.camera_sigma_m, True, _shifted)
         add([f"camera rotation about {axis}" for axis in AXES], "rad", known.camera_sigma_rad, True,
             _turned)
-        # Scan and observation locate a point on the branch each in its own way, in each pull.
-        add([f"position of point {number + 1} along the branch"
-             for number in range(forward.frames.positions.shape[1])], "m", known.point_sigma_m,
-            False, _along)
+        # Scan and observation locate a point each in its own way, in each pull, and the scanned
+        # axis has an error: only a stated position is exact across the branch.
+        points, off = range(1, 1 + forward.frames.positions.shape[1]), known.point_sigma_m
+        add([f"position of point {each} along the branch" for each in points], "m", off, False,
+            _along)
+        if forward.entry.rest_points_m is None:
+            add([f"position of point {each} across the branch ({way})" for each in points
+                 for way in (1, 2)], "m", off, False, _across)
         if len(forward.frames) > 3:
             add(["camera clock"], "s", known.clock_sigma_s, False, _late)
     seconds = forward.creep_time
@@ -292,6 +294,19 @@ def _along(pull: _Pull) -> dict[str, np.ndarray]:
     """Each point alone moves along the branch, which bends with it."""
     directions = present(pull.directions, "direction of the branch at the observed points")
     return {"points": directions[..., None] * np.eye(directions.shape[1])[:, None, :]}
+
+
+def _across(pull: _Pull) -> dict[str, np.ndarray]:
+    """Each point alone is aside of the axis, in two ways, and turns as the branch there."""
+    directions = present(pull.directions, "direction of the branch at the observed points")
+    first, count = directions[0], directions.shape[1]
+    aside = np.linalg.svd(first[:, None])[2][:, 1:].swapaxes(1, 2)
+    # The least rotation from the first direction to each.
+    turn = np.einsum("fmi,mik->fmk", directions, aside) / np.maximum(
+        1 + np.einsum("fmi,mi->fm", directions, first), 0.1)[..., None]
+    turned = aside - (directions + first)[..., None] * turn[:, :, None]
+    return {"points": np.einsum("fmik,mn->fmink", turned, np.eye(count)).reshape(
+        *directions.shape, 2 * count)}
 
 
 def _late(pull: _Pull) -> dict[str, np.ndarray]:

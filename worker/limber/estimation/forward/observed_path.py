@@ -18,7 +18,7 @@ import numpy as np
 from limber.core.not_none import present
 from limber.core.numerics.rigid import principal_axes
 from limber.estimation.forward.forward_model import Forward, Simulated
-from limber.estimation.forward.input_force import Response
+from limber.estimation.forward.input_force import Response, compliance
 from limber.estimation.forward.quasi_static import FEW_KEYS, QuasiStaticForward
 from limber.estimation.parameters import Values, equal_values, mechanics_names
 from limber.mechanics.model import BranchModel
@@ -34,6 +34,16 @@ ROUGH_POSE_M = 5e-3
 as recorded. Without the path, the branch beyond the last point would be undetermined.
 """
 TANGENT_RADII = 4.0
+LED_STEP = 0.03
+"""Longest step along a recorded path over the branch's size: its response is then nearly linear."""
+LED_ROUNDS = 40
+"""Most steps to a key frame."""
+LED_END_M = 1e-3
+"""Step at which a key frame is reached."""
+LED_PART = 0.02
+"""Compliance over the largest one below which a path tells no force: along a slender branch, it
+would take hundreds of newtons to follow an error of a millimetre.
+"""
 SAME_RESPONSE = 0.02
 """Change over the branch's size below which the response to its force is unchanged."""
 
@@ -129,6 +139,54 @@ class ObservedPathForward(QuasiStaticForward):
         self._good = self._drives_for = None
         self._memory = [None] * len(self.keys)
         self.set_key_count(self.key_count)
+
+    def lead_along_path(self, values: Values) -> bool:
+        """Find the force that leads a branch of these values along the recorded path.
+
+        From rest in short steps, each by the compliance at the last: the path tells the force
+        across the branch, and the sum of squares is least along it, where the path is too uncertain
+        to tell any. Unlike the readings, whose zero may be as large as the force, such a force
+        folds no branch.
+
+        Returns:
+            Whether there are equilibria; otherwise force and states are those before.
+        """
+        model, place = self.model_with(values), self.frames.poses[:, :3]
+        offset = self.entry.grasp.point_m - place[0]
+        if np.linalg.norm(offset) < AT_REST_M:
+            place = place + offset
+        drive, state, found = np.zeros(self._measured.shape[1]), np.zeros_like(self.mesh.nodes), []
+        for loads, target in zip(self._loads, place[self.keys], strict=True):
+            led = self._led(model, loads, drive, state, target)
+            if led is None:
+                return False
+            drive, state = led
+            found.append(led)
+        self._drives = [drive for drive, _ in found]
+        self._drives_for, self._values, self.response = values, None, None
+        self._memory = [None] * len(self.keys)
+        self.hint([state for _, state in found])
+        return True
+
+    def _led(self, model: BranchModel, loads: np.ndarray, drive: np.ndarray, state: np.ndarray,
+             target: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Force and state with the gripper as near to a position [m] as a force tells."""
+        longest = LED_STEP * float(np.linalg.norm(np.ptp(self.mesh.nodes, axis=0)))
+        for _ in range(LED_ROUNDS):
+            moved = compliance(model, state, loads)
+            slopes = self.grasp.position_slopes(self.mesh.nodes, state, np.moveaxis(moved, 0, -1))
+            step = np.linalg.lstsq(slopes, target - self.grasp_position(state), rcond=LED_PART)[0]
+            size = float(np.linalg.norm(slopes @ step))
+            if size < LED_END_M:
+                return drive, state
+            step *= min(1.0, longest / size)
+            drive = drive + step
+            result = self._solve(model, np.tensordot(drive, loads, axes=1),
+                                 state + np.tensordot(step, moved, axes=1))
+            if result is None:
+                return None
+            state = result.displacement
+        return None
 
     def moved_by(self, change: np.ndarray) -> float:
         """Largest motion of the gripper position by a change of the force unknowns [m]."""

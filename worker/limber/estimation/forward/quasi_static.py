@@ -37,15 +37,14 @@ from limber.recordings.synchronisation import Frames
 SETTINGS = StaticSettings(tolerance=1e-8, total_iterations=200, way_back=False, keeps_factor=True)
 """From the previous state, an equilibrium takes 3 to 10 iterations, from rest some tens. A branch
 with far too soft moduli folds up: no useful step of a fit, and minutes of solving."""
+NEAR = replace(SETTINGS, total_iterations=40, snap=False)
+"""From a state near a recorded path: without equilibrium nearby, the branch folds or snaps away."""
 ITERATIONS_A_KEY = 20
 """Most iterations per simulated frame, in addition to those of a single solve. Branches that did
-not fold needed at most 12 until the force had settled, and 4 in one simulation. Under a force that
-folds a branch up, nearly every frame needs hundreds, from one start after the other.
+not fold needed at most 12 until the force had settled, 4 in one simulation; folding ones, hundreds.
 """
 FEW_KEYS = 4
-"""Simulated frames if only the difference of two pulls is needed, which varies slowly: with 4, 6
-and 12 the resulting changes of the moduli agreed within 1.5 %.
-"""
+"""Simulated frames for the difference of two pulls: with 4, 6 and 12, moduli agreed to 1.5 %."""
 YOUNG_STEP_LIMIT = 0.7
 """Largest change of a log E for which a state is extrapolated by its derivative; chosen."""
 
@@ -364,7 +363,8 @@ class QuasiStaticForward(Forward):
                ) -> StaticResult | None:
         loads = ({"grasp": self.grasp, "pose": drive} if self.drive == "pose"
                  else {"nodal_forces": drive})
-        result = solve_static(model, start=start, settings=SETTINGS, **loads)
+        settings = NEAR if self.watches_pose and start is not None else SETTINGS
+        result = solve_static(model, start=start, settings=settings, **loads)
         self.iteration_count += result.iterations
         return result if result.converged else None
 
@@ -379,7 +379,8 @@ class QuasiStaticForward(Forward):
                 start = start + memory.slope[..., :len(jump)] @ jump
             starts.append(start)
         starts += [before] if before is not None else []
-        for begin in [*starts, None]:
+        starts += [] if starts and self.watches_pose else [None]
+        for begin in starts:
             if self.iteration_count > self.iteration_limit:
                 break
             try:

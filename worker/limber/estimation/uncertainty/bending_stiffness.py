@@ -76,8 +76,9 @@ def strain_energy(objective: Objective, values: Values) -> np.ndarray | None:
     Returns:
         None if a pull is dynamic.
     """
-    forwards = [forward.full for forward in objective.forwards]
-    if not all(isinstance(forward, QuasiStaticForward) for forward in forwards):
+    forwards = [forward.full for forward in objective.forwards
+                if isinstance(forward.full, QuasiStaticForward)]
+    if len(forwards) < len(objective.forwards):
         return None
     energies = [forward.model_with(values).internal(state).tet_energy for forward in forwards
                 for state in forward.displacements()]
