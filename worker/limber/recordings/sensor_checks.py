@@ -183,7 +183,8 @@ def _tared(pull: Pull) -> Pull:
 
 
 def _with_right_sign(pull: Pull) -> Pull:
-    if not np.isfinite(pull.wrenches).any():
+    if not np.isfinite(pull.wrenches).any() or not pull.entry.sensor.tared:
+        # Without a zero, the work is unknown.
         return pull
     work = work_done(pull)
     most, least = work.max(), work.min()
