@@ -54,14 +54,25 @@ def element_gradients(mesh: TetMesh, rule: Quadrature) -> tuple[np.ndarray, np.n
     Raises:
         InputError: an element is inverted or flat; its number and position are given.
     """
-    corners = mesh.nodes[mesh.tets]
     local = shape_gradients(rule.points, mesh.tets.shape[1])
-    jacobian = np.einsum("qla,eax->eqlx", local, corners)
-    determinant = np.linalg.det(jacobian)
+    jacobian, determinant = _jacobian(mesh, local)
     _check_orientation(mesh, determinant)
-    gradients = np.linalg.solve(jacobian, np.broadcast_to(local, (*jacobian.shape[:2],
-                                                                  *local.shape[1:])))
+    gradients = np.linalg.inv(jacobian) @ local
     return np.ascontiguousarray(gradients), determinant / 6.0 * rule.weights
+
+
+def _jacobian(mesh: TetMesh, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of positions to local coordinates and their determinants at q points.
+
+    Shapes [tet_count, q, 3, 3] and [tet_count, q]; q is 1 for straight elements, where both are the
+    same at all points.
+    """
+    if not has_curved_sides(mesh):
+        corners = mesh.nodes[mesh.tets[:, :4]]
+        jacobian = (corners[:, 1:] - corners[:, :1])[:, None]
+    else:
+        jacobian = np.einsum("qla,eax->eqlx", local, mesh.nodes[mesh.tets])
+    return jacobian, np.linalg.det(jacobian)
 
 
 def node_weights(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -90,8 +101,7 @@ def volume_weights(mesh: TetMesh) -> np.ndarray:
 def _weighted_shapes(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return shape functions [q, n] and volume weights [m^3], [tet_count, q], for masses."""
     rule = mesh.element.mass_rule()
-    local = shape_gradients(rule.points, mesh.tets.shape[1])
-    determinant = np.linalg.det(np.einsum("qla,eax->eqlx", local, mesh.nodes[mesh.tets]))
+    determinant = _jacobian(mesh, shape_gradients(rule.points, mesh.tets.shape[1]))[1]
     return (shape_functions(rule.points, mesh.tets.shape[1]),
             determinant / 6.0 * rule.weights)
 
