@@ -33,13 +33,15 @@ from limber.geometry.io.skeletons import read_cylinders, write_cylinders
 from limber.geometry.leaf_removal import without_leaves
 from limber.geometry.reconstruction import seen_skeleton
 from limber.geometry.settings import ReconstructSettings
-from limber.geometry.skeleton.confidence import evidence
+from limber.geometry.skeleton.confidence import PLACED, evidence
 from limber.geometry.skeleton.contraction.root_end import ROOT_ODDS
 from limber.geometry.skeleton.joining.rivals import bridge_evidence
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
-SIGNS = {"twigs": (1, 1, -1, -1), "nodes": (-1, -1, -1), "bridges": (1, -1, -1), "roots": (1,)}
+SIGNS = {"twigs": (1,), "nodes": (-1, -1, -1), "bridges": (1, -1, -1), "roots": (1,)}
+MOST = {"twigs": PLACED}
+"""Most of what is said; 1 for those not named."""
 OWN = "own"
 """Source of the kinds of the project's own generator."""
 _RIDGE = 0.002  # of a slope's square, against the mean loss: weak
@@ -152,19 +154,25 @@ def _there(truth: Skeleton, found: Skeleton) -> tuple[np.ndarray, np.ndarray, np
     return there, inside[::5], here.high[::5]
 
 
-def fitted(evidence_rows: np.ndarray, there: np.ndarray, signs: tuple[int, ...]) -> np.ndarray:
-    """Constant and slopes of a logistic function with the least mean loss."""
+def fitted(evidence_rows: np.ndarray, there: np.ndarray, signs: tuple[int, ...],
+           most: float = 1.0) -> np.ndarray:
+    """Constant and slopes of a logistic function, times ``most``, with the least mean loss."""
     system = np.column_stack([np.ones(len(there)), evidence_rows])
-    side = np.where(there, 1.0, -1.0)
 
     def loss(odds: np.ndarray) -> tuple[float, np.ndarray]:
-        margin = side * (system @ odds)
-        slope = -side / (1 + np.exp(np.clip(margin, -500, 500)))
-        value = np.logaddexp(0, -margin).mean() + _RIDGE * float(odds[1:] @ odds[1:]) / len(odds)
-        return value, system.T @ slope / len(side) + 2 * _RIDGE / len(odds) * np.r_[0, odds[1:]]
+        share = _share(system @ odds)
+        stated = np.clip(most * share, 1e-12, 1 - 1e-12)
+        slope = np.where(there, share - 1, most * share * (1 - share) / (1 - stated))
+        value = -np.log(np.where(there, stated, 1 - stated)).mean() + _RIDGE * float(
+            odds[1:] @ odds[1:]) / len(odds)
+        return value, system.T @ slope / len(there) + 2 * _RIDGE / len(odds) * np.r_[0, odds[1:]]
 
     bounds = [(None, None), *((0, None) if sign > 0 else (None, 0) for sign in signs)]
     return minimize(loss, np.zeros(system.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x
+
+
+def _share(odds: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(np.clip(-odds, -500, 500)))
 
 
 def bins(stated: np.ndarray, there: np.ndarray) -> str:
@@ -180,16 +188,17 @@ def tell(name: str, told: Outcomes, left_out: Sequence[str]) -> None:
     """Print the coefficients, and the accuracy of fits without a source on that source."""
     rows, there = np.vstack(told.evidence), np.concatenate(told.there)
     source = np.array(told.source)
-    signs = SIGNS[name]
+    signs, most = SIGNS[name], MOST.get(name, 1.0)
     inside = ~np.isin(source, left_out)
-    odds = fitted(rows[inside], there[inside], signs)
+    odds = fitted(rows[inside], there[inside], signs, most)
     print(f"{name}: {inside.sum()}, {100 * there[inside].mean():.1f} % there; odds "
           f"({', '.join(f'{value:.2f}' for value in odds)})")
     every = np.zeros(len(there))
     for one in np.unique(source):
         own = source == one
-        fit = odds if one in left_out else fitted(rows[inside & ~own], there[inside & ~own], signs)
-        every[own] = 1 / (1 + np.exp(-(fit[0] + rows[own] @ fit[1:])))
+        fit = odds if one in left_out else fitted(rows[inside & ~own], there[inside & ~own], signs,
+                                                  most)
+        every[own] = most * _share(fit[0] + rows[own] @ fit[1:])
         print(f"  {one}, left out: {bins(every[own], there[own])}")
     print(f"  all, each left out: {bins(every, there)}")
 

@@ -165,7 +165,9 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         scale = UNIT_METRES[settings.unit]
         with named_if_refused(named), shown_if_refused(show, prepared, leaves, supports,
                                                        off_axes(whole)):
-            check_explained(whole, settings.unexplained, wood.cloud.points,
+            # Who keeps the leaves has answered for the points beside axes that go through them.
+            answered = settings.leaves == "keep" and whole.leafy and not supports
+            check_explained(whole, 1.0 if answered else settings.unexplained, wood.cloud.points,
                             lambda place: (place + wood.origin) / scale,
                             lambda off: bool(supports) or (
                                 settings.leaves != "keep" and show_leaves(wood, off)))

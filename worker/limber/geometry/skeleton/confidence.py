@@ -1,12 +1,12 @@
 """Probabilities of a skeleton's twigs and nodes from the evidence of the scan; gaps in the scan."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.geometry.cloud.single_view import View
-from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.radii.cylinders import match_cylinders, nearest_cylinders
 from limber.geometry.skeleton.radii.likeliest_shape import (
     SPACINGS,
     ShapeEvidence,
@@ -25,13 +25,35 @@ from limber.geometry.skeleton.sweep import stretches
 _GAP = 4.0  # radii without a point that make a gap
 # Logistic models: a constant, then a slope for each column of the evidence. A twig exists where its
 # fork is true, a node where it lies inside the true wood. Both were fitted by maximum likelihood
-# (benchmarks.scan_probabilities) to 769 side branches of 62 generated scans: the project's own
-# generator and five of the six worlds (seeds 7400 to 7501). With each source left out in turn, bins
-# of a tenth agreed with the outcome within 8 percentage points and their binomial error.
-_TWIG_ODDS = (-1.55, 0.57, 1.20, -2.88, -1.51)
-_NODE_ODDS = (5.80, -1.96, -1.09, -0.91)
-_POINTS_MOST = 3.0  # ln(1 + points / 10) above which more points are no more evidence
+# (benchmarks.scan_probabilities) to 1,581 side branches of 114 generated scans: the project's own
+# generator and the six worlds (seeds 7600 to 7605), of which each in turn was left out.
+_TWIG_ODDS = (-5.00, 2.30)
+PLACED = 0.98
+"""Most of the probability of a fork: however many points show a branch, it may start elsewhere."""
+_NODE_ODDS = (5.85, -2.07, -1.00, -1.08)
+_STRAY = 3.0  # standard deviations from a carrier's surface beyond which it explains no point
+_ROUGH = 0.1  # fraction of its radius by which a carrier's surface is not round
+_TOGETHER = 3  # points at one node that count
+_BESIDE = 6  # cylinders of the carrier that may be nearest to a point
 _NOISE_MOST = 2.0  # noise in radii above which it no longer matters
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What points show of a skeleton: their spacing around each node [m] and their number on each,
+    shape [n] each, and the number on each side run that its carrier does not explain, [runs]."""
+
+    spacing: np.ndarray
+    count: np.ndarray
+    beside: np.ndarray
+
+    @classmethod
+    def of(cls, skeleton: Skeleton, points: np.ndarray, noise: float) -> "_Shown":
+        segment, residual = nearest_cylinders(skeleton, points)
+        near = np.abs(residual) < np.maximum(skeleton.radius[segment], 3 * noise)
+        return cls(point_spacing(skeleton, points, segment, noise),
+                   np.bincount(segment[near], minlength=skeleton.node_count),
+                   _beside_carriers(skeleton, points[near], segment[near], noise))
 
 
 def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool = False,
@@ -46,7 +68,8 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool
         one_sided: The points show one side of the branches.
         view: The depth camera's view, if there was one.
     """
-    spacing, count = _shown(skeleton, points, noise)
+    shown = _Shown.of(skeleton, points, noise)
+    spacing, count = shown.spacing, shown.count
     # A quarter of a circle is off together; the four average.
     shared = shared_error(skeleton, points, noise) / 2
     pixel = None if view is None else view.pitch * np.linalg.norm(skeleton.nodes - view.eye, axis=1)
@@ -61,17 +84,17 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool
         smoothing = sensor_smoothing(skeleton, typical_radius(skeleton, skeleton.radius), count,
                                      float(np.median(spacing)))
         skeleton, covariance = smoothing.undone(skeleton, covariance)
-    shown = ShapeEvidence(covariance, spacing, 0.0 if rays else noise, shared, rays or one_sided,
+    shape = ShapeEvidence(covariance, spacing, 0.0 if rays else noise, shared, rays or one_sided,
                           pixel, smoothing)
-    likeliest = likeliest_shape(skeleton, shown)
+    likeliest = likeliest_shape(skeleton, shape)
     # Wood hardly thickens outwards. What does so nevertheless, beyond its interval, is a bunch of
     # twigs or two limbs in one: it counts for nothing.
     swollen = tapered(replace(likeliest, radius_state=skeleton.radius_state),
                       count).radius_state == LIMITED
     if swollen.any():
         likeliest = likeliest_shape(replace(skeleton, radius_state=np.where(
-            swollen, LIMITED, skeleton.radius_state).astype(np.int8)), shown)
-    return _with_probability(likeliest, count, _gaps(likeliest, count, spacing), noise)
+            swollen, LIMITED, skeleton.radius_state).astype(np.int8)), shape)
+    return _with_probability(likeliest, shown, noise)
 
 
 def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
@@ -82,22 +105,21 @@ def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
         points: The scan [m], shape [m, 3].
         noise: Standard deviation of the points [m].
     """
-    spacing, count = _shown(skeleton, points, noise)
-    return _with_probability(skeleton, count, _gaps(skeleton, count, spacing), noise)
+    return _with_probability(skeleton, _Shown.of(skeleton, points, noise), noise)
 
 
 def evidence(skeleton: Skeleton, points: np.ndarray, noise: float,
              ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the evidence for the probabilities: of runs [runs, 4] and of nodes [n, 3].
+    """Return the evidence for the probabilities: of runs [runs, 1] and of nodes [n, 3].
 
     Args:
         skeleton: As :func:`assessed` returned it.
         points: The scan [m], shape [m, 3].
         noise: Standard deviation of the points [m].
     """
-    spacing, count = _shown(skeleton, points, noise)
-    gap = _gaps(skeleton, count, spacing)
-    return _twig_evidence(skeleton, count, noise), _node_evidence(skeleton, gap, noise)
+    shown = _Shown.of(skeleton, points, noise)
+    return np.log1p(shown.beside)[:, None], _node_evidence(
+        skeleton, _gaps(skeleton, shown), noise)
 
 
 def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
@@ -143,22 +165,30 @@ def shares(skeleton: Skeleton) -> dict[str, float]:
             for name, value in STATES.items()}
 
 
-def _twig_evidence(skeleton: Skeleton, count: np.ndarray, noise: float) -> np.ndarray:
-    """Evidence for each side run, shape [runs, 4]; zeros for the main run.
+def _beside_carriers(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray, noise: float,
+                     ) -> np.ndarray:
+    """Number of points of each side run that its carrier does not explain, shape [runs].
 
-    ln(1 + points / 10), ln(1 + reach / its carrier's radius), the bridged fraction, and the noise
-    over its radius.
+    They lie farther from the carrier's surface than its scatter. Of those at one node no more than
+    ``_TOGETHER`` count: what they are off has one cause.
     """
-    rows = np.zeros((skeleton.branch_count, 4))
+    count, run = np.zeros(skeleton.branch_count), skeleton.branch[segment]
+    order = np.argsort(run, kind="stable")
+    first = np.searchsorted(run[order], np.arange(skeleton.branch_count + 1))
     runs = skeleton.runs()
-    for run, members in enumerate(runs[1:], start=1):
-        own, carrier = members[1:], runs[int(skeleton.branch[members[0]])]
-        away = cKDTree(skeleton.nodes[carrier]).query(skeleton.nodes[own])[0]
-        rows[run] = (min(np.log1p(count[own].sum() / 10), _POINTS_MOST),
-                     np.log1p(away.max() / max(float(skeleton.radius[members[0]]), 1e-12)),
-                     float(np.mean(skeleton.radius_state[own] == BRIDGED)),
-                     min(noise / max(float(np.median(skeleton.radius[own])), 1e-12), _NOISE_MOST))
-    return rows
+    for number, members in enumerate(runs[1:], start=1):
+        own = order[first[number]:first[number + 1]]
+        carrier = runs[int(skeleton.branch[members[0]])][1:]
+        if len(own) == 0 or len(carrier) == 0:
+            continue
+        middle = (skeleton.nodes[carrier] + skeleton.nodes[skeleton.parent[carrier]]) / 2
+        near = cKDTree(middle).query(points[own], k=min(_BESIDE, len(carrier)))[1]
+        match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
+                                points[own], carrier[near.reshape(len(own), -1)])
+        off = match.residual > _STRAY * np.hypot(noise, _ROUGH * match.thick)
+        count[number] = np.minimum(np.unique(segment[own[off]], return_counts=True)[1],
+                                   _TOGETHER).sum()
+    return count
 
 
 def _node_evidence(skeleton: Skeleton, gap: np.ndarray, noise: float) -> np.ndarray:
@@ -172,13 +202,12 @@ def _node_evidence(skeleton: Skeleton, gap: np.ndarray, noise: float) -> np.ndar
                             np.log1p(gap / radius), skeleton.radius_state == UNRESOLVED])
 
 
-def _with_probability(skeleton: Skeleton, count: np.ndarray, gap: np.ndarray, noise: float,
-                      ) -> Skeleton:
+def _with_probability(skeleton: Skeleton, shown: _Shown, noise: float) -> Skeleton:
+    gap = _gaps(skeleton, shown)
     state = np.where(gap > 0, BRIDGED, skeleton.radius_state).astype(np.int8)
     with_state = replace(skeleton, radius_state=state)
     return replace(with_state, probability=_probability(
-        with_state, _twig_evidence(with_state, count, noise),
-        _node_evidence(with_state, gap, noise)))
+        with_state, np.log1p(shown.beside)[:, None], _node_evidence(with_state, gap, noise)))
 
 
 def _probability(skeleton: Skeleton, twig: np.ndarray, node: np.ndarray) -> np.ndarray:
@@ -193,6 +222,7 @@ def _probability(skeleton: Skeleton, twig: np.ndarray, node: np.ndarray) -> np.n
     for run in range(1, skeleton.branch_count):
         own[run] *= own[int(skeleton.branch[runs[run][0]])]
         placed[runs[run][1]] = 1.0
+    own[1:] *= PLACED  # what it carries does not depend on the place of its fork
     return own[skeleton.branch] * placed
 
 
@@ -201,23 +231,15 @@ def _logistic(evidence: np.ndarray, odds: tuple[float, ...]) -> np.ndarray:
     return 1 / (1 + np.exp(-(start + evidence @ np.array(slopes))))
 
 
-def _shown(skeleton: Skeleton, points: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """Spacing of the points around each node [m], and number of points on each, shape [n] each."""
-    segment, residual = nearest_cylinders(skeleton, points)
-    near = np.abs(residual) < np.maximum(skeleton.radius[segment], 3 * noise)
-    return (point_spacing(skeleton, points, segment, noise),
-            np.bincount(segment[near], minlength=skeleton.node_count))
-
-
-def _gaps(skeleton: Skeleton, count: np.ndarray, spacing: np.ndarray) -> np.ndarray:
+def _gaps(skeleton: Skeleton, shown: _Shown) -> np.ndarray:
     """Length [m] of the long stretch without points that contains each node, or 0, shape [n]."""
     gap, step = np.zeros(skeleton.node_count), skeleton.steps
     for members in skeleton.runs():
         own = members[1:]
-        for part in stretches(count[own] == 0):
+        for part in stretches(shown.count[own] == 0):
             bare = own[part]
             length = float(step[bare].sum())
             if length > max(_GAP * float(np.median(skeleton.radius[bare])),
-                            SPACINGS * float(np.median(spacing[bare]))):
+                            SPACINGS * float(np.median(shown.spacing[bare]))):
                 gap[bare] = length
     return gap

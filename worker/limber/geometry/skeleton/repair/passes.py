@@ -8,7 +8,7 @@ import numpy as np
 
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.single_view import View
-from limber.geometry.skeleton.confidence import assessed
+from limber.geometry.skeleton.confidence import assessed, doubted
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.ray_fit import fit_of_rays
 from limber.geometry.skeleton.repair.attachment import attached
@@ -153,6 +153,12 @@ def _settle(now: Repaired) -> Repaired:
                       seen=now.last_fit.seen)
 
 
+def _mend_kinks(now: Repaired) -> Repaired:
+    skeleton, count = without_kinks(now.skeleton)
+    # Where a folded end carried the run's number, the runs are others now: so is what they state.
+    return now.of(doubted(skeleton, now.points, now.noise) if count else skeleton)
+
+
 STEADY = Pass("steady radii", "Where points are missing, a first radius is far too small.",
               lambda now: now.of(steadied(now.skeleton, now.points)))
 DROP_BARE_ENDS = Pass("drop bare ends",
@@ -201,8 +207,7 @@ PASSES = (
          lambda now: now.of(assessed(
              now.skeleton, now.points, now.noise, rays=now.rays,
              one_sided=now.last_fit.seen.one_sided, view=now.view))),
-    Pass("mend kinks", "A branch turns more sharply than wood does.",
-         lambda now: now.of(without_kinks(now.skeleton)[0])),
+    Pass("mend kinks", "A branch turns more sharply than wood does.", _mend_kinks),
 )
 """In the order in which they run; some run again after a fit."""
 
