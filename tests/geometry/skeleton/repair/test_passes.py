@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.geometry.skeleton.repair.test_feet import two_in_one, two_limbs
+from tests.geometry.skeleton.repair.test_fused_limbs import limbs_side_by_side
 
 from limber.geometry.skeleton.radii.axis_fit import AxisFit
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
@@ -111,6 +112,8 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
                                 lambda now: bool((now.skeleton.radius == 0.05).all())),
         "follow feet down": lambda: (_before(two_in_one(0.2), two_limbs()), lambda now: float(
             now.skeleton.nodes[now.skeleton.forks()[0], 2]) < 0.17),
+        "split limbs": lambda: (_before(*limbs_side_by_side()),
+                                lambda now: now.skeleton.branch_count == 2),
         "fit finely": lambda: (_before(_aside()), _centred),
         "settle": lambda: (_before(_aside(), strands=1), _centred),
         "draw ends back": lambda: (_before(_branch(np.vstack([

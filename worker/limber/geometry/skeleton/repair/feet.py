@@ -27,9 +27,10 @@ _SECTIONS = 3  # sections in a row that must show two: a few stray points are in
 
 
 @dataclass(frozen=True)
-class _Foot:
+class Foot:
     """The axes of a side run beside its carrier: carrier's nodes from the fork down, shape [k],
-    and of both limbs there the positions [m], [k, 3], and radii [m], [k]."""
+    and of both limbs there the positions [m], [k, 3], and radii [m], [k].
+    """
 
     nodes: np.ndarray
     carrier: np.ndarray
@@ -50,32 +51,42 @@ def with_feet(skeleton: Skeleton, points: np.ndarray, noise: float) -> tuple[Ske
         The skeleton, and the number of side runs that were followed down.
     """
     run = skeleton.branch[nearest_cylinders(skeleton, points)[0]]
-    nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
-    parent, below, count = skeleton.parent.copy(), [], 0
-    added: list[tuple[np.ndarray, np.ndarray]] = []
-    done = np.zeros(skeleton.node_count, bool)
+    done, feet, starts = np.zeros(skeleton.node_count, bool), [], []
     for members in skeleton.runs()[1:]:
         own = np.isin(run, skeleton.branch[members[:2]])
         foot = _foot(skeleton, members, points[own], noise)
         if foot is None or done[foot.nodes].any():
             continue
         done[foot.nodes] = True
+        feet.append(foot)
+        starts.append(int(members[1]))
+    return (with_side_axes(skeleton, feet, starts), len(feet)) if feet else (skeleton, 0)
+
+
+def with_side_axes(skeleton: Skeleton, feet: list[Foot], starts: list[int | None]) -> Skeleton:
+    """Return the skeleton with a second axis beside each of some stretches of runs.
+
+    Args:
+        skeleton: With radii.
+        feet: The stretches.
+        starts: For each the first node of the side run that goes on from it; None: it ends there.
+    """
+    nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
+    parent, below, first = skeleton.parent.copy(), [], skeleton.node_count
+    for foot, start in zip(feet, starts, strict=True):
         nodes[foot.nodes], radius[foot.nodes] = foot.carrier, foot.carrier_radius
-        first = len(nodes) + sum(len(side) for side, _ in added)
         chain = np.arange(first, first + len(foot.nodes))
-        parent[members[1]] = chain[0]
+        first += len(foot.nodes)
+        if start is not None:
+            parent[start] = chain[0]
         below.append(np.append(chain[1:], skeleton.parent[foot.nodes[-1]]))
-        added.append((foot.side, foot.side_radius))
-        count += 1
-    if not count:
-        return skeleton, 0
     return Skeleton.from_edges(
-        np.vstack([nodes, *(side for side, _ in added)]), np.concatenate([parent, *below]),
-        np.concatenate([radius, *(thick for _, thick in added)])), count
+        np.vstack([nodes, *(foot.side for foot in feet)]), np.concatenate([parent, *below]),
+        np.concatenate([radius, *(foot.side_radius for foot in feet)]))
 
 
 def _foot(skeleton: Skeleton, members: np.ndarray, points: np.ndarray, noise: float,
-          ) -> _Foot | None:
+          ) -> Foot | None:
     """The part of a side run that its carrier's axis hides; None if there is none."""
     fork = int(members[0])
     run = int(skeleton.branch[fork])
@@ -98,7 +109,7 @@ def _foot(skeleton: Skeleton, members: np.ndarray, points: np.ndarray, noise: fl
         node = int(skeleton.parent[node])
     if len(found) < _SECTIONS:
         return None
-    return _Foot(np.array([each for each, _ in found]), *(
+    return Foot(np.array([each for each, _ in found]), *(
         np.array([both[k] for _, both in found]) for k in (0, 2, 1, 3)))
 
 
@@ -110,26 +121,17 @@ def _two_limbs(skeleton: Skeleton, node: int, at: np.ndarray, side: float, point
         at: Where the side limb's axis is expected [m], shape [3].
         side: Its radius above [m].
     """
-    before = int(skeleton.parent[node])
-    axis = skeleton.nodes[node] - skeleton.nodes[before]
-    size = float(np.linalg.norm(axis))
-    if size == 0:
+    thick = float(skeleton.radius[node])
+    seen = section(skeleton, node, points, 3 * thick + 2 * side, _HALF * min(thick, side))
+    if seen is None:
         return None
-    axis /= size
-    middle, thick = skeleton.nodes[node], float(skeleton.radius[node])
-    near = np.flatnonzero(np.linalg.norm(points - middle, axis=1) < 3 * thick + 2 * side)
-    offset = points[near] - middle
-    along = offset @ axis
-    kept = np.abs(along) < max(_HALF * min(thick, side), size / 2)
-    one = any_normal(axis)
-    frame = np.stack([one, np.cross(axis, one)])
-    flat = offset[kept] @ frame.T
+    (flat, frame), middle = seen, skeleton.nodes[node]
     spread = float(np.hypot(noise, _ROUGH * min(thick, side)))
     aside = (at - middle) @ frame.T
-    single = _fitted(flat, np.array([[0.0, 0.0, thick]]), spread, np.inf)
+    single = fitted_circles(flat, np.array([[0.0, 0.0, thick]]), spread, np.inf)
     above = float(skeleton.radius[_outwards(skeleton, node)])
     first = np.array([[*(-0.3 * aside), above], [*aside, side]])
-    double = _fitted(flat, first, spread, _KNOWN)
+    double = fitted_circles(flat, first, spread, _KNOWN)
     if single is None or double is None:
         return None
     (carrier, limb), gap = double[0], float(np.linalg.norm(double[0][0, :2] - double[0][1, :2]))
@@ -140,6 +142,27 @@ def _two_limbs(skeleton: Skeleton, node: int, at: np.ndarray, side: float, point
             float(limb[2]))
 
 
+def section(skeleton: Skeleton, node: int, points: np.ndarray, reach: float, half: float,
+            ) -> tuple[np.ndarray, np.ndarray] | None:
+    """Points in the section at a node, in its plane [m], shape [k, 2], and the plane's two unit
+    vectors; None where the axis has no direction.
+
+    Args:
+        reach: Largest distance of points from the node [m].
+        half: Half the section's thickness [m], or that of the node's step if larger.
+    """
+    axis = skeleton.nodes[node] - skeleton.nodes[int(skeleton.parent[node])]
+    size = float(np.linalg.norm(axis))
+    if size == 0:
+        return None
+    axis /= size
+    offset = points[np.linalg.norm(points - skeleton.nodes[node], axis=1) < reach
+                    ] - skeleton.nodes[node]
+    one = any_normal(axis)
+    frame = np.stack([one, np.cross(axis, one)])
+    return offset[np.abs(offset @ axis) < max(half, size / 2)] @ frame.T, frame
+
+
 def _outwards(skeleton: Skeleton, node: int) -> int:
     """The node of the same run some radii above."""
     own = np.flatnonzero(skeleton.branch == skeleton.branch[node])
@@ -148,8 +171,8 @@ def _outwards(skeleton: Skeleton, node: int) -> int:
     return int(above[far][0]) if far.any() else int(above[-1]) if len(above) else node
 
 
-def _fitted(flat: np.ndarray, first: np.ndarray, spread: float, known: float,
-            ) -> tuple[np.ndarray, float] | None:
+def fitted_circles(flat: np.ndarray, first: np.ndarray, spread: float, known: float,
+                   ) -> tuple[np.ndarray, float] | None:
     """Circles fitted to points of a section, each point to the nearest, and the log-likelihood.
 
     Args:

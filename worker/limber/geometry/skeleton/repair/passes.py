@@ -15,6 +15,7 @@ from limber.geometry.skeleton.repair.attachment import attached
 from limber.geometry.skeleton.repair.backward_twigs import without_backward_starts
 from limber.geometry.skeleton.repair.double_strands import without_strands
 from limber.geometry.skeleton.repair.feet import with_feet
+from limber.geometry.skeleton.repair.fused_limbs import with_split_limbs
 from limber.geometry.skeleton.repair.kinks import without_kinks
 from limber.geometry.skeleton.repair.resampling import PointSpacing, resampled
 from limber.geometry.skeleton.repair.run_ends import ends_within, with_full_tips, without_bare_ends
@@ -191,6 +192,8 @@ PASSES = (
     LIMIT,
     Pass("follow feet down", "Two limbs side by side have one axis, up to a fork too far out.",
          lambda now: now.of(with_feet(now.skeleton, now.points, now.noise)[0])),
+    Pass("split limbs", "Two limbs side by side have one axis up to their tips.",
+         lambda now: now.of(with_split_limbs(now.skeleton, now.points, now.noise)[0])),
     Pass("fit finely",
          "Axes and radii come from too few nodes, and from forks that have moved since.",
          lambda now: now.fitted(now.sampled(now.skeleton), uncertainty=False), until=0.8),
