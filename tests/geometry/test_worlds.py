@@ -7,6 +7,7 @@ from benchmarks.scan_runs import Outcomes
 from benchmarks.worlds.degraded import DEGRADED
 from benchmarks.worlds.plant import Plant, pipe_radii
 from benchmarks.worlds.ray_casting import cast
+from benchmarks.worlds.real_scans import beyond_ends
 from benchmarks.worlds.rows import potted_rows, source_rows
 from benchmarks.worlds.sources import SOURCES, WORLDS
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
@@ -104,3 +105,16 @@ def test_a_row_is_met_only_if_all_of_it_is() -> None:
     named, = potted_rows([Outcomes([], ["a stake at (0, 0, 0)"])])
     unnamed, = potted_rows([Outcomes([], ["46 % are leaves"])])
     assert named.met is True and unnamed.met is False
+
+
+def test_only_what_goes_on_beyond_anothers_ends_is_told_apart() -> None:
+    """A stem 50 mm longer at its tip and 20 mm at its root counts; a twig beside its end, and a gap
+    of the other within the stem, do not."""
+    def line(*z: float) -> np.ndarray:
+        nodes = np.outer(z, [0, 0, 1.0])
+        return np.stack([nodes[:-1], nodes[1:]], axis=1)
+    other = line(0, 0.1, 0.2, 0.3)
+    twig = np.array([[[0, 0, 0.3], [0.1, 0, 0.3]], [[0, 0, 0.1], [0, 0.1, 0.1]]])
+    found = np.vstack([line(-0.02, 0.15, 0.35), twig])
+    assert beyond_ends(found, other) == pytest.approx(0.07, abs=0.02)
+    assert beyond_ends(line(0, 0.15, 0.3), other) == pytest.approx(0.0, abs=1e-9)
