@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.geometry.skeleton.alternatives import SearchDoubts
-from limber.geometry.skeleton.confidence import likely
+from limber.geometry.skeleton.confidence import PLACED, likely
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.totals import total_length, total_volume, totals
 from limber.geometry.surface.tubes import branch_surface
@@ -34,15 +34,21 @@ def _with_chances(tree: Skeleton, side: float, last: float) -> Skeleton:
 
 
 def test_doubted_twigs_count_by_their_probability() -> None:
-    """Mean and deviation are those of 40,000 draws, in which a twig goes with its carrier."""
+    """Mean and deviation are those of 40,000 draws, in which a twig goes with its carrier, the
+    odds of all twigs are off together, and wood whose fork is elsewhere is there."""
     tree = _with_chances(_tree(), 0.8, 0.5)
     rng = np.random.default_rng(0)
-    side = rng.uniform(size=40_000) < 0.8
-    last = side & (rng.uniform(size=40_000) < 0.5 / 0.8)
+    together = rng.normal(0, 0.9, 40_000)
+
+    def drawn_with(chance: float) -> np.ndarray:
+        odds = np.log(chance / (1 - chance)) + together
+        return rng.uniform(size=40_000) < 1 / (1 + np.exp(-odds))
+    side = drawn_with(0.8 / PLACED)
+    last = side & drawn_with(0.5 / 0.8 / PLACED)
     drawn = 1 + 0.3 * side + 0.15 * last
     found = total_length(tree)
-    assert found.expected == pytest.approx(drawn.mean(), abs=2e-3)
-    assert found.sigma == pytest.approx(np.hypot(drawn.std(), 0.015), rel=0.05)
+    assert found.expected == pytest.approx(drawn.mean(), abs=0.015)
+    assert found.sigma == pytest.approx(np.hypot(drawn.std(), 0.015), rel=0.1)
     sure = total_length(_tree())
     assert sure.expected == pytest.approx(1.45) and sure.sigma < 0.02
 

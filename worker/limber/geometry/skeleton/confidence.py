@@ -216,13 +216,12 @@ def _probability(skeleton: Skeleton, twig: np.ndarray, node: np.ndarray) -> np.n
     A run's first node stands for its fork. The run's own evidence was fitted to the existence and
     position of that fork. The node's gap and noise would count against it twice.
     """
-    own = _logistic(twig, _TWIG_ODDS)
+    own = PLACED * _logistic(twig, _TWIG_ODDS)
     own[0] = 1.0
     placed, runs = _logistic(node, _NODE_ODDS), skeleton.runs()
     for run in range(1, skeleton.branch_count):
         own[run] *= own[int(skeleton.branch[runs[run][0]])]
         placed[runs[run][1]] = 1.0
-    own[1:] *= PLACED  # what it carries does not depend on the place of its fork
     return own[skeleton.branch] * placed
 
 
