@@ -12,7 +12,7 @@ from limber.geometry.skeleton.radii.axis_fit import AxisFit
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
 from limber.geometry.skeleton.repair.passes import PASSES, Pass, Repaired
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
-from limber.geometry.skeleton.uncertain_parts import KINK, start_angle, turns
+from limber.geometry.skeleton.uncertain_parts import KINK, turns
 
 Z, RADIUS, NOISE = 0.005 * np.arange(81), 0.008, 0.0005
 ALONG = np.stack([0 * Z, 0 * Z, Z], axis=1)
@@ -83,8 +83,6 @@ def _twig(start: float, count: int = 24, reach: float = 0.0) -> np.ndarray:
 def _of_pass(name: str) -> tuple[Repaired, Mended]:
     """A branch with what the pass repairs, and how to tell that it is repaired."""
     strip = _tube(wide=1.2)
-    led = _twig(0.08, reach=0.018)
-    hook = np.vstack([(ALONG[21] + led[0]) / 2, led])
     folded = np.vstack([ALONG, [[0.004, 0, 0.398], [0.006, 0, 0.39], [0.007, 0, 0.38]]])
     blank = replace(_hair(slice(20, 40)), radius_state=np.where(
         np.isin(np.arange(81), range(20, 40)), INTERPOLATED, 0).astype(np.int8))
@@ -99,9 +97,6 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
             _before(_branch(twig=np.vstack([_twig(0.2, 1, 0.004) - [0, 0, 0.01],
                                             _twig(0.14, reach=0.018)]), at=39)),
             lambda now: abs(now.skeleton.nodes[now.skeleton.forks()[0], 2] - 0.14) < 0.011),
-        "lead twigs back": lambda: (
-            _before(_branch(twig=hook, at=21, radius=0.005, thin=0.003)),
-            lambda now: start_angle(now.skeleton, now.skeleton.runs()[1]) < np.deg2rad(60)),
         "drop bare ends": lambda: (_before(_branch(), _tube(0.05, 0.35)), _ends(0.05, 0.35, 0.006)),
         "lengthen ends": lambda: (_before(_branch(ALONG[10:70])), _ends(0.0, 0.392)),
         "prune spurs": lambda: (_before(_branch(twig=_twig(0.2, 4, 0.003))), _one_run),
@@ -116,8 +111,6 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
                                 lambda now: now.skeleton.branch_count == 2),
         "fit finely": lambda: (_before(_aside()), _centred),
         "settle": lambda: (_before(_aside(), strands=1), _centred),
-        "draw ends back": lambda: (_before(_branch(np.vstack([
-            [0, 0, -0.012], ALONG[1:-1], [0, 0, 0.412]]))), _ends(0.0, 0.4)),
         "find the likeliest axes and radii": lambda: (_before(blank, gap), _thick),
         "mend kinks": lambda: (_before(_branch(folded, radius=0.005)), lambda now: bool(
             turns(now.skeleton, now.skeleton.runs()[0]).max() <= KINK)),

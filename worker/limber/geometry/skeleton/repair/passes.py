@@ -12,13 +12,12 @@ from limber.geometry.skeleton.confidence import assessed, doubted
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.ray_fit import fit_of_rays
 from limber.geometry.skeleton.repair.attachment import attached
-from limber.geometry.skeleton.repair.backward_twigs import without_backward_starts
 from limber.geometry.skeleton.repair.double_strands import without_strands
 from limber.geometry.skeleton.repair.feet import with_feet
 from limber.geometry.skeleton.repair.fused_limbs import with_split_limbs
 from limber.geometry.skeleton.repair.kinks import without_kinks
 from limber.geometry.skeleton.repair.resampling import PointSpacing, resampled
-from limber.geometry.skeleton.repair.run_ends import ends_within, with_full_tips, without_bare_ends
+from limber.geometry.skeleton.repair.run_ends import with_full_tips, without_bare_ends
 from limber.geometry.skeleton.repair.run_radii import (
     limited,
     steadied,
@@ -179,8 +178,6 @@ PASSES = (
          _fit_unpinched, until=0.5),
     Pass("attach twigs", "The contraction pulls a fork towards its twig.",
          lambda now: now.of(attached(now.skeleton))),
-    Pass("lead twigs back", "A twig whose first part is missing is attached too far out.",
-         lambda now: now.of(without_backward_starts(now.skeleton)[0])),
     DROP_BARE_ENDS,
     Pass("lengthen ends", "The contraction shortens an end.",
          lambda now: now.of(with_full_tips(now.skeleton, now.points, now.noise))),
@@ -201,8 +198,6 @@ PASSES = (
     Pass("settle", "The fit is unfinished because of noise or a strand that was just dropped.",
          _settle, until=1.0),
     DROP_BARE_ENDS,
-    Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
-         lambda now: now.of(ends_within(now.skeleton, now.points))),
     LIMIT,
     Pass("find the likeliest axes and radii",
          "A radius that few points, the spacing or the noise determine, or that no wood has, is "
