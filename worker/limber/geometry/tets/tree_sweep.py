@@ -86,7 +86,10 @@ class _TreeSweep:
             self._sweep(run, 0.0, 6, None)
             return
         carrier, axis = self._swept.get(self._carrier[run]), self._axes[run]
-        for at in self._slices(carrier, run) if carrier else []:
+        if carrier is None:
+            self._left_out.append(run)
+            return
+        for at in self._slices(carrier, run):
             for reach in _STRAIGHTENED:
                 # A twig that starts along its carrier's side, or in a hook, leaves it on a straight
                 # line instead.

@@ -5,6 +5,7 @@ makes one axis of both for some way. Its points then lie on two circles in a sec
 below the fork. The likelihoods of both decide at each node, from the fork towards the root.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,7 +64,8 @@ def with_feet(skeleton: Skeleton, points: np.ndarray, noise: float) -> tuple[Ske
     return (with_side_axes(skeleton, feet, starts), len(feet)) if feet else (skeleton, 0)
 
 
-def with_side_axes(skeleton: Skeleton, feet: list[Foot], starts: list[int | None]) -> Skeleton:
+def with_side_axes(skeleton: Skeleton, feet: list[Foot], starts: Sequence[int | None],
+                   ) -> Skeleton:
     """Return the skeleton with a second axis beside each of some stretches of runs.
 
     Args:
