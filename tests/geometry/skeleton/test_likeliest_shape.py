@@ -171,3 +171,14 @@ def test_beyond_a_fork_the_stem_is_thinner_by_the_wood_of_its_twig(twig: float) 
     step = told.radius[41] / told.radius[40]
     assert step == pytest.approx((1 - (twig / 0.008)**2.7)**(1 / 2.7), abs=0.06)
     assert told.radius_sigma[41] / told.radius[41] > 2 * told.radius_sigma[38] / told.radius[38]
+
+
+def test_a_stem_that_no_point_shows_beyond_a_fat_twig_stays_a_stem() -> None:
+    """The wood of the twig explains the fork alone: the stem beyond it must not vanish."""
+    plant = _plant(twig=0.012, sigma=0.01)
+    hidden = (plant.branch == 0) & (plant.nodes[:, 2] > 0.201)
+    told = _told(replace(plant, radius_state=np.where(hidden, INTERPOLATED, MEASURED).astype(
+        np.int8)), 0.0003, 0.0001)
+    beyond = told.radius[hidden & (plant.nodes[:, 2] < 0.25)]
+    assert 0.002 < beyond.min() and beyond.max() < 0.009
+    assert np.isfinite(told.radius_sigma).all()

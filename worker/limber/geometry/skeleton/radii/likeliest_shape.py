@@ -6,9 +6,9 @@ what a sensor smooths or widens at the scale of its points and which diameter on
 whole scan), the effect of noise and of sections that are not round (a run). A shared error moves
 axis and radius together, as far as the points leave both open: from one side they show the sum of
 depth and radius, not each. The prior is how wood grows (:mod:`wood`): an axis bends little; a
-radius changes slowly along a run and falls towards its tip, at a fork by the side branches' wood.
-Where points determine a radius, it is theirs. Where they hardly do, it follows from the carrier and
-the resolved part, with a wide interval.
+radius changes slowly along a run and falls towards its tip, at a fork by the wood of the side
+branches. Where points determine a radius, it is theirs. Where they hardly do, it follows from the
+carrier and the resolved part, with a wide interval.
 """
 
 from dataclasses import dataclass, replace

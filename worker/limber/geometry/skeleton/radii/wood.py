@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sparse
 
-from limber.geometry.skeleton.radii.smoothness import second_differences
+from limber.geometry.skeleton.radii.smoothness import FORK, second_differences
 from limber.geometry.skeleton.skeleton import Skeleton
 
 # In logarithms of radii: a side branch against its carrier and the fall along a whole run (mean and
 # deviation each); deviation of a root from any radius.
 _SIDE, _SIDE_SIGMA = -1.0, 0.8
 _TAPER, _TAPER_SIGMA, _ROOT = -0.5, 0.7, 3.0
+_GOES_ON = -0.15  # mean at forks, where a run goes on
 WANDER = 5e-3
 """Variance of a radius's logarithm per radius of length."""
 # Power of the pipe model, and deviations from it as logarithms of a radius: of all forks of a plant
@@ -38,97 +39,88 @@ class Wood:
     forks of the plant are off the pipe model together.
 
     Attributes:
-        steps: Changes from each node's parent to it, as a matrix over nodes, [n, n]; the root's
-            own. Where a run goes on from a fork, the change to the wood of all children.
-        trends: How they go with the trends, shape [n, k].
-        start: Their means without trends, shape [n].
-        weight: Their inverse variances, shape [n].
+        changes: As a matrix over nodes, [m, n]: the root's radius, each node's change from its
+            parent, then at each fork that from the parent to the wood of all children.
+        trends: How they go with the trends, shape [m, k].
+        start: Their means without trends, shape [m].
+        weight: Their inverse variances, shape [m].
         known: Inverse variances of the trends, shape [k].
         mean: Means of the trends, shape [k].
-        scale: Half the logarithm of the determinant of the precision.
     """
 
-    steps: sparse.csr_matrix
+    changes: sparse.csr_matrix
     trends: sparse.csr_matrix
     start: np.ndarray
     weight: np.ndarray
     known: np.ndarray
     mean: np.ndarray
-    scale: float
 
     @classmethod
     def of(cls, skeleton: Skeleton, radius: np.ndarray) -> "Wood":
         """Its lengths are counted, and its forks linearised, in current radii [m], shape [n]."""
-        count, runs, parent = len(radius), skeleton.branch_count, skeleton.parent.copy()
-        parent[0] = 0
-        node, run, step = np.arange(count), skeleton.branch, skeleton.steps
-        side = run != run[parent]
-        at_fork = ~side & (skeleton.child_counts()[parent] > 1) & (node > 0)
-        steps, part, start, variance = _changes(parent, radius, side, at_fork)
-        variance = np.where(side, _SIDE_SIGMA**2, np.maximum(
-            variance + WANDER * step / radius[parent], 1e-12))
-        start = np.where(side, _SIDE, start)
-        start[0], variance[0] = np.log(radius[0]), _ROOT**2
+        count, runs, run, step = (len(radius), skeleton.branch_count, skeleton.branch,
+                                  skeleton.steps)
+        node, parent = np.arange(1, count), skeleton.parent[1:]
+        side = run[1:] != run[parent]
+        at_fork = ~side & (skeleton.child_counts()[parent] > 1)
+        one_by_one = sparse.identity(count) - sparse.coo_matrix(
+            (np.ones(count - 1), (node, parent)), (count, count))
+        variance = WANDER * step[1:] / radius[parent] + np.where(at_fork, FORK**2, 0.0)
+        pipes, start, off = _pipes(skeleton.parent, radius, parent[at_fork])
         length = np.bincount(run[1:], step[1:], runs)
-        fall = np.where(side | (node == 0), 0.0, step / np.maximum(length[run], 1e-300))
-        trends = sparse.coo_matrix((np.concatenate([fall, at_fork]), (
-            np.tile(node, 2), np.concatenate([run, np.full(count, runs)]))),
-            (count, runs + 1)).tocsr()
-        known = np.append(np.full(runs, _TAPER_SIGMA**-2), _PIPE_SIGMA**-2)
-        return cls(steps, trends, start, 1 / variance, known, np.append(np.full(runs, _TAPER), 0.0),
-                   float(np.log(part[at_fork]).sum()
-                         + (np.log(known).sum() - np.log(variance).sum()) / 2))
+        fall = np.where(side, 0.0, step[1:] / np.maximum(length[run[1:]], 1e-300))
+        trends = sparse.block_diag([
+            sparse.coo_matrix((fall, (node, run[1:])), (count, runs)), np.ones((len(start), 1))])
+        return cls(
+            sparse.vstack([one_by_one, pipes]).tocsr(), trends.tocsr(),
+            np.concatenate([[np.log(radius[0])], np.where(
+                side, _SIDE, np.where(at_fork, _GOES_ON, 0.0)), start]),
+            1 / np.concatenate([[_ROOT**2], np.where(
+                side, _SIDE_SIGMA**2, np.maximum(variance, 1e-12)), off]),
+            np.append(np.full(runs, _TAPER_SIGMA**-2), _PIPE_SIGMA**-2),
+            np.append(np.full(runs, _TAPER), 0.0))
 
     @property
     def precision(self) -> sparse.csr_matrix:
         """Of nodes and trends, shape [n + k, n + k]."""
-        both = sparse.hstack([self.steps, -self.trends])
-        return (both.T @ sparse.diags(self.weight) @ both + sparse.diags(
-            np.concatenate([np.zeros(len(self.start)), self.known]))).tocsr()
+        both = sparse.hstack([self.changes, -self.trends])
+        return (both.T @ sparse.diags(self.weight) @ both + sparse.diags(np.concatenate(
+            [np.zeros(self.changes.shape[1]), self.known]))).tocsr()
 
     @property
     def pull(self) -> np.ndarray:
         """Precision times mean of nodes and trends, shape [n + k]."""
         start = self.weight * self.start
-        return np.concatenate([self.steps.T @ start,
+        return np.concatenate([self.changes.T @ start,
                                self.known * self.mean - self.trends.T @ start])
 
-    def log_density(self, log_radius: np.ndarray, trends: np.ndarray) -> float:
-        """Of logarithms of radii, shape [n], and trends, shape [k]; without powers of 2 pi."""
-        off = self.steps @ log_radius - self.trends @ trends - self.start
-        return self.scale - float(self.weight @ off**2 + self.known @ (trends - self.mean)**2) / 2
 
-
-def _changes(parent: np.ndarray, radius: np.ndarray, side: np.ndarray, at_fork: np.ndarray,
-             ) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
-    """Changes of radii as a matrix over nodes, [n, n], the part of each child in the wood of its
-    parent's, and the means and variances of what forks add, shape [n] each.
+def _pipes(parent: np.ndarray, radius: np.ndarray, forks: np.ndarray,
+           ) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray]:
+    """Changes from forks to the wood of their children as a matrix over nodes, [f, n], and their
+    means and variances, shape [f].
 
     Args:
-        parent: The root's is itself, shape [n].
+        parent: Of each node, shape [n].
         radius: Current radii [m], shape [n].
-        side: Whether a run starts there, shape [n].
-        at_fork: Whether a run goes on from a fork there, shape [n].
+        forks: Nodes at which runs go on and others start, shape [f].
     """
-    count, node, log, wood = len(radius), np.arange(len(radius)), np.log(radius), radius**_POWER
-    wood[0] = 0.0
-    total = np.bincount(parent, wood, count)
-    part = wood / np.maximum(total[parent], 1e-300)
-    goes_on = np.zeros(count, np.int64)
-    goes_on[parent[at_fork]] = node[at_fork]
-    joined = side & (goes_on[parent] > 0)
-    steps = sparse.coo_matrix((
-        np.concatenate([np.where(at_fork, part, 1.0), np.full(count - 1, -1.0), part[joined]]),
-        (np.concatenate([node, node[1:], goes_on[parent[joined]]]),
-         np.concatenate([node, parent[1:], node[joined]]))), (count, count)).tocsr()
-    pipe = np.log(np.maximum(total, 1e-300)) / _POWER
-    start = np.bincount(parent, part * log, count)[parent] - pipe[parent]
-    miss, own = (pipe - log)[parent], _FORK_SIGMA**2
-    if at_fork.any():
-        miss -= np.clip(np.median(miss[at_fork]), -_PIPE_SIGMA, _PIPE_SIGMA)
+    count, child = len(radius), np.flatnonzero(np.isin(parent, forks))
+    row, log, wood = np.full(count, -1), np.log(radius), radius[child]**_POWER
+    row[forks] = np.arange(len(forks))
+    own = row[parent[child]]
+    total = np.bincount(own, wood, len(forks))
+    part, pipe = wood / total[own], np.log(total) / _POWER
+    pipes = sparse.coo_matrix((
+        np.concatenate([part, np.full(len(forks), -1.0)]),
+        (np.concatenate([own, row[forks]]), np.concatenate([child, forks]))),
+        (len(forks), count)).tocsr()
+    miss = pipe - log[forks]
+    if len(forks):
+        miss -= np.clip(np.median(miss), -_PIPE_SIGMA, _PIPE_SIGMA)
     # Some forks swell, and at some a branch was cut off.
-    variance = own * (FREEDOM + miss**2 / own) / (FREEDOM + 1)
-    return (steps, part, np.where(at_fork, start, 0.0), np.where(at_fork, variance, 0.0))
+    return (pipes, np.bincount(own, part * log[child], len(forks)) - pipe,
+            (FREEDOM * _FORK_SIGMA**2 + miss**2) / (FREEDOM + 1))
 
 
 @dataclass(frozen=True)
