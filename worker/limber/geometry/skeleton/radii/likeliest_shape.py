@@ -89,7 +89,9 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
     measured = skeleton.radius_state == MEASURED
     evidence = replace(evidence, covariance=_coupled(evidence.covariance, first, measured))
     independent = np.clip(skeleton.steps / first, DISTINCT, _APART) / _APART
-    vague = np.where(_is_coarse(first, evidence), _VAGUE**2, 0.0)
+    # As the points show it: what a sensor drew in may have too few around it.
+    seen = first if evidence.smoothing is None else evidence.smoothing.drawn_in(first)
+    vague = np.where(_is_coarse(seen, evidence), _VAGUE**2, 0.0)
     trust, local, bends = np.ones(len(radius)), _LOCAL[2], Bends.of(skeleton)
     for _ in range(_ROUNDS):
         own = evidence.covariance[:, 3, 3] / first**2 + local**2 + vague
@@ -107,7 +109,7 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
         if measured.any():
             local = float(np.clip(1.4826 * np.median(miss[measured]), *_LOCAL[:2]))
     # A fit that collapsed resolves nothing; one that does not count is no evidence of thin wood.
-    coarse = _is_coarse(np.where(measured, first, radius), evidence)
+    coarse = _is_coarse(np.where(measured, seen, radius), evidence)
     scan = np.hypot(resolution / thin, _OVAL_SIDE if evidence.one_sided else 0.0)
     if evidence.smoothing is not None:
         scan = np.hypot(scan, evidence.smoothing.uncertainty(thin))

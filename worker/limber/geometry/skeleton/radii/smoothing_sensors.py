@@ -57,6 +57,10 @@ class Smoothing:
         return (replace(skeleton, radius=radius, radius_sigma=change * skeleton.radius_sigma),
                 covariance * scale[:, :, None] * scale[:, None, :])
 
+    def drawn_in(self, radius: np.ndarray) -> np.ndarray:
+        """True radii [m] as the sensor measures them [m], shape [n]."""
+        return radius * np.exp(-self.shrink * (self.spacing / radius)**2)
+
     def uncertainty(self, radius: np.ndarray) -> np.ndarray:
         """Standard deviation of the logarithm of true radii [m], shape [n]."""
         return self.sigma * (self.spacing / radius)**2 * self._slope(radius)
