@@ -2,6 +2,7 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from limber.geometry.leaf_removal import (
     without_leaves,
 )
 from limber.geometry.point_classes import COLOURS, shown_if_refused
-from limber.geometry.reconstruction import _MOSTLY, reconstruct_cloud
+from limber.geometry.reconstruction import _MOSTLY, _most_off, reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.stages.shape.edit_skeleton import review_skeleton
@@ -137,6 +138,16 @@ def test_leaves_are_not_cut_off_unasked(seedling, tmp_path) -> None:
     shown = read_cloud(tmp_path / "a_points.ply")
     assert np.abs(shown.points - moved / 1000).max() < 0.01 or len(shown) < len(moved)
     assert (shown.attributes["class"] == 1).mean() == pytest.approx(on_leaf.mean(), abs=0.1)
+
+
+def test_who_keeps_leaves_is_not_refused_for_them() -> None:
+    """Where axes go through leaves that the user keeps, any share of points may lie beside them;
+    not where leaves are still asked for, no leaf was found, or a pot stands below."""
+    for leaves, leafy, supports, most in (
+            ("keep", True, [], 1.0), ("ask", True, [], 0.25), ("keep", False, [], 0.25),
+            ("keep", True, ["pot"], 0.25)):
+        settings = ReconstructSettings(leaves=leaves, unexplained=0.25)
+        assert _most_off(SimpleNamespace(leafy=leafy), settings, supports) == most
 
 
 def test_few_leaves_need_no_consent() -> None:

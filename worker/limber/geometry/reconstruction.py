@@ -47,9 +47,7 @@ from limber.geometry.skeleton.plausibility import (
     unexplained_share,
 )
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
-from limber.geometry.skeleton.radii.silhouette import (
-    without_hidden_twigs,
-)
+from limber.geometry.skeleton.radii.silhouette import without_hidden_twigs
 from limber.geometry.skeleton.search_result import SkeletonResult, result_of_skeleton
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import Apart, skeletonise
@@ -165,9 +163,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         scale = UNIT_METRES[settings.unit]
         with named_if_refused(named), shown_if_refused(show, prepared, leaves, supports,
                                                        off_axes(whole)):
-            # Who keeps the leaves has answered for the points beside axes that go through them.
-            answered = settings.leaves == "keep" and whole.leafy and not supports
-            check_explained(whole, 1.0 if answered else settings.unexplained, wood.cloud.points,
+            check_explained(whole, _most_off(whole, settings, supports), wood.cloud.points,
                             lambda place: (place + wood.origin) / scale,
                             lambda off: bool(supports) or (
                                 settings.leaves != "keep" and show_leaves(wood, off)))
@@ -225,6 +221,14 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
             check_agreed(prepared, leaves, settings.unit)
     return (_skeleton(wood, settings, own, progress.part(0.55, 1.0)), wood, leaves) if leaves else (
         found, prepared, [])
+
+
+def _most_off(found: SkeletonResult, settings: ReconstructSettings, supports: list[Support],
+              ) -> float:
+    """Fraction of points off all axes up to which a scan is accepted."""
+    # Who keeps the leaves has answered for the points beside axes that go through them.
+    answered = settings.leaves == "keep" and found.leafy and not supports
+    return 1.0 if answered else settings.unexplained
 
 
 def _found_before(prepared: Prepared, known: FoundSkeleton, progress: Progress,
