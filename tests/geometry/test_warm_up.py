@@ -1,5 +1,6 @@
 """Warming up compiles what fits and surfaces need."""
 
+from limber.geometry.cloud.leaf_trees import _voted
 from limber.geometry.skeleton.joining.bridge_kernels import far_sides, nearest_others, priced
 from limber.geometry.skeleton.radii.fit_kernels import (
     mean_on_circle,
@@ -17,5 +18,5 @@ def test_warm_up_compiles_the_loops():
     """After it they exist as machine code, each in one form."""
     warm_up()
     for kernel in (pierced, fillet_level, _distances, nearest_of, normal_blocks, mean_on_circle,
-                   reach_on_circle, priced, nearest_others, far_sides):
+                   reach_on_circle, priced, nearest_others, far_sides, _voted):
         assert len(kernel.signatures) == 1

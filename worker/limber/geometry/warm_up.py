@@ -3,6 +3,7 @@
 import numpy as np
 
 from limber.core.progress import SILENT, Progress
+from limber.geometry.cloud.leaf_trees import leaf_log_odds, surroundings
 from limber.geometry.skeleton.joining.join_pieces import join_pieces
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
@@ -26,4 +27,5 @@ def warm_up(progress: Progress = SILENT) -> None:
                 np.full(8, 20), np.full(8, 0.01), gap=0.03, bridge_limit=0.1,
                 up=np.array([0.0, 0.0, 1.0]), join_plants=False)
     reach_on_circle(np.zeros(1), np.ones(1), np.ones(1), 1.0, 0.5)  # used by one-sided scans alone
+    leaf_log_odds(surroundings(skeleton.nodes, 0.1))
     progress(1.0, "compiling the surface's loops")
