@@ -43,7 +43,6 @@ class Repaired:
         skeleton: Its current state.
         points: The scan, thinned [m], shape [m, 3].
         radius_limits: Least and largest radius [m].
-        apart: How far apart the points are.
         view: The depth camera's view of the points, if they are one's.
         rays: The points are one sensor's, evenly spaced across its sight and scattered along it.
         fit: The last fit.
@@ -52,12 +51,12 @@ class Repaired:
         strands: Number of strands that the last search dropped.
         pruned: Number of twigs dropped.
         progress: Called during a fit.
+        apart: How far apart the points are; None: not known yet.
     """
 
     skeleton: Skeleton
     points: np.ndarray
     radius_limits: tuple[float, float]
-    apart: PointSpacing
     view: View | None = None
     rays: bool = False
     fit: AxisFit | None = None
@@ -65,6 +64,7 @@ class Repaired:
     strands: int = 0
     pruned: int = 0
     progress: Progress = SILENT
+    apart: PointSpacing | None = None
 
     def of(self, skeleton: Skeleton) -> "Repaired":
         """The same with another skeleton."""
@@ -80,7 +80,8 @@ class Repaired:
 
     def sampled(self, skeleton: Skeleton, spacing: float = 1.0) -> Skeleton:
         """A skeleton with nodes ``spacing`` local radii apart, where there are points for each."""
-        return resampled(skeleton, spacing, self.apart.at(skeleton.nodes))
+        apart = self.apart or PointSpacing.of(self.points)
+        return resampled(skeleton, spacing, apart.at(skeleton.nodes))
 
     @property
     def noise(self) -> float:
@@ -221,8 +222,8 @@ def repaired(skeleton: Skeleton, points: np.ndarray, diagonal: float, view: View
         view: The depth camera's view of the points, if they are one's.
         progress: Called during fits.
     """
-    now = Repaired(skeleton, points, (_LEAST_RADIUS * diagonal, _MOST_RADIUS * diagonal),
-                   PointSpacing.of(points), view)
+    now = Repaired(skeleton, points, (_LEAST_RADIUS * diagonal, _MOST_RADIUS * diagonal), view,
+                   apart=PointSpacing.of(points))
     done = 0.0
     for each in PASSES:
         until = done if each.until is None else each.until
