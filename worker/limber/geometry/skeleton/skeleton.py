@@ -240,13 +240,14 @@ def _check_tree(nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray) -> No
 
 def _depths(parent: np.ndarray) -> np.ndarray:
     """Number of edges to the root; -1 for nodes that never reach it."""
-    ancestor, depth = parent.copy(), np.zeros(len(parent), np.int64)
-    for _ in range(len(parent)):
-        alive = ancestor >= 0
-        if not alive.any():
+    ancestor, depth = parent.copy(), (parent >= 0).astype(np.int64)
+    # Each round doubles the distance to the ancestor.
+    for _ in range(len(parent).bit_length() + 1):
+        alive = np.flatnonzero(ancestor >= 0)
+        if len(alive) == 0:
             return depth
-        depth[alive] += 1
-        ancestor[alive] = parent[ancestor[alive]]
+        depth[alive] += depth[ancestor[alive]]
+        ancestor[alive] = ancestor[ancestor[alive]]
     depth[ancestor >= 0] = -1
     return depth
 

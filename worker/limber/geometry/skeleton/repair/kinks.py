@@ -25,12 +25,12 @@ def without_kinks(skeleton: Skeleton) -> tuple[Skeleton, int]:
     """
     count = 0
     while True:
-        beyond = _folded(skeleton)
-        if len(beyond) == 0:
+        folded = _folded(skeleton)
+        if not folded:
             break
         keep = np.ones(skeleton.node_count, bool)
-        keep[beyond] = False
-        skeleton, count = skeleton.subset(keep), count + 1
+        keep[np.concatenate(folded)] = False
+        skeleton, count = skeleton.subset(keep), count + len(folded)
     nodes = skeleton.nodes.copy()
     for members in skeleton.runs():
         sharp = np.flatnonzero(turns(skeleton, members) > KINK)
@@ -40,17 +40,18 @@ def without_kinks(skeleton: Skeleton) -> tuple[Skeleton, int]:
     return replace(skeleton, nodes=nodes), count
 
 
-def _folded(skeleton: Skeleton) -> np.ndarray:
-    """Nodes of one folded end beyond its kink; none if there is none."""
-    children = skeleton.child_counts()
+def _folded(skeleton: Skeleton) -> list[np.ndarray]:
+    """Nodes of each folded end beyond its kink."""
+    children, found = skeleton.child_counts(), []
     for members in skeleton.runs():
         for k in np.flatnonzero(turns(skeleton, members) > KINK):
             rest = members[k:]
             step = np.linalg.norm(np.diff(skeleton.nodes[rest], axis=0), axis=1)
             if k > 1 and len(rest) > 1 and (children[rest] < 2).all() and (
                     step.sum() < _END * skeleton.radius[rest[0]]):
-                return rest[1:]
-    return np.empty(0, np.int64)
+                found.append(rest[1:])
+                break
+    return found
 
 
 def _round_off(skeleton: Skeleton, nodes: np.ndarray, members: np.ndarray) -> None:
