@@ -33,7 +33,7 @@ from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.simulated_pull import simulate_pull
 from limber.estimation.uncertainty.path_error import path_error, path_prescribed
 from limber.estimation.uncertainty.variance_parts import ADVICE, largest, variance_parts
-from limber.estimation.virtual_cell import marked_points
+from limber.estimation.virtual_cell import CellErrors, marked_points
 from limber.recordings.cell_errors import EXACT, CalibrationEntry, calibration_of
 from limber.recordings.recording import Observations, PullEntry, read_entry, write_entry
 from limber.recordings.synchronisation import frames_of
@@ -493,3 +493,22 @@ def test_a_point_aside_of_the_axis_turns_with_the_branch():
         about = np.cross(directions[0, point], directions[-1, point])
         assert own.swapaxes(1, 2) @ about == pytest.approx(np.stack(
             5 * [own[0].T @ about]))
+
+
+@pytest.mark.slow
+def test_a_zero_larger_than_the_force_ends_soon_with_a_wide_interval(small_bench, small,
+                                                                     small_pull):
+    """Readings up to nine times the force: few simulations, the truth inside, the zero named."""
+    pull = measured(small_pull, 3)
+    peak = float(np.linalg.norm(small_pull.wrenches[:, :3], axis=1).max())
+    known = CalibrationEntry(force_bias_sigma_n=3 * peak, force_drift_sigma_n=3 * peak)
+    rng = np.random.default_rng(7)
+    seen = CellErrors.drawn(known, rng).recorded(pull, rng)
+    assert np.linalg.norm(seen.wrenches[:, :3], axis=1).max() > 9 * peak
+    subject = subject_of(small_bench, small)
+    found = fit_branch([seen], subject, SETTINGS.model_copy(update={"mesh_check": False}),
+                       log=EvaluationLog(None, ""))
+    low, high = found.uncertainty.young_interval.T
+    assert found.is_bad is None and found.objective.forward_count < 60
+    assert np.all((low < TRUTH) & (TRUTH < high)) and np.log(high / low).max() > 0.5
+    assert "force zero" in in_words(found.cell_errors)

@@ -17,6 +17,7 @@ import numpy as np
 
 from limber.core.not_none import present
 from limber.core.numerics.rigid import principal_axes
+from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.forward.input_force import Response, compliance
 from limber.estimation.forward.quasi_static import FEW_KEYS, QuasiStaticForward
@@ -157,7 +158,10 @@ class ObservedPathForward(QuasiStaticForward):
             place = place + offset
         drive, state, found = np.zeros(self._measured.shape[1]), np.zeros_like(self.mesh.nodes), []
         for loads, target in zip(self._loads, place[self.keys], strict=True):
-            led = self._led(model, loads, drive, state, target)
+            try:
+                led = self._led(model, loads, drive, state, target)
+            except NotPositiveDefiniteError:
+                led = None
             if led is None:
                 return False
             drive, state = led
