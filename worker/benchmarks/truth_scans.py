@@ -1,8 +1,9 @@
 """From a scan to moduli like a user: scan, reconstruct, import a pull, estimate.
 
-The branches are cut from plants of the worlds, which no constant was set on, and seen by their
-sensors. The pull is that of a rod with the true axes and radii, in a cell with all its errors. A
-refusal counts as correct if it states what the scan lacks.
+The branches are cut from plants of the worlds and seen by their sensors. No constant was set on
+their sources, but how the radius' error varies along a run (:mod:`limber.geometry.shape_samples`),
+on other seeds. The pull is that of a rod with the true axes and radii, in a cell with all its
+errors. A refusal counts as correct if it states what the scan lacks.
 """
 
 import json
