@@ -90,6 +90,10 @@ def test_a_mean_is_over_what_the_pull_bends(fitted, small):
     moment = np.pi / 4 * small.skeleton.radius**4
     assert np.all(np.diff(sections.log_second_moment(small.skeleton.radius)) < 0)
     assert np.log(moment.min()) < sections.log_second_moment(small.skeleton.radius).min()
+    at_rest, by_length = (SectionMean.of(subject.skeleton, subject.mesh, subject.weights, energy)
+                          for energy in (np.zeros(subject.mesh.tet_count), None))
+    assert at_rest.share == pytest.approx(by_length.share)
+    assert np.all(by_length.share @ along > sections.share @ along - 1e-3)
 
 
 def test_the_largest_part_of_a_wide_interval_is_named():

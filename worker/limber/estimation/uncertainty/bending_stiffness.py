@@ -42,14 +42,16 @@ class SectionMean:
             mesh: The branch's tetrahedra.
             weights: Weight of each control point in each tetrahedron, shape [tet_count, K].
             energy: Strain energy of each tetrahedron [J], shape [tet_count]; None: each piece of
-                the branch counts by its length.
+                the branch counts by its length, as where there is no energy.
         """
         low, high, fraction, _ = on_cylinders(skeleton, mesh.centroids)
-        if energy is None:
-            radius = (1 - fraction) * skeleton.radius[low] + fraction * skeleton.radius[high]
-            energy = np.abs(mesh.volumes) / radius**2
+        radius = (1 - fraction) * skeleton.radius[low] + fraction * skeleton.radius[high]
         # A twig's own bending does not contribute to that of the branch which carries it.
-        each = weights * (energy * np.isin(high, skeleton.main_path()))[:, None]
+        weights = weights * np.isin(high, skeleton.main_path())[:, None]
+        each = by_length = weights * (np.abs(mesh.volumes) / radius**2)[:, None]
+        if energy is not None:
+            each = weights * energy[:, None]
+            each = np.where(each.sum(axis=0) > 0, each, by_length)
         share = np.array([
             np.bincount(low, (1 - fraction) * own, skeleton.node_count)
             + np.bincount(high, fraction * own, skeleton.node_count) for own in each.T])
