@@ -17,7 +17,7 @@ from limber.geometry.skeleton.repair.feet import with_feet
 from limber.geometry.skeleton.repair.fused_limbs import with_split_limbs
 from limber.geometry.skeleton.repair.kinks import without_kinks
 from limber.geometry.skeleton.repair.resampling import PointSpacing, resampled
-from limber.geometry.skeleton.repair.run_ends import with_full_tips, without_bare_ends
+from limber.geometry.skeleton.repair.run_ends import ends_within, with_full_tips, without_bare_ends
 from limber.geometry.skeleton.repair.run_radii import (
     limited,
     steadied,
@@ -199,6 +199,8 @@ PASSES = (
     Pass("settle", "The fit is unfinished because of noise or a strand that was just dropped.",
          _settle, until=1.0),
     DROP_BARE_ENDS,
+    Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
+         lambda now: now.of(ends_within(now.skeleton, now.points))),
     LIMIT,
     Pass("find the likeliest axes and radii",
          "A radius that few points, the spacing or the noise determine, or that no wood has, is "
