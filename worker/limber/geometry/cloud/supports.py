@@ -141,8 +141,8 @@ def _circles(flat: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarra
         [slices] each; the fraction is 0 for slices of too few points.
     """
     count = np.bincount(layer, minlength=_SLICES)
-    start = np.stack([np.bincount(layer, values, _SLICES) for values in flat.T], axis=1)
-    start /= np.maximum(count, 1)[:, None]
+    total = np.stack([np.bincount(layer, values, _SLICES) for values in flat.T], axis=1)
+    start = total / np.maximum(count, 1)[:, None]
     own = flat - start[layer]
     row = np.column_stack([2 * own, np.ones(len(own)), (own**2).sum(axis=1)])
     one, other = np.triu_indices(4)
