@@ -26,8 +26,11 @@ from limber.geometry.skeleton.repair.run_radii import (
 from limber.geometry.skeleton.repair.spurs import SPUR_REACH, prune_spurs
 from limber.geometry.skeleton.skeleton import Skeleton
 
-LEAF_SHARE = 0.5
-"""Fraction of points over two radii off their axis from which a scan shows leaves, not branches."""
+LEAF_SHARE = 0.4
+"""Fraction of points over two radii off their axis from which a scan shows leaves, not branches. Of
+eleven bare scans, most with noise as large as their radii, it is at most 0.30; of leaves 0.48 and
+0.73.
+"""
 
 _COARSE = 1.5  # local radii between the nodes of the first fit
 _NOISY = 0.2  # fraction of the median radius
