@@ -7,7 +7,9 @@ from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.radii import visible_sides
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
+from limber.geometry.skeleton.radii.cylinders import match_cylinders
 from limber.geometry.skeleton.radii.noisy_rings import mean_positions, weighted_aims
+from limber.geometry.skeleton.radii.normal_equations import normal_equations
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -41,6 +43,18 @@ def test_radius_under_noise_has_no_bias(half: bool, share: float) -> None:
     inner = fit.skeleton.radius[5:-5]
     assert np.median(inner) == pytest.approx(0.006, rel=0.06)
     assert fit.noise == pytest.approx(share * 0.006, rel=0.08)
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-9, 1e-4])
+def test_nodes_that_come_near_each_other_do_not_throw_a_round_off(apart: float) -> None:
+    """Whatever is left of their distance: no node moves by more than a radius."""
+    start, points = _axis(0.006), _points(0.006, 0.0008, half=False)
+    nodes = start.nodes.copy()
+    nodes[21, 2] = nodes[20, 2] + apart
+    match = match_cylinders(start.parent, start.order, nodes, start.radius, points)
+    step = normal_equations(start, nodes, start.radius, match, np.ones(len(points)), 8e-4).solve()
+    assert np.linalg.norm(step[:, :3], axis=1).max() < 0.006
+    assert np.abs(step[:, 3]).max() < 0.001
 
 
 @pytest.mark.parametrize("radius", [0.7, 1.0, 2.0, 4.0])
