@@ -57,10 +57,10 @@ def unfolded(axis: RunAxis, start: float, windows: list[Window], sides: int, spa
 def _loose(where: np.ndarray, folded: np.ndarray, kept: np.ndarray) -> list[int]:
     """One ring of each folded slice that need not be kept; none of two slices side by side."""
     found: list[int] = []
-    for slice_ in folded:
-        rings_ = [r for r in (slice_ + 1, slice_) if np.abs(where[r] - kept).min() > 1e-9]
-        if rings_ and not (found and slice_ - found[-1] < 1):
-            found.append(int(rings_[0]))
+    for low in folded:
+        free = [ring for ring in (low + 1, low) if np.abs(where[ring] - kept).min() > 1e-9]
+        if free and not (found and low <= found[-1]):
+            found.append(int(free[0]))
     return found
 
 

@@ -19,7 +19,8 @@ from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.radii.smoothing_sensors import Smoothing
-from limber.geometry.skeleton.radii.wood import DISTINCT, FREEDOM, Bends, Wood
+from limber.geometry.skeleton.radii.smoothness import DISTINCT
+from limber.geometry.skeleton.radii.wood import FREEDOM, Bends, Wood
 from limber.geometry.skeleton.skeleton import MEASURED, UNRESOLVED, Skeleton
 
 SPACINGS = 1.0

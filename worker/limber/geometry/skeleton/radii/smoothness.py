@@ -7,8 +7,10 @@ from limber.geometry.skeleton.skeleton import Skeleton
 
 FORK = 0.3
 """Deviation of a radius's logarithm from that before a fork."""
+DISTINCT = 1e-3
+"""Radii between nodes at different places."""
 _SLOPE = 1.0  # smoothing length of the radius against slopes, in local radii
-_NEAREST, _DISTINCT = 0.5, 1e-3  # least distance of nodes, in that at the start and in radii
+_NEAREST = 0.5  # least distance of nodes over that at the start of a fit
 _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 
 
@@ -34,7 +36,7 @@ def smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_no
     density = float(per_node.sum()) / max(skeleton.length, 1e-300)
     forks = skeleton.child_counts() > 1
     # The nearer two nodes, the more smoothness would draw them together, until they coincide.
-    least = np.maximum(_NEAREST * skeleton.steps, _DISTINCT * skeleton.radius)
+    least = np.maximum(_NEAREST * skeleton.steps, DISTINCT * skeleton.radius)
     steps = [np.maximum(np.linalg.norm(np.diff(nodes[chain], axis=0), axis=1), least[chain[1:]])
              for chain in chains]
     mean = np.concatenate([(step[:-1] + step[1:]) / 2 for step in steps])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sparse
 
-from limber.geometry.skeleton.radii.smoothness import FORK, second_differences
+from limber.geometry.skeleton.radii.smoothness import DISTINCT, FORK, second_differences
 from limber.geometry.skeleton.skeleton import Skeleton
 
 # In logarithms of radii: a side branch against its carrier and the fall along a whole run (mean and
@@ -27,8 +27,6 @@ WANDER = 5e-3
 _POWER, _PIPE_SIGMA, _FORK_SIGMA = 2.7, 0.08, 0.04
 # An axis: variance of the direction per radius of length [rad^2], deviation at a fork [rad].
 _BEND, _KINK = 1e-3, 0.25
-DISTINCT = 1e-3
-"""Radii between nodes at different places."""
 FREEDOM = 4.0
 """Of Student's distribution of what fits and forks are off: some fail."""
 
