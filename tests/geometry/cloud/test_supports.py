@@ -33,6 +33,13 @@ def _wire(long: float, sag: float, tip: float = 0.0015, bend: float = 0.0,
     return points + 0.0003 * rng.standard_normal(points.shape)
 
 
+@pytest.mark.filterwarnings("error")
+def test_two_stakes_and_nothing_else_are_two_stakes() -> None:
+    """No point is left to search for wires, and nothing warns of that."""
+    found = find_supports(np.vstack([_rod(0.006, 0.4), _rod(0.006, 0.4, at=(0.3, 0.0))]), UP)
+    assert [each.kind for each in found] == ["stake", "stake"]
+
+
 @pytest.mark.parametrize("source", ["monopodial", "opposite"])
 def test_pot_and_stake_of_a_potted_plant_are_named(source: str) -> None:
     """With nearly all of their points and few of the plant's; the plant without them has none."""

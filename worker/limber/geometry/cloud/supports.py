@@ -249,9 +249,9 @@ def _wires(points: np.ndarray, placed: np.ndarray, rest: np.ndarray, held: np.nd
         held: Points of other supports, placed likewise, shape [k, 3].
     """
     size = float(np.linalg.norm(np.ptp(placed, axis=0)))
-    rest = rest[own_order(points[rest])][:_WIRE_POINTS]
     if len(rest) < _LONG * _LEAST:
         return []
+    rest = rest[own_order(points[rest])][:_WIRE_POINTS]
     places, reach, found = placed[rest], _WIRE_SCALE * size, list[np.ndarray]()
     free, tried, tree = np.ones(len(rest), bool), np.zeros(len(rest), bool), cKDTree(places)
     supports = cKDTree(held) if len(held) else None
