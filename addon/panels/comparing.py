@@ -87,13 +87,13 @@ def draw_branches(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
     for branch in shown:
         layout.operator("limber.choose_branch", text=branch.name, depress=branch == chosen,
                         icon="ERROR" if several.is_lost(branch) else "NONE").branch = branch.name
-        draw_text(layout, context, _told(branch), "BLANK1")
+        draw_text(layout, context, _modulus_and_saving(branch), "BLANK1")
     row = layout.row(align=True)
     row.operator("limber.side_by_side", icon="MOD_ARRAY")
     row.operator("limber.side_by_side", text="In Place").back = True
 
 
-def _told(branch: bpy.types.Collection) -> str:
+def _modulus_and_saving(branch: bpy.types.Collection) -> str:
     """Return E and the energy saved of a branch, as far as its folder has them."""
     record = branch_folder.read_record(bpy.path.abspath(branch[branches.FOLDER_KEY]))
     if record is None:

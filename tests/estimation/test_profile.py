@@ -30,7 +30,7 @@ class TwoPieces:
     def __init__(self, readings):
         self.readings = readings
 
-    def without_priors(self):
+    def on_copies(self):
         return self
 
     def evaluate(self, free, *, jacobian):
@@ -101,7 +101,7 @@ def test_limits_of_a_pull_are_where_the_squares_have_risen(small_bench, small_pu
     assert objective.evaluate(best.free) is before
     assert limits.mean() > best.free[widest]
     others = np.arange(len(best.free)) != widest
-    tried = objective.without_priors()
+    tried = objective.on_copies()
     for limit in limits:
         def held(rest, limit=limit):
             free = np.empty(len(best.free))

@@ -5,7 +5,12 @@ import pytest
 
 from limber.core.errors import MeshingError
 from limber.core.progress import SILENT
-from limber.geometry.pruned_twigs import tell_left_out, touching_runs, touching_texts, twig_mass
+from limber.geometry.pruned_twigs import (
+    report_pruned_twigs,
+    touching_runs,
+    touching_texts,
+    twig_mass,
+)
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import frames, tangents
@@ -41,10 +46,10 @@ def test_much_left_out_is_asked_for() -> None:
     """Over 3 % of the mass the stage stops and names the branch, unless it is accepted."""
     masses = [twig_mass(_tree(0.05), 1, 900.0)]
     with pytest.raises(MeshingError, match=r"branch 1 \(1\d\d mm.*--leave-out"):
-        tell_left_out(masses, 0.05, ReconstructSettings(), SILENT)
+        report_pruned_twigs(masses, 0.05, ReconstructSettings(), SILENT)
     said: list[str] = []
-    tell_left_out(masses, 0.05, ReconstructSettings(leave_out=True), SILENT.keeping(said))
-    tell_left_out(masses, 5.0, ReconstructSettings(), SILENT.keeping(said))
+    report_pruned_twigs(masses, 0.05, ReconstructSettings(leave_out=True), SILENT.keeping(said))
+    report_pruned_twigs(masses, 5.0, ReconstructSettings(), SILENT.keeping(said))
     assert len(said) == 2 and all("branch 1" in text for text in said)
 
 

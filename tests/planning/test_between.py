@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.planning.field import disagreeing_neighbours
-from limber.planning.field.disagreeing_neighbours import ask_between, disagreeing, jump
+from limber.planning.field.disagreeing_neighbours import disagreeing, jump, sample_between
 from limber.planning.field.interpolation.chart import Chart
 from limber.planning.field.solver_pool import SolverPool
 from limber.planning.field.stored_states import Solved
@@ -82,19 +82,19 @@ USUAL = places(500)
 
 
 def test_where_it_may_go_either_way_is_refused_and_elsewhere_a_sample_more(bow):
-    """Neighbours on both sides: places between them where both shapes stand are torn; where one
+    """Neighbours on both sides: places between them where both shapes stand are bistable; where one
     shape gives way to the other on the way, or only changes fast, there are new samples."""
     known = bow.at(places())
-    added, torn = ask_between(SolverPool(bow, 1), known, PLAIN, USUAL, 60)
-    assert len(torn) and len(added)
-    assert (torn[:, 2] < 0.0).all() and (np.abs(torn[:, 0]) <= bow.hold).all()
-    for place in torn:
+    added, bistable = sample_between(SolverPool(bow, 1), known, PLAIN, USUAL, 60)
+    assert len(bistable) and len(added)
+    assert (bistable[:, 2] < 0.0).all() and (np.abs(bistable[:, 0]) <= bow.hold).all()
+    for place in bistable:
         shapes = [bow.shape(np.array([[side, *place]])) for side in (-1.0, 1.0)]
         assert np.abs(shapes[1] - shapes[0]).max() > 0.003 * LENGTH
     for one in added:
         assert np.allclose(one.tip, bow.shape(one.displacement)[3:])
-    assert len(added) + len(torn) <= 60
-    assert ask_between(SolverPool(bow, 1), known, PLAIN, USUAL, 0)[0] == []
+    assert len(added) + len(bistable) <= 60
+    assert sample_between(SolverPool(bow, 1), known, PLAIN, USUAL, 0)[0] == []
 
 
 def test_what_many_poses_lie_near_is_asked_first(bow):
@@ -118,7 +118,7 @@ def test_what_agrees_is_asked_nothing(bow):
     alone are enough to say so."""
     known = bow.at(places() + [0.0, 0.0, 0.2])
     assert disagreeing(known, PLAIN, USUAL + [0.0, 0.0, 0.2], LENGTH) == []
-    assert ask_between(SolverPool(bow, 1), known, PLAIN, USUAL, 60)[1].shape == (0, 3)
+    assert sample_between(SolverPool(bow, 1), known, PLAIN, USUAL, 60)[1].shape == (0, 3)
     one, two = bow.at([[-0.05, 0.0, -0.05], [0.05, 0.0, -0.05]])
     assert jump(one, two) == pytest.approx(2.0 * np.sqrt(0.05 * 0.05))
     assert jump(one, bow.at([[-0.06, 0.0, -0.05]])[0]) < 1e-12

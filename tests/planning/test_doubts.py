@@ -21,7 +21,7 @@ from limber.planning.settings import PlanSettings
 
 START, GOAL = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
 LEVEL, RISE, ROUGH = 1.0, 2.0, 0.15
-"""Of a load: everywhere, more of it in a layer across the way, and what no fit can foretell."""
+"""Of a load: everywhere, more of it in a layer across the way, and what no fit can score_unused."""
 
 
 @pytest.fixture(autouse=True)

@@ -54,7 +54,7 @@ def test_what_is_too_little_adds_nothing_and_too_few_samples_say_nothing():
 
 @pytest.fixture(scope="module")
 def half_rough(well):
-    """A strain with a wall across x = 0, which no fit can foretell where y is above 0."""
+    """A strain with a wall across x = 0, which no fit can score_unused where y is above 0."""
     samples = well.samples(count=200)
     generator = np.random.default_rng(1)
     x, y = samples.positions[:, 0], samples.positions[:, 1]

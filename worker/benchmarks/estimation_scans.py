@@ -142,8 +142,8 @@ def trial_of(task: tuple[int, str]) -> Trial:
     deviation = found["young_deviation"]
     medians = [np.nan if deviation[name] is None else float(np.median(deviation[name]))
                for name in PARTS]
-    return Trial(seed, view, _told(np.log(np.array(found["young_pa"]) / truth)),
-                 _told(interval[:, 0]), _told(interval[:, 1]), _told(deviation["total"]),
+    return Trial(seed, view, _floats(np.log(np.array(found["young_pa"]) / truth)),
+                 _floats(interval[:, 0]), _floats(interval[:, 1]), _floats(deviation["total"]),
                  tuple(medians), any("fit is poor" in text for text in found["warnings"]), "",
                  seconds, _source_digest())
 
@@ -159,7 +159,7 @@ def from_scan(folder: Path, seed: int, view: str) -> dict:
     return json.loads(Branch.open(branch).path("estimate.json").read_text(encoding="utf-8"))
 
 
-def _told(values: np.ndarray) -> tuple[float, ...]:
+def _floats(values: np.ndarray) -> tuple[float, ...]:
     return tuple(np.asarray(values, float).tolist())
 
 

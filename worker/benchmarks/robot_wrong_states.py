@@ -37,13 +37,13 @@ _CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
 
 
 class _Misread(Nothing):
-    """A load whose force the sensor tells wrongly."""
+    """A load whose force the sensor misreads by a matrix [3, 3]."""
 
-    def __init__(self, load: Nothing, told: np.ndarray):
-        self._load, self._told = load, told
+    def __init__(self, load: Nothing, matrix: np.ndarray):
+        self._load, self._matrix = load, matrix
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
-        force = self._told @ self._load.wrench(flange, seconds)[:3]
+        force = self._matrix @ self._load.wrench(flange, seconds)[:3]
         return np.concatenate((force, crossed(TOOL, force)))
 
 

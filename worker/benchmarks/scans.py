@@ -157,8 +157,8 @@ def _probabilities(done: dict[str, Outcomes]) -> list[Row]:
             *probability_rows(LEAFY, [done["leafy"]])]
 
 
-def _told(setting: Setting, kinds: tuple[str, ...],
-          rows: Callable[[dict[str, Outcomes]], list[Row]]) -> list[Row]:
+def _rows_of(setting: Setting, kinds: tuple[str, ...],
+             rows: Callable[[dict[str, Outcomes]], list[Row]]) -> list[Row]:
     """The rows of cases of some kinds, as many as there is time for."""
     return rows(outcomes(setting, {
         kind: setting.at_most(_COUNTS[kind], max(_COUNTS[kind] // _QUICK, 2)) for kind in kinds}))
@@ -167,8 +167,8 @@ def _told(setting: Setting, kinds: tuple[str, ...],
 def _part(kind: str, rows: Callable[[Outcomes], list[Row]], gives: tuple[Asked, ...],
           seconds: float = 30.0) -> Part:
     """The part for one kind of case."""
-    return Part(partial(_told, kinds=(kind,), rows=lambda done: rows(done[kind])), seconds, gives,
-                grows=True)
+    of_kind = partial(_rows_of, kinds=(kind,), rows=lambda done: rows(done[kind]))
+    return Part(of_kind, seconds, gives, grows=True)
 
 
 LEAFY = " of leafy plants"
@@ -181,11 +181,11 @@ PARTS = {
     "2-mm": _part("2-mm", partial(_noise_rows, kind="2 mm"), noise_asked("2 mm")),
     "3-mm": _part("3-mm", partial(_noise_rows, kind="3 mm"), noise_asked("3 mm")),
     "same-tree": Part(same_tree_rows, 60, (same_tree_asked("scans"),), grows=True),
-    "root": Part(partial(_told, kinds=("one-sided", "round"), rows=lambda done: _root_rows(
+    "root": Part(partial(_rows_of, kinds=("one-sided", "round"), rows=lambda done: _root_rows(
         list(done.values()))), 30, (ROOT_ROW,), grows=True),
     "leafy": _part("leafy", _leafy_rows, (LEAFY_ROW,), 60),
     "crowns": _part("crowns", _crown_rows, (CROWN_ROW,), 90),
-    "probabilities": Part(partial(_told, kinds=tuple(_COUNTS), rows=_probabilities), 30, (
+    "probabilities": Part(partial(_rows_of, kinds=tuple(_COUNTS), rows=_probabilities), 30, (
         *probability_asked(""), *probability_asked(LEAFY)), grows=True),
     "single-view": _part("single-view", partial(_view_rows, view=SINGLE_VIEW), SINGLE_VIEW.rows)}
 """The table, in order of importance; ``--only`` also accepts one source of the worlds, and one scan

@@ -236,7 +236,7 @@ def real_row(_setting: Setting) -> list[Row]:
     beyond = [value for value in values if not low <= value <= high]
     unheld = [value for value in values if not soft <= value <= stiff]
     told = "".join(_why_not_at_rest(value, found.measured_drop) for value in beyond)
-    return [Row(*REAL_ROW, f"{_told(found, swung)}; outside the dynamic one: "
+    return [Row(*REAL_ROW, f"{_static_and_dynamic(found, swung)}; outside the dynamic one: "
                 f"{', '.join(f'{value / 1e3:.0f}' for value in unheld) or 'none'}{told}"
                 f"; drop {1e3 * found.simulated_drop:.2f} of {1e3 * found.measured_drop:.2f} mm",
                 not unheld and max(low, soft) <= min(high, stiff)
@@ -262,7 +262,7 @@ def swing_row(_setting: Setting) -> list[Row]:
     found, swung = _of_the_recording()
     (low, high), (soft, stiff) = found.interval, swung["young_interval_pa"]
     least, most = swung["damping_ratio_interval"]
-    return [Row(*SWING_ROW, _told(found, swung), max(low, soft) <= min(high, stiff)
+    return [Row(*SWING_ROW, _static_and_dynamic(found, swung), max(low, soft) <= min(high, stiff)
                 and 0 < least < swung["damping_ratio"] < most)]
 
 
@@ -282,7 +282,7 @@ def _of_the_recording() -> tuple[BeamResult, dict[str, Any]]:
             "csv"), swung
 
 
-def _told(found: BeamResult, swung: dict[str, Any]) -> str:
+def _static_and_dynamic(found: BeamResult, swung: dict[str, Any]) -> str:
     (low, high), (soft, stiff) = found.interval, swung["young_interval_pa"]
     least, most = swung["damping_ratio_interval"]
     return (f"static {found.young / 1e3:.0f} kPa ({low / 1e3:.0f} to {high / 1e3:.0f}), dynamic "

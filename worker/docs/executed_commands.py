@@ -62,13 +62,13 @@ class Run(Directive):
             shown.append(block)
             if not _enabled(env):
                 continue
-            told = self._told(env, line.partition(" #")[0])
+            told = self._output_of(env, line.partition(" #")[0])
             if told:
                 shown.append(nodes.literal_block(told, told, language="text",
                                                  classes=["command-output"]))
         return shown
 
-    def _told(self, env: Any, line: str) -> str:
+    def _output_of(self, env: Any, line: str) -> str:
         """Run one line; return the end of what it printed."""
         folder = _folder(env, env.docname)
         folder.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.radii import visible_sides
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.cylinders import match_cylinders
-from limber.geometry.skeleton.radii.noisy_rings import mean_positions, weighted_aims
+from limber.geometry.skeleton.radii.noisy_rings import mean_positions, weighted_target_distances
 from limber.geometry.skeleton.radii.normal_equations import normal_equations
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -71,7 +71,7 @@ def test_points_lie_at_their_aims_on_average(radius: float) -> None:
     distance = np.linalg.norm(points, axis=1)
     out = points / distance[:, None]
     weight = np.clip(1 - ((distance - radius) / limit(radius))**2, 0, None)**2
-    mean, near = weighted_aims(np.array([radius]), 1.0, limit)
+    mean, near = weighted_target_distances(np.array([radius]), 1.0, limit)
 
     def average(values):
         return np.average(values, weights=weight, axis=0)

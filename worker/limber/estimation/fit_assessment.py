@@ -248,7 +248,7 @@ def _score(forward: Forward, distance: float, force: float, *, in_fit: bool) -> 
             "relative_force": force / peak if peak > 0 else np.nan}
 
 
-def foretell(pull: Pull, subject: Subject, found: Estimate, settings: EstimateSettings) -> None:
+def score_unused(pull: Pull, subject: Subject, found: Estimate, settings: EstimateSettings) -> None:
     """Score the prediction of a pull that the estimate does not use, into ``found.held_out``.
 
     Raises:

@@ -61,8 +61,8 @@ def twig_mass(skeleton: Skeleton, run: int, density: float, keep: np.ndarray | N
             "inertia_kg_m2": (np.trace(second) * np.eye(3) - second).tolist(), "branch": run}
 
 
-def tell_left_out(masses: list[dict[str, Any]], meshed: float, settings: ReconstructSettings,
-                  progress: Progress) -> None:
+def report_pruned_twigs(masses: list[dict[str, Any]], meshed: float, settings: ReconstructSettings,
+                        progress: Progress) -> None:
     """Report the pruned twigs by branch, length and mass, heaviest first.
 
     Args:

@@ -31,7 +31,7 @@ from limber.geometry.leaf_removal import (
 from limber.geometry.point_classes import Show, classified, shown_if_refused
 from limber.geometry.pruned_twigs import (
     leave_out_twigs,
-    tell_left_out,
+    report_pruned_twigs,
     touching_runs,
     touching_texts,
     twig_mass,
@@ -298,7 +298,8 @@ def mesh_skeleton(skeleton: Skeleton, settings: ReconstructSettings,
     for text in meshed.warnings:
         progress.warn(text)
     masses += [twig_mass(kept, run, settings.density) for run in meshed.left_out]
-    tell_left_out(masses, float(meshed.mesh.volumes.sum()) * settings.density, settings, progress)
+    report_pruned_twigs(masses, float(meshed.mesh.volumes.sum()) * settings.density, settings,
+                        progress)
     touching = touching_runs(kept)
     for text in touching_texts(surface.handle_count, touching):
         progress.warn(text)

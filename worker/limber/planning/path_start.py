@@ -5,7 +5,7 @@ import numpy as np
 from limber.core.errors import InputError, NoPathError
 from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import EnergyField, FieldArrays
-from limber.planning.goals.allowed_poses import allowed_points, over_limits, unit_uncertainty
+from limber.planning.goals.allowed_poses import allowed_points, over_limits, unit_hint
 from limber.planning.goals.goal import Goal
 from limber.planning.settings import PlanSettings
 
@@ -58,7 +58,7 @@ def check_start(field: EnergyField, start: np.ndarray, limits: FieldArrays) -> N
     if not field.region.contains(start)[0]:
         away = float(np.linalg.norm(start - field.rest))
         raise InputError(f"The start ({position}) m lies outside the sampled region"
-                         f"{unit_uncertainty(away, field)}.",
+                         f"{unit_hint(away, field)}.",
                          "The branch's energy is not known there.",
                          "Choose a start nearer to rest, or sample farther (`limber energy "
                          "--deflection`).")

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.geometry.skeleton.repair.test_feet import two_in_one, two_limbs
+from tests.geometry.skeleton.repair.test_fused_forks import two_in_one, two_limbs
 from tests.geometry.skeleton.repair.test_fused_limbs import limbs_side_by_side
 
 from limber.geometry.skeleton.radii.axis_fit import AxisFit
@@ -100,17 +100,17 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
         "drop bare ends": lambda: (_before(_branch(), _tube(0.05, 0.35)), _ends(0.05, 0.35, 0.006)),
         "lengthen ends": lambda: (_before(_branch(ALONG[10:70])), _ends(0.0, 0.392)),
         "prune spurs": lambda: (_before(_branch(twig=_twig(0.2, 4, 0.003))), _one_run),
-        "drop strands": lambda: (_before(_branch(twig=ALONG[42:60] + [0.003, 0, 0])),
-                                 _one_run),
+        "drop duplicate axes": lambda: (_before(_branch(twig=ALONG[42:60] + [0.003, 0, 0])),
+                                        _one_run),
         "unpinch radii": lambda: (_before(_hair(slice(0, 40)), strip, pinched=_branch()), _thick),
         "limit radii": lambda: (_before(_branch(radius=0.3)),
                                 lambda now: bool((now.skeleton.radius == 0.05).all())),
-        "follow feet down": lambda: (_before(two_in_one(0.2), two_limbs()), lambda now: float(
+        "separate fused forks": lambda: (_before(two_in_one(0.2), two_limbs()), lambda now: float(
             now.skeleton.nodes[now.skeleton.forks()[0], 2]) < 0.17),
         "split limbs": lambda: (_before(*limbs_side_by_side()),
                                 lambda now: now.skeleton.branch_count == 2),
         "fit finely": lambda: (_before(_aside()), _centred),
-        "settle": lambda: (_before(_aside(), strands=1), _centred),
+        "settle": lambda: (_before(_aside(), duplicates=1), _centred),
         "draw ends back": lambda: (_before(_branch(np.vstack([
             [0, 0, -0.012], ALONG[1:-1], [0, 0, 0.412]]))), _ends(0.0, 0.4)),
         "find the likeliest axes and radii": lambda: (_before(blank, gap), _thick),

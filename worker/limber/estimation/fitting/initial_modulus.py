@@ -225,11 +225,12 @@ def standing_start(objective: Objective, start: Values, uniform: Values, *, expl
         found = objective.evaluate(objective.space.pack(start), jacobian=True)
         if found is not None:
             return start, found
-    led = [each for values in (uniform, start) if (each := _led(objective, values)) is not None]
-    if led:
-        best = min(led, key=lambda each: each[1].objective)
+    found_along = [each for values in (uniform, start)
+                   if (each := _along_recorded_path(objective, values)) is not None]
+    if found_along:
+        best = min(found_along, key=lambda each: each[1].objective)
         # Simulations continue from their last state.
-        return best if best is led[-1] else _led(objective, best[0])
+        return best if best is found_along[-1] else _along_recorded_path(objective, best[0])
     index = np.arange(len(uniform.young))
     falling = np.exp(FALL * (index.mean() - index))
     return _first_standing(objective, [
@@ -237,7 +238,7 @@ def standing_start(objective: Objective, start: Values, uniform: Values, *, expl
         for factor in (1.0, 3.0, 0.3, 10.0, 0.1) for course in (falling, 1.0)])
 
 
-def _led(objective: Objective, values: Values) -> tuple[Values, Evaluation] | None:
+def _along_recorded_path(objective: Objective, values: Values) -> tuple[Values, Evaluation] | None:
     """Evaluate with pulls led along their recorded paths; None: there is none, or no equilibrium.
     """
     observed = [forward for forward in objective.forwards if is_path_observed(forward)]

@@ -142,7 +142,7 @@ class Objective:
         other.forward_count = self.forward_count
         return other
 
-    def without_priors(self) -> "Objective":
+    def on_copies(self) -> "Objective":
         """Return an objective on copies of the pulls with its own log; evaluating it does not
         change this one.
         """

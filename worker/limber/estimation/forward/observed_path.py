@@ -159,7 +159,7 @@ class ObservedPathForward(QuasiStaticForward):
         drive, state, found = np.zeros(self._measured.shape[1]), np.zeros_like(self.mesh.nodes), []
         for loads, target in zip(self._loads, place[self.keys], strict=True):
             try:
-                led = self._led(model, loads, drive, state, target)
+                led = self._moved_to(model, loads, drive, state, target)
             except NotPositiveDefiniteError:
                 led = None
             if led is None:
@@ -172,8 +172,8 @@ class ObservedPathForward(QuasiStaticForward):
         self.hint([state for _, state in found])
         return True
 
-    def _led(self, model: BranchModel, loads: np.ndarray, drive: np.ndarray, state: np.ndarray,
-             target: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def _moved_to(self, model: BranchModel, loads: np.ndarray, drive: np.ndarray, state: np.ndarray,
+                  target: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Force and state with the gripper as near to a position [m] as a force tells."""
         longest = LED_STEP * float(np.linalg.norm(np.ptp(self.mesh.nodes, axis=0)))
         for _ in range(LED_ROUNDS):

@@ -94,7 +94,7 @@ class _Profile:
 
     def _limit(self, group: int, side: float, first: float) -> tuple[float, float]:
         """Limit to one side, in deviations, and the curvature of the profile up to there."""
-        objective, target = self._objective.without_priors(), side * self._quantile
+        objective, target = self._objective.on_copies(), side * self._quantile
         farthest, bend = self._farthest(group, side), 0.0
         at, others = side * min(abs(first), abs(farthest)), np.zeros(len(self._best.free))
         for _ in range(TRIES):

@@ -18,7 +18,7 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.uncertainty.bending_stiffness import SectionMean
 from limber.estimation.uncertainty.path_error import WIDEST
-from limber.estimation.uncertainty.shape_sensitivity import hung_slopes, shape_slopes, taken_up
+from limber.estimation.uncertainty.shape_sensitivity import compensation, hung_slopes, shape_slopes
 from limber.geometry.shape_samples import reshaped, sample_skeletons
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.added_masses import HungTwig
@@ -52,7 +52,7 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
 
     Returns:
         Those of E and of E I, shape [K] each; None if there are too few shapes, or as for
-        :func:`taken_up`.
+        :func:`compensation`.
     """
     if count < FEWEST:
         return None
@@ -60,8 +60,8 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
     shapes = sample_skeletons(subject.skeleton, points, count, np.random.default_rng(seed))
     meshes = [reshaped(subject.mesh, subject.skeleton, _towards(subject.skeleton, shape))
               for shape in shapes]
-    near = taken_up(evaluation, objective,
-                    lambda forward, values: shape_slopes(forward, values, meshes))
+    near = compensation(evaluation, objective,
+                        lambda forward, values: shape_slopes(forward, values, meshes))
     if near is None:
         return None
     steps = near / NEARER
@@ -87,7 +87,7 @@ def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np
         sigma: Relative standard deviation of that mass, common to all.
 
     Returns:
-        None if nothing hangs on the branch or there is no gravity, or as :func:`taken_up`.
+        None if nothing hangs on the branch or there is no gravity, or as :func:`compensation`.
     """
     models = [forward.full.model for forward in objective.forwards
               if isinstance(forward.full, QuasiStaticForward)]
@@ -96,5 +96,5 @@ def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np
             model.gravity.any() and any(isinstance(one, HungTwig) for one in model.point_masses)
             for model in models):
         return None
-    steps = taken_up(evaluation, objective, hung_slopes)
+    steps = compensation(evaluation, objective, hung_slopes)
     return None if steps is None else np.minimum(sigma * np.abs(steps[:, 0]), WIDEST)

@@ -35,8 +35,8 @@ response of a branch turned by a radian to the whole change of a radius is far f
 """
 
 
-def taken_up(evaluation: Evaluation, objective: Objective,
-             slopes: Callable[[QuasiStaticForward, Values], ErrorSlopes]) -> np.ndarray | None:
+def compensation(evaluation: Evaluation, objective: Objective,
+                 slopes: Callable[[QuasiStaticForward, Values], ErrorSlopes]) -> np.ndarray | None:
     """Change of log E at the control points by which a fit compensates S changes, [K, S].
 
     Linear in the change of the residuals r: d log E = -(J^T J)^-1 J^T dr, at few key frames:
@@ -200,11 +200,11 @@ def grip_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
 
     Returns:
         None if no gripper clamps or its length is known, or as for
-        :func:`limber.estimation.uncertainty.shape_sensitivity.taken_up`.
+        :func:`limber.estimation.uncertainty.shape_sensitivity.compensation`.
     """
     if not any(forward.entry.grasp.mode == "clamped"
                and calibration_of(forward.entry).held_length_sigma_m > 0
                for forward in objective.forwards):
         return None
-    steps = taken_up(evaluation, objective, grip_slopes)
+    steps = compensation(evaluation, objective, grip_slopes)
     return None if steps is None else np.minimum(np.abs(steps[:, 0]), WIDEST)

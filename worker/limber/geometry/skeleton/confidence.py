@@ -45,7 +45,7 @@ class _Shown:
 
     spacing: np.ndarray
     count: np.ndarray
-    beside: np.ndarray
+    unexplained: np.ndarray
 
     @classmethod
     def of(cls, skeleton: Skeleton, points: np.ndarray, noise: float) -> "_Shown":
@@ -53,7 +53,7 @@ class _Shown:
         near = np.abs(residual) < np.maximum(skeleton.radius[segment], 3 * noise)
         return cls(point_spacing(skeleton, points, segment, noise),
                    np.bincount(segment[near], minlength=skeleton.node_count),
-                   _beside_carriers(skeleton, points[near], segment[near], noise))
+                   _unexplained_by_carriers(skeleton, points[near], segment[near], noise))
 
 
 def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool = False,
@@ -118,7 +118,7 @@ def evidence(skeleton: Skeleton, points: np.ndarray, noise: float,
         noise: Standard deviation of the points [m].
     """
     shown = _Shown.of(skeleton, points, noise)
-    return np.log1p(shown.beside)[:, None], _node_evidence(
+    return np.log1p(shown.unexplained)[:, None], _node_evidence(
         skeleton, _gaps(skeleton, shown), noise)
 
 
@@ -165,8 +165,8 @@ def shares(skeleton: Skeleton) -> dict[str, float]:
             for name, value in STATES.items()}
 
 
-def _beside_carriers(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray, noise: float,
-                     ) -> np.ndarray:
+def _unexplained_by_carriers(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
+                             noise: float) -> np.ndarray:
     """Number of points of each side run that its carrier does not explain, shape [runs].
 
     They lie farther from the carrier's surface than its scatter. Of those at one node no more than
@@ -207,7 +207,7 @@ def _with_probability(skeleton: Skeleton, shown: _Shown, noise: float) -> Skelet
     state = np.where(gap > 0, BRIDGED, skeleton.radius_state).astype(np.int8)
     with_state = replace(skeleton, radius_state=state)
     return replace(with_state, probability=_probability(
-        with_state, np.log1p(shown.beside)[:, None], _node_evidence(with_state, gap, noise)))
+        with_state, np.log1p(shown.unexplained)[:, None], _node_evidence(with_state, gap, noise)))
 
 
 def _probability(skeleton: Skeleton, twig: np.ndarray, node: np.ndarray) -> np.ndarray:

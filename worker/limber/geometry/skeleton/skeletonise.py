@@ -168,7 +168,8 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     check_round(fitted.skeleton, points, segment, residual)
     skeleton, more = fitted.skeleton, fitted.pruned
-    leafy = max(fitted.beside, float(np.mean(residual > skeleton.radius[segment]))) > LEAF_SHARE
+    off_axis = float(np.mean(residual > skeleton.radius[segment]))
+    leafy = max(fitted.off_axis_fraction, off_axis) > LEAF_SHARE
     if leafy:
         graph, start = search.in_levels(thin, graph.nodes[start],
                                         float(np.median(graph.thickness)))

@@ -24,7 +24,7 @@ _NOT_KNOWN = {"sag_interval_m": None, "greatest_strain_interval": None,
 
 def tip_node(outdoors: LoadedOutdoors) -> int:
     """Return the mesh's node at the end of the main path that is not cut off."""
-    skeleton, nodes = outdoors.skeleton, outdoors.prestress.mesh.nodes
+    skeleton, nodes = outdoors.skeleton, outdoors.unloaded.mesh.nodes
     path = [node for node in skeleton.main_path() if not outdoors.gone[node]]
     return int(np.linalg.norm(nodes - skeleton.nodes[path[-1]], axis=1).argmin())
 
@@ -69,7 +69,7 @@ def load_effects(outdoors: LoadedOutdoors, *, strain_limit: float, deviation: fl
     Raises:
         WorkError: no equilibrium was found under the loads.
     """
-    gravity = outdoors.prestress.gravity
+    gravity = outdoors.unloaded.gravity
     down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
     tip = tip_node(outdoors)
 

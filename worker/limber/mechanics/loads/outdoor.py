@@ -103,7 +103,7 @@ class LoadedOutdoors:
         self.cut_mass = float(lost.sum())
 
     @property
-    def prestress(self) -> BranchModel:
+    def unloaded(self) -> BranchModel:
         """The branch as it hangs, without these loads."""
         return self._plain
 

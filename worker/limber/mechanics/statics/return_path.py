@@ -15,7 +15,7 @@ _SAME = 1e-3
 """Distance, as a fraction of the branch's extent, below which the start counts as reached."""
 
 
-def uncertainty_of(path: Path, result: StaticResult) -> str:
+def why_uncertain(path: Path, result: StaticResult) -> str:
     """Return why a converged result may not be the only state of its grasp, or an empty string.
 
     Free unless the branch snapped; then it costs as much as the path itself.

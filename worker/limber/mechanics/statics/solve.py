@@ -18,7 +18,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.solve_status import Status
 from limber.mechanics.statics.equilibrium_path import Path
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
-from limber.mechanics.statics.return_path import uncertainty_of
+from limber.mechanics.statics.return_path import why_uncertain
 from limber.mechanics.statics.static_problem import StaticProblem, Target
 
 
@@ -85,7 +85,7 @@ def _walked(path: Path, progress: Progress, guess: np.ndarray | None = None,
     """Return the end of a path, with a warning if it is uncertain."""
     result = path.run(progress, guess, strain)
     asked = result.converged and path.settings.way_back
-    uncertainty = uncertainty_of(path, result) if asked else ""
+    uncertainty = why_uncertain(path, result) if asked else ""
     if not uncertainty:
         return result
     return replace(

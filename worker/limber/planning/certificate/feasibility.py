@@ -89,7 +89,7 @@ class _Cells:
         number = np.floor((self.chart.map(point)[0] - self.low) / self.edges)
         return (np.abs(self.numbers - number) <= 1).all(axis=1)
 
-    def prestress(self, some: np.ndarray) -> np.ndarray:
+    def connected(self, some: np.ndarray) -> np.ndarray:
         """Return which cells are connected to any of ``some``, bool [n]."""
         together = connected_components(self._neighbours(), directed=False)[1]
         return np.isin(together, together[some])
@@ -182,11 +182,11 @@ def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> 
         open_cells = np.flatnonzero(~over | begin)
         wall.add(cells.take(np.flatnonzero(over & ~begin)))
         cells, begin, ends = cells.take(open_cells), begin[open_cells], ends[open_cells]
-        prestress = cells.prestress(begin) if begin.any() else begin
-        if not (prestress & ends).any():
-            reached = cells.take(prestress)
+        connected = cells.connected(begin) if begin.any() else begin
+        if not (connected & ends).any():
+            reached = cells.take(connected)
             return Verdict(cells.edges, proven=True, wall=wall.about(reached), nearest=_nearest(
-                reached, short[open_cells][prestress]) if off.any() else _NOWHERE)
+                reached, short[open_cells][connected]) if off.any() else _NOWHERE)
         free = kept[open_cells][:, _AT].all(axis=1)
         reached = free & (away[open_cells][:, _AT] <= tolerance).any(axis=1)
         inner = cells.take(free)
@@ -202,9 +202,9 @@ def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> 
         uncertainty = np.maximum(uncertainty[open_cells][~free].sum(axis=0),
                            (bends / tolerance)[open_cells][ends].sum(axis=0))
         parts = np.where(uncertainty >= _DOUBTED * uncertainty.max(), 2, 1)
-        if prestress.sum() * parts.prod() > most_cells:
+        if connected.sum() * parts.prod() > most_cells:
             return Verdict(cells.edges)
-        cells = cells.take(prestress).cut(parts)
+        cells = cells.take(connected).cut(parts)
 
 
 def _nearest(cells: _Cells, short: np.ndarray) -> np.ndarray:

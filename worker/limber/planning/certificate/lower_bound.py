@@ -143,18 +143,18 @@ def _next_grid(searches: "list[_Search]", grid: Grid, cell: np.ndarray, *, is_fi
     """Bound on a grid; return the next one, None if a finer grid is not worth its time."""
     keep, near = np.zeros(grid.open_cells.shape, bool), grid.about_goal
     common, ratios = COARSEST, np.ones(3)
-    land: _Land | None = None
+    on_grid: _FieldOnGrid | None = None
     for one in searches:
         try:
-            land = land or _land(searches[0].problem, grid, cell)
-            found = _bound(one.problem, land, grid, cell)
+            on_grid = on_grid or _field_on_grid(searches[0].problem, grid, cell)
+            found = _bound(one.problem, on_grid, grid, cell)
         except NoPathError as separated:
             return _unbounded(searches, grid, cell, separated, is_first=is_first)
         one.take(found, grid, is_first=is_first)
         if not one.is_done:
             own, near = found.keep(one.upper), found.about_goal
             common = min(common, one.ratio())
-            ratios = np.minimum(ratios, _ratios(found.ground, own, one.ratio()))
+            ratios = np.minimum(ratios, _ratios(found.rates, own, one.ratio()))
             keep |= own
         del found
     if not keep.any():
@@ -228,18 +228,18 @@ class _Search:
                             "seconds": perf_counter() - self.began})
 
 
-def _ratios(ground: Terrain, keep: np.ndarray, ratio: float) -> np.ndarray:
+def _ratios(rates: Terrain, keep: np.ndarray, ratio: float) -> np.ndarray:
     """Return the ratios of the next grid's edges to this one's, [3], for the cells ``keep``.
 
     Together they lower what the bends of c take off it as a common ``ratio`` would, with the fewest
     cells: equal bends along each axis. None is too flat for the sub-solution, which bends along all
     axes near start and goal.
     """
-    bends = np.array([axis[keep].mean() for axis in ground.bends])
+    bends = np.array([axis[keep].mean() for axis in rates.bends])
     ratios = ratio * np.sqrt(bends.mean() / np.maximum(bends, 1e-9 * bends.mean() + 1e-300))
     ratios = np.clip(ratios, FINEST, 1.0)
-    edges = ratios * ground.edges
-    return np.minimum(edges, _FLATTEST * edges.min()) / ground.edges
+    edges = ratios * rates.edges
+    return np.minimum(edges, _FLATTEST * edges.min()) / rates.edges
 
 
 @dataclass(frozen=True)
@@ -247,7 +247,7 @@ class _Bounds:
     """The sub-solution of the goal on one grid, and its bound."""
 
     lower: float
-    ground: Terrain
+    rates: Terrain
     to_goal: np.ndarray
     cell: np.ndarray
     slack: float
@@ -256,7 +256,7 @@ class _Bounds:
 
     @property
     def open_cells(self) -> np.ndarray:
-        return self.ground.open_cells
+        return self.rates.open_cells
 
     def to_go(self, grid: Grid) -> BoundGrid:
         """Return the bound in open cells, in the smallest box with their coefficients."""
@@ -270,12 +270,12 @@ class _Bounds:
 
     def keep(self, upper: float) -> np.ndarray:
         """Return the cells through which a path could still be cheaper than ``upper``."""
-        through = least_in_cells(self.to_goal + _from_start(self.ground, self.cell),
+        through = least_in_cells(self.to_goal + _from_start(self.rates, self.cell),
                                  self.open_cells)
         return self.open_cells & np.isfinite(through) & (through - self.slack <= upper)
 
 
-class _Land(NamedTuple):
+class _FieldOnGrid(NamedTuple):
     """What a grid has for any weight of length.
 
     Attributes:
@@ -291,7 +291,7 @@ class _Land(NamedTuple):
     slopes: np.ndarray
 
 
-def _land(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Land:
+def _field_on_grid(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _FieldOnGrid:
     open_cells = grid.open_cells & ~_surely_outside(problem, grid)
     # One corner more than the active cells': for the second differences there.
     corners = np.argwhere(widened(corners_of(widened(open_cells, RIM))))
@@ -304,51 +304,51 @@ def _land(problem: GentleProblem, grid: Grid, cell: np.ndarray) -> _Land:
         raise _separated(problem, grid, open_cells, grid.points(cell[None] + 0.5))
     # Only cells connected to the start, also by an edge or a corner of a cell.
     together = scipy.ndimage.label(open_cells, _NEAR)[0]
-    return _Land(together == together[tuple(cell)], over, corners, energy,
-                 grid.along_edges(force))
+    return _FieldOnGrid(together == together[tuple(cell)], over, corners, energy,
+                        grid.along_edges(force))
 
 
-def _terrain(problem: GentleProblem, land: _Land, grid: Grid) -> Terrain:
+def _terrain(problem: GentleProblem, on_grid: _FieldOnGrid, grid: Grid) -> Terrain:
     """Return the terrain of a problem's own weights."""
-    raw = land.energy - problem.field_error
+    raw = on_grid.energy - problem.field_error
     rate = problem.weights.length + problem.weights.energy * np.maximum(raw, 0.0)
-    return terrain(grid.spread(land.corners, rate),
-                   grid.spread(land.corners, problem.weights.energy * land.slopes),
-                   grid.spread(land.corners, raw) > 0.0, land.open_cells, grid.edges,
+    return terrain(grid.spread(on_grid.corners, rate),
+                   grid.spread(on_grid.corners, problem.weights.energy * on_grid.slopes),
+                   grid.spread(on_grid.corners, raw) > 0.0, on_grid.open_cells, grid.edges,
                    problem.weights.length)
 
 
-def _bound(problem: GentleProblem, land: _Land, grid: Grid, cell: np.ndarray) -> _Bounds:
-    ground = _terrain(problem, land, grid)
-    goal = about_goal(problem, grid, ground)
+def _bound(problem: GentleProblem, on_grid: _FieldOnGrid, grid: Grid, cell: np.ndarray) -> _Bounds:
+    rates = _terrain(problem, on_grid, grid)
+    goal = about_goal(problem, grid, rates)
     if not goal.meets:
-        centres = grid.points(np.argwhere(ground.open_cells) + 0.5)
+        centres = grid.points(np.argwhere(rates.open_cells) + 0.5)
         if (problem.bounded_goal.uncertainty(problem.energy_field, centres) > 0.0).any():
             raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm the goal is out "
                             "of reach, but by less than the error of the energy field.")
-        wall = land.over & scipy.ndimage.binary_dilation(ground.open_cells, _NEAR)
-        raise _separated(problem, grid, ground.open_cells, grid.points(np.argwhere(wall) + 0.5))
+        wall = on_grid.over & scipy.ndimage.binary_dilation(rates.open_cells, _NEAR)
+        raise _separated(problem, grid, rates.open_cells, grid.points(np.argwhere(wall) + 0.5))
     if problem.longest < np.inf:
-        ground = ground._replace(
-            open_cells=short_enough(problem, grid, ground.open_cells, goal.near, cell))
-    to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
+        rates = rates._replace(
+            open_cells=short_enough(problem, grid, rates.open_cells, goal.near, cell))
+    to_goal, factor = subsolution(rates, goal.known, goal.cost, goal.inside)
     slack = factor * goal.slack
     lower = spline_value(to_goal, cell) - slack
-    return _Bounds(max(lower, 0.0), ground, to_goal, cell, slack, descent(grid, to_goal, cell),
+    return _Bounds(max(lower, 0.0), rates, to_goal, cell, slack, descent(grid, to_goal, cell),
                    goal.near)
 
 
-def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:
-    h = float(ground.edges.max())
+def _from_start(rates: Terrain, cell: np.ndarray) -> np.ndarray:
+    h = float(rates.edges.max())
     offsets = [(edge * (np.arange(n) - k)).reshape([-1 if a == axis else 1 for a in range(3)])
                for axis, (n, k, edge) in enumerate(zip(
-                   ground.open_cells.shape, cell, ground.edges, strict=True))]
+                   rates.open_cells.shape, cell, rates.edges, strict=True))]
     away = np.sqrt(sum(offset**2 for offset in offsets))
     rounded = np.sqrt(away**2 + 4.0 * h**2) - 2.0 * h  # a cone with a rounded tip, without a kink
-    nothing = np.zeros(ground.open_cells.shape, bool)
-    u, factor = subsolution(ground, away <= 3.0 * h, rounded, nothing, rounds=2)
+    nothing = np.zeros(rates.open_cells.shape, bool)
+    u, factor = subsolution(rates, away <= 3.0 * h, rounded, nothing, rounds=2)
     # At the start, the spline exceeds the zero of its blunt tip by at most its error there.
-    return u - factor * CURVATURE_FACTOR * float((ground.edges**2).sum()) / (16.0 * h)
+    return u - factor * CURVATURE_FACTOR * float((rates.edges**2).sum()) / (16.0 * h)
 
 
 def _surely_outside(problem: GentleProblem, grid: Grid) -> np.ndarray:

@@ -178,12 +178,12 @@ def with_corner(nodes: np.ndarray) -> np.ndarray:
     return cells
 
 
-def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cells: np.ndarray,
+def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells: np.ndarray,
                 rounds: int = _ROUNDS) -> tuple[np.ndarray, float]:
     """Return coefficients of a ``u`` with |grad u| <= c in every open cell, and a factor.
 
     Args:
-        ground: The terrain.
+        rates: The cost a length at the corners, with its slopes.
         known: Cells on and about the source, bool [nx, ny, nz].
         shape: A length [m] there that grows by about a metre per metre: a signed distance.
         free_cells: Cells without a condition: those entirely inside the source.
@@ -191,16 +191,16 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
 
     The coefficients are ``factor * shape`` on ``known``; infinite where unreachable from there.
     """
-    active = ground.active
+    active = rates.active
     around = known & active
     u = np.full(active.shape, np.inf)
     if not around.any():
         return u, 0.0
     numbers, indices, near = neighbours(active)
-    bound = _middles(ground.rate, indices, active.shape)
+    bound = _middles(rates.rate, indices, active.shape)
     u[around] = shape[around]
-    steep = float(_excess(u, *ground, np.argwhere(around & ground.open_cells)).max(initial=0.0))
-    asked = np.argwhere(ground.open_cells & ~free_cells)
+    steep = float(_excess(u, *rates, np.argwhere(around & rates.open_cells)).max(initial=0.0))
+    asked = np.argwhere(rates.open_cells & ~free_cells)
     own = numbers[tuple(asked.T)]
     held, about = around.ravel()[indices], widened(around).ravel()[indices]
     lengths = shape.ravel()[indices]
@@ -208,10 +208,10 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
     rate, beside = bound, held
     least, best, of_best, idle = np.inf, bound, factor, 0
     for _ in range(rounds):
-        values = march(rate, near, held, factor * lengths, ground.edges)
+        values = march(rate, near, held, factor * lengths, rates.edges)
         u.ravel()[indices] = values
         over = np.ones(len(indices))
-        over[own] = np.maximum(_excess(u, *ground, asked), 1.0)
+        over[own] = np.maximum(_excess(u, *rates, asked), 1.0)
         worst = float(over.max())
         idle = 0 if worst < least / _WORTH else idle + 1
         if worst < least:

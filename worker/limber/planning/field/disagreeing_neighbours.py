@@ -33,7 +33,7 @@ _CORNERS = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 Pair = tuple[Solved, Solved]
 
 
-def ask_between(
+def sample_between(
     solvers: SolverPool,
     known: Sequence[Solved],
     chart: Chart,
@@ -52,11 +52,11 @@ def ask_between(
         most: Most places to solve.
     """
     known, begun, asked = list(known), len(known), 0
-    torn = np.empty((0, 3))
+    bistable = np.empty((0, 3))
     for number in range(_ROUNDS):
         budget = round(most * (number + 1) / _ROUNDS) - asked
         pairs = disagreeing(known, chart, usual, solvers.grasp_model.reach.arc_length)
-        chosen = _apart(pairs, known, torn, chart)[:budget]
+        chosen = _apart(pairs, known, bistable, chart)[:budget]
         if not chosen:
             break
         asked += len(chosen)
@@ -67,8 +67,8 @@ def ask_between(
                          progress=progress.part(number / _ROUNDS, (number + 1) / _ROUNDS),
                          message="between neighbouring poses")
         known += [one for added, _ in found for one in added]
-        torn = np.concatenate([torn, *(middles for _, middles in found)])
-    return known[begun:], torn
+        bistable = np.concatenate([bistable, *(middles for _, middles in found)])
+    return known[begun:], bistable
 
 
 def disagreeing(known: Sequence[Solved], chart: Chart, usual: np.ndarray, length: float,
@@ -123,35 +123,35 @@ def _jumps(known: Sequence[Solved], edges: np.ndarray) -> np.ndarray:
     return np.linalg.norm(off, axis=2).max(axis=1)
 
 
-def _apart(pairs: list[tuple[int, int, np.ndarray]], known: Sequence[Solved], torn: np.ndarray,
+def _apart(pairs: list[tuple[int, int, np.ndarray]], known: Sequence[Solved], bistable: np.ndarray,
            chart: Chart) -> list[tuple[Pair, np.ndarray]]:
     """Return pairs and the places [1, 3] half-way, one pair per tetrahedron; none where a place
     with two shapes is nearer than any known one.
     """
     flat = chart.map(np.array([one.pose[:3] for one in known]))
-    positions, taken_up, chosen = np.array([one.pose[:3] for one in known]), set(), []
+    positions, used, chosen = np.array([one.pose[:3] for one in known]), set(), []
     for first, second, about in pairs:
-        if not taken_up.isdisjoint(about.tolist()):
+        if not used.isdisjoint(about.tolist()):
             continue
         middle = chart.curved(flat[[first, second]].mean(axis=0)[None])
-        if len(torn) and _nearest(middle, torn) < _nearest(middle, positions):
+        if len(bistable) and _nearest(middle, bistable) < _nearest(middle, positions):
             continue
-        taken_up.update(about.tolist())
+        used.update(about.tolist())
         chosen.append(((known[first], known[second]), middle))
     return chosen
 
 
 def _ask(grasp_model: GraspModel, pairs: list[tuple[Pair, np.ndarray]],
          progress: Progress = SILENT) -> tuple[list[Solved], np.ndarray]:
-    added, torn = [], [np.empty((0, 3))]
+    added, bistable = [], [np.empty((0, 3))]
     for number, ((first, second), middle) in enumerate(pairs):
         progress(number / len(pairs), "between neighbouring poses")
         found = _solved_midpoint(grasp_model, first, second, middle)
         if found is None:
-            torn.append(middle)
+            bistable.append(middle)
         else:
             added.append(found)
-    return added, np.concatenate(torn)
+    return added, np.concatenate(bistable)
 
 
 def _solved_midpoint(grasp_model: GraspModel, first: Solved, second: Solved, middle: np.ndarray,

@@ -16,7 +16,7 @@ import scipy
 
 from limber.core.errors import ConvergenceError, WorkError
 from limber.core.progress import SILENT, Progress
-from limber.planning.field.disagreeing_neighbours import ask_between
+from limber.planning.field.disagreeing_neighbours import sample_between
 from limber.planning.field.grasp_model import GraspModel, Reach
 from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.initial_guess import guess_of
@@ -90,11 +90,11 @@ def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: 
         slack = _slack(forces, forces[1 + len(walked):], drawn)
         good = [one for one, kept in zip(good, slack, strict=True) if kept]
         chart = Chart.about(energy_surface.pivot, energy_surface.radius, grasp_model.rest_position)
-        added, torn = ask_between(solvers, good, chart, usual, settings.samples - spread,
-                                  progress=progress.part(0.6, 1.0))
+        added, bistable = sample_between(solvers, good, chart, usual, settings.samples - spread,
+                                         progress=progress.part(0.6, 1.0))
     good += added
-    reasons = _counted(bad) | ({TWO_SHAPES: len(torn)} if len(torn) else {})
-    samples = samples_of(good, np.concatenate([_asked(bad, targets), torn]))
+    reasons = _counted(bad) | ({TWO_SHAPES: len(bistable)} if len(bistable) else {})
+    samples = samples_of(good, np.concatenate([_asked(bad, targets), bistable]))
     return Sampled(samples, [one.displacement for one in good], energy_surface, reasons,
                    int((~slack).sum()))
 

@@ -87,7 +87,7 @@ def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> 
                 if (least := float(one.size(points).min())) > one.limit]
     if outside.min() > 0.0:
         exceeded.append(f"the workspace is {outside.min():.3f} m away"
-                        + unit_uncertainty(outside.min(), field))
+                        + unit_hint(outside.min(), field))
     return " and ".join(exceeded) or "every pose breaks at least one of them"
 
 
@@ -108,13 +108,13 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
     return NoPathError(
         f"No sampled pose brings {goal.what} {goal.where}; the nearest misses it by "
         f"{missed:.3f} m, with the grasp at {position_text(nearest)} m"
-        f"{unit_uncertainty(missed, field)}.",
+        f"{unit_hint(missed, field)}.",
         "The branch was sampled with its grasp from "
         f"{position_text(field.region.low)} to {position_text(field.region.high)} m.",
         f"{goal.advice}, or sample farther (`limber energy --deflection`).")
 
 
-def unit_uncertainty(off: float, field: EnergyField) -> str:
+def unit_hint(off: float, field: EnergyField) -> str:
     """Return a hint about the unit if something is so far ``off`` [m] that it is hardly in metres;
     else an empty text.
     """

@@ -66,7 +66,8 @@ class UrControl(SampleStream):
         ask = self._dashboard.ask
         model = ask("get robot model")
         facts = {"address": self.address, "version": version, "model": model,
-                 "serial": ask("get serial number"), "remote": _told(ask("is in remote control")),
+                 "serial": ask("get serial number"),
+                 "remote": _yes_or_no(ask("is in remote control")),
                  "rate_hz": self.rate}
         known = model.lower()
         if known.startswith("ur") and known != arm.name.rstrip("e"):
@@ -188,7 +189,7 @@ class UrControl(SampleStream):
         self._dashboard.close()
 
 
-def _told(answer: str) -> bool | None:
+def _yes_or_no(answer: str) -> bool | None:
     """Whether a controller says yes; None if it does not know the question, as a CB3."""
     return {"true": True, "false": False}.get(answer)
 

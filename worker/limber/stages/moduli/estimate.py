@@ -128,7 +128,7 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
         add_other_skeletons(found, branch, _placed(pulls, initial), settings,
                             heard.part(0.95, 0.98))
         if settings.hold_out:
-            _foretell_others(branch, names, subject, found, settings, initial, heard)
+            _score_unused_pulls(branch, names, subject, found, settings, initial, heard)
     result = summary(found, settings) | ({} if evidence is None else {
         "control_point_evidence": evidence, "fractions": settings.initial_fractions})
     earlier = branch.manifest.stages.get("estimate")
@@ -274,19 +274,19 @@ def _cloud(branch: Branch) -> np.ndarray | None:
     return cloud.points[cloud.attributes.get("leaf", np.zeros(len(cloud))) == 0]
 
 
-def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,
-                     settings: EstimateSettings, initial: Subject, progress: Progress) -> None:
+def _score_unused_pulls(branch: Branch, names: list[str], subject: Subject, found: Estimate,
+                        settings: EstimateSettings, initial: Subject, progress: Progress) -> None:
     """Score the branch's pulls that this estimate did not use.
 
     ``initial``: the branch with the control points where markers without a position are.
     """
-    from limber.estimation.fit_assessment import foretell
+    from limber.estimation.fit_assessment import score_unused
     from limber.store.loading import known_pulls, load_pulls
 
     for name in [name for name in known_pulls(branch) if name not in names]:
         try:
             pulls = load_pulls(branch, [name], initial, settings)
-            foretell(_placed(pulls, initial)[0], subject, found, settings)
+            score_unused(_placed(pulls, initial)[0], subject, found, settings)
         except LimberError as error:
             progress.warn(
                 f"The pull {name}, which the estimate did not use, could not be scored: {error}")

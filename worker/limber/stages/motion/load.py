@@ -132,11 +132,11 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
             f"load:{settings.name}", settings, **inputs):
         return read_json(branch.path(f"loads/{settings.name}.json"), "the effects of loads")
     skeleton = load_skeleton(branch)
-    prestress = load_branch(branch, progress=progress).model
-    _require_near(prestress.mesh.nodes, [one[:3] for one in settings.fruit])
+    model = load_branch(branch, progress=progress).model
+    _require_near(model.mesh.nodes, [one[:3] for one in settings.fruit])
     loads = Outdoors(wind, settings.drag, settings.snow, tuple(
         PointMass(one[:3], one[3]) for one in settings.fruit), settings.cut)
-    outdoors = LoadedOutdoors(prestress, skeleton, loads)
+    outdoors = LoadedOutdoors(model, skeleton, loads)
     peak = None
     if gusts is not None:
         progress(0.1, "gusts")
@@ -144,10 +144,10 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
     bent, result = load_effects(
         outdoors, strain_limit=settings.strain_limit, deviation=stiffness_deviation(branch),
         most=_MOST_MULTIPLE if settings.limit_load else None, progress=progress.part(0.2, 1.0))
-    result |= {"frequencies_before_hz": lowest_modes(prestress, len(bent.frequencies)).frequencies,
+    result |= {"frequencies_before_hz": lowest_modes(model, len(bent.frequencies)).frequencies,
                "gusts": peak}
     if settings.name is not None:
-        _keep(branch, settings, inputs, prestress, bent, result)
+        _keep(branch, settings, inputs, model, bent, result)
     return result
 
 
@@ -164,7 +164,7 @@ def _inputs(branch: Branch, settings: LoadSettings) -> dict[str, Any]:
         {} if record is None else {"gust_record": file_digest(record)})}
 
 
-def _keep(branch: Branch, settings: LoadSettings, inputs: dict[str, Any], prestress: BranchModel,
+def _keep(branch: Branch, settings: LoadSettings, inputs: dict[str, Any], model: BranchModel,
           bent: Bent, result: dict[str, Any]) -> None:
     """Write the result, and the branch before and under the loads as frames."""
     import json
@@ -173,14 +173,14 @@ def _keep(branch: Branch, settings: LoadSettings, inputs: dict[str, Any], prestr
     from limber.mechanics.strain import strain_state
     from limber.results.motion_files import surface_fields, surface_nodes, write_pc2
 
-    nodes, name = surface_nodes(prestress.mesh), f"frames/load-{settings.name}"
+    nodes, name = surface_nodes(model.mesh), f"frames/load-{settings.name}"
     displacements = np.stack([np.zeros_like(bent.displacement), bent.displacement])
-    states = [strain_state(prestress, displacement) for displacement in displacements]
+    states = [strain_state(model, displacement) for displacement in displacements]
     with branch.stage(f"load:{settings.name}", settings, **inputs) as stage:
         stage.path(f"loads/{settings.name}.json").write_text(
             json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        write_pc2(stage.path(f"{name}.pc2"), prestress.mesh.nodes[nodes] + displacements[:, nodes])
-        np.savez_compressed(stage.path(f"{name}.npz"), **surface_fields(prestress.mesh, states))
+        write_pc2(stage.path(f"{name}.pc2"), model.mesh.nodes[nodes] + displacements[:, nodes])
+        np.savez_compressed(stage.path(f"{name}.npz"), **surface_fields(model.mesh, states))
         stage.path(f"{name}.json").write_text(json.dumps({
             "frame_count": len(displacements), "rate": 1.0,
             "largest_principal_strains": [float(state.principal_strain[:, -1].max())

@@ -14,11 +14,11 @@ import numpy as np
 from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.radii.cylinders import Match, cylinders_around, match_cylinders
 from limber.geometry.skeleton.radii.noisy_rings import (
-    Aims,
+    TargetDistances,
     held_across,
     mean_positions,
     position_uncertainty,
-    weighted_aims,
+    weighted_target_distances,
 )
 from limber.geometry.skeleton.radii.normal_equations import normal_equations, radius_deviations
 from limber.geometry.skeleton.radii.robust_noise import (
@@ -130,7 +130,7 @@ class _Rounds:
         limit = partial(residual_limit, self._spread, noise, 0.0 if self._along_sight else trusted)
         weight = tukey(match.residual, limit(match.thick))
         asked = self._asked(match, weight, limit) if trusted else (
-            match.normal, Aims(match.thick, match.thick), None)
+            match.normal, TargetDistances(match.thick, match.thick), None)
         step = normal_equations(self._start, self._nodes, self._radius, match, weight, trusted,
                                 *asked).solve()
         size = np.linalg.norm(step[:, :3], axis=1)
@@ -189,7 +189,7 @@ class _Rounds:
         return seen, axis, sharpness, stout
 
     def _asked(self, match: Match, weight: np.ndarray, limit: partial,
-               ) -> tuple[np.ndarray, Aims, np.ndarray | None]:
+               ) -> tuple[np.ndarray, TargetDistances, np.ndarray | None]:
         """Where noise hides positions: each point's mean position, how far out it should lie, and
         how firmly it holds the axis across.
         """
@@ -200,10 +200,10 @@ class _Rounds:
                 match.normal, axis, sharpness, shown_weight, now.view, self._fitted_side or now,
                 limit_free=self._side_fit_count >= _HELD)
             self._side_fit_count += 1
-        positions, aims = mean_positions(match.normal, axis, sharpness, stout, now), Aims(
-            match.thick, match.thick)
+        positions = mean_positions(match.normal, axis, sharpness, stout, now)
+        targets = TargetDistances(match.thick, match.thick)
         if not now.along_sight:
-            aims, nearest = weighted_aims(match.thick, self.noise, limit)
+            targets, nearest = weighted_target_distances(match.thick, self.noise, limit)
         if now.one_sided:
             if self._even is None:
                 # Estimated once, from axes fitted to the nearest positions: a strip makes a thin
@@ -212,9 +212,9 @@ class _Rounds:
                                          across_sight(match.normal, axis, now), self.noise)
             whole = self._even[match.segment]
             positions = np.where(whole[:, None], positions, match.normal)
-            aims = Aims(np.where(whole, aims.axis, nearest.axis),
-                        np.where(whole, aims.radius, nearest.radius))
-        return positions, aims, None if now.along_sight else held_across(
+            targets = TargetDistances(np.where(whole, targets.axis, nearest.axis),
+                                      np.where(whole, targets.radius, nearest.radius))
+        return positions, targets, None if now.along_sight else held_across(
             match.normal, axis, positions, stout)
 
     def _move(self, step: np.ndarray, size: np.ndarray) -> None:

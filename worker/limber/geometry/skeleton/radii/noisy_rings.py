@@ -38,7 +38,7 @@ def position_uncertainty(seen: SeenSides, radius: np.ndarray, noise: float) -> n
 
 
 @dataclass(frozen=True)
-class Aims:
+class TargetDistances:
     """Distance from the axis at which points should lie on average [m], shape [m] each.
 
     Attributes:
@@ -50,8 +50,9 @@ class Aims:
     radius: np.ndarray
 
 
-def weighted_aims(radius: np.ndarray, noise: float,
-                  limit: Callable[[np.ndarray], np.ndarray]) -> tuple[Aims, Aims]:
+def weighted_target_distances(radius: np.ndarray, noise: float,
+                              limit: Callable[[np.ndarray], np.ndarray],
+                              ) -> tuple[TargetDistances, TargetDistances]:
     """Distances at which points should lie, if farther points count less.
 
     Noise puts more points outside a thin branch than inside, and farther. Weights that fall with
@@ -67,7 +68,7 @@ def weighted_aims(radius: np.ndarray, noise: float,
         radii [m].
 
     Returns:
-        Aims where mean positions are taken for the true ones, and where the nearest are.
+        TargetDistances where mean positions are taken for the true ones, and where the nearest are.
     """
     thick = _RADII[:, None]
     reach = limit(_RADII * noise)[:, None] / noise
@@ -81,11 +82,11 @@ def weighted_aims(radius: np.ndarray, noise: float,
     mean, near = outward / total, (share * distance).sum(axis=1) / total
     along = outward / (share * toward).sum(axis=1)
 
-    def of(aim: np.ndarray) -> np.ndarray:
+    def of(target: np.ndarray) -> np.ndarray:
         past = np.maximum(radius / (noise * _RADII[-1]), 1.0)
-        return radius + noise * np.interp(radius / noise, _RADII, aim - _RADII) / past
+        return radius + noise * np.interp(radius / noise, _RADII, target - _RADII) / past
 
-    return Aims(of(mean), of(mean)), Aims(of(along), of(near))
+    return TargetDistances(of(mean), of(mean)), TargetDistances(of(along), of(near))
 
 
 def held_across(out: np.ndarray, axis: np.ndarray, positions: np.ndarray, stout: np.ndarray,

@@ -8,7 +8,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from limber.geometry.skeleton.radii.cylinders import Match, match_cylinders
 from limber.geometry.skeleton.radii.fit_kernels import normal_blocks
-from limber.geometry.skeleton.radii.noisy_rings import Aims
+from limber.geometry.skeleton.radii.noisy_rings import TargetDistances
 from limber.geometry.skeleton.radii.robust_noise import robust_sigma, settled_weights
 from limber.geometry.skeleton.radii.smoothness import smoothness
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -59,7 +59,7 @@ class NormalEquations:
 
 def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
                      weight: np.ndarray, noise: float, positions: np.ndarray | None = None,
-                     aims: Aims | None = None, across: np.ndarray | None = None,
+                     targets: TargetDistances | None = None, across: np.ndarray | None = None,
                      stepped: bool = False) -> NormalEquations:
     """Set up a round: terms of the points, smoothness of runs, and constraints on bare nodes.
 
@@ -72,12 +72,12 @@ def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, 
         noise: Standard deviation of the points [m].
         positions: Mean direction of each point's true position (:mod:`noisy_rings`), shape [m, 3];
             None: the nearest position on the circle is the true one.
-        aims: Distances at which the points should lie; None: at the radius.
+        targets: Distances at which the points should lie; None: at the radius.
         across: How firmly points hold the axis across their own direction, shape [m, 3]; None: not
         at all.
         stepped: Whether radii may fall in a step at each fork.
     """
-    data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, positions, aims,
+    data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, positions, targets,
                                         across)
     smooth = smoothness(skeleton, nodes, radius, per_node, noise, stepped)
     state = np.column_stack([nodes, radius]).ravel()
@@ -154,18 +154,19 @@ def fit_with_steps(skeleton: Skeleton, points: np.ndarray) -> tuple[Skeleton, np
 
 
 def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
-                positions: np.ndarray | None, aims: Aims | None, across: np.ndarray | None,
+                positions: np.ndarray | None, targets: TargetDistances | None,
+                across: np.ndarray | None,
                 ) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:
     """Normal equations of the residuals in (x, y, z, r) of both ends, and weight per node."""
     count = len(nodes)
-    aims = Aims(match.thick, match.thick) if aims is None else aims
+    targets = TargetDistances(match.thick, match.thick) if targets is None else targets
     across = np.zeros_like(match.normal) if across is None else across
     positions = match.normal if positions is None else positions
     low = np.where(match.own_radius, 0.0, 1 - match.share)
     high = np.where(match.own_radius, 1.0, match.share)
     distance = match.residual + match.thick
-    pull = distance[:, None] * match.normal - aims.axis[:, None] * positions
-    grow = distance * np.einsum("mj,mj->m", match.normal, positions) - aims.radius
+    pull = distance[:, None] * match.normal - targets.axis[:, None] * positions
+    grow = distance * np.einsum("mj,mj->m", match.normal, positions) - targets.radius
     gradient = np.column_stack([
         (1 - match.share)[:, None] * pull, low * grow, match.share[:, None] * pull, high * grow])
     block, right = normal_blocks(match.segment, match.share, low, high, match.normal, across,

@@ -64,7 +64,8 @@ def _of_skin(beside: np.ndarray, depth: np.ndarray, radius: np.ndarray, limit: f
     best = -np.inf
     for share in _NOISES:
         spread = np.full((len(radius), 1), share * max(noise, 1e-12))
-        best = max(best, _told(beside, depth, radius, np.sin(angle), np.cos(angle), spread, spread))
+        best = max(best, _log_likelihood(beside, depth, radius, np.sin(angle), np.cos(angle),
+                                         spread, spread))
     return best
 
 
@@ -74,13 +75,14 @@ def _of_rays(beside: np.ndarray, depth: np.ndarray, radius: np.ndarray) -> float
     rise = np.sqrt(1 - across**2)
     miss = depth - np.sqrt(np.maximum(radius**2 - beside**2, 0.0))
     noise = 1.4826 * float(np.median(np.abs(miss)))
-    return max(_told(beside, depth, radius, across, rise, blur * radius[:, None],
-                     np.maximum(share * noise / np.maximum(rise, 0.1)**power, 1e-12)[None])
+    return max(_log_likelihood(
+        beside, depth, radius, across, rise, blur * radius[:, None],
+        np.maximum(share * noise / np.maximum(rise, 0.1)**power, 1e-12)[None])
                for blur in _BLURS for share in _NOISES for power in _GRAZING)
 
 
-def _told(beside: np.ndarray, depth: np.ndarray, radius: np.ndarray, across: np.ndarray,
-          rise: np.ndarray, blur: np.ndarray, noise: np.ndarray) -> float:
+def _log_likelihood(beside: np.ndarray, depth: np.ndarray, radius: np.ndarray, across: np.ndarray,
+                    rise: np.ndarray, blur: np.ndarray, noise: np.ndarray) -> float:
     """Log-likelihood of offsets [m] from places at ``across`` and ``rise`` [radii]."""
     miss = ((beside[:, None] - radius[:, None] * across) / blur)**2 + (
         (depth[:, None] - radius[:, None] * rise) / noise)**2

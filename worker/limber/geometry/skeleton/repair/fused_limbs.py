@@ -8,7 +8,12 @@ nothing else can be meant, the run is split into two.
 import numpy as np
 
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
-from limber.geometry.skeleton.repair.feet import Foot, fitted_circles, section, with_side_axes
+from limber.geometry.skeleton.repair.fused_forks import (
+    FusedFork,
+    fitted_circles,
+    section,
+    with_side_axes,
+)
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import stretches
 
@@ -36,16 +41,16 @@ def with_split_limbs(skeleton: Skeleton, points: np.ndarray, noise: float,
     count = np.maximum(np.bincount(segment, minlength=skeleton.node_count), 1)
     off = np.bincount(segment, np.abs(residual), skeleton.node_count) / count
     tried = (off > _OFF * skeleton.radius) & (skeleton.radius > _RESOLVED * noise)
-    feet = []
+    forks = []
     for number, members in enumerate(skeleton.runs()):
         own = members[1:]
         mine = points[skeleton.branch[segment] == number]
         for part in _stretches(tried[own]):
             shown = {int(node): both for node in own[part][tried[own[part]]]
                      if (both := _two(skeleton, int(node), mine)) is not None}
-            feet += [_limbs(skeleton, own[part][inner], shown)
-                     for inner in _stretches(np.isin(own[part], list(shown)))]
-    return (with_side_axes(skeleton, feet, [None] * len(feet)), len(feet)) if feet else (
+            forks += [_limbs(skeleton, own[part][inner], shown)
+                      for inner in _stretches(np.isin(own[part], list(shown)))]
+    return (with_side_axes(skeleton, forks, [None] * len(forks)), len(forks)) if forks else (
         skeleton, 0)
 
 
@@ -90,7 +95,7 @@ def _scatter(flat: np.ndarray, circles: np.ndarray) -> float:
     return max(float(np.sqrt((off.min(axis=1)**2).mean())), _LEAST * float(circles[:, 2].max()))
 
 
-def _limbs(skeleton: Skeleton, nodes: np.ndarray, shown: dict[int, np.ndarray]) -> Foot:
+def _limbs(skeleton: Skeleton, nodes: np.ndarray, shown: dict[int, np.ndarray]) -> FusedFork:
     """Axes and radii of both limbs along nodes, given from the root outwards."""
     nodes = nodes[::-1]  # the carrier goes on where the run does, beyond the outermost
     known = np.array([k for k, node in enumerate(nodes) if int(node) in shown])
@@ -107,4 +112,4 @@ def _limbs(skeleton: Skeleton, nodes: np.ndarray, shown: dict[int, np.ndarray]) 
     every = np.stack(pairs)
     filled = np.stack([[np.interp(np.arange(len(nodes)), known, every[:, limb, column])
                         for column in range(4)] for limb in range(2)])
-    return Foot(nodes, filled[0, :3].T, filled[0, 3], filled[1, :3].T, filled[1, 3])
+    return FusedFork(nodes, filled[0, :3].T, filled[0, 3], filled[1, :3].T, filled[1, 3])

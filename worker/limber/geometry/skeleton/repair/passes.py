@@ -12,8 +12,8 @@ from limber.geometry.skeleton.confidence import assessed, doubted
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.ray_fit import fit_of_rays
 from limber.geometry.skeleton.repair.attachment import attached
-from limber.geometry.skeleton.repair.double_strands import without_strands
-from limber.geometry.skeleton.repair.feet import with_feet
+from limber.geometry.skeleton.repair.duplicate_axes import without_duplicate_axes
+from limber.geometry.skeleton.repair.fused_forks import separate_fused_forks
 from limber.geometry.skeleton.repair.fused_limbs import with_split_limbs
 from limber.geometry.skeleton.repair.kinks import without_kinks
 from limber.geometry.skeleton.repair.resampling import PointSpacing, resampled
@@ -51,7 +51,7 @@ class Repaired:
         fit: The last fit.
         pinched: Start of the first fit, where only one side of wood was seen: it may make a stem
             far too thin.
-        strands: Number of strands that the last search dropped.
+        duplicates: Number of duplicate axes that the last search dropped.
         pruned: Number of twigs dropped.
         progress: Called during a fit.
         apart: How far apart the points are; None: not known yet.
@@ -64,7 +64,7 @@ class Repaired:
     rays: bool = False
     fit: AxisFit | None = None
     pinched: Skeleton | None = None
-    strands: int = 0
+    duplicates: int = 0
     pruned: int = 0
     progress: Progress = SILENT
     apart: PointSpacing | None = None
@@ -92,7 +92,7 @@ class Repaired:
         return self.last_fit.noise
 
     @property
-    def beside(self) -> float:
+    def off_axis_fraction(self) -> float:
         """Fraction of points farther off their axis than twice its radius, as on leaves."""
         fit = self.last_fit
         return float(np.mean(fit.residual > fit.skeleton.radius[fit.segment]))
@@ -127,7 +127,7 @@ def _fit_coarsely(now: Repaired) -> Repaired:
     if by_rays is not None:
         return replace(after, rays=True, fit=by_rays, skeleton=by_rays.skeleton)
     # For leaves too, unpinched radii would make thick stems that seem to have no leaves.
-    may_be = after.last_fit.seen.one_sided and after.beside <= LEAF_SHARE
+    may_be = after.last_fit.seen.one_sided and after.off_axis_fraction <= LEAF_SHARE
     return replace(after, pinched=now.skeleton if may_be else None)
 
 
@@ -144,16 +144,16 @@ def _prune_spurs(now: Repaired) -> Repaired:
     return replace(now, skeleton=now.skeleton.subset(keep), pruned=now.pruned + count)
 
 
-def _drop_strands(now: Repaired) -> Repaired:
-    skeleton, count = without_strands(now.skeleton)
-    return replace(now, skeleton=skeleton, strands=count, pruned=now.pruned + count)
+def _drop_duplicate_axes(now: Repaired) -> Repaired:
+    skeleton, count = without_duplicate_axes(now.skeleton)
+    return replace(now, skeleton=skeleton, duplicates=count, pruned=now.pruned + count)
 
 
 def _settle(now: Repaired) -> Repaired:
     # Noise leaves little information per round.
     noisy = now.noise > _NOISY * float(np.median(now.skeleton.radius))
-    rounds = _ROUNDS_NOISY if noisy else _ROUNDS_LATE if now.strands else 0
-    return now.fitted(now.skeleton, rounds=rounds, settled=noisy and not now.strands,
+    rounds = _ROUNDS_NOISY if noisy else _ROUNDS_LATE if now.duplicates else 0
+    return now.fitted(now.skeleton, rounds=rounds, settled=noisy and not now.duplicates,
                       seen=now.last_fit.seen)
 
 
@@ -168,8 +168,9 @@ STEADY = Pass("steady radii", "Where points are missing, a first radius is far t
 DROP_BARE_ENDS = Pass("drop bare ends",
                       "The contraction overshoots an end, beyond the last points.",
                       lambda now: now.of(without_bare_ends(now.skeleton, now.points)))
-DROP_STRANDS = Pass("drop strands", "Where a scan has holes, one branch has two parallel axes.",
-                    _drop_strands)
+DROP_DUPLICATE_AXES = Pass("drop duplicate axes",
+                           "Where a scan has holes, one branch has two parallel axes.",
+                           _drop_duplicate_axes)
 LIMIT = Pass("limit radii", "A radius is outside the range for a cloud of this size.",
              lambda now: now.of(limited(now.skeleton, *now.radius_limits)))
 
@@ -186,20 +187,20 @@ PASSES = (
     Pass("lengthen ends", "The contraction shortens an end.",
          lambda now: now.of(with_full_tips(now.skeleton, now.points, now.noise))),
     Pass("prune spurs", "A twig hardly extends beyond its parent and the noise.", _prune_spurs),
-    DROP_STRANDS,
+    DROP_DUPLICATE_AXES,
     STEADY,
     Pass("unpinch radii", "Where only a strip of a stem is visible, the radius is far too small.",
          lambda now: now if now.pinched is None else now.of(unpinched(now.skeleton, now.points))),
     LIMIT,
-    Pass("follow feet down", "Two limbs side by side have one axis, up to a fork too far out.",
-         lambda now: now.of(with_feet(now.skeleton, now.points, now.noise)[0])),
+    Pass("separate fused forks", "Two limbs side by side have one axis, up to a fork too far out.",
+         lambda now: now.of(separate_fused_forks(now.skeleton, now.points, now.noise)[0])),
     Pass("split limbs", "Two limbs side by side have one axis up to their tips.",
          lambda now: now.of(with_split_limbs(now.skeleton, now.points, now.noise)[0])),
     Pass("fit finely",
          "Axes and radii come from too few nodes, and from forks that have moved since.",
          lambda now: now.fitted(now.sampled(now.skeleton), uncertainty=False), until=0.8),
-    DROP_STRANDS,
-    Pass("settle", "The fit is unfinished because of noise or a strand that was just dropped.",
+    DROP_DUPLICATE_AXES,
+    Pass("settle", "Noise, or a duplicate axis that was just dropped, leaves the fit unfinished.",
          _settle, until=1.0),
     DROP_BARE_ENDS,
     Pass("draw ends back", "A fit moves an end along its axis beyond the points.",

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.repair.feet import with_feet
+from limber.geometry.skeleton.repair.fused_forks import separate_fused_forks
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _NOISE = 3e-4
@@ -50,9 +50,9 @@ def two_in_one(fork: float, true: float = 0.1) -> Skeleton:
 
 
 @pytest.mark.parametrize("arc", [2 * np.pi, np.pi])
-def test_a_foot_is_followed_down_to_where_the_limbs_meet(arc: float) -> None:
+def test_fused_limbs_get_a_fork_where_they_meet(arc: float) -> None:
     """Found 100 mm too high; no lower than the fork, and both axes within 1.5 mm."""
-    skeleton, count = with_feet(two_in_one(0.2), two_limbs(arc), _NOISE)
+    skeleton, count = separate_fused_forks(two_in_one(0.2), two_limbs(arc), _NOISE)
     assert count == 1
     fork = float(skeleton.nodes[skeleton.forks()[0], 2])
     assert 0.1 <= fork < 0.165
@@ -63,9 +63,9 @@ def test_a_foot_is_followed_down_to_where_the_limbs_meet(arc: float) -> None:
     assert np.abs(limb[:, 0] - (limb[:, 2] - 0.1) * np.tan(0.16)).max() < 0.0015
 
 
-def test_a_right_foot_and_an_oval_stem_stay() -> None:
+def test_a_right_fork_and_an_oval_stem_stay() -> None:
     """One limb below the fork, and a section 1.3 times as wide as deep, show no second limb."""
-    assert with_feet(two_in_one(0.13), two_limbs(), _NOISE)[1] == 0
+    assert separate_fused_forks(two_in_one(0.13), two_limbs(), _NOISE)[1] == 0
     rng, z = np.random.default_rng(1), np.arange(0, 0.4, 0.004)
     stem = _tube(np.zeros(3), np.array([0, 0, 0.4]), 0.008, rng) * [1.3, 1, 1]
     twig = _tube(np.array([0, 0, 0.2]), np.array([0.1, 0, 0.2]), 0.003, rng)
@@ -74,4 +74,5 @@ def test_a_right_foot_and_an_oval_stem_stay() -> None:
     parent = np.r_[np.arange(len(z)) - 1, 50, len(z) + np.arange(len(x) - 1)]
     plain = Skeleton.from_edges(nodes, parent, np.repeat([0.009, 0.003], [len(z), len(x)]))
     points = np.vstack([stem, twig[twig[:, 0] > 0.01]])
-    assert with_feet(plain, points + _NOISE * rng.standard_normal(points.shape), _NOISE)[1] == 0
+    noisy = points + _NOISE * rng.standard_normal(points.shape)
+    assert separate_fused_forks(plain, noisy, _NOISE)[1] == 0

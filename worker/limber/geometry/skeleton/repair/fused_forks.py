@@ -28,7 +28,7 @@ _SECTIONS = 3  # sections in a row that must show two: a few stray points are in
 
 
 @dataclass(frozen=True)
-class Foot:
+class FusedFork:
     """The axes of a side run beside its carrier: carrier's nodes from the fork down, shape [k],
     and of both limbs there the positions [m], [k, 3], and radii [m], [k].
     """
@@ -40,7 +40,8 @@ class Foot:
     side_radius: np.ndarray
 
 
-def with_feet(skeleton: Skeleton, points: np.ndarray, noise: float) -> tuple[Skeleton, int]:
+def separate_fused_forks(skeleton: Skeleton, points: np.ndarray, noise: float,
+                         ) -> tuple[Skeleton, int]:
     """Return the skeleton with side runs that start where their points meet the carrier's.
 
     Args:
@@ -52,43 +53,43 @@ def with_feet(skeleton: Skeleton, points: np.ndarray, noise: float) -> tuple[Ske
         The skeleton, and the number of side runs that were followed down.
     """
     run = skeleton.branch[nearest_cylinders(skeleton, points)[0]]
-    done, feet, starts = np.zeros(skeleton.node_count, bool), [], []
+    done, forks, starts = np.zeros(skeleton.node_count, bool), [], []
     for members in skeleton.runs()[1:]:
         own = np.isin(run, skeleton.branch[members[:2]])
-        foot = _foot(skeleton, members, points[own], noise)
-        if foot is None or done[foot.nodes].any():
+        fork = _fused_fork(skeleton, members, points[own], noise)
+        if fork is None or done[fork.nodes].any():
             continue
-        done[foot.nodes] = True
-        feet.append(foot)
+        done[fork.nodes] = True
+        forks.append(fork)
         starts.append(int(members[1]))
-    return (with_side_axes(skeleton, feet, starts), len(feet)) if feet else (skeleton, 0)
+    return (with_side_axes(skeleton, forks, starts), len(forks)) if forks else (skeleton, 0)
 
 
-def with_side_axes(skeleton: Skeleton, feet: list[Foot], starts: Sequence[int | None],
+def with_side_axes(skeleton: Skeleton, forks: list[FusedFork], starts: Sequence[int | None],
                    ) -> Skeleton:
     """Return the skeleton with a second axis beside each of some stretches of runs.
 
     Args:
         skeleton: With radii.
-        feet: The stretches.
+        forks: The stretches.
         starts: For each the first node of the side run that goes on from it; None: it ends there.
     """
     nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
     parent, below, first = skeleton.parent.copy(), [], skeleton.node_count
-    for foot, start in zip(feet, starts, strict=True):
-        nodes[foot.nodes], radius[foot.nodes] = foot.carrier, foot.carrier_radius
-        chain = np.arange(first, first + len(foot.nodes))
-        first += len(foot.nodes)
+    for fork, start in zip(forks, starts, strict=True):
+        nodes[fork.nodes], radius[fork.nodes] = fork.carrier, fork.carrier_radius
+        chain = np.arange(first, first + len(fork.nodes))
+        first += len(fork.nodes)
         if start is not None:
             parent[start] = chain[0]
-        below.append(np.append(chain[1:], skeleton.parent[foot.nodes[-1]]))
+        below.append(np.append(chain[1:], skeleton.parent[fork.nodes[-1]]))
     return Skeleton.from_edges(
-        np.vstack([nodes, *(foot.side for foot in feet)]), np.concatenate([parent, *below]),
-        np.concatenate([radius, *(foot.side_radius for foot in feet)]))
+        np.vstack([nodes, *(fork.side for fork in forks)]), np.concatenate([parent, *below]),
+        np.concatenate([radius, *(fork.side_radius for fork in forks)]))
 
 
-def _foot(skeleton: Skeleton, members: np.ndarray, points: np.ndarray, noise: float,
-          ) -> Foot | None:
+def _fused_fork(skeleton: Skeleton, members: np.ndarray, points: np.ndarray, noise: float,
+                ) -> FusedFork | None:
     """The part of a side run that its carrier's axis hides; None if there is none."""
     fork = int(members[0])
     run = int(skeleton.branch[fork])
@@ -111,7 +112,7 @@ def _foot(skeleton: Skeleton, members: np.ndarray, points: np.ndarray, noise: fl
         node = int(skeleton.parent[node])
     if len(found) < _SECTIONS:
         return None
-    return Foot(np.array([each for each, _ in found]), *(
+    return FusedFork(np.array([each for each, _ in found]), *(
         np.array([both[k] for _, both in found]) for k in (0, 2, 1, 3)))
 
 
