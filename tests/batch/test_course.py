@@ -68,7 +68,7 @@ def test_run_fail_mend_and_resume(orchard, capsys):
     code, told = call(capsys, "batch", jobs, "--dry-run")
     assert code == 0 and [row[2] for row in told["planned"]] == ["to run"] * 4
     code, told = call(capsys, "batch", jobs, "--workers", "1")
-    assert code == 3 and "1 of 2 branches failed; two: target:flower" in told["error"]
+    assert code == 3 and "1 of 2 branches failed: two; two: target:flower" in told["error"]
     assert states(jobs) == [["done", "done"], ["failed", "waiting"]]
     rows = list(csv.DictReader((orchard / "results/jobs.csv").open()))
     assert Branch.open(orchard / "one.branch").has("pulls/pull-2/pull.toml")

@@ -1,5 +1,6 @@
 """The job file: what it says, what is wrong with it and in which line, and that it stays inside."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from limber.core.errors import InputError
 from limber.core.units import in_unit
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.registry import stage_description, stage_summaries
+from limber.store import Branch
 
 
 @pytest.fixture
@@ -167,7 +169,41 @@ def test_two_branches_never_share_a_folder(write, tmp_path):
     (tmp_path / "more").mkdir()
     (tmp_path / "more" / "apple.ply").write_text("")
     told = refusal(write(SCANS.replace('"scans/*.ply"', '"scans/*.ply", "more/*.ply"')))
-    assert "Two branches would be named apple.branch" in told
+    assert "2 branches would be named apple.branch" in told
+
+
+def test_another_scans_branch_is_not_replaced(write, tmp_path):
+    """One of an earlier job file, from a scan of the same stem."""
+    folder = tmp_path / "jobs" / "apple.branch"
+    Branch.create(folder)
+    content = json.loads((folder / "branch.json").read_text())
+    (folder / "branch.json").write_text(json.dumps(content | {"source": {"file": "apple.xyz"}}))
+    told = refusal(write(SCANS))
+    assert "apple.branch was made from apple.xyz, not from apple.ply" in told
+
+
+def test_no_two_results_share_a_name(write, tmp_path):
+    """Names that differ in suffix or case only; an output without the branch's name."""
+    (tmp_path / "scans" / "Apple.xyz").write_text("")
+    (tmp_path / "pulls" / "apple" / "one.mcap").write_text("")
+    told = refusal(write(SCANS.replace("*.ply", "*.*") + """
+[[job.stage]]
+run = "import-pull"
+source = "pulls/apple/*"
+name = "{file}"
+[[job.stage]]
+run = "import-pull"
+source = "pulls/apple/*.csv"
+name = "always"
+[[job.stage]]
+run = "export"
+output = "all.obj"
+"""))
+    assert "2 branches would be named" in told and "Apple" in told
+    assert "line 7: 2 runs of import-pull on apple would have one result, pull:one" in told
+    assert "one.csv; one.mcap" in told
+    assert "line 11: 2 runs of import-pull on apple would have one result, pull:always" in told
+    assert "3 branches would write" in told and "all.obj" in told
 
 
 def test_every_stage_may_stand_in_a_job_file(write, tmp_path):

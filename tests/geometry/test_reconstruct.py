@@ -1,6 +1,7 @@
 """The commands reconstruct, generate and mesh, on real scans and on what they must refuse."""
 
 import json
+import shutil
 import time
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from limber.cli.main import call
-from limber.core.errors import Cancelled, InputError
+from limber.core.errors import Cancelled, InputError, PartlyFailedError
 from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.generated import generate_branch
@@ -22,7 +23,13 @@ from limber.mechanics.pull_simulation import SimulateSettings
 from limber.stages.motion.simulate import simulate
 from limber.stages.shape.generate import write_generated
 from limber.stages.shape.mesh import mesh_surface
-from limber.stages.shape.reconstruct import _without, reconstruct, reconstruct_folder
+from limber.stages.shape.reconstruct import (
+    CLASSES_COMMENT,
+    _place_of_classes,
+    _without,
+    reconstruct,
+    reconstruct_folder,
+)
 from limber.store import Branch
 from limber.store.loading import load_model
 
@@ -161,17 +168,59 @@ def test_failed_run_leaves_the_folder_as_it_was(generated, tmp_path):
 
 
 @pytest.mark.slow
-def test_batch_goes_on_after_a_bad_scan(generated, tmp_path):
-    """One bad scan never stops the others."""
+def test_batch_goes_on_after_a_bad_scan(generated, tmp_path, capsys):
+    """One bad scan never stops the others; the command ends with 3 and names it."""
     folder, _, _ = generated
     scans = tmp_path / "scans"
     scans.mkdir()
     (scans / "a_bad.xyz").write_text("1 2 three\n")
     (scans / "b_good.ply").write_bytes((folder / "cloud.ply").read_bytes())
-    told = []
-    result = reconstruct_folder(scans, tmp_path / "out", progress=Progress(on_warning=told.append))
-    assert result["done_count"] == 1 and list(result["failed"]) == ["a_bad.xyz"]
+    (scans / "._b_good.ply").write_bytes(b"resource fork")
+    for _ in range(2):
+        assert call(["reconstruct", str(scans), "-o", str(tmp_path / "out"), "--json"]) == 3
+        result = json.loads(capsys.readouterr().out.splitlines()[-1])
+        assert result["done_count"] == 1 and list(result["failed"]) == ["a_bad.xyz"]
+        assert "1 of 2 scans could not be reconstructed: a_bad.xyz" in result["error"]
     assert Branch.open(tmp_path / "out" / "b_good.branch").has("mesh.vtu")
+
+
+@pytest.mark.parametrize("names", [
+    ("tree 1.ply", "tree 1.xyz"), ("Tree.ply", "tree.ply"), ("a.b.ply", "a.b.PLY"),
+    ("\u00e9.ply", "e\u0301.csv")])
+def test_no_two_scans_of_a_folder_have_one_branch(tmp_path, names):
+    """Refused before anything is computed, with both names."""
+    for name in (*names, "other.ply"):
+        (tmp_path / name).write_text("1 2 3\n")
+    if len([*tmp_path.iterdir()]) < 3:
+        pytest.skip("this file system does not distinguish the names")
+    with pytest.raises(InputError) as refused:
+        reconstruct_folder(tmp_path, tmp_path / "out")
+    assert all(name in str(refused.value) for name in names)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_scans_replaces_no_other_scans_branch(generated, tmp_path):
+    """Another site's scan of one name, or another file of one stem: kept, with what to type."""
+    kept = tmp_path / "out" / "cloud.branch"
+    shutil.copytree(generated[0] / "g.branch", kept)
+    before = (kept / "branch.json").read_bytes()
+    for name, seen in (("cloud.csv", "not from cloud.csv"), ("cloud.ply", "not the same as")):
+        scans = tmp_path / name.replace(".", "_")
+        scans.mkdir()
+        (scans / name).write_text("1 2 3\n")
+        with pytest.raises(PartlyFailedError, match=rf"{seen}.*limber reconstruct .*{name}"):
+            reconstruct_folder(scans, tmp_path / "out")
+    assert (kept / "branch.json").read_bytes() == before
+
+
+def test_points_by_class_are_no_scan_and_replace_none(tmp_path):
+    """The second run of one command finds its own pictures of refused scans beside the scans."""
+    Cloud(np.zeros((1, 3))).write_ply(tmp_path / "a_points.ply", CLASSES_COMMENT)
+    with pytest.raises(InputError, match="no point clouds"):
+        reconstruct_folder(tmp_path, tmp_path)
+    Cloud(np.zeros((1, 3))).write_ply(tmp_path / "b 1.5_points.ply")
+    assert _place_of_classes(tmp_path / "a.branch").name == "a_points.ply"
+    assert _place_of_classes(tmp_path / "b 1.5").name == "b 1.5-2_points.ply"
 
 
 def test_generate_is_reproducible(tmp_path):

@@ -31,7 +31,7 @@ from limber.cli.terminal import (
     result_lines,
     table_lines,
 )
-from limber.core.errors import LimberError, SafetyStop
+from limber.core.errors import LimberError, PartlyFailedError, SafetyStop
 from limber.core.machine_errors import machine_error
 from limber.core.processes.heartbeat import Heartbeat
 from limber.core.progress import BarSink, JsonSink, Progress, Sink, report_damage_to
@@ -288,7 +288,7 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
             result = function(state, **options)
     except LimberError as error:
         code = error.exit_code
-        if isinstance(error, SafetyStop):
+        if isinstance(error, SafetyStop | PartlyFailedError):
             result = error.result
         outcome |= {"status": error.status, "error": str(error), "fix": error.fix,
                     "code": type(error).__name__, "choices": _choices(name, error),

@@ -50,6 +50,14 @@ class WorkError(LimberError):
     """The input was understood but the work failed (exit code 3)."""
 
 
+class PartlyFailedError(WorkError):
+    """Some of several inputs failed; ``result`` has what was done, for the command's JSON."""
+
+    def __init__(self, seen: str, why: str = "", fix: str = "", *, result: dict[str, Any]):
+        super().__init__(seen, why, fix)
+        self.result = result
+
+
 class ConvergenceError(WorkError):
     """A solver ended without a solution; ``result`` holds its last state and history."""
 

@@ -15,14 +15,16 @@ from typing import Any
 from limber.batch.jobs.branch_jobs import BranchJob, JobFile, StageTask
 from limber.batch.jobs.job_paths import JobPaths
 from limber.batch.jobs.problems import Problems
-from limber.batch.jobs.stage_tables import Source, StageTables
+from limber.batch.jobs.stage_tables import Source, StageTables, written_by
 from limber.batch.jobs.toml_positions import KeyPath, toml_lines
-from limber.core.errors import InputError
+from limber.core.errors import BranchFolderError, InputError
 from limber.core.files.atomic import require_file
 from limber.core.files.reading import read_text, read_toml
+from limber.core.files.safe_names import same_named
 from limber.core.processes import Limits
 from limber.core.settings import nearest
 from limber.core.units import in_unit
+from limber.store.manifest import read_manifest
 
 CLUSTERS = ("local", "slurm", "pbs", "lsf", "sge", "oar", "moab", "htcondor")
 """Where a batch may run besides this process's own pool: a Dask cluster, local or on a queue."""
@@ -111,6 +113,11 @@ class _Reader:
         home = paths.address_of(folder)
         if source.is_scan and paths.home:
             home = f"{paths.home}/{name}.branch"
+        before = _scan_of(folder) if source.is_scan else ""
+        if before and before != source.path.name:
+            self.problems.add(key_path, f"{folder} was made from {before}, not from "
+                              f"{source.path.name}, which would replace it. Use another `out`, or "
+                              "remove that folder.")
         tasks = StageTables(self.problems, paths, source, folder, sweep).tasks(stages, key_path)
         return BranchJob(name, folder, tuple(tasks), sweep,
                          paths.fetched([path for path in _paths_in(tasks) if path != folder]),
@@ -165,14 +172,28 @@ class _Reader:
         return [dict(choice) for choice in itertools.product(*choices)]
 
     def check_folders(self, branches: list[BranchJob]) -> None:
-        """Report branches that share a folder."""
-        seen: set[Path] = set()
-        for branch in branches:
-            folder = branch.folder.resolve()
-            if folder in seen:
-                self.problems.add((), f"Two branches would be named {branch.name}.branch. Give "
-                                  "the scans different names, or use two job files.")
-            seen.add(folder)
+        """Report branches that share a folder or a file that they write."""
+        folders = [str(branch.folder.resolve()) for branch in branches]
+        for group in same_named(folders):
+            named = ", ".join(dict.fromkeys(branches[index].name for index in group))
+            self.problems.add((), f"{len(group)} branches would be named {named}.branch. Give "
+                              "the scans names that differ in more than their suffix or upper and "
+                              "lower case, or use two job files with different `out`.")
+        outputs = [(branch.name, str(path)) for branch in branches
+                   for path in {path for task in branch.tasks
+                                for path in written_by(task) if path != branch.folder}]
+        for group in same_named([path for _, path in outputs]):
+            self.problems.add((), f"{len(group)} branches would write {outputs[group[0]][1]}: "
+                              f"{', '.join(outputs[index][0] for index in group[:5])}. Put "
+                              "{scan} into the name.")
+
+
+def _scan_of(folder: Path) -> str:
+    """Return the name of the scan that a branch folder was made from; empty if there is none."""
+    try:
+        return str(read_manifest(folder).source.get("file", ""))
+    except BranchFolderError:  # none there, or the stage reports its damage
+        return ""
 
 
 def _paths_in(tasks: list[StageTask]) -> list[Path]:

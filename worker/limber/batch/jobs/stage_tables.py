@@ -13,6 +13,7 @@ from limber.batch.jobs.branch_jobs import StageTask
 from limber.batch.jobs.job_paths import JobPaths
 from limber.batch.jobs.problems import Problems
 from limber.batch.jobs.toml_positions import KeyPath
+from limber.core.files.safe_names import same_named
 from limber.core.settings import Settings, nearest, why_constant
 from limber.core.units import in_unit
 from limber.stages.registry import (
@@ -112,8 +113,24 @@ class _StageValues:
                                    f"{nearest(key, list(self._fields))}")
             else:
                 values[key] = self._value(key, value)
-        return [task for each in self._runs(values)
-                if (task := self._checked(own | each)) is not None]
+        tasks = [task for each in self._runs(values)
+                 if (task := self._checked(own | each)) is not None]
+        self._check_results(tasks)
+        return tasks
+
+    def _check_results(self, tasks: list[StageTask]) -> None:
+        """Report runs of this table that would replace each other's result."""
+        for group in same_named([self._stage.entry(task.inputs, task.settings) or " ".join(
+                map(str, written_by(task))) or task.fingerprint for task in tasks]):
+            files = [", ".join(path.name for key, path in vars(tasks[index].inputs).items()
+                               if isinstance(path, Path) and key in self._values)
+                     for index in group]
+            same = self._stage.entry(tasks[group[0]].inputs, tasks[group[0]].settings)
+            self._problems.add(self._key_path, (
+                f"{len(group)} runs of {self._stage.name} on {self._of.source.name} would have one "
+                f"result{f', {same}' if same else ''}: {'; '.join(files[:5])}. Each would replace "
+                "the one before. Put {file} into the name, and give files that differ in their "
+                "suffix only other names."))
 
     def _models(self) -> tuple[type[Settings], ...]:
         return self._stage.inputs, self._stage.settings, self._stage.options
@@ -195,6 +212,13 @@ class _StageValues:
         self._problems.add(self._key_paths.get(key, (*self._key_path, key)),
                            f"{self._stage.name} {key}: {refusal['msg']}{seen}"
                            + (f" [{unit}]." if unit else "."))
+
+
+def written_by(task: StageTask) -> list[Path]:
+    """Return the files and folders that a task writes and its inputs name."""
+    model = type(task.inputs)
+    return [value for key, value in vars(task.inputs).items()
+            if isinstance(value, Path) and model.group_of(key) == "output"]
 
 
 def _trouble(name: str) -> str:

@@ -9,6 +9,9 @@ import click
 from limber.batch.jobs.job_file import CLUSTERS
 from limber.cli.main import Run, stage_command
 
+_NAMED = 10
+"""Failed branches that the error names; the page has all."""
+
 
 @stage_command("batch")
 @click.argument("job_file", type=click.Path(path_type=Path), metavar="JOBS.toml")
@@ -99,8 +102,10 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     put_summary(jobs)
     failed = failures(jobs, records)
     if failed:
-        first = ": ".join(failed[0])
-        raise WorkError(f"{len(failed)} of {len(jobs.branches)} branches failed; {first}",
+        names = ", ".join(name for name, _stage, _why in failed[:_NAMED]) + (
+            f" and {len(failed) - _NAMED} more" if len(failed) > _NAMED else "")
+        raise WorkError(f"{len(failed)} of {len(jobs.branches)} branches failed: {names}; "
+                        f"{': '.join(failed[0])}",
                         "The others are done.",
                         f"See {path_of_page(jobs)}, correct the cause, and run this with "
                         "--retry-failed.")

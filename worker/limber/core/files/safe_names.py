@@ -9,6 +9,7 @@ import os
 import re
 import stat
 import unicodedata
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from limber.core.errors import InputError
@@ -52,6 +53,17 @@ def relative_name(name: str) -> str:
         return pure.as_posix()
     raise InputError(f"{name[:200]!r} cannot be used as a file name in a folder.", why,
                      "Use a relative name with / that stays inside the folder.")
+
+
+def same_named(names: Sequence[str]) -> list[list[int]]:
+    """Return the indices of names that are one on some system: equal but for their case, or for
+    how accents are coded.
+    """
+    groups: dict[str, list[int]] = {}
+    for index, name in enumerate(names):
+        groups.setdefault(unicodedata.normalize(
+            "NFC", unicodedata.normalize("NFD", name).casefold()), []).append(index)
+    return [group for group in groups.values() if len(group) > 1]
 
 
 def inside(folder: Path, name: str) -> Path:

@@ -83,7 +83,7 @@ class Cloud:
         attributes, titles = valid_columns(self.attributes, self.titles, len(self), taken)
         return replace(self, attributes=attributes, titles=titles)
 
-    def write_ply(self, path: Path | IO[bytes]) -> None:
+    def write_ply(self, path: Path | IO[bytes], *comments: str) -> None:
         """Write a binary PLY file, or to a stream: positions as double, attributes in their types.
 
         Attributes get valid names; comments state their names in the scan's file.
@@ -101,6 +101,6 @@ class Cloud:
         titles = [f"column {name}: {title[:_LONGEST_TITLE]!a}"
                   for name, title in valid.titles.items()]
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<",
-                comments=["unit: m", *titles]).write(
+                comments=["unit: m", *comments, *titles]).write(
                     str(path) if isinstance(path, Path) else path)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,17 +14,20 @@ from pydantic import Field
 
 from limber.core.alignment import Alignment
 from limber.core.constants import FOUND_SKELETON
-from limber.core.errors import Cancelled, InputError, LimberError, WorkError
+from limber.core.errors import Cancelled, InputError, LimberError, PartlyFailedError
 from limber.core.files.atomic import file_digest, replacing, require_file
+from limber.core.files.safe_names import same_named
+from limber.core.machine_errors import machine_error
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.geometry.io.clouds import CLOUDS, read_points, unit_of
-from limber.geometry.io.formats import listed, suffixes_of
+from limber.geometry.io.formats import head_of, listed, suffixes_of
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton, read_swc, write_cylinders
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.inputs import RunOptions, argument
 from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
+from limber.store.manifest import MANIFEST
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,6 +44,8 @@ between continues from it.
 """
 CLASSES = "_points.ply"
 """End of the file, beside the folder of a refused scan, that shows its points by class."""
+CLASSES_COMMENT = "limber: points of a refused scan by class"
+"""Comment that distinguishes such a file from a scan."""
 EDITS = "edits.json"
 """The edits that a branch keeps, in the coordinates of the scan's file."""
 
@@ -150,9 +157,9 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         is_kept = True
 
     def show(classes: Cloud) -> None:
-        place = branch.folder.with_name(f"{branch.folder.stem}{CLASSES}")
+        place = _place_of_classes(branch.folder)
         with replacing(place) as file:
-            classes.write_ply(file)
+            classes.write_ply(file, CLASSES_COMMENT)
         progress.warn(f"The points are coloured by class in {place}, in metres: wood brown, leaves "
                       "green, points on no round axis red, a pot grey, stakes, posts "
                       "and wires blue, another plant violet.")
@@ -192,40 +199,88 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
     """Reconstruct every cloud in a folder into ``folder/NAME.branch``.
 
     Args:
-        clouds: The folder of scans; files of other kinds in it are skipped.
+        clouds: The folder of scans; hidden files and files of other kinds in it are skipped.
         folder: Parent folder of the branch folders.
         settings: Settings of all of them.
-        force: Run even if nothing has changed.
+        force: Run even if nothing has changed, and replace branches of other scans.
         progress: Called as it goes; receives each scan's warnings, with its name, and each failure.
 
     Returns:
-        ``done`` and ``failed``: name to result, name to message.
+        ``done``: name to result; ``done_count``.
 
     Raises:
-        InputError: there is no scan.
-        WorkError: all of them failed.
+        InputError: there is no scan, or two would have one branch folder; nothing was computed.
+        PartlyFailedError: some failed; ``result`` also has ``failed``, name to message.
     """
     known = suffixes_of(CLOUDS.readers())
-    paths = sorted(p for p in Path(clouds).iterdir() if p.suffix.lower() in known)
+    paths = sorted(p for p in Path(clouds).iterdir() if p.suffix.lower() in known
+                   and not p.name.startswith(".") and not _shows_classes(p))
     if not paths:
         raise InputError(f"{clouds} has no point clouds.", f"Known are: {' '.join(known)}.",
                          "Name another folder.")
+    if clashes := same_named([path.stem for path in paths]):
+        named = "; ".join(" and ".join(paths[index].name for index in group) for group in clashes)
+        raise InputError(f"Scans of {clouds} would have one branch folder: {named}.",
+                         "A branch folder has the scan's name without its suffix, and many "
+                         "systems do not distinguish upper and lower case. One would replace the "
+                         "other.", "Rename these scans, or move copies of a scan elsewhere.")
     done: dict[str, Any] = {}
     failed: dict[str, str] = {}
     for number, path in enumerate(paths):
         part = progress.part(number / len(paths), (number + 1) / len(paths)).named(path.name)
+        target = Path(folder) / f"{path.stem}.branch"
         try:
-            done[path.name] = reconstruct(path, Path(folder) / f"{path.stem}.branch", settings,
-                                          force=force, progress=part)
+            if not force:
+                _require_same_scan(path, target)
+            done[path.name] = reconstruct(path, target, settings, force=force, progress=part)
+            continue
         except Cancelled:
             raise
         except LimberError as error:
             failed[path.name] = str(error)
-            part.warn(str(error))
-    if not done:
-        raise WorkError(f"None of the {len(paths)} scans could be reconstructed.",
-                        next(iter(failed.values())), "See the warnings for each.")
-    return {"done": done, "failed": failed, "done_count": len(done), "failed_count": len(failed)}
+        except Exception as error:  # a bug costs this scan, not the others
+            failed[path.name] = str(machine_error(error, target) or f"internal error: {error!r}; "
+                                    "please report it (`limber bug-report`).")
+        part.warn(failed[path.name])
+    result: dict[str, Any] = {"done": done, "done_count": len(done)}
+    if failed:
+        raise PartlyFailedError(
+            f"{len(failed)} of {len(paths)} scans could not be reconstructed: "
+            f"{', '.join(failed)}.", next(iter(failed.values())) if len(failed) == 1 else "",
+            "The warnings state the reason for each; the others are done." if done
+            else "The warnings state the reason for each.",
+            result=result | {"failed": failed, "failed_count": len(failed)})
+    return result
+
+
+def _require_same_scan(scan: Path, target: Path) -> None:
+    """Refuse to replace another scan's branch: equal names may be those of two plants."""
+    if not (target / MANIFEST).is_file():
+        return
+    source = Branch.read(target, unfinished=True).manifest.source
+    if source and source.get("sha256") != file_digest(scan):
+        before = source.get("file", "another scan")
+        raise InputError(
+            f"{target} was made from {before}" + (
+                ", and that file was not the same as this one." if before == scan.name
+                else f", not from {scan.name}."),
+            "It was kept: it may be another plant's.",
+            "Choose another folder with -o. If it is the same plant, replace it with: limber "
+            f"reconstruct {shlex.quote(str(scan))} -o {shlex.quote(str(target))}")
+
+
+def _place_of_classes(folder: Path) -> Path:
+    """Return where to show a refused scan's points by class: over no file of the user's."""
+    name = folder.name.removesuffix(".branch")
+    for number in itertools.count(1):
+        place = folder.with_name(f"{name}{'' if number == 1 else f'-{number}'}{CLASSES}")
+        if not place.exists() or _shows_classes(place):
+            break
+    return place
+
+
+def _shows_classes(path: Path) -> bool:
+    return path.name.endswith(CLASSES) and CLASSES_COMMENT.encode() in head_of(path, 1000)
 
 
 def _without(cloud: Cloud, path: Path) -> Cloud:
@@ -376,5 +431,5 @@ STAGE = StageDescription(
     found=("{length_m:m} of centreline in {branch_count:#branch/branches}, radius "
            "{radius_min_m:m} to {radius_max_m:m}.",
            "{tet_count:count} tetrahedra, {mesh_volume_m3:cm3}.",
-           "{done_count} scans reconstructed, {failed_count} failed."),
+           "{done_count:#scan/scans} reconstructed."),
     then="{tet_count:if}limber skeleton {output}", step="skeleton", label="Reconstruct")
