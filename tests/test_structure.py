@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from limber.core.optional import DISTRIBUTION
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -126,6 +128,30 @@ def test_nothing_names_an_index_or_this_machine():
                              check=True).stdout.splitlines()
     wrong = [name for name in tracked if name != "tests/test_structure.py"
              and (ROOT / name).is_file() and pattern.search((ROOT / name).read_bytes())]
+    assert not wrong
+
+
+def test_no_text_advises_the_stranger_of_our_name():
+    """The package index's `limber` is another program: ours is `limber-branch`."""
+    import re
+    import subprocess
+    import tomllib
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["name"] == DISTRIBUTION
+    # `pip install 'limber[report]'`, `pip install -U limber`, limber[report], limber==0.1.
+    pattern = re.compile(r"(pip3?|pipx|uv|conda|mamba)\s+(install|download|add|run|tool)\b[^\n`]*"
+                         r"[\s'\"]limber(?![\w/.-])|(?<![\w.-])limber(\[[a-z$]|\s*[=~<>]=\s*\d)")
+    assert all(map(pattern.search, (
+        "pip install limber", "pip install 'limber[report]'", "python -m pip install -U limber\n",
+        "`limber[robot]`", "limber==0.1", "uv pip install limber")))
+    assert not any(map(pattern.search, ("pip install limber-branch", "uv run limber-branch",
+                                        "'build/limber_branch-0.1-py3-none-any.whl[report]'")))
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True,
+                             check=True).stdout.splitlines()
+    wrong = [name for name in tracked if name != "tests/test_structure.py"
+             and (ROOT / name).is_file()
+             and pattern.search((ROOT / name).read_text(encoding="utf-8", errors="replace"))]
     assert not wrong
 
 

@@ -120,7 +120,7 @@ def test_kernels_are_compiled_where_the_zip_is_to_run(build, tmp_path, monkeypat
         assert "NOT in the zip: compiled kernels" in capsys.readouterr().err
     if system is None:
         pytest.skip("no zip is for this system")
-    for name in ("limber-1.0-py3-none-any", "llvmlite-1.0-cp311-cp311-any"):
+    for name in ("limber_branch-1.0-py3-none-any", "llvmlite-1.0-cp311-cp311-any"):
         _wheel(tmp_path, f"{name}.whl")
     (tmp_path / "bundled.py").write_text(
         "import os, pathlib, sys\n"

@@ -78,5 +78,5 @@ def _not_loaded(error: ImportError) -> LimberError:
     return MissingDependencyError(
         f"{error.name or 'A package'} does not load ({error}).",
         f"The installed packages are incomplete, or do not fit each other or {python}.",
-        f"In Blender, install the extension's zip for this system and {python} again. Elsewhere, "
-        "install Limber anew with pip.")
+        f"In Blender, install the extension's zip for this system and {python} again. In a "
+        "checkout, remove .venv and run scripts/setup. Elsewhere, install Limber's wheel anew.")

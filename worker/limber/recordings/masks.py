@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 
 from limber.core.errors import InputError, MissingDependencyError, WorkError
+from limber.core.optional import pip_install
 from limber.geometry.cloud.pixels import read_pixels
 
 
@@ -68,7 +69,7 @@ class YoloSegmenter:
         except ImportError as error:
             raise MissingDependencyError(
                 "The package ultralytics is not installed.", "It is needed to run YOLO models.",
-                "Install it (pip install ultralytics), use masks from files, or use the built-in "
+                f"{pip_install('ultralytics')} Or use masks from files, or the built-in "
                 "segmenter.") from error
         self._model = YOLO(str(weights))
         self._confidence = confidence

@@ -10,6 +10,7 @@ import numpy as np
 
 from limber.core.errors import MissingDependencyError, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
+from limber.core.optional import pip_install
 from limber.geometry.cloud.camera import Camera, depth_to_cloud
 from limber.robot.cell.cell import Cell
 
@@ -150,5 +151,5 @@ def _library() -> Any:
     except ImportError as error:
         raise MissingDependencyError(
             "pyrealsense2 is not installed.", "A RealSense camera is read by its maker's package.",
-            "Install with: pip install pyrealsense2") from error
+            pip_install("pyrealsense2")) from error
     return pyrealsense2

@@ -11,38 +11,43 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from limber.cli.main import Run, stage_command
+from limber.core.optional import how_to_install
 
 if TYPE_CHECKING:
     from limber.core.files.caches import Cache
 
 _LEAST_FREE_BYTES = 200e6
 
-# Module, distribution, and what does not work without it. None: nothing works without it.
+# Module, distribution, what does not work without it (None: nothing works), and the extra that
+# brings it, if it is optional.
 PARTS = [
-    ("numpy", "numpy", None),
-    ("scipy", "scipy", None),
-    ("numba", "numba", None),
-    ("cvxopt", "cvxopt", "fast factorisation; without it SuperLU is used, about 4 times slower"),
-    ("robust_laplacian", "robust_laplacian", "the robust Laplacian; without it our own is used"),
-    ("pytetwild", "pytetwild", "fTetWild meshes; without it the sweep mesher is used"),
-    ("manifold3d", "manifold3d", "smooth unions at forks"),
-    ("ompl", "ompl", "OMPL's RRT*; without it our own planner is used (no wheel for Windows)"),
-    ("rtde_control", "ur-rtde", "motion of a UR robot (pip install 'limber[robot]')"),
-    ("laspy", "laspy", "LAS and LAZ scans"),
-    ("pypcd4", "pypcd4", "PCD scans"),
-    ("ezc3d", "ezc3d", "C3D motion capture"),
-    ("distributed", "distributed", "work on more than one machine (pip install 'limber[cluster]')"),
-    ("websockets", "websockets", "robots behind ROS 2 (pip install 'limber[ros]')"),
-    ("cv2", "opencv-python-headless", "calibration by pictures (pip install 'limber[camera]')"),
-    ("fsspec", "fsspec", "addresses such as s3:// in job files (pip install 'limber[remote]')"),
-    ("h5py", "h5py", "MAT files of version 7.3 (pip install 'limber[matlab]')"),
-    ("rosbags", "rosbags", "MCAP, rosbag2 and ROS 1 bags (pip install 'limber[bags]')"),
-    ("mcap", "mcap", "`limber export-pull` (pip install 'limber[bags]')"),
-    ("matplotlib", "matplotlib", "`limber report` (pip install 'limber[report]')"),
-    ("jinja2", "jinja2", "`limber report` (pip install 'limber[report]')"),
-    ("pxr", "usd-core", "`limber export` to USD (pip install 'limber[usd]')"),
-    ("bpy", "bpy", "`limber scene` without a real Blender (pip install 'limber[blender]')"),
-    ("ultralytics", "ultralytics", "masks by a YOLO model of your own (optional)"),
+    ("numpy", "numpy", None, ""),
+    ("scipy", "scipy", None, ""),
+    ("numba", "numba", None, ""),
+    ("cvxopt", "cvxopt",
+     "fast factorisation; without it SuperLU is used, about 4 times slower", ""),
+    ("robust_laplacian", "robust_laplacian",
+     "the robust Laplacian; without it our own is used", ""),
+    ("pytetwild", "pytetwild", "fTetWild meshes; without it the sweep mesher is used", ""),
+    ("manifold3d", "manifold3d", "smooth unions at forks", ""),
+    ("ompl", "ompl",
+     "OMPL's RRT*; without it our own planner is used (no wheel for Windows)", "planning"),
+    ("rtde_control", "ur-rtde", "motion of a UR robot", "robot"),
+    ("laspy", "laspy", "LAS and LAZ scans", ""),
+    ("pypcd4", "pypcd4", "PCD scans", ""),
+    ("ezc3d", "ezc3d", "C3D motion capture", ""),
+    ("distributed", "distributed", "work on more than one machine", "cluster"),
+    ("websockets", "websockets", "robots behind ROS 2", "ros"),
+    ("cv2", "opencv-python-headless", "calibration by pictures", "camera"),
+    ("fsspec", "fsspec", "addresses such as s3:// in job files", "remote"),
+    ("h5py", "h5py", "MAT files of version 7.3", "matlab"),
+    ("rosbags", "rosbags", "MCAP, rosbag2 and ROS 1 bags", "bags"),
+    ("mcap", "mcap", "`limber export-pull`", "bags"),
+    ("matplotlib", "matplotlib", "`limber report`", "report"),
+    ("jinja2", "jinja2", "`limber report`", "report"),
+    ("pxr", "usd-core", "`limber export` to USD", "usd"),
+    ("bpy", "bpy", "`limber scene` without a real Blender", "blender"),
+    ("ultralytics", "ultralytics", "masks by a YOLO model of your own (optional)", ""),
 ]
 
 
@@ -62,11 +67,9 @@ def command(run: Run, warm: bool) -> dict[str, Any]:
         compile_kernels()
         warm_geometry(run.progress.part(0.4, 0.5))
         warm_planning(run.progress.part(0.5, 1.0))
-    costs = {module: cost for module, _distribution, cost in PARTS}
     run.close(f"Python {result['python']}, {result['cores']} cores, {result['system']}.",
               f"{len(PARTS) - len(result['missing'])} of {len(PARTS)} packages are installed.",
-              *(f"Missing {module}: {costs[module] or 'nothing works'}."
-                for module in result["missing"]),
+              *(f"{module} is {result['packages'][module]}" for module in result["missing"]),
               f"Blender: {result['blender']}")
     return result
 
@@ -75,12 +78,13 @@ def report() -> dict[str, Any]:
     """Return what is installed and what is missing."""
     parts = {}
     missing = []
-    for module, distribution, cost in PARTS:
-        present = importlib.util.find_spec(module) is not None
-        parts[module] = _version(distribution) if present else (
-            f"missing: {cost or 'nothing works without it'}")
-        if not present:
-            missing.append(module)
+    for module, distribution, cost, extra in PARTS:
+        if importlib.util.find_spec(module) is not None:
+            parts[module] = _version(distribution)
+            continue
+        missing.append(module)
+        parts[module] = f"missing: {cost or 'nothing works without it'}." + (
+            f" {how_to_install(extra)}" if extra else "")
     from limber.core.files.caches import known_caches
 
     return {

@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from limber.core.errors import MissingDependencyError
+from limber.core.optional import how_to_install
 from limber.core.progress import Progress
 from limber.planning.cost import edge_cost
 from limber.planning.planners.tree_search import PathProblem, Search, Searched, SearchTree
@@ -35,7 +36,7 @@ class OmplRrtStar:
         if reason := self.missing():
             raise MissingDependencyError(
                 "OMPL is not installed.", f"The import failed with: {reason}.",
-                "Use --engine own, which needs no other package, or install the extra `planning`.")
+                f"{how_to_install('planning')} Or use --engine own, which needs no other package.")
         from ompl import base, geometric
         from ompl import util as ompl_util
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from limber.core.errors import MissingDependencyError
+from limber.core.optional import how_to_install
 from limber.core.progress import Progress
 
 _OLDEST = (4, 2)
@@ -49,7 +50,7 @@ def blender_command() -> list[str]:
         raise MissingDependencyError(
             "There is no bpy package in this Python and no Blender was found.",
             "A scene needs one of the two.",
-            "Install bpy (pip install 'limber[blender]'), or set LIMBER_BLENDER to a Blender.")
+            f"{how_to_install('blender')} Or set LIMBER_BLENDER to a Blender.")
     return [blender, "--background", "--factory-startup", "--python-exit-code", "3",
             "--python", script]
 
