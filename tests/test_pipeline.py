@@ -12,7 +12,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -130,12 +129,11 @@ def test_picture_shows_something(done):
 def test_second_run_computes_nothing(done):
     """A stage whose input and settings have not changed is skipped and gives the same result."""
     branch, results = done
-    before = (branch / "mesh.vtu").read_bytes()
+    before = {path: path.stat().st_mtime_ns for path in branch.rglob("*") if path.is_file()}
     again = result_of("reconstruct", branch.parent / "scan" / "cloud.ply", "-o", branch,
                       "--mesh-spacing", 4)
     assert again["tet_count"] == results["reconstruct"]["tet_count"]
-    assert again["seconds"] < 0.5 * results["reconstruct"]["seconds"]
-    assert (branch / "mesh.vtu").read_bytes() == before
+    assert {path: path.stat().st_mtime_ns for path in branch.rglob("*") if path.is_file()} == before
     Branch.open(branch, verify=True)
 
 
@@ -175,12 +173,10 @@ def test_ctrl_c_in_a_stage_keeps_the_folder(done, tmp_path, stage: str, options:
     process = subprocess.Popen(
         [sys.executable, "-m", "limber", stage, str(branch), *options, "--json", "--progress",
          "json"], stdout=subprocess.PIPE, text=True, stderr=subprocess.DEVNULL)
-    started = time.time()
     for line in process.stdout:
         content = json.loads(line) if line.startswith("{") else {}
         if content.get("progress", 0) > 0.2:
             break
-        assert time.time() - started < 120
     process.send_signal(signal.SIGINT)
     out, _ = process.communicate(timeout=30)
     assert process.returncode == 130

@@ -353,3 +353,27 @@ def test_dependencies_are_imported():
         if modules.get(name, name).replace("-", "_") not in imported:
             unused.append(name)
     assert not unused
+
+
+def test_no_test_asserts_a_duration():
+    """Machines differ: a test counts the work. Waits may end, and robots are held to their clocks
+    (mark ``real_time``), where a failure says what the machine did."""
+    clocks = {"time.monotonic", "time.perf_counter", "time.process_time", "time.time"}
+    found = []
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        if path.is_relative_to(ROOT / "tests" / "robot"):
+            continue
+        text = path.read_text(encoding="utf-8")
+        tree = ast.parse(text if any(one in text for one in (*clocks, '["seconds"]')) else "")
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Assert):
+                continue
+            spent = [each for each in ast.walk(node.test)
+                     if isinstance(each, ast.BinOp) and isinstance(each.op, ast.Sub)
+                     and isinstance(each.left, ast.Call) and _dotted(each.left.func) in clocks]
+            compared = [each for each in ast.walk(node.test) if isinstance(each, ast.Compare)
+                        and isinstance(each.ops[0], ast.Lt | ast.LtE)
+                        and ast.unparse(each.left).endswith("['seconds']")]
+            if spent or compared:
+                found.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert not found, f"these assert how long something took: {', '.join(found)}"

@@ -4,7 +4,6 @@ import errno
 import io
 import os
 import struct
-import time
 import zipfile
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 
 from limber.batch.jobs.toml_positions import toml_lines
 from limber.core.errors import InputError, WorkError
+from limber.core.files import reading
 from limber.core.files.atomic import file_digest, replacing, require_file
 from limber.core.files.reading import (
     MOST_TOML_BYTES,
@@ -65,14 +65,13 @@ def test_toml_that_is_refused(tmp_path, text):
 @pytest.mark.parametrize("key", [
     ".".join(["a"] * 60_000), "[" + " . ".join(["a", "'b c'", '"d.e"'] * 20) + "]",
     "x = {" + ".".join(["a-1"] * 40) + " = 1}"])
-def test_endless_keys_are_refused_at_once(tmp_path, key):
+def test_endless_keys_are_refused_before_they_are_parsed(tmp_path, monkeypatch, key):
     """The parser would take 21 s and 5.8 GB for the first; depth is counted before it begins."""
     path = tmp_path / "a.toml"
     path.write_text(f"b = 1\n{key} = 1\n")
-    begun = time.process_time()
+    monkeypatch.setattr(reading.tomllib, "loads", lambda *_, **__: pytest.fail("it was parsed"))
     with pytest.raises(InputError, match=r"a\.toml.*line 2: a key has more than 32 parts"):
         read_toml(path, "settings")
-    assert time.process_time() - begun < 1.0
 
 
 def test_what_only_looks_like_a_long_key_is_read(tmp_path):
@@ -94,12 +93,11 @@ def test_a_toml_file_has_a_size(tmp_path):
         toml_content(path.read_text(), path, "settings")
 
 
-def test_lines_of_toml_take_no_time_for_blanks():
-    """A line of blanks in a text of several lines looks like the start of a table."""
-    begun = time.process_time()
-    lines = toml_lines("x = '''\n[" + " " * 50_000 + "\n'''\n[ a . b ]\n c = 1")
+def test_lines_of_toml_are_found_behind_a_million_blanks():
+    """A line of blanks in a text of several lines looks like the start of a table. A search that
+    looks at the blanks again from each of them would not end within a test's limit."""
+    lines = toml_lines("x = '''\n[" + " " * 1_000_000 + "\n'''\n[ a . b ]\n c = 1")
     assert lines[("a", "b", "c")] == 5
-    assert time.process_time() - begun < 1.0
 
 
 def test_a_long_field_of_a_table_is_refused(tmp_path):

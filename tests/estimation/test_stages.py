@@ -9,6 +9,7 @@ import pytest
 from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError
 from limber.core.progress import Progress
+from limber.estimation import fit
 from limber.estimation.fitting import reduced_fit
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
@@ -42,7 +43,7 @@ def test_virtual_pull_is_a_recording_with_its_truth(branch_folder):
 
 
 @pytest.mark.slow
-def test_estimate_from_the_command_line(branch_folder, capsys):
+def test_estimate_from_the_command_line(branch_folder, capsys, monkeypatch):
     """The JSON line has the promised keys, the mesh the new modulus, a second call does nothing.
     """
     arguments = ["estimate", str(branch_folder), "--json", "--progress", "none",
@@ -57,9 +58,10 @@ def test_estimate_from_the_command_line(branch_folder, capsys):
     assert mesh.cell_data["young"].max() < 1.02 * young.max()
     assert mesh.cell_data["young"].min() > 0.98 * young.min()
     assert not (branch_folder / EVALUATIONS).exists()
+    monkeypatch.setattr(fit, "fit_branch", lambda *_, **__: pytest.fail("it was fitted again"))
     assert call(arguments) == 0
     again = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    assert again["young_pa"] == line["young_pa"] and again["seconds"] < 5
+    assert again["young_pa"] == line["young_pa"]
     branch = Branch.open(branch_folder)
     stored = json.loads(branch.path("estimate.json").read_text())
     assert stored["truth"]["young_pa"] == TRUTH.tolist()

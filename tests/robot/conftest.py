@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 
 import numpy as np
+import psutil
 import pytest
 
 from benchmarks.machine_stalls import HELD_UP_SECONDS, Witness
@@ -202,6 +203,21 @@ def _watched(request):
     if request.node.get_closest_marker("real_time") is not None:
         Watch.witness = Watch.witness or Witness()
         Watch.began = time.monotonic()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item):
+    """Say of a failed test that is held to a clock what the machine did meanwhile."""
+    report = yield
+    if report.failed and Watch.witness is not None and item.get_closest_marker("real_time"):
+        longest = Watch.witness.longest(Watch.began)
+        lost = Watch.witness.lost(Watch.began, time.monotonic())
+        slow = "THE MACHINE WAS SLOW: " if longest > HELD_UP_SECONDS else ""
+        report.sections.append(("machine", (
+            f"{slow}while this test ran, the machine stood still for {1e3 * longest:.0f} ms at a "
+            f"time and {lost:.2f} s in all; a robot's loop stops the arm after 50 ms. The load was "
+            f"{psutil.getloadavg()[0]:.1f} on {os.cpu_count()} cores.")))
+    return report
 
 
 def pytest_sessionfinish() -> None:

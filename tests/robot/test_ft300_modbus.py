@@ -61,9 +61,7 @@ class Line:
 
 
 def read_soon(line: Ft300Line) -> np.ndarray:
-    end = time.monotonic() + 1.0
-    while (found := line.poll()) is None:
-        assert time.monotonic() < end
+    while (found := line.poll()) is None:  # pytest's own limit ends it
         time.sleep(0.001)
     return found
 
@@ -86,9 +84,8 @@ def test_readings_come_in_newtons_and_turn_into_the_flange():
         serial.close()
         sensor = Ft300UsbSensor(cell.model_copy(update={"sensor": cell.sensor.model_copy(
             update={"device": line.device})}))
-        end = time.monotonic() + 1.0
         while np.isnan((reading := sensor.read(SAMPLE)).raw).any():
-            assert time.monotonic() < end
+            time.sleep(0.001)
         assert reading.wrench == pytest.approx([-1.0, 0, 0, 0, 0, 0], abs=1e-9)
         line.spoil = lambda told: b""
         sensor.read(SAMPLE)

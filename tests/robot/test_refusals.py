@@ -4,7 +4,6 @@ Nothing here depends on clocks, so these tests run beside others.
 """
 
 import signal
-import time
 
 import numpy as np
 import pytest
@@ -96,11 +95,9 @@ def test_the_last_sample_is_had_from_the_link(resting_robot):
     assert np.allclose(row[1:4], resting_robot.state["pose"][:3], atol=1e-4)
 
 
-def test_nobody_at_the_address_is_told_soon():
-    begin = time.monotonic()
+def test_nobody_at_the_address_is_told():
     with pytest.raises(WorkError, match="No robot answers"):
         RobotLink(cell_for("127.0.0.99")).close()
-    assert time.monotonic() - begin < 20
 
 
 def test_what_is_read_writes_nothing_and_what_is_set_is_put_back(resting_robot):

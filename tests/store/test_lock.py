@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import warnings
 from pathlib import Path
 
@@ -45,12 +44,10 @@ def holder(branch: Branch):
 
 def test_a_second_writer_is_told_who_writes_and_readers_go_on(branch: Branch, holder):
     """The message names purpose, process, machine and time; nothing is computed or changed."""
-    started = time.monotonic()
     with pytest.raises(BranchFolderError, match=(
             rf"limber energy, process {holder.pid} of .* on .*, since 20..-.* UTC")), \
             branch.stage("second"):
         pytest.fail("the stage began")
-    assert time.monotonic() - started < 5
     assert Branch.open(branch.folder, verify=True).path("data.txt").read_text() == "one"
 
 

@@ -193,21 +193,17 @@ def test_a_crash_is_an_error_and_not_the_end(runner):
 
 
 def test_cancel_ends_a_job_that_reports(runner):
-    started = time.monotonic()
     outcome = runner.run("patient", cancel_at="on")
     assert outcome.is_cancelled and not outcome.result
     assert_ended(outcome)
-    assert time.monotonic() - started < 20
 
 
 @pytest.mark.slow
 def test_cancel_ends_a_job_that_hangs(runner):
     """It ignores being asked: after the grace it is killed."""
-    started = time.monotonic()
     outcome = runner.run("hang", cancel_at="about to hang")
     assert outcome.is_cancelled and not outcome.result
     assert_ended(outcome)
-    assert time.monotonic() - started < 20
 
 
 @pytest.mark.slow

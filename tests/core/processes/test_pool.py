@@ -1,7 +1,6 @@
 """The pool: order, budget, errors, and what nested programs may use."""
 
 import os
-import time
 
 import pytest
 from tests.subjects.tasks import (
@@ -69,12 +68,10 @@ def test_a_wrong_budget_is_refused(monkeypatch, text: str):
 @pytest.mark.slow
 def test_the_first_error_stops_the_others_and_keeps_what_it_carries(monkeypatch):
     monkeypatch.setattr(pool_module, "_GRACE_SECONDS", 0.3)
-    started = time.monotonic()
     with Pool(2) as pool, pytest.raises(ConvergenceError, match=r"diverged\. Too far") as error:
         pool.map(diverges, [(0,), (1,), (2,)])
     assert error.value.result == {"steps": 3}
     assert error.value.fix == "Go less far."
-    assert time.monotonic() - started < 20
 
 
 def test_a_bug_comes_with_the_trace_of_its_process():
@@ -119,11 +116,16 @@ def test_progress_tells_share_count_and_remaining_time(monkeypatch):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_cancel_reaches_the_tasks(workers: int, monkeypatch):
     monkeypatch.setenv("LIMBER_CORES", "2")
-    progress = Progress(lambda fraction, _m, _n: progress.cancel() if fraction > 0.01 else None)
-    started = time.monotonic()
+    done = []
+
+    def hear(fraction: float, _message: str, numbers: dict) -> None:
+        done.append(numbers.get("done", 0))
+        if fraction > 0.01:
+            progress.cancel()
+    progress = Progress(hear)
     with pytest.raises(Cancelled):
         run_tasks(half, [()] * 100, workers=workers, progress=progress)
-    assert time.monotonic() - started < 15
+    assert max(done) < 20
 
 
 def test_a_task_cancelled_by_its_own_progress_ends_alone():
