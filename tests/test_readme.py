@@ -62,6 +62,13 @@ def test_the_readmes_picture_moves_and_is_small():
         assert picture.n_frames > 50 and picture.width >= 600
 
 
+def test_the_readme_says_how_many_rows_of_other_generators_miss_a_limit():
+    rows = json.loads((ROOT / "worker/docs/data/worlds.json").read_text(encoding="utf-8"))["rows"]
+    met = [row["met"] for row in rows if "(left out)" in row["measure"]]
+    text = " ".join(README.read_text(encoding="utf-8").split())
+    assert f"{met.count(False)} of the {len(met)} rows of other generators miss" in text
+
+
 def test_a_figure_without_a_row_is_an_error(monkeypatch):
     """A bench that says it otherwise does not leave an old figure."""
     monkeypatch.syspath_prepend(ROOT / "worker" / "docs")
