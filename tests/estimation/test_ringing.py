@@ -195,3 +195,103 @@ def test_the_magnitude_of_the_others_is_no_reading(axes):
     assert found.frequencies[0] == pytest.approx(3.0, rel=5e-3)
     equal = Stream(times, np.c_[swing + 2, swing + 2], ("a", "b"))
     assert ringing_columns(equal).columns == ("a", "b")
+
+
+def in_packets(path, size, *, within=0, jitter=0.0, lost=(), counter=False):
+    """Write 8 s of a sensor that reads 62.5 times a second and sends ``size`` readings together.
+
+    Stamps in whole milliseconds, ``within`` apart in a packet; ``jitter`` [ms] of its arrival.
+    """
+    rng = np.random.default_rng(size)
+    times, values = decays(rng, starts=(0.5,), frequency=5.2, ratio=0.02, noise=0.03, seconds=8.0,
+                           rate=62.5)
+    number = np.arange(len(times))
+    packet = number // size
+    late = np.abs(jitter * rng.standard_normal(packet[-1] + 1))
+    stamps = 16 * (packet + 1) * size + late[packet] + within * (number % size)
+    kept = ~np.isin(packet, lost)
+    written = np.maximum.accumulate(np.round(stamps[kept]))
+    columns = [written, *([number[kept]] if counter else []), *np.round(1e3 * values[kept]).T]
+    np.savetxt(path, np.column_stack(columns), "%d", ",", comments="",
+               header="time_ms,sample,a" if counter else "time_ms,a")
+    return path
+
+
+@pytest.mark.parametrize(("size", "within", "jitter"), [
+    (2, 0, 0), (3, 0, 5), (4, 1, 5), (8, 1, 5), (8, 2, 0), (16, 0, 0), (16, 1, 15), (62, 0, 0)])
+def test_readings_in_packets_are_counted(tmp_path, size, within, jitter):
+    """By their stamps those in packets of 8 rang at 4.2 Hz; equal stamps were refused."""
+    record = read_record(in_packets(tmp_path / "a.csv", size, within=within, jitter=jitter))
+    found = identify(record.times, record.values, rate_deviation=record.rate_deviation)
+    assert abs(found.frequencies[0] - 5.2) < max(3 * found.frequency_deviations[0], 0.005)
+    assert found.frequency_deviations[0] < 0.02
+    assert found.damping[0] == pytest.approx(0.02, rel=0.05)
+    text, = (text for text in record.warnings if "packets" in text)
+    assert "--rate-hz" in text and "missing" not in text
+
+
+@pytest.mark.parametrize("counter", [False, True])
+def test_a_lost_packet_takes_its_time(tmp_path, counter):
+    """The stamps jump there, or the column that counts the readings does."""
+    record = read_record(in_packets(tmp_path / "a.csv", 8, within=1, jitter=5, lost=(20, 40),
+                                    counter=counter))
+    found = identify(record.times, record.values)
+    assert found.frequencies[0] == pytest.approx(5.2, abs=0.01)
+    assert any("missing before 2.8" in text for text in record.warnings) == (not counter)
+
+
+def test_stamps_of_true_packets_are_kept(tmp_path):
+    """A logger that reads ten times in a row and then waits has true stamps."""
+    times, values = decays(np.random.default_rng(3), starts=(0.0,), frequency=2.3, seconds=20.0)
+    kept = np.arange(len(times)) % 30 < 10
+    np.savetxt(tmp_path / "a.csv", np.c_[times, values][kept], "%.5f", ",", header="t_s,a",
+               comments="")
+    record = read_record(tmp_path / "a.csv")
+    assert not any("packets" in text for text in record.warnings)
+    assert identify(record.times, record.values).frequencies[0] == pytest.approx(2.3, rel=5e-3)
+
+
+def test_stamps_that_tell_nothing_are_asked_for(tmp_path):
+    """Stamps that change every three seconds do not show the rate."""
+    path = in_packets(tmp_path / "a.csv", 2)
+    lines = path.read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    coarse = [f"{int(stamp) // 3000 * 3000},{value}" for stamp, value in rows]
+    path.write_text("\n".join([lines[0], *coarse]) + "\n")
+    with pytest.raises(InputError, match=r"have the time of another.*--rate-hz"):
+        read_record(path)
+    assert_rate_is_used(path)
+
+
+def assert_rate_is_used(path):
+    """With a stated rate the stamps do not matter."""
+    record = read_record(path, 62.5)
+    assert identify(record.times, record.values).frequencies[0] == pytest.approx(5.2, abs=0.01)
+    other = read_record(path, 125.0)
+    assert identify(other.times, other.values).frequencies[0] == pytest.approx(10.4, abs=0.02)
+    assert any("stated rate is used" in text for text in other.warnings)
+
+
+def test_a_stated_rate_is_used(tmp_path):
+    """Also where stamps run backwards within a packet, which is refused without it."""
+    assert_rate_is_used(in_packets(tmp_path / "a.csv", 8, within=1))
+    rows = (tmp_path / "a.csv").read_text().splitlines()
+    stamps = [line.split(",")[0] for line in rows[1:]]
+    mixed = [f"{stamps[k // 8 * 8 + 7 - k % 8] if k // 8 * 8 + 7 < len(stamps) else stamps[k]},"
+             f"{line.split(',')[1]}" for k, line in enumerate(rows[1:])]
+    (tmp_path / "a.csv").write_text("\n".join([rows[0], *mixed]) + "\n")
+    with pytest.raises(InputError, match=r"run backwards.*--rate-hz"):
+        read_record(tmp_path / "a.csv")
+    record = read_record(tmp_path / "a.csv", 62.5)
+    assert identify(record.times, record.values).frequencies[0] == pytest.approx(5.2, abs=0.01)
+
+
+@pytest.mark.parametrize(("size", "first", "told"), [
+    ((0.1, 1.0), 5.2, "not taken for the branch"), ((0.3, 1.0), 1.3, "vibrates most at 5.2")])
+def test_the_first_frequency_has_a_share_of_the_power(size, first, told):
+    """A weak slow sway was taken for the branch. A strong second mode is its second."""
+    times, channels = record(np.random.default_rng(2), frequencies=(1.3, 5.2), damping=(0.02, 0.02),
+                             size=size, noise=0.02, seconds=15.0)
+    found = identify(times, channels)
+    assert found.frequencies[0] == pytest.approx(first, rel=5e-3)
+    assert any(told in text for text in found.warnings)

@@ -47,6 +47,8 @@ TORQUE_UNITS_NM = {"Nm": 1.0, "Nmm": 1e-3, "mNm": 1e-3}
 _UNITS = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_NAMES_N, *TIME_UNITS_S,
                                     *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
+_RATE_OFF = 0.02
+"""Relative difference of a stated rate from that of the stamps that is reported."""
 _COUNTERS = r"frames?|samples?|index|framenumber"
 
 
@@ -155,8 +157,14 @@ def time_column(table: Table) -> int | None:
                 None)
 
 
-def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
+def time_stream(table: Table, rate_hz: float | None = None, *, keep_repeated: bool = False,
+                ) -> Stream:
     """Return the table with its time stamps [s] in order; other columns keep their titles.
+
+    Args:
+        table: The table.
+        rate_hz: Rows per second, if it has no stamps.
+        keep_repeated: Keep all rows of the same stamp.
 
     Raises:
         InputError: there is no column of times (and no ``rate_hz``), or the rows are too few or too
@@ -185,11 +193,40 @@ def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
             "No column is named time (t_s, Time (ms), timestamp, ...).",
             "Rename the column of time stamps, or give --rate-hz.")
     kept = [k for k in range(len(titles)) if k not in used]
-    times, values = in_order(table.path, times, table.values[:, kept], warnings)
+    times, values = in_order(table.path, times, table.values[:, kept], warnings,
+                             keep_repeated=keep_repeated)
     if len(times) < 2:
         raise InputError(f"{table.path} has {len(times)} complete rows.",
                          "A pull needs at least two samples.", "Record it again.")
     return Stream(times, values, tuple(table.titles[k] for k in kept), tuple(warnings))
+
+
+def at_rate(table: Table, rate_hz: float) -> Stream:
+    """Return the table with a stated number of rows per second, whatever its stamps.
+
+    The first row keeps its stamp [s], if that is known. A column that counts the rows shows missing
+    ones.
+
+    Raises:
+        InputError: the rows are too few.
+    """
+    titles = [split_title(title) for title in table.titles]
+    stamps = {k for k, title in enumerate(titles) if is_time(title.name)} | set(
+        _split_stamps(titles) or ())
+    kept = [k for k in range(len(titles)) if k not in stamps]
+    bare = time_stream(replace(table, titles=[table.titles[k] for k in kept], clocks=(),
+                               values=table.values[:, kept]), rate_hz)
+    try:
+        stamped = time_stream(table, keep_repeated=True)
+    except InputError:
+        # There are no stamps, or they cannot be used.
+        return bare
+    length, stated = (float(np.ptp(each.times)) for each in (stamped, bare))
+    warnings = bare.warnings if abs(stated / length - 1) < _RATE_OFF else (
+        *bare.warnings,
+        f"{table.path.name}: {len(bare)} rows at {rate_hz:g} per second last {stated:.4g} s, but "
+        f"their stamps span {length:.4g} s. The stated rate is used.")
+    return replace(bare, times=stamped.times[0] + bare.times, warnings=warnings)
 
 
 def _stamps(table: Table, titles: list[Title], at: int,

@@ -176,11 +176,12 @@ def _read_rows(path: Path) -> _Rows:
     return rows
 
 
-def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[str],
-             ) -> tuple[np.ndarray, np.ndarray]:
+def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[str], *,
+             keep_repeated: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Sort rows by time and drop those without a stamp or with a duplicate one.
 
-    Each repair adds a sentence to ``warnings``.
+    Each repair adds a sentence to ``warnings``. With ``keep_repeated`` rows with a duplicate stamp
+    are kept, in the order of the file.
 
     Raises:
         InputError: a tenth or more of the stamps run backwards, half or more are not unique, or
@@ -195,17 +196,21 @@ def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[s
     if backward and backward >= 0.1 * len(times):
         raise InputError(f"{path}: {backward} of {len(times)} time stamps run backwards.",
                          "The order of the rows is not reliable.",
-                         "Check the recorder's clock and the column used as time.")
+                         "Check the recorder's clock and the column used as time"
+                         + (", or state the readings per second with --rate-hz."
+                            if keep_repeated else "."))
     if backward:
         warnings.append(f"{path.name}: {backward} time stamps are out of order. The rows were "
                         "sorted.")
-    times, first = np.unique(times, return_index=True)
-    step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    order = np.argsort(times, kind="stable")
+    times, values = times[order], values[order]
+    first = np.flatnonzero(np.diff(times, prepend=-np.inf) > 0)
+    step = float(np.median(np.diff(times[first]))) if len(first) > 1 else 1.0
     if not _SHORTEST_STEP <= step <= _LONGEST_STEP:
         raise InputError(f"{path}: the time stamps are {step:.3g} s apart.",
                          f"Recorders take {_SHORTEST_STEP:g} s to {_LONGEST_STEP:g} s.",
                          "Check the column used as time, and its unit.")
-    doubled = len(values) - len(first)
+    doubled = 0 if keep_repeated else len(values) - len(first)
     if 2 * doubled >= len(values) > 1:
         raise InputError(f"{path}: {doubled} of {len(values)} rows have the time of another row.",
                          "The clock is too coarse, or several rows belong together.",
@@ -214,4 +219,5 @@ def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[s
     if doubled:
         warnings.append(f"{path.name}: there are {doubled} duplicate time stamps. The first row "
                         "of each was kept.")
-    return times, values[first]
+        times, values = times[first], values[first]
+    return times, values

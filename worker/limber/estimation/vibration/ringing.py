@@ -16,11 +16,12 @@ import scipy
 
 from limber.core.errors import InputError
 from limber.core.not_none import present
+from limber.estimation.vibration.packets import Packets, packets_of
 from limber.estimation.vibration.ringing_detection import cut_off, plucks, ringing_columns
 from limber.recordings.importing.import_request import ImportRequest
 from limber.recordings.importing.recording_formats import RECORDINGS
-from limber.recordings.tables import read_table, split_title, time_stream
-from limber.recordings.time_series import Stream
+from limber.recordings.tables import at_rate, read_table, split_title, time_stream
+from limber.recordings.time_series import Stream, in_order
 
 _COUNTS = r"frames?|samples?|index|framenumber|subframes?"
 """Columns that count the rows."""
@@ -33,7 +34,13 @@ _PERIODS = 60
 """Number of first periods that are used: later ones are noise, or disturbances."""
 _LEAST_SHARE = 0.005
 """Fraction of the record's power below which a vibration is not taken as the first one."""
+_FIRST_SHARE = 0.1
+"""Least power of the branch's first vibration over that of the strongest one."""
+_PLANES = 0.15
+"""Relative difference within which two frequencies are those of two bending planes."""
 _DAMPING = (1e-4, 0.5)
+_AGREED = 0.01
+"""Frequencies by stamps and by count that differ by less are the same."""
 _SAME, _CHANGED = 0.05, 0.03
 """Plucks whose frequencies differ by less are of one vibration; by more, of a changed branch."""
 
@@ -73,11 +80,24 @@ class Ringing:
         return self.damping[:, None] * np.exp(np.clip(wide, 0, 30)[:, None] * np.array([-1, 1]))
 
 
-def read_record(path: Path, rate_hz: float | None = None) -> Stream:
+@dataclass(frozen=True)
+class Record(Stream):
+    """Readings over time.
+
+    Attributes:
+        rate_deviation: Relative standard deviation of the rate at which they were taken.
+    """
+
+    rate_deviation: float = 0.0
+
+
+def read_record(path: Path, rate_hz: float | None = None) -> Record:
     """Read a record: a table of times and readings in any unit, or a C3D file's marker tracks.
 
     Columns with gaps, such as those of a hidden marker, are discarded, and those that do not ring
-    (:func:`.ringing_detection.ringing_columns`). ``rate_hz`` is the rate of readings without times.
+    (:func:`.ringing_detection.ringing_columns`). Readings that come in packets are taken at even
+    steps, where they ring better so. ``rate_hz``, if given, is the rate of all readings, whatever
+    their stamps.
 
     Raises:
         InputError: it cannot be read, has no times or no readings, or its times do not ascend in
@@ -88,24 +108,87 @@ def read_record(path: Path, rate_hz: float | None = None) -> Stream:
     if tracks:
         stream = RECORDINGS.read_as(tracks[0], path, request=ImportRequest(path))[0]
     else:
-        stream = time_stream(read_table(path), rate_hz)
+        table = read_table(path)
+        stream = (time_stream(table, keep_repeated=True) if rate_hz is None else
+                  at_rate(table, rate_hz))
     used = [number for number, title in enumerate(stream.columns)
             if np.isfinite(stream.values[:, number]).all()
             and not re.fullmatch(_COUNTS, split_title(title).plain)]
-    times = stream.times
     if not used:
         raise InputError(f"{path} has no complete column of readings beside its times.",
                          "A record needs at least one.", "Correct the file.")
+    record = Record(stream.times, stream.values[:, used],
+                    tuple(stream.columns[number] for number in used), stream.warnings)
+    counters = [values for title, values in zip(stream.columns, stream.values.T, strict=True)
+                if re.fullmatch(_COUNTS, split_title(title).plain) and (np.diff(values) > 0).all()]
+    packets = None if rate_hz is not None else packets_of(
+        stream.times, counters[0] if counters else np.arange(float(len(stream))))
+    return _stamped(path, record) if packets is None else _of_packets(path, record, packets)
+
+
+def _stamped(path: Path, record: Record) -> Record:
+    """The record by its stamps, with the columns that ring.
+
+    Raises:
+        InputError: they do not ascend in even steps.
+    """
+    doubled = int(np.sum(np.diff(record.times) == 0))
+    if 2 * doubled >= len(record):
+        raise InputError(f"{path}: {doubled} of {len(record)} readings have the time of another.",
+                         "The clock is too coarse to tell how often the sensor reads.",
+                         "State the sensor's readings per second with --rate-hz.")
+    warnings = list(record.warnings)
+    times, values = in_order(path, record.times, record.values, warnings)
     steps = (times[-1] - times[0]) / np.median(np.diff(times))
     if not steps < min(_MOST_STEPS, _MOST_GAPS * len(times)):
         raise InputError(f"{path} has gaps that are far longer than its time steps.",
                          "The analysis needs uniform time steps.",
-                         "Give a part of the record without gaps.")
-    return ringing_columns(replace(stream, values=stream.values[:, used],
-                                   columns=tuple(stream.columns[number] for number in used)))
+                         "Give a part of the record without gaps, or the sensor's readings per "
+                         "second with --rate-hz.")
+    return ringing_columns(replace(record, times=times, values=values, warnings=tuple(warnings)))
 
 
-def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None) -> Ringing:
+def _of_packets(path: Path, record: Record, packets: Packets) -> Record:
+    """The record by its stamps or by the count of its readings, whichever rings better.
+
+    Raises:
+        InputError: both ring about as well, with different frequencies.
+    """
+    gone = "".join(f" Readings are missing before {time:.4g} s." for time in packets.missing[:3])
+    seen = (f"{path.name}: {packets.shared} of {len(record)} readings have the time of another, or "
+            f"nearly so. They came in packets.{gone}")
+    counted = ringing_columns(replace(
+        record, times=packets.times, rate_deviation=packets.deviation, warnings=(
+            *record.warnings,
+            f"{seen} Their times are counted: {packets.rate_hz:.5g} readings per second. If the "
+            "sensor has another rate, state it with --rate-hz.")))
+    try:
+        stamped = _stamped(path, record)
+    except InputError:
+        return counted
+    by_count, by_stamps = _first_of(counted), _first_of(stamped)
+    if by_count is None or by_stamps is None:
+        return stamped if by_count is None and by_stamps is not None else counted
+    ratio = (by_count.left_over / by_stamps.left_over)**2
+    is_same = abs(by_count.frequencies[0] / by_stamps.frequencies[0] - 1) < _AGREED
+    if not is_same and 0.5 < ratio < 2:
+        raise InputError(
+            f"{seen} They ring at {by_stamps.frequencies[0]:.4g} Hz by their stamps, and at "
+            f"{by_count.frequencies[0]:.4g} Hz if they are {packets.rate_hz:.5g} a second.",
+            "The record does not show which is right.",
+            "State the sensor's readings per second with --rate-hz.")
+    return counted if ratio < 1 else stamped
+
+
+def _first_of(record: Record) -> "Ringing | None":
+    try:
+        return identify(record.times, record.values)
+    except InputError:
+        return None
+
+
+def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None, *,
+             rate_deviation: float = 0.0) -> Ringing:
     """Return the vibrations of a free decay.
 
     Args:
@@ -113,6 +196,7 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
         channels: Displacements, accelerations or strains, shape [n, c].
         start: Start of the free decay [s]. Default: the time of the largest motion. If the branch
             is plucked again, each decay is used.
+        rate_deviation: Relative standard deviation of the rate of the times.
 
     Raises:
         InputError: the record is too short, shows no free vibration, or is sampled too slowly.
@@ -143,7 +227,10 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
     best = min(found, key=lambda one: float(one.frequency_deviations[0] / one.frequencies[0]))
     alike = [one for one in found
              if abs(one.frequencies[0] / best.frequencies[0] - 1) < _SAME]
-    return _cut_record(_united(best, alike), len(parts), len(alike), int(cut.sum()))
+    united = _united(best, alike)
+    united = replace(united, frequency_deviations=np.hypot(
+        united.frequency_deviations, rate_deviation * united.frequencies))
+    return _cut_record(united, len(parts), len(alike), int(cut.sum()))
 
 
 def _too_short(count: int) -> InputError:
@@ -154,7 +241,7 @@ def _too_short(count: int) -> InputError:
 
 def _cut_record(found: Ringing, count: int, used: int, cut: int) -> Ringing:
     """The vibrations, and warnings on the record for the user."""
-    warnings = []
+    warnings = list(found.warnings)
     if count > 1:
         others = "" if used == count else (
             f" {count - used} of them are too short, too weak or of another frequency.")
@@ -276,10 +363,36 @@ def _judged(free: np.ndarray, times: np.ndarray, channels: np.ndarray, power: fl
                        for k in range(count)]) / power
     order = [k for k in np.argsort(free[::2]) if shares[k] >= _LEAST_SHARE] or [
         int(np.argmax(shares))]
+    order, warnings = _first_line(np.exp(free[::2]), shares, order)
     frequencies, damping = np.exp(free[::2])[order], np.exp(free[1::2])[order]
     return Ringing(frequencies, frequencies * deviation[::2][order], damping,
                    damping * deviation[1::2][order], shares[order],
-                   float(np.sqrt((left**2).sum() / power)), 0.0, float(times[-1]))
+                   float(np.sqrt((left**2).sum() / power)), 0.0, float(times[-1]),
+                   warnings=warnings)
+
+
+def _first_line(frequencies: np.ndarray, shares: np.ndarray, order: list[int],
+                ) -> tuple[list[int], tuple[str, ...]]:
+    """The vibrations from the first one on, by frequency, and what makes that one doubtful.
+
+    A branch that is plucked vibrates most in its first modes. A line far below the strongest one
+    is the wind, the support, or drift.
+    """
+    largest = order[int(np.argmax(shares[order]))]
+    at = next(n for n, k in enumerate(order) if shares[k] >= _FIRST_SHARE * shares[largest])
+    first, warnings = order[at], []
+    if at:
+        warnings.append(
+            f"The record also vibrates at {', '.join(f'{frequencies[k]:.4g}' for k in order[:at])} "
+            f"Hz, with less than {100 * _FIRST_SHARE:.0f} % of the power at "
+            f"{frequencies[largest]:.4g} Hz. This is not taken for the branch.")
+    if frequencies[largest] > (1 + _PLANES) * frequencies[first]:
+        warnings.append(
+            f"The record vibrates most at {frequencies[largest]:.4g} Hz. The lower frequency, "
+            f"{frequencies[first]:.4g} Hz, with {100 * shares[first] / shares[largest]:.0f} % of "
+            "that power, is taken for the branch's first. If it is not the branch's, record with "
+            "the branch sheltered and its support held.")
+    return order[at:], tuple(warnings)
 
 
 def _peak(times: np.ndarray, channels: np.ndarray, step: float) -> float:

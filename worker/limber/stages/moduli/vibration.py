@@ -58,7 +58,7 @@ class VibrationSettings(Settings):
         None, description="Position [m] and mass [kg] of a sensor that swings with the branch.",
         json_schema_extra={"metavar": "X Y Z KG"})
     rate_hz: float | None = Field(
-        None, gt=0, description="Readings per second, if RECORD has no times.")
+        None, gt=0, description="Readings per second of the sensor. Default: by RECORD's times.")
     density_sigma: float = Field(0.1, ge=0, le=1, description="Relative standard deviation of the "
                                  "wood's density.")
     radius_sigma: float = Field(0.02, ge=0, le=1, description="Relative standard deviation of the "
@@ -98,7 +98,8 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
         digests = {"record": file_digest(record), "mesh geometry": mesh.geometry_digest()}
         if not force and branch.is_current("vibration", settings, digests=digests):
             return branch.manifest.stages["vibration"].result
-        seen = identify(rung.times, rung.values, settings.start)
+        seen = identify(rung.times, rung.values, settings.start,
+                        rate_deviation=rung.rate_deviation)
         for text in seen.warnings:
             progress.warn(text)
         if not _SLOWEST_HZ < seen.frequencies[0] < _FASTEST_HZ:

@@ -159,8 +159,9 @@ def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
         # The load is unknown: the frequencies determine the modulus, positions do not.
         from limber.stages.moduli.vibration import VibrationSettings, vibration
 
-        vibration_result = vibration(inputs.branch_folder, inputs.source, VibrationSettings(),
-                                     force=options.force, progress=progress)
+        vibration_result = vibration(
+            inputs.branch_folder, inputs.source, VibrationSettings(rate_hz=settings.rate_hz),
+            force=options.force, progress=progress)
         return vibration_result | {"kind": "ringing"}
     if inputs.swing:
         settings = settings.model_copy(update={"motion": "swing"})
