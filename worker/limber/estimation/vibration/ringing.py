@@ -180,7 +180,7 @@ def _of_packets(path: Path, record: Record, packets: Packets) -> Record:
     return counted if ratio < 1 else stamped
 
 
-def _first_of(record: Record) -> "Ringing | None":
+def _first_of(record: Record) -> Ringing | None:
     try:
         return identify(record.times, record.values)
     except InputError:

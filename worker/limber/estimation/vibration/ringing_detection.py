@@ -1,11 +1,14 @@
 """Detection of the ringing columns of a record, its plucks, and clipped readings."""
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from limber.core.errors import InputError
 from limber.recordings.time_series import Stream
+
+_Record = TypeVar("_Record", bound=Stream)
 
 _BAND = 0.15
 """Width of the band around a frequency, as a fraction: that of a tenth of critical damping."""
@@ -36,7 +39,7 @@ class _Spectrum:
         return self.prominence > _PROMINENT and self.share > _SHARE and self.burst > _BURST
 
 
-def ringing_columns(record: Stream) -> Stream:
+def ringing_columns(record: _Record) -> _Record:
     """Return the record with the columns that ring, and a sentence on those that do not.
 
     A logger's table may also contain accelerations of other directions, a temperature, a voltage or
