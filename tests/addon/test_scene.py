@@ -13,6 +13,7 @@ import pytest
 from tests.subjects.processes import left_alive
 
 from limber.cli.main import call
+from limber.core.progress import SILENT
 
 ADDON = Path(__file__).parents[2] / "addon"
 
@@ -415,6 +416,24 @@ def test_a_long_legend_keeps_to_its_margin_and_height(bpy, addon, beam, tmp_path
         corner = thing.location + Vector(thing.dimensions) / 2
         assert thing.location.x + thing.dimensions.x <= limit * scale * (1 - 1e-3) + 1e-9, thing
         assert corner.y - thing.dimensions.y > low * scale, thing
+
+
+@pytest.mark.parametrize("reason, remedy", [
+    ("libX11.so.6: cannot open shared object file",
+     "apt-get install libegl1 .*LIMBER_SCENE_BLENDER"),
+    ("no such thing", "a Blender. Or set LIMBER_SCENE_BLENDER to a Blender")])
+def test_a_bpy_that_does_not_load_is_named_with_its_remedy(tmp_path, monkeypatch, reason, remedy):
+    """As on a server, where the package is installed and a desktop's libraries are not."""
+    from limber.core.errors import MissingDependencyError
+    from limber.results.scene.blender_process import make_scene
+
+    (tmp_path / "bpy.py").write_text(f"raise ImportError({reason!r})\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr("shutil.which", lambda _name: None)
+    for name in ("LIMBER_BLENDER", "LIMBER_SCENE_BLENDER"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(MissingDependencyError, match=f"does not load .*{reason}.*{remedy}"):
+        make_scene(["--data", tmp_path / "none.npz"], SILENT)
 
 
 @pytest.mark.slow

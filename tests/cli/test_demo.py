@@ -1,5 +1,7 @@
 """`limber demo`: what it hands to the stages, and its end when one of them fails."""
 
+import importlib.util
+import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -100,8 +102,39 @@ def test_a_second_demo_keeps_results_and_renders_nothing_again(stages, tmp_path,
     assert stages["order"].count("scene") == 2
 
 
+def test_the_scene_comes_last_and_its_failure_is_a_warning(stages, tmp_path, capsys) -> None:
+    """The report is there before it, and gets the picture after it; nothing old is shown as new."""
+    out = tmp_path / "out"
+    assert main.call(["demo", "-o", str(out)]) == 0
+    assert stages["order"][-4:] == ["plan", "report", "scene", "report"]
+    assert "--picture" in stages["report"]
+    out.joinpath("scene.blend").write_text("old")
+    stages["fail"], stages["order"] = ["scene"], []
+    capsys.readouterr()
+    assert main.call(["demo", "-o", str(out), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert stages["order"][-2:] == ["report", "scene"] and "--picture" not in stages["report"]
+    assert told["report"].endswith("report.html") and told["scene"] is told["picture"] is None
+    assert [one for one in told["warnings"] if "There is no scene and no picture" in one
+            and "Or move the goal" in one]
+
+
+def test_without_the_packages_of_the_report_all_else_is_made(stages, tmp_path, monkeypatch,
+                                                             capsys) -> None:
+    """It is said before the work begins, with the remedy."""
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec",
+                        lambda name, *more: None if name == "jinja2" else found(name, *more))
+    assert main.call(["demo", "-o", str(tmp_path / "out"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert "report" not in stages["order"] and stages["order"][-1] == "scene"
+    assert told["report"] is None and "jinja2 is not installed" in told["warnings"][0]
+    assert "[report]" in told["warnings"][0]
+
+
 def test_a_demo_ends_with_what_was_found_and_where(stages, tmp_path, capsys) -> None:
     """Few lines; a scene that was not made is not named."""
+    stages["fail"] = ["scene"]
     assert main.call(["demo", "-o", str(tmp_path / "out")]) == 0
     told = capsys.readouterr().out.splitlines()
     assert told[0].startswith("The gentle path is 200 mm long")
@@ -187,4 +220,4 @@ def test_a_demo_with_a_robot_ends_with_what_came_of_it(monkeypatch, tmp_path, ca
     assert told.out.startswith("1 of 2 intervals contain the true modulus; the flower "
                                + ("was brought to its goal" if in_goal else "did not reach"))
     assert "98.7 % of it" in told.out and "report  loop.branch/report.html" in told.out
-    assert "picture" not in told.out and "There is no picture" in told.err
+    assert "picture" not in told.out and "There is no scene and no picture" in told.err

@@ -67,6 +67,24 @@ def test_a_page_of_an_unchanged_folder_is_left_as_it_is(meshed: Branch):
     assert Branch.open(meshed.folder).manifest.stages["report"] != entry
 
 
+def test_a_picture_comes_into_a_page_that_is_drawn(meshed: Branch, tmp_path, monkeypatch):
+    """As into a new one, without drawing the rest again."""
+    from limber.results.report import page as page_module
+
+    picture = tmp_path / "scene.png"
+    picture.write_bytes(b"\x89PNG made")
+    page = meshed.folder / "report.html"
+    new = write_report(meshed.folder, picture=picture)
+    html = page.read_text()
+    assert html.index("Rendered scene.") < html.index('<section id="part2">')
+    plain, without = write_report(meshed.folder), page.read_text()
+    assert plain["figure_count"] == new["figure_count"] - 1
+    monkeypatch.setattr(page_module, "draw_page", None)
+    assert write_report(meshed.folder, picture=picture) == new
+    lines = page.read_text().splitlines()
+    assert [line for line in lines if "Rendered scene." not in line] == without.splitlines()
+
+
 def test_an_execution_shows_felt_beside_predicted(meshed: Branch):
     """A log of the robot becomes a table and a picture; one without a prediction says so."""
     from limber.robot.driver.link import COLUMNS

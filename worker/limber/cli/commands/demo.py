@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from limber.cli.main import Run, stage_command
-from limber.core.errors import Cancelled, InputError, LimberError
+from limber.core.errors import Cancelled, InputError, LimberError, MissingDependencyError
 from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_json
 from limber.core.optional import require_extra
@@ -40,7 +40,7 @@ _SMALL_SENSOR = ("--force-bias-sigma", "0.01", "--force-drift-sigma", "0.01")
 
 # Fraction of the whole time at which each stage ends, for the bar; measured once, only approximate.
 _ENDS = {"generate": 0.01, "reconstruct": 0.15, "virtual-pull": 0.3, "estimate": 0.5,
-         "simulate": 0.55, "energy": 0.8, "plan": 0.92, "scene": 0.97, "report": 1.0}
+         "simulate": 0.55, "energy": 0.8, "plan": 0.92, "report": 0.95, "scene": 1.0}
 
 
 @dataclass
@@ -52,6 +52,8 @@ class _Demo:
     run: Run
     own: frozenset[str]
     """The demo's options."""
+    reports: bool
+    """Whether the packages of the report are installed."""
     results: dict[str, dict[str, Any]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     kept: set[str] = field(default_factory=set)
@@ -79,17 +81,41 @@ class _Demo:
             if text := without_foreign_options(warning, self.own):
                 self.run.progress.warn(f"{name}: {text}")
 
-    def scene(self, scene: Path, picture: Path) -> None:
-        """Make scene and picture, unless they exist and show the current branch."""
+    def show(self) -> None:
+        """Write the report, then scene and picture, unless they exist and show the current branch.
+
+        The report needs no Blender; it gets the picture once there is one.
+        """
         title, note = "a Blender scene and its picture", self.folder / "demo.json"
         origin = {"branch": self._digest(), "limber": VERSION}
+        scene, picture = self.folder / "scene.blend", self.folder / "scene.png"
         if scene.is_file() and picture.is_file() and _read_note(note) == origin:
             self.kept.add("scene")
+        pictured = ["report", self.branch, "--picture", picture]
+        if self.reports:
+            self.stage("the report", *pictured[:4 if "scene" in self.kept else 2])
+        if "scene" in self.kept:
             self.seconds["scene"], self.done = 0.0, _ENDS["scene"]
             self._tell(title, "scene")
             return
-        self.stage(title, "scene", self.branch, "-o", scene, "--render", picture)
+        try:
+            self.stage(title, "scene", self.branch, "-o", scene, "--render", picture)
+        except Cancelled:
+            raise
+        except LimberError as error:
+            self.run.progress.warn(f"There is no scene and no picture: {error}")
+            return
         write_atomically(note, json.dumps(origin) + "\n")
+        if self.reports:
+            run_stage([str(word) for word in pictured], self.run.progress.part(1.0, 1.0))
+
+    def written(self) -> dict[str, Path | None]:
+        """Return the paths of report, scene and picture, as far as this demo has them."""
+        report, scene, picture = (self.branch / "report.html", self.folder / "scene.blend",
+                                  self.folder / "scene.png")
+        shown = "scene" in self.kept or "scene" in self.results
+        return {"report": report if self.reports else None, "scene": scene if shown else None,
+                "picture": picture if shown else None}
 
     def _tell(self, title: str, name: str) -> None:
         duration = "kept" if name in self.kept else f"{self.seconds[name]:.1f} s"
@@ -154,12 +180,10 @@ def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed:
     if cloud is not None and not cloud.is_file():
         raise InputError(f"There is no file {cloud}.", "The demo needs the scan of one branch.",
                          "Name a PLY, XYZ, TXT, CSV, PCD or LAS file, or none at all.")
-    # Checked before minutes of work, not after them.
-    require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
     name = cloud.stem if cloud else "generated"
     folder = output or Path("out") / name
     demo = _Demo(folder, folder / f"{name}.branch", run,
-                 options_of(click.get_current_context().command))
+                 options_of(click.get_current_context().command), _has_report(run))
     _make_folder(demo.folder)
     started = time.perf_counter()
     run.say(f"Limber demo on {cloud or 'a generated branch'}, results in {demo.folder}")
@@ -167,16 +191,28 @@ def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed:
         run.say("The pull is simulated with an assumed Young's modulus (--young). The stiffness "
                 "of this branch was not measured.")
     failure = _run_stages(demo, cloud, young=young, seed=seed, options=wishes)
+    demo.show()
     _show_tables(demo)
     summary = _summary(demo) | {"demo_seconds": round(time.perf_counter() - started, 1)}
     if failure is not None:
-        run.say(f"The report has what was found before: {summary['report']}")
+        if demo.reports:
+            run.say(f"The report has what was found before: {summary['report']}")
         raise failure
-    run.close(*_found(demo), *_files(summary["report"], summary["scene"], summary["picture"]),
+    run.close(*_found(demo), *_files(demo),
               then="limber demo SCAN.ply   (your own scan)" if cloud is None else
               f"limber import-pull {shlex.quote(str(demo.branch))} PULL --name NAME   "
               "(a pull that you measured)")
     return summary
+
+
+def _has_report(run: Run) -> bool:
+    """Whether a report can be written; a warning with the remedy, before minutes of work."""
+    try:
+        require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
+    except MissingDependencyError as error:
+        run.progress.warn(f"There will be no report: {error}")
+        return False
+    return True
 
 
 def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[str, Any]:
@@ -185,7 +221,7 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
                          "The virtual robot scans a generated branch.",
                          "Omit one of them.")
     require_extra("robot", ("rtde_control", "rtde_io"), "The virtual robot's client")
-    require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
+    reports = _has_report(run)
     from limber.cli.closed_loop.comparison import comparison
     from limber.cli.closed_loop.loop import ClosedLoop
 
@@ -194,23 +230,15 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
     result = ClosedLoop(folder, seed, say=run.say, progress=run.progress).run()
     for title, rows in comparison(result):
         run.show(title, rows)
-    scene, picture = folder / "scene.blend", folder / "scene.png"
-    try:
-        run_stage(["scene", result["branch"], "-o", str(scene), "--render", str(picture)])
-    except Cancelled:
-        raise
-    except LimberError as error:
-        run.progress.warn(f"There is no picture: {error}")
-    with_picture = ["--picture", str(picture)] if picture.exists() else []
-    report = run_stage(["report", result["branch"], *with_picture])["report"]
-    seconds = round(time.perf_counter() - started, 1)
-    run.close(_loop_sentence(result), *_files(report, scene, picture))
-    return result | {"report": report, "demo_seconds": seconds}
+    demo = _Demo(folder, Path(result["branch"]), run, frozenset(), reports, done=_ENDS["plan"])
+    demo.show()
+    run.close(_loop_sentence(result), *_files(demo))
+    return result | demo.written() | {"demo_seconds": round(time.perf_counter() - started, 1)}
 
 
 def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
                 options: Mapping[str, Any]) -> LimberError | None:
-    """Run all stages; a failure between mesh and scene still ends in a report.
+    """Run all stages up to the plan; a failure after the mesh still ends in a report.
 
     Returns:
         The stages that failed.
@@ -239,10 +267,7 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
         raise
     except LimberError as error:
         failure = error
-        demo.run.progress.warn(f"{error} Scene and report show the results so far.")
-    picture = demo.folder / "scene.png"
-    demo.scene(demo.folder / "scene.blend", picture)
-    demo.stage("the report", "report", branch, "--picture", picture)
+        demo.run.progress.warn(f"{error} Report and scene show the results so far.")
     return failure
 
 
@@ -309,11 +334,9 @@ def _loop_sentence(result: Mapping[str, Any]) -> str:
             f"{100 * result['force_within_share']:.1f} % of it.")
 
 
-def _files(report: object, scene: Path, picture: Path) -> list[str]:
+def _files(demo: _Demo) -> list[str]:
     """Print where the results are."""
-    written = [(name, path) for name, path in (("scene", scene), ("picture", picture))
-               if path.is_file()]
-    return [f"{name:<8}{path}" for name, path in (("report", report), *written)]
+    return [f"{name:<8}{path}" for name, path in demo.written().items() if path is not None]
 
 
 def _read_note(path: Path) -> Any:
@@ -326,8 +349,7 @@ def _read_note(path: Path) -> Any:
 
 def _summary(demo: _Demo) -> dict[str, Any]:
     return {
-        "branch": demo.branch, "report": demo.branch / "report.html",
-        "scene": demo.folder / "scene.blend", "picture": demo.folder / "scene.png",
+        "branch": demo.branch, **demo.written(),
         "stage_seconds": demo.seconds,
         "young_pa": demo.results.get("estimate", {}).get("young_pa"),
         "energy_saved_percent": demo.results.get("plan", {}).get("energy_saved_percent"),

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,7 @@ from limber.results.report.report_tables import (
     rigidity_rows,
 )
 from limber.results.report.ringing_section import vibration_rows
-from limber.results.report.section import Section, inline_png, read_png
+from limber.results.report.section import Section, inline_png
 from limber.results.report.shape_sections import (
     cylinders_section,
     mesh_section,
@@ -51,20 +50,19 @@ _SOURCE_LABELS = {"file": "source", "unit": "unit of length", "sha256": "sha256 
                   "truth": "known truth"}
 
 
-def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence[Caliper] = (),
-              progress: Progress = SILENT) -> tuple[str, list[Section]]:
+def draw_page(branch: Branch, *, calipers: Sequence[Caliper] = (), progress: Progress = SILENT,
+              ) -> tuple[str, list[Section]]:
     """Return the page for the stages that have been run, as HTML, and its sections.
 
     Args:
-        picture: A render of the scene to put at the top, PNG.
         calipers: Caliper diameters to compare with the scan's.
 
     Raises:
-        InputError: the picture is not a PNG, or a diameter's position is beyond the branch.
+        InputError: a diameter's position is beyond the branch.
         MissingDependencyError: the packages of the extra ``report`` are not installed.
     """
     require_extra("report", ("matplotlib", "jinja2"), "The report")
-    page = [_found(branch, picture), *_held_back(branch), _summary(branch)]
+    page = [_found(branch), *_held_back(branch), _summary(branch)]
     loads = [name.removesuffix(".json") for name in branch.names("loads")
              if name.endswith(".json")]
     motions = [key for key in branch.manifest.stages if key.split(":")[0] == "simulate"]
@@ -98,8 +96,15 @@ def _names(branch: Branch, stage: str) -> list[str]:
                   if key.startswith(f"{stage}:"))
 
 
-def _found(branch: Branch, picture: Path | None) -> Section:
-    """The findings in one paragraph, their limits, and a picture."""
+def with_picture(html: str, png: bytes) -> str:
+    """Return a page with a render of the scene at the end of its first section."""
+    figure = (f'<figure><img src="{inline_png(png)}" alt="Rendered scene.">'
+              "<figcaption>Rendered scene.</figcaption></figure>\n")
+    return html.replace("</section>", f"{figure}</section>", 1)
+
+
+def _found(branch: Branch) -> Section:
+    """The findings in one paragraph, and their limits."""
     section, pull = Section("What was found"), simulated_pull(branch)
     if pull is not None:
         section.text.append(ASSUMED if pull["young_assumed"] else (
@@ -117,8 +122,6 @@ def _found(branch: Branch, picture: Path | None) -> Section:
         newest = max(plans, key=lambda entry: entry.finished).result
         sentences += [path_sentence(newest), certificate_sentence(newest), beyond_sentence(newest)]
     section.text.append(" ".join(filter(None, sentences)))
-    if picture is not None:
-        section.pictures.append((inline_png(read_png(picture)), "Rendered scene."))
     return section
 
 

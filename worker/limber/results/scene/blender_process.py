@@ -14,23 +14,49 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from limber.core.errors import MissingDependencyError
+from limber.core.errors import MissingDependencyError, WorkError
 from limber.core.optional import how_to_install
 from limber.core.progress import Progress
 
 _OLDEST = (4, 2)
 """Blender that the add-on's script runs in."""
 _ANSWER_SECONDS = 20.0
+LIBRARIES = ("libegl1", "libgl1", "libice6", "libsm6", "libx11-6", "libxext6", "libxfixes3",
+             "libxi6", "libxkbcommon0", "libxrender1", "libxxf86vm1", "libgomp1")
+"""Debian's packages that the bpy package is linked against; scripts/setup reads them too."""
 
 
 def make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
-    """Run the script with ``arguments``; return its output and the Blender used."""
+    """Run the script with ``arguments``; return its output and the Blender used.
+
+    Raises:
+        MissingDependencyError: there is no bpy package and no Blender, or bpy does not load.
+    """
     from limber.core.processes.stage_process import run_json_process
 
     progress(0.0, "starting Blender")
-    result = run_json_process("scene", [*blender_command(), "--", *map(str, arguments)], progress,
-                              fix="`limber doctor` states which Blender was used.")
+    command = blender_command()
+    try:
+        result = run_json_process("scene", [*command, "--", *map(str, arguments)], progress,
+                                  fix="`limber doctor` states which Blender was used.")
+    except WorkError as error:
+        if command[0] != sys.executable or (reason := _why_bpy_does_not_load()) is None:
+            raise
+        raise MissingDependencyError(
+            f"The bpy package does not load ({reason}).",
+            "It needs a desktop's libraries, even where it opens no window."
+            if ".so" in reason else "A scene needs it, or a Blender.",
+            (f"On Debian or Ubuntu, as root: apt-get install {' '.join(LIBRARIES)}. "
+             if ".so" in reason else "") + "Or set LIMBER_SCENE_BLENDER to a Blender.") from error
     return {key: result[key] for key in ("object_count", "frame_count", "blender")}
+
+
+def _why_bpy_does_not_load() -> str | None:
+    """The error of importing bpy in a process of its own; None if it loads."""
+    done = subprocess.run([sys.executable, "-c", "import bpy"], capture_output=True, text=True,
+                          check=False)
+    return (done.stderr.strip().splitlines() or ["it ended without a word"])[-1] if (
+        done.returncode) else None
 
 
 def blender_command() -> list[str]:

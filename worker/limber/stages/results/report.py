@@ -45,23 +45,33 @@ def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Pat
         InputError: the picture or the measured diameters cannot be used.
     """
     from limber.geometry.skeleton.qsm_tables import against_calipers, read_calipers
-    from limber.results.report.page import draw_page
+    from limber.results.report.page import draw_page, with_picture
+    from limber.results.report.section import read_png
     from limber.store.loading import load_skeleton
 
     branch = Branch.open(folder)
+    png = None if picture is None else read_png(picture)
     calipers = [] if caliper_path is None else read_calipers(caliper_path)
     settings, digests = {"picture": bool(picture)}, _shown(branch, picture, caliper_path)
     if not force and branch.is_current("report", settings, digests=digests):
         return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
-    html, page = draw_page(branch, picture=picture, calipers=calipers, progress=progress)
+    if not force and png and branch.is_current(
+            "report", {"picture": False}, digests=_shown(branch, None, caliper_path)):
+        html = branch.path("report.html").read_text(encoding="utf-8")
+        found = branch.manifest.stages["report"].result
+    else:
+        html, page = draw_page(branch, calipers=calipers, progress=progress)
+        found = {"figure_count": sum(len(section.pictures) for section in page),
+                 "sections": [section.title for section in page if not section.missing],
+                 "missing": [section.title for section in page if section.missing]}
+        if calipers:
+            found["calipers"] = against_calipers(load_skeleton(branch), calipers)
+    if png:
+        html = with_picture(html, png)
+        found = found | {"figure_count": found["figure_count"] + 1}
     with branch.stage("report", settings, digests=digests) as stage:
         stage.path("report.html").write_text(html, encoding="utf-8")
-        stage.result.update(
-            figure_count=sum(len(section.pictures) for section in page),
-            sections=[section.title for section in page if not section.missing],
-            missing=[section.title for section in page if section.missing])
-        if calipers:
-            stage.result["calipers"] = against_calipers(load_skeleton(branch), calipers)
+        stage.result.update(found)
     progress(1.0, "written")
     return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
 
