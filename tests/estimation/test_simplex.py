@@ -6,7 +6,7 @@ import pytest
 from limber.estimation.fitting import optimise
 from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.objective import Evaluation
-from limber.estimation.fitting.optimise import SETTLED_FALL, _Settling, nelder_mead
+from limber.estimation.fitting.optimise import SETTLED_FALL, FitStatus, _Settling, nelder_mead
 from limber.estimation.parameters import ParameterSpace, Values
 
 FORM = 0.4
@@ -51,6 +51,18 @@ def test_what_is_known_by_its_prior_alone_is_not_searched():
     valley = _Valley()
     nelder_mead(valley, valley.space.pack(valley.space.base), evaluation_limit=60)
     assert {float(free[2]) for free in valley.asked} == {FORM}
+
+
+@pytest.mark.parametrize(("delta", "status", "reason"), [
+    (2.7, FitStatus.converged, "fell below 2.7 m2"),
+    (1.0, FitStatus.misfit, "settled above the requested 1 m2 (--delta-m2)")])
+def test_it_ends_below_the_papers_delta(delta, status, reason):
+    """The form of the field alone leaves 2.56 here."""
+    valley = _Valley()
+    start = valley.space.pack(valley.space.base)
+    fit = nelder_mead(valley, start, evaluation_limit=1500, delta_m2=delta)
+    assert fit.status is status and reason in fit.reason
+    assert (fit.evaluation.loss < delta) == (status is FitStatus.converged)
 
 
 def test_no_more_simulations_than_allowed():

@@ -22,7 +22,9 @@ from limber.core.json_values import plain
 from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.io.clouds import read_points
 from limber.geometry.io.skeletons import read_cylinders, read_swc
+from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.contraction.laplacian_contraction import contract
+from limber.geometry.skeleton.radii.nearest_points import nearest_point_radii
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.geometry.surface.forks import smooth_forks
@@ -78,12 +80,6 @@ def _authors_asked(stem: str) -> Asked:
     return Asked(f"{stem}: axes against the authors'", "report")
 
 
-def _median_radii(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
-    """The paper's radii: median distance of the 24 nearest points to each node [m], shape [n]."""
-    distance, _ = cKDTree(points).query(skeleton.nodes, k=min(24, len(points)))
-    return np.median(distance, axis=1)
-
-
 def generated(seed: int, **changes: object) -> GeneratedBranch:
     """Return branch ``seed`` of the accuracy benchmark: sizes and fork counts vary with it."""
     rng = np.random.default_rng(1000 + seed)
@@ -116,7 +112,8 @@ def _generated_trial(seed: int, source: str, first: int, out: Path | None) -> Nu
         if view == "round":
             meshed = mesh_branch(result.skeleton).mesh
             found["volume"] = float(meshed.volumes.sum() / branch.surface.volume - 1)
-            radii = _median_radii(result.skeleton, branch.cloud.points)
+            radii = nearest_point_radii(result.skeleton, branch.cloud.points,
+                                        SkeletonSettings()).radius
             found["paper"] = float(np.median(np.abs(radii / result.skeleton.radius - 1)))
         if out is not None and seed < first + 3:
             _draw(out / f"generated_{seed}_{view}.png", branch, result.skeleton, surface)

@@ -312,7 +312,8 @@ def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
             is_near: bool) -> tuple[Fit, Objective]:
     def optimise(chosen: Objective, free: np.ndarray, is_near: bool = False) -> Fit:
         if settings.method == "nelder-mead":
-            return nelder_mead(chosen, free, evaluation_limit=EVALUATION_LIMIT)
+            return nelder_mead(chosen, free, evaluation_limit=EVALUATION_LIMIT,
+                               delta_m2=settings.delta_m2)
         return gauss_newton(chosen, free, is_near=is_near, evaluation_limit=EVALUATION_LIMIT)
 
     if settings.method == "gauss-newton":

@@ -1,8 +1,8 @@
 """Settings of estimates, virtual pulls and predictions, without heavy imports."""
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from limber.core.settings import (
     GraspMode,
@@ -26,17 +26,20 @@ class EstimateSettings(Settings):
         "input": ("pull", "drive", "motion", "fractions", "free_frame"),
         "material": ("young", "poisson", "density", "gravity", "fit_poisson", "fit_density",
                      "fit_damping", "orders", "pith_radius", "bark_thickness", "bark_modulus"),
-        "solver": ("method", "forward", "key_frames"),
+        "solver": ("method", "delta_m2", "forward", "key_frames"),
         "uncertainty": ("field", "poisson_sigma", "density_sigma", "hung_sigma", "hold_out",
                         "mesh_check", "shapes"),
     }
     common = ("pull", "fractions")
     retired: ClassVar[dict[str, Any]] = {
-        "evaluations": 400, "delta_m2": None, "robust": True, "control_points": "evidence"}
+        "evaluations": 400, "robust": True, "control_points": "evidence"}
 
     pull: tuple[str, ...] = Field((), description="Names of the pulls to use. Default: all.")
     method: Literal["gauss-newton", "nelder-mead"] = Field(
         "gauss-newton", description="Optimiser; nelder-mead is the paper's.")
+    delta_m2: float | None = Field(
+        None, gt=0, description="Mean squared distance of the points [m^2] below which "
+        "nelder-mead ends: the paper's delta. Default: where it no longer falls.")
     forward: Literal["full", "reduced"] = Field(
         "full", description="reduced: a reduced model of slow pose-driven pulls, corrected by "
         "the full model. Its basis is kept in the branch folder, so further estimates take "
@@ -102,6 +105,13 @@ class EstimateSettings(Settings):
 
     _young = field_validator("young")(possible_young)
     _density = field_validator("density")(possible_density)
+
+    @model_validator(mode="after")
+    def _of_the_simplex(self) -> Self:
+        if self.delta_m2 is not None and self.method != "nelder-mead":
+            raise ValueError("--delta-m2 ends only --method nelder-mead; gauss-newton ends at the "
+                             "least loss")
+        return self
 
     @property
     def initial_fractions(self) -> tuple[float, ...]:

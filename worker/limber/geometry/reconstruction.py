@@ -9,6 +9,7 @@ import numpy as np
 from limber.core.alignment import Alignment
 from limber.core.constants import STANDARD_GRAVITY, UNIT_METRES
 from limber.core.errors import InputError
+from limber.core.lazy import loaded
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf
@@ -36,6 +37,7 @@ from limber.geometry.pruned_twigs import (
     touching_texts,
     twig_mass,
 )
+from limber.geometry.radius_estimators import ESTIMATORS
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.alternatives import alternatives, entries
 from limber.geometry.skeleton.checkpoint import FoundSkeleton
@@ -157,6 +159,10 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         if text:
             progress.warn(text)
     alignment, cloud, found = _aligned(wood, found, settings)
+    if own is None and settings.radii in ESTIMATORS:
+        estimate = loaded(ESTIMATORS[settings.radii])
+        found = replace(found, skeleton=estimate(found.skeleton, cloud.points, settings))
+        cloud = labelled(cloud, found.skeleton)
     if keep is not None and known is None:
         keep(alignment, found.skeleton, FoundSkeleton(whole, leaves))
     if own is None:

@@ -1,10 +1,18 @@
 """Settings of reconstruction from scans and surfaces; this module imports nothing heavy."""
 
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
-from limber.core.settings import Direction, Groups, Settings, possible_density, possible_young
+from limber.core.settings import (
+    Direction,
+    Groups,
+    OneOf,
+    Settings,
+    possible_density,
+    possible_young,
+)
+from limber.geometry.radius_estimators import estimator_names
 
 GRASP_FRACTION = 2.0 / 3.0
 """Position along the main path at which a branch is held by default."""
@@ -40,10 +48,11 @@ class SkeletonSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "shape": ("bridge_limit", "twig_probability", "plants"),
+        "the paper's equations": ("contraction_weight", "gap_factor", "radii",
+                                  "radius_neighbours", "radius_low", "radius_high"),
     }
     retired: ClassVar[dict[str, Any]] = {
-        "gap_factor": 3.0, "contraction_points": 12_000, "attraction": "constant", "prune": 2.5,
-        "radii": "fit", "radius_low": 5e-4, "radius_high": 0.1}
+        "contraction_points": 12_000, "attraction": "constant", "prune": 2.5}
 
     bridge_limit: float = Field(
         0.15, ge=0, le=1, description="Bridge gaps up to this fraction of the cloud's diagonal.")
@@ -52,6 +61,35 @@ class SkeletonSettings(Settings):
     plants: Literal["refuse", "largest", "joined"] = Field(
         "refuse", description="Two plants in one cloud: refuse the cloud, keep the largest, or "
             "join them.")
+    contraction_weight: float = Field(
+        1.0, gt=0, le=1e3, description="Weight of smoothness relative to that of position in the "
+        "first contraction of the cloud: W_L / W_H of the paper's equation 1.")
+    gap_factor: float = Field(
+        3.0, gt=1, le=100, description="A step between contracted points of more than this many "
+        "median steps is a gap: the paper's gamma.")
+    radii: Annotated[str, OneOf(estimator_names)] = Field(
+        "fit", description="fit: radii fitted together with the axes. paper: the median distance "
+        "of the nearest points from each node of the skeleton.")
+    radius_neighbours: int = Field(
+        24, ge=1, le=10_000, description="Number of nearest points for --radii paper: the paper's "
+        "k.")
+    radius_low: float = Field(
+        5e-4, gt=0, lt=1, description="Smallest radius, as a fraction of the cloud's diagonal D: "
+        "the paper's alpha.")
+    radius_high: float = Field(
+        0.1, gt=0, le=1, description="Largest radius, as a fraction of the cloud's diagonal D: "
+        "the paper's beta.")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.radius_low >= self.radius_high:
+            raise ValueError(f"--radius-low {self.radius_low:g} is not below --radius-high "
+                             f"{self.radius_high:g}")
+        return self
+
+    def radius_limits(self, diagonal: float) -> tuple[float, float]:
+        """Return the smallest and the largest radius [m] in a cloud of this diagonal [m]."""
+        return self.radius_low * diagonal, self.radius_high * diagonal
 
 
 class MeshSettings(Settings):

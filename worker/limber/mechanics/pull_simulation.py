@@ -111,7 +111,8 @@ def motion_of(case: LoadCase, settings: SimulateSettings,
         return static_motion(case, progress)
     scheme: MotionSettings = EnergyMomentumSettings(max_step=settings.step)
     if settings.scheme == "newmark":
-        scheme = NewmarkSettings(max_step=settings.step)
+        scheme = NewmarkSettings(max_step=settings.step, beta=settings.newmark_beta,
+                                 gamma=settings.newmark_gamma)
     return dynamic_motion(case, scheme, progress)
 
 

@@ -23,11 +23,10 @@ class SimulateSettings(Settings):
             "mass_at"),
         "material": ("young", "material", "gravity", "rest_shape", "damping_mass",
             "damping_stiffness"),
-        "solver": ("step", "scheme"),
+        "solver": ("step", "scheme", "newmark_beta", "newmark_gamma"),
     }
     common = ("name", "move", "grasp_force", "young")
-    retired: ClassVar[dict[str, Any]] = {
-        "newmark_beta": 0.25, "newmark_gamma": 0.5, "lumped_mass": False}
+    retired: ClassVar[dict[str, Any]] = {"lumped_mass": False}
 
     name: str = Field("simulate", pattern=r"^[\w-]+$",
                       description="Name of the result files: frames/NAME.pc2 and frames/NAME.json.")
@@ -65,6 +64,11 @@ class SimulateSettings(Settings):
     scheme: Literal["energy_momentum", "newmark"] = Field(
         "energy_momentum", description="Time integration (dynamic). energy_momentum: conserves "
         "the energy at any amplitude. newmark: the paper's.")
+    newmark_beta: float = Field(
+        0.25, gt=0, le=0.5, description="Beta of --scheme newmark.")
+    newmark_gamma: float = Field(
+        0.5, ge=0.5, le=1, description="Gamma of --scheme newmark; above 1/2 it damps high "
+        "frequencies.")
     young: float | None = Field(
         None, gt=0, description="Young's modulus of the whole branch [Pa]. Default: the mesh's.")
     gravity: bool = Field(

@@ -217,6 +217,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         goals, nobody = np.empty((0, 3)), error
     # Scales by the goal's centre, not by a random point in it: costs of two seeds compare.
     weighed = CostWeights.between(field, start, goal.centre(field),
+                                  deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
     problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond,
                             errors=errors or {}, asked_goal=asked_goal)
@@ -282,6 +283,7 @@ def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSe
              limits: FieldArrays, beyond: FieldArrays | None) -> PathPair:
     """Return the plan if the start is in the goal: both paths stay there."""
     weighed = CostWeights.between(field, start, goal.centre(field),
+                                  deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
     problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond)
     path = FoundPath(np.stack([start, start]), 0.0, 0.0, engine=NOTHING_ASKED)
@@ -359,7 +361,8 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
     field, start = problem.energy_field, problem.start
     if np.linalg.norm(start - field.rest) < STEP:
         return field.rest[None]
-    cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight)
+    cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight,
+                               deformation=settings.deformation_weight)
     goal = near(start, _AT_START)
     path = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), goal,
                          beyond=problem.beyond, errors=problem.errors)

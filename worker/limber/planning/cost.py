@@ -44,7 +44,7 @@ class CostWeights:
 
     @classmethod
     def between(cls, field: EnergyField, start: np.ndarray, goal: np.ndarray, *,
-                distance: float, deformation: float = 1.0) -> "CostWeights":
+                deformation: float, distance: float) -> "CostWeights":
         """Scale to the straight line from ``start`` to ``goal`` [3]."""
         line = resample(np.stack([start, goal]), STEP)
         line = line[field.region.contains(line)]

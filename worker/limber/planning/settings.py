@@ -39,7 +39,7 @@ class PlanSettings(Settings):
     groups: ClassVar[Groups] = {
         "start and goal": ("goal", "tip_goal", "target", "target_box", "in_view", "second_arm",
                            "goal_seed", "goal_tolerance", "start", "start_seed"),
-        "weights and limits": ("distance_weight", "max_detour", "max_energy",
+        "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "wood", "max_damage", "max_stress", "workspace_low",
                                "workspace_high", "clearance", "turn_slack", "confidence"),
@@ -47,7 +47,7 @@ class PlanSettings(Settings):
         "solver": ("planner", "iterations", "engine", "field_error", "seed"),
     }
     common = ("goal", "tip_goal", "target", "max_force", "max_strain")
-    retired: ClassVar[dict[str, Any]] = {"slowings": 4, "replans": 3, "deformation_weight": 1.0}
+    retired: ClassVar[dict[str, Any]] = {"slowings": 4, "replans": 3}
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the grasp, in the branch's frame [m]. Without any goal, a distant pose "
@@ -76,8 +76,11 @@ class PlanSettings(Settings):
         json_schema_extra=POSITION)
     start_seed: int | None = Field(None, ge=0, description=(
         "Seed of a random deformed start configuration, as in the paper's trials."))
+    deformation_weight: float = Field(1.0, gt=0, description=(
+        "Weight of deformation, the paper's alpha_def; the path depends on its ratio to the weight "
+        "of distance."))
     distance_weight: float = Field(1.5, gt=0, description=(
-        "Weight of distance relative to that of deformation: the paper's alpha_dis / alpha_def."))
+        "Weight of distance, the paper's alpha_dis."))
     max_detour: float | None = Field(None, ge=0, le=1000, description=(
         "Largest extra length over the shortest path [%]. The weight of distance is set so that "
         "the gentlest such path is found."))

@@ -47,12 +47,14 @@ class FitStatus(StrEnum):
 
     converged: by the optimiser's own criterion.
     out_of_evaluations: no more simulations were allowed.
+    misfit: it settled, but farther from the measurements than requested.
     unconfirmed: a reduced model's fit that the full model could not confirm.
     stopped: by the user.
     """
 
     converged = "converged"
     out_of_evaluations = "out of evaluations"
+    misfit = "misfit"
     unconfirmed = "unconfirmed"
     stopped = "stopped"
 
@@ -192,22 +194,24 @@ def _wanted_step(found: Evaluation, loss: str) -> tuple[np.ndarray, float]:
 
 
 def nelder_mead(objective: Objective, start: np.ndarray, *,
-                evaluation_limit: int = EVALUATION_LIMIT, tolerance: float = 1e-3) -> Fit:
+                evaluation_limit: int = EVALUATION_LIMIT, delta_m2: float | None = None,
+                tolerance: float = 1e-3) -> Fit:
     """The paper's estimator (Algorithm 1): scipy's Nelder-Mead on the free vector.
 
     Values that are free only within their priors, such as the form of the field, stay at the start:
     no simplex finds them beside the moduli. A settled search begins again from its best values with
     a simplex of full size, until that gains nothing: a simplex may collapse far from the minimum.
 
-    A search stops when the error settles, that is, no longer decreases by an amount that is
+    A search stops when the mean squared error of the points falls below ``delta_m2`` [m^2], the
+    algorithm's delta; when the error settles, that is, no longer decreases by an amount that is
     relevant compared to the noise; or when the simplex spans less than ``tolerance`` in every log E
-    and in the objective.
+    and in the objective. Settled above ``delta_m2`` is not converged.
 
     Raises:
         WorkError: no candidate had an equilibrium.
     """
     lower, upper = objective.space.bounds()
-    rule = _Settling(objective)
+    rule = _Settling(objective, delta_m2)
     if any(forward.drive == "force" for forward in objective.forwards):
         # The effect of its errors on the points is computed with the derivatives.
         _required(objective, start)
@@ -226,7 +230,7 @@ def nelder_mead(objective: Objective, start: np.ndarray, *,
 
     steps = _first_steps(objective)
     best, value, is_settled = np.clip(start, lower, upper), np.inf, False
-    while rule.count < evaluation_limit:
+    while rule.count < evaluation_limit and not rule.is_small_enough:
         found = _simplex_search(cost, best, steps, (lower, upper), rule, tolerance,
                                 evaluation_limit - rule.count)
         gain, value = value - found.fun, float(found.fun)
@@ -268,9 +272,10 @@ def _first_steps(objective: Objective) -> np.ndarray:
 
 
 class _Settling:
-    """The paper's termination: the mean squared error of the points settles."""
+    """The paper's termination: the mean squared error of the points settles below a threshold."""
 
-    def __init__(self, objective: Objective):
+    def __init__(self, objective: Objective, delta_m2: float | None = None):
+        self._delta = delta_m2
         self._points = max(sum(int(np.isfinite(f.frames.positions).all(axis=2).sum())
                                for f in objective.forwards), 1)
         self._window = SETTLED_ITERATIONS * (np.count_nonzero(_first_steps(objective)) + 1)
@@ -287,9 +292,14 @@ class _Settling:
 
     def begin_again(self) -> bool:
         """Return whether the last search ended by this rule; the next one is judged anew."""
-        ended = self._has_settled
+        ended = self._has_settled or self.is_small_enough
         self._course, self._has_settled = [], False
         return ended
+
+    @property
+    def is_small_enough(self) -> bool:
+        """Whether the error is below the requested one."""
+        return self._delta is not None and self._error < self._delta
 
     def seen(self, objective: float, loss: float) -> None:
         self._best = min(self._best, (objective, loss))
@@ -297,6 +307,8 @@ class _Settling:
     def after_iteration(self, _free: np.ndarray) -> None:
         self._course.append(self._best[0])
         self._iterations += 1
+        if self.is_small_enough:
+            raise StopIteration
         if len(self._course) > self._window:
             fell = self._course[-1 - self._window] - self._course[-1]
             self._has_settled = fell <= min(SETTLED_FALL, 1e-3 * self._course[-1])
@@ -306,11 +318,17 @@ class _Settling:
     def verdict(self, is_settled: bool, limit: int) -> tuple[FitStatus, str]:
         """Status and reason."""
         error = f"the mean squared distance of the points, {self._error:.3g} m2,"
+        if self.is_small_enough:
+            return FitStatus.converged, f"{error} fell below {self._delta:.3g} m2"
         if not is_settled:
             return FitStatus.out_of_evaluations, (
                 f"{limit} simulations were not enough: {error} is still falling. "
                 f"{self._outlook()} Use --method gauss-newton")
-        return FitStatus.converged, f"{error} settled"
+        if self._delta is None:
+            return FitStatus.converged, f"{error} settled"
+        return FitStatus.misfit, (
+            f"{error} settled above the requested {self._delta:.3g} m2 (--delta-m2). The noise or "
+            "the error of the model is larger")
 
     def _outlook(self) -> str:
         """After how many simulations it would settle if its fall went on shrinking as it does."""

@@ -43,7 +43,6 @@ _CONTRACTED_POINTS = 12_000  # more are thinned evenly: the fit, not contraction
 # twigs of a real branch of 784. Of 9,000 and 20,000 points contraction makes more false twigs, or
 # finds less.
 _FEW = 5_000
-_GAP_FACTOR = 3.0  # the paper's gamma: a step of more than this many median steps is a gap
 
 
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
@@ -134,7 +133,7 @@ class _Search:
 
     def _joining(self) -> dict[str, Any]:
         settings = self.settings
-        return {"gap_factor": _GAP_FACTOR, "up": self.up,
+        return {"gap_factor": settings.gap_factor, "up": self.up,
                 "bridge_limit": settings.bridge_limit * self.diagonal,
                 "join_plants": settings.plants == "joined"}
 
@@ -147,7 +146,8 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     search = _Search(points, settings, up, float(np.linalg.norm(np.ptp(points, axis=0))))
     thin = points[thinned(points, _CONTRACTED_POINTS)]
     check_no_sheet(thin)
-    contraction = contract(thin, progress=progress.part(0.0, 0.6))
+    contraction = contract(thin, weight=settings.contraction_weight,
+                           progress=progress.part(0.0, 0.6))
     progress(0.6, "connecting")
     graph = search.connected(thin, contraction.points)
     try:
@@ -164,7 +164,8 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
         graph.loops = loops
     first, pruned = search.pruned(graph, start)
     some = search.to_fit(graph, thin)
-    fitted = repaired(first, some, search.diagonal, view, progress.part(0.65, 0.95))
+    fitted = repaired(first, some, settings.radius_limits(search.diagonal), view,
+                      progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     check_round(fitted.skeleton, points, segment, residual)
     skeleton, more = fitted.skeleton, fitted.pruned

@@ -73,7 +73,8 @@ class Contraction:
     history: list[dict[str, float]] = field(default_factory=list)
 
 
-def contract(points: np.ndarray, *, progress: Progress = SILENT) -> Contraction:
+def contract(points: np.ndarray, *, weight: float = 1.0, progress: Progress = SILENT,
+             ) -> Contraction:
     """Contract points to the axes of their branches.
 
     The contraction weight of a point grows while the points around it do not lie on a line yet,
@@ -84,6 +85,7 @@ def contract(points: np.ndarray, *, progress: Progress = SILENT) -> Contraction:
 
     Args:
         points: Positions [m], shape [n, 3].
+        weight: Of W_L relative to W_H at the start.
         progress: Called each iteration.
 
     Raises:
@@ -95,12 +97,12 @@ def contract(points: np.ndarray, *, progress: Progress = SILENT) -> Contraction:
     progress(0.0, "laplacian")
     laplacian = cloud_laplacian(positions)
     solver = _NormalEquations(laplacian)
-    weight = np.ones(len(points))
+    weights = np.full(len(points), weight)
     history: list[dict[str, float]] = []
     status, linearity = ContractionStatus.iteration_limit, local_linearity(positions)
     for iteration in range(_SOLVES):
         started = time.perf_counter()
-        drawn = solver.solve(weight, positions)
+        drawn = solver.solve(weights, positions)
         moved = float(np.linalg.norm(drawn - positions, axis=1).mean())
         positions = drawn
         linearity = local_linearity(positions)
@@ -108,7 +110,7 @@ def contract(points: np.ndarray, *, progress: Progress = SILENT) -> Contraction:
         # Beyond that fraction, only forks and noise remain, which never become lines. More weight
         # only pulls the rest off its axis.
         growth = _GROWTH if active.mean() > _STILL_THICK else 1.0
-        weight *= np.where(active, growth, 0.1)
+        weights *= np.where(active, growth, 0.1)
         history.append({"moved": moved * scale, "active": float(active.mean()),
                         "seconds": time.perf_counter() - started})
         progress((iteration + 1) / _SOLVES, "contracting", iteration=iteration + 1,

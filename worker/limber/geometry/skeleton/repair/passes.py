@@ -34,7 +34,6 @@ eleven bare scans, most with noise as large as their radii, it is at most 0.30; 
 
 _COARSE = 1.5  # local radii between the nodes of the first fit
 _NOISY = 0.2  # fraction of the median radius
-_LEAST_RADIUS, _MOST_RADIUS = 5e-4, 0.1  # fractions of the cloud's diagonal: the paper's rule
 _ROUNDS_NOISY, _ROUNDS_LATE = 18, 6  # rounds of the last fit
 
 
@@ -217,19 +216,18 @@ PASSES = (
 """In the order in which they run; some run again after a fit."""
 
 
-def repaired(skeleton: Skeleton, points: np.ndarray, diagonal: float, view: View | None,
-             progress: Progress = SILENT) -> Repaired:
+def repaired(skeleton: Skeleton, points: np.ndarray, radius_limits: tuple[float, float],
+             view: View | None, progress: Progress = SILENT) -> Repaired:
     """Run all passes on the skeleton of the contracted points.
 
     Args:
         skeleton: With first radii.
         points: The scan, thinned [m], shape [m, 3].
-        diagonal: Size of the cloud [m].
+        radius_limits: Least and largest radius [m].
         view: The depth camera's view of the points, if they are one's.
         progress: Called during fits.
     """
-    now = Repaired(skeleton, points, (_LEAST_RADIUS * diagonal, _MOST_RADIUS * diagonal), view,
-                   apart=PointSpacing.of(points))
+    now = Repaired(skeleton, points, radius_limits, view, apart=PointSpacing.of(points))
     done = 0.0
     for each in PASSES:
         until = done if each.until is None else each.until
