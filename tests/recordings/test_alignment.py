@@ -28,7 +28,7 @@ def there_and_back(pull):
                    wrenches=np.vstack([pull.wrenches[::2], pull.wrenches[::-2]])[:-1])
 
 
-@pytest.mark.parametrize("offset", [-0.37, 0.0, 0.154])
+@pytest.mark.parametrize("offset", [-0.37, 0.0, 0.154, 3.0, -8.0])
 def test_clock_offset_is_found(plain_pull, offset):
     """An observer's clock that is off is found to a few milliseconds, from the motion alone."""
     rng = np.random.default_rng(1)
@@ -42,6 +42,23 @@ def test_clock_offset_is_found(plain_pull, offset):
     found, sigma = estimate_offset(pull)
     assert sigma < 5e-3
     assert abs(found - offset) < 4 * sigma
+
+
+@pytest.mark.parametrize(("offset", "told"), [
+    (13.0, "at the end of that range"), (2.0, "fit, so the pull does not determine")])
+def test_an_offset_that_is_not_determined_is_refused(plain_pull, offset, told):
+    """An optimum at the end of the search was taken; so was one of many on a way at even speed."""
+    seen = np.linspace(-20, 24, 300) if offset > 10 else np.linspace(0.5, 3.5, 60)
+    times, poses = plain_pull.times, plain_pull.poses
+    if offset < 10:
+        poses = np.outer(np.linspace(0, 1, len(times)), [0.05, 0, 0, 0, 0, 0])
+    way = np.interp(seen, times, poses[:, 0])
+    positions = np.zeros((len(seen), 2, 3))
+    positions[:, 0, 0], positions[:, 1, 0] = 0.3 * way, 0.7 * way
+    positions += 1e-4 * np.random.default_rng(1).standard_normal(positions.shape)
+    pull = replace(plain_pull, poses=poses, observations=Observations(seen - offset, positions))
+    with pytest.raises(InputError, match=rf"-10 to 10 s were tried.*{told}.*--time-offset"):
+        estimate_offset(pull)
 
 
 @pytest.mark.slow

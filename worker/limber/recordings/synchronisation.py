@@ -17,6 +17,15 @@ from limber.recordings.time_series import gaps, inside_gap
 UNMEASURED_M = 1.0
 """Standard deviation of a position across the direction in which a ruler measures it."""
 
+SEARCH_S = 10.0
+"""Largest offset between the clocks that is searched for."""
+DETERMINED_S = 0.02
+"""Largest standard deviation of an offset that counts as found."""
+_COARSE_S, _COARSE_ROWS = 0.1, 100
+"""Step of the first search, and the frames that it uses."""
+_SURE = 3.0
+"""Standard deviations within which another offset fits as well."""
+
 
 @dataclass(frozen=True)
 class Frames:
@@ -91,14 +100,19 @@ def _reading_covariance(pull: Pull) -> np.ndarray:
     return sensor.position_sigma_m**2 * np.outer(along, along) + UNMEASURED_M**2 * across
 
 
-def estimate_offset(pull: Pull, *, limit_s: float = 1.0) -> tuple[float, float]:
+def estimate_offset(pull: Pull) -> tuple[float, float]:
     """Find the offset [s] to add to the observations' stamps, and its standard deviation.
 
     Without inertia the observed motion is a smooth function of the gripper's pose. The offset
     returned is the one for which a quadratic function of the pose best fits the observed points.
-    A pull at constant speed, started and ended out of view, does not determine it: the standard
-    deviation is then infinite. It includes the rounding of poses and positions: as long as a
-    rounded value stays the same, its error does not average out.
+    A pull at constant speed, started and ended out of view, does not determine it, nor does one in
+    which others fit about as well: the standard deviation is then infinite. It includes the
+    rounding of poses and positions: as long as a rounded value stays the same, its error does not
+    average out.
+
+    Raises:
+        InputError: the best offset is at the end of the search, or several fit, but not the pull's
+            own one.
     """
     seen = pull.observations
     if seen is None or len(seen.times) < 12:
@@ -119,28 +133,58 @@ def estimate_offset(pull: Pull, *, limit_s: float = 1.0) -> tuple[float, float]:
         moments = np.clip(seen.times[rows] + offset, pull.times[0], pull.times[-1])
         return poses_at(pull.times, poses, moments)
 
-    def unexplained(offset: float) -> float:
-        features = _Quadratic.of(at(offset)).features(at(offset))
-        solved = np.linalg.lstsq(features, target, rcond=1e-9)[0]
-        return float(np.mean((target - features @ solved)**2))
+    def unexplained(offset: float, every: int = 1) -> float:
+        poses = at(offset)[::every]
+        features = _Quadratic.of(poses).features(poses)
+        solved = np.linalg.lstsq(features, target[::every], rcond=1e-9)[0]
+        left = target[::every] - features @ solved
+        # Per reading that is left over: many functions fit a few readings whatever the offset.
+        return float(np.sum(left**2) / max(left.size - solved.size, 1))
 
     start = pull.entry.time_offset_s
-    grid = start + np.linspace(-limit_s, limit_s, 81)
+    every = max(len(target) // _COARSE_ROWS, 1)
+    coarse = start + np.arange(-SEARCH_S, SEARCH_S + _COARSE_S / 2, _COARSE_S)
+    rough = np.array([unexplained(offset, every) for offset in coarse])
+    near = coarse[int(np.argmin(rough))]
+    grid = near + np.linspace(-_COARSE_S, _COARSE_S, 17)
     cost = np.array([unexplained(offset) for offset in grid])
     best = int(np.argmin(cost))
-    low, high = grid[max(best - 1, 0)], grid[min(best + 1, 80)]
+    low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
     found = scipy.optimize.minimize_scalar(unexplained, bounds=(low, high), method="bounded",
                                            options={"xatol": 1e-5})
+    if np.ptp(rough) <= 0.2 * rough.min() + 1e-16:
+        return start, np.inf
+    if abs(near - start) > SEARCH_S - _COARSE_S / 2:
+        raise _not_found(pull.name, start, near, near)
+    # Others that fit as well, by a likelihood ratio (three standard deviations).
+    allowed = 1 + _SURE**2 / max(target.size - 15 * target.shape[1], target.shape[1])
+    others = np.r_[coarse[rough < 1.3 * rough.min() + 1e-16], grid]
+    fits = others[[unexplained(other) < allowed * found.fun + 1e-16 for other in others]]
+    if np.abs(fits - found.x).max(initial=0.0) > 2 * DETERMINED_S:
+        if unexplained(start) < 1.2 * found.fun + 1e-16:
+            return start, np.inf
+        raise _not_found(pull.name, start, float(fits.min()), float(fits.max()))
     step = 2e-3
     beside = unexplained(found.x + step) + unexplained(found.x - step)
     curvature = (beside - 2 * found.fun) / step**2
     noise = max(found.fun, 1e-16)
-    if not (curvature > 0 and np.ptp(cost) > 0.2 * noise + 1e-16):
+    if not curvature > 0:
         return start, np.inf
     kept = np.searchsorted(pull.times, seen.times[rows] + found.x).clip(0, len(pull.times) - 1)
     rounded = _rounding(pull.poses[kept], quanta, observed,
                         [at(found.x + k * step) for k in (-1, 0, 1)], step)
     return float(found.x), float(np.hypot(np.sqrt(2 * noise / (curvature * target.size)), rounded))
+
+
+def _not_found(name: str, start: float, low: float, high: float) -> InputError:
+    several = f"Offsets of {low:.2f} to {high:.2f} s fit" if high > low else (
+        f"An offset of {low:.2f} s fits best, at the end of that range")
+    return InputError(
+        f"{name}: the observed points do not follow the gripper with the clocks as they are. "
+        f"Offsets of {start - SEARCH_S:.4g} to {start + SEARCH_S:.4g} s were tried.",
+        f"{several}, so the pull does not determine the offset between the clocks.",
+        "Check that both tables are of the same pull and that their times are in the stated unit; "
+        "then state the offset with --time-offset.")
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from limber.recordings.recording import (
     write_pull,
 )
 from limber.recordings.sensor_checks import clean
-from limber.recordings.synchronisation import estimate_offset
+from limber.recordings.synchronisation import DETERMINED_S, estimate_offset
 from limber.recordings.time_series import Stream
 
 
@@ -137,7 +137,11 @@ def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEn
             "start together, and the offset was estimated from there.")
     entry = pull.entry.model_copy(update={"time_offset_s": offset})
     found, sigma = estimate_offset(replace(pull, entry=entry))
-    if sigma < 0.02:
+    if sigma < DETERMINED_S:
+        request.progress.warn(
+            f"{pull.name}: the clocks' offset was found from the motion: {found:.4f} s "
+            f"(standard deviation {1e3 * sigma:.1f} ms) is added to the observations' times. If "
+            "the clocks are one, state --time-offset 0.")
         known = calibration_of(entry)
         is_wider = sigma > known.clock_sigma_s > 0
         return entry.model_copy(update={"time_offset_s": found} | ({
