@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
+from limber.core.errors import InputError
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.progress import Progress
 from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.mechanics.added_masses import PointMass
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.loads.loaded_branch import NamedTarget, hang, target_masses
 from limber.mechanics.model import BranchModel
@@ -64,6 +66,20 @@ def test_what_cannot_carry_itself_is_told_and_has_no_weight():
     assert "too soft to carry" in told[0]
     assert branch.model.weight_stiffness is None
     assert not branch.model.weight_force.any()
+
+
+def test_a_target_too_heavy_for_the_branch_is_named(mesh):
+    """Its weight was neglected with that of the branch, and a further fruit weighed nothing."""
+    model = BranchModel(box_mesh((0.012, 0.012, 0.6), (1, 1, 30)), young=4e7, poisson=0.35,
+                        density=900, gravity=(0, 0, -9.81))
+    assert hang(model, loaded=True).model.gravity.any()
+    apple = NamedTarget("apple", (0.006, 0.006, 0.6), 0.5)
+    heavy = model.with_point_masses([PointMass(apple.position, apple.mass)])
+    with pytest.raises(InputError, match=r"apple \(0.5 kg\).*own wood.*--fruit"):
+        hang(heavy, (apple,), loaded=True)
+    told = []
+    assert not hang(heavy, (apple,), progress=Progress(on_warning=told.append)).model.gravity.any()
+    assert "apple (0.5 kg)" in told[0]
 
 
 def test_goes_to_another_process(loaded):

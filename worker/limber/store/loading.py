@@ -165,21 +165,23 @@ class Overrides(ModelOptions, total=False):
     point_masses: Iterable[PointMass] | None
 
 
-def load_branch(branch: Branch, *, gravity: bool = True, progress: Progress = SILENT,
-                **overrides: Unpack[Overrides]) -> LoadedBranch:
+def load_branch(branch: Branch, *, gravity: bool = True, loaded: bool = False,
+                progress: Progress = SILENT, **overrides: Unpack[Overrides]) -> LoadedBranch:
     """Return the branch for all computations: as it hangs, with targets and grasp.
 
     Args:
         gravity: Whether it has weight.
+        loaded: Whether further weights are hung on it.
         progress: Warned if the branch cannot carry itself and its weight is ignored.
         overrides: As for :func:`load_model`.
 
     Raises:
-        BranchFolderError: there is no mesh. InputError: it lacks material data.
+        BranchFolderError: there is no mesh. InputError: it lacks material data, or is ``loaded``
+            and too soft to carry itself.
     """
     model = load_model(branch, gravity=gravity, **overrides)
-    loaded = hang(model, load_targets(branch), progress=progress)
-    return replace(loaded, grasp_point=load_grasp_point(branch))
+    hanging = hang(model, load_targets(branch), loaded=loaded, progress=progress)
+    return replace(hanging, grasp_point=load_grasp_point(branch))
 
 
 def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDamping:

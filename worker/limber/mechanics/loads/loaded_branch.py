@@ -20,6 +20,7 @@ from typing import Literal
 import numpy as np
 import scipy.sparse as sp
 
+from limber.core.errors import InputError
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -108,7 +109,7 @@ class LoadedBranch:
         return point_operator(self.mesh, np.array([t.position for t in self.targets]))
 
 
-def hang(model: BranchModel, targets: tuple[NamedTarget, ...] = (), *,
+def hang(model: BranchModel, targets: tuple[NamedTarget, ...] = (), *, loaded: bool = False,
          progress: Progress = SILENT) -> LoadedBranch:
     """Return a model's branch as it hangs in its mesh's shape.
 
@@ -118,16 +119,39 @@ def hang(model: BranchModel, targets: tuple[NamedTarget, ...] = (), *,
     Args:
         model: Its gravity is that of the scan; zero for a branch without weight. Its masses include
             those of the targets.
+        targets: Named points on it.
+        loaded: Whether further weights are hung on it. They need gravity, so a branch that is too
+            soft is refused.
+        progress: Receives the warning.
+
+    Raises:
+        InputError: it is ``loaded`` and too soft.
     """
     if not model.gravity.any():
         return LoadedBranch(model, targets)
-    loaded = model.as_scanned()
-    if is_stable(loaded):
-        return LoadedBranch(loaded, targets)
-    progress.warn(
-        "The branch is too soft to carry its own weight in the scanned shape. Its weight is "
-        "neglected. Check Young's modulus, density and gravity.")
+    hanging = model.as_scanned()
+    if is_stable(hanging):
+        return LoadedBranch(hanging, targets)
+    seen, advice = _too_soft(model, targets)
+    if loaded:
+        raise InputError(seen, "Without weight, further loads would have no effect.", advice)
+    progress.warn(f"{seen} Its weight is neglected. {advice}")
     return LoadedBranch(model.with_parameters(gravity=(0.0, 0.0, 0.0)), targets)
+
+
+def _too_soft(model: BranchModel, targets: tuple[NamedTarget, ...]) -> tuple[str, str]:
+    """What a branch cannot carry in the scanned shape, and what to do."""
+    bare = model.without_point_masses()
+    heavy = [f"{target.name} ({target.mass:g} kg)" for target in targets if target.mass > 0]
+    if not (model.point_masses and is_stable(bare.as_scanned())):
+        return ("The branch is too soft to carry its own weight in the scanned shape.",
+                "Check Young's modulus, density and gravity.")
+    hung = sum(one.mass for one in model.point_masses)
+    named = f", with {', '.join(heavy)} among it" if heavy else ""
+    return (f"The branch is too soft to carry the {hung:.3g} kg that hang on it in the scanned "
+            f"shape{named}. It can carry its own wood.",
+            "A target's mass hung there when the branch was scanned. If it did not, remove it from "
+            "the target and give it as a load (--fruit). Else check Young's modulus.")
 
 
 def is_stable(model: BranchModel) -> bool:

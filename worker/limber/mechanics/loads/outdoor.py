@@ -75,8 +75,14 @@ class LoadedOutdoors:
             loads: The loads.
 
         Raises:
-            InputError: a cut leaves nothing, or is at the base.
+            InputError: a cut leaves nothing, or is at the base; or the branch has no weight, so
+            that fruit and snow would have none.
         """
+        if (loads.fruit or loads.snow) and not model.gravity.any():
+            raise InputError("The branch has no weight, so fruit and snow would have none either.",
+                             "Its weight was switched off, or neglected because it could not carry "
+                             "itself (see the warnings).",
+                             "Start with gravity; check Young's modulus and the masses of targets.")
         self.skeleton = skeleton
         self.gone = _beyond(skeleton, loads.cuts)
         self.is_gone = _tets_of(model.mesh, skeleton, self.gone)

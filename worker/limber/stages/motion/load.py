@@ -132,7 +132,7 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
             f"load:{settings.name}", settings, **inputs):
         return read_json(branch.path(f"loads/{settings.name}.json"), "the effects of loads")
     skeleton = load_skeleton(branch)
-    model = load_branch(branch, progress=progress).model
+    model = load_branch(branch, loaded=True, progress=progress).model
     _require_near(model.mesh.nodes, [one[:3] for one in settings.fruit])
     loads = Outdoors(wind, settings.drag, settings.snow, tuple(
         PointMass(one[:3], one[3]) for one in settings.fruit), settings.cut)

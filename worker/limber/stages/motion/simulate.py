@@ -114,7 +114,8 @@ def _model(branch: Branch, settings: SimulateSettings, progress: Progress) -> Br
         "young": settings.young, "material": settings.material,
         "damping": RayleighDamping(settings.damping_mass, settings.damping_stiffness)}
     if settings.rest_shape:
-        return load_branch(branch, gravity=settings.gravity, progress=progress, **values).model
+        return load_branch(branch, gravity=settings.gravity, loaded=bool(settings.mass_at),
+                           progress=progress, **values).model
     return load_model(branch, gravity=settings.gravity, **values)
 
 
