@@ -7,9 +7,11 @@ All but the measured points are hidden at first. The panel's "Show" makes each o
 import json
 
 import bpy
+import numpy as np
 
-from .branches import SCALE_KEY, ShownBranch, add_object
+from .branches import SCALE_KEY
 from .bridge import animation, materials, meshes
+from .parts import ShownBranch
 from .scene_data import SceneData
 
 _HALF_BALL = (0.35, 0.45, 0.55)
@@ -25,11 +27,11 @@ def add_rods(shown: ShownBranch, data: SceneData) -> None:
         mesh = meshes.new_mesh(about["title"], data.arrays[f"rods:{key}"],
                                data.arrays[f"rod_faces:{key}"])
         meshes.set_colors(mesh, "color", data.arrays[f"rod_color:{key}"])
-        thing = add_object(shown.collection, about["title"], mesh,
-                                 materials.vertex_color_material(about["title"], "color"))
+        thing, is_new = shown.put(f"rods:{key}", about["title"], mesh,
+                                  materials.vertex_color_material(about["title"], "color"))
         thing[SCALE_KEY] = json.dumps(about["scale"])
-        _hide(thing)
-        shown.objects[f"rods:{key}"] = [thing]
+        if is_new:
+            _hide(thing)
 
 
 def add_cell(shown: ShownBranch, data: SceneData) -> None:
@@ -39,9 +41,8 @@ def add_cell(shown: ShownBranch, data: SceneData) -> None:
         mesh = meshes.new_mesh(title, data.arrays[f"solid:{key}"],
                                data.arrays[f"solid_faces:{key}"])
         meshes.set_one_color(mesh, color)
-        shown.objects[f"cell:{key}"] = [add_object(
-            shown.collection, title, mesh,
-            materials.plain_material(title, color, alpha=about["alpha"]))]
+        shown.put(f"cell:{key}", title, mesh,
+                  materials.plain_material(title, color, alpha=about["alpha"]))
 
 
 def add_hemisphere(shown: ShownBranch, data: SceneData) -> None:
@@ -49,15 +50,15 @@ def add_hemisphere(shown: ShownBranch, data: SceneData) -> None:
     about = data.info.get("hemisphere")
     if not about:
         return
-    thing = add_object(shown.collection, "Grasps in reach",
-                             meshes.new_half_ball("Grasps in reach", about["radius_m"]))
-    thing.location = about["centre_m"]
-    thing.display_type, thing.color = "WIRE", (*_HALF_BALL, 1.0)
-    _hide(thing)
-    shown.objects["hemisphere"] = [thing]
+    thing, is_new = shown.put("hemisphere", "Grasps in reach",
+                              meshes.new_half_ball("Grasps in reach", about["radius_m"]))
+    thing.delta_location = np.array(about["centre_m"]) + shown.place
+    if is_new:
+        thing.display_type, thing.color = "WIRE", (*_HALF_BALL, 1.0)
+        _hide(thing)
 
 
-def add_measured(shown: ShownBranch, data: SceneData, speed: float) -> None:
+def add_measured(shown: ShownBranch, data: SceneData) -> None:
     """Add the points observed in the shown pull, at their positions in each frame; hidden in frames
     without an observation.
     """
@@ -66,14 +67,15 @@ def add_measured(shown: ShownBranch, data: SceneData, speed: float) -> None:
     ball = meshes.new_sphere("Measured", 1.0)
     meshes.set_one_color(ball, MEASURED)
     material = materials.plain_material("Measured", MEASURED, alpha=0.6, roughness=0.3)
-    places, seen = data.arrays["observation_motion"], data.arrays["observation_seen"]
-    shown.objects["observed"] = []
+    places, seen = data.arrays["observation_motion"] + shown.place, data.arrays["observation_seen"]
+    timing = {"frame_start": shown.start, "speed": shown.speed}
     for number in range(places.shape[1]):
-        thing = add_object(shown.collection, f"Measured point {number + 1}", ball, material)
-        thing.show_in_front = True
-        animation.move_along(thing, places[:, number], speed=speed)
-        animation.appear(thing, seen[:, number], _SHARE * data.info["size_m"], speed=speed)
-        shown.objects["observed"].append(thing)
+        thing, is_new = shown.put("observed", f"Measured point {number + 1}", ball, material,
+                                  str(number + 1))
+        if is_new:
+            thing.show_in_front = True
+        animation.move_along(thing, places[:, number], **timing)
+        animation.appear(thing, seen[:, number], _SHARE * data.info["size_m"], **timing)
 
 
 def _hide(thing: bpy.types.Object) -> None:

@@ -1,7 +1,6 @@
 """The branches of a scene: identifies their objects and the current branch."""
 
 import json
-from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,8 +20,13 @@ GRASP_KEY = "limber_grasp_m"
 """Key of the marked grasp: its position on the branch as scanned, and its radius."""
 UUID_KEY = "limber_uuid"
 """Key of a branch's collection: its identity, regardless of its folder and name."""
+ID_KEY = "limber_id"
+"""Key of a branch's collection, and of each object of a branch: that of the collection, what it
+shows, and which of several: ``TOKEN/targets/flower``. Blender copies it with an object; see
+:func:`parts.release_copies`.
+"""
 SHOWS_KEY = "limber_shows"
-"""Key of each object of a branch: what it shows, a key of :attr:`ShownBranch.objects`."""
+"""Key of each object of a branch: what it shows, a key of :attr:`parts.ShownBranch.objects`."""
 SCALE_KEY = "limber_scale"
 """Key of a coloured object beside the branch: its scale, as JSON."""
 VIEW_KEY = "limber_view"
@@ -33,35 +37,60 @@ OFFSET_KEY = "limber_map_offset"
 """The branch's origin in the scan's coordinates, in double precision: a viewport has single."""
 
 
-@dataclass
-class ShownBranch:
-    """Result of :func:`show_branch`: the objects by what they show."""
-
-    collection: bpy.types.Collection
-    surface: bpy.types.Object
-    objects: dict[str, list[bpy.types.Object]] = field(default_factory=dict)
-    frame_count: int = 1
-
-
 def branches(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
     """Return the collections of the shown branches, the one opened last at the end."""
     return [collection for collection in scene.collection.children_recursive
             if FOLDER_KEY in collection]
 
 
+def token_of(thing: bpy.types.Object) -> str:
+    """Return the identity of the branch to which an object of ours belongs; else an empty text."""
+    return str(thing.get(ID_KEY, "")).partition("/")[0]
+
+
 def branch_of(thing: bpy.types.Object) -> bpy.types.Collection | None:
     """Return the collection of the branch to which an object, or its parent, belongs."""
     while thing is not None:
-        for collection in bpy.data.collections:
-            if FOLDER_KEY in collection and collection.all_objects.get(thing.name) == thing:
-                return collection
+        shown = [branch for branch in bpy.data.collections if FOLDER_KEY in branch]
+        within = [branch for branch in shown if branch.all_objects.get(thing.name) == thing]
+        token = token_of(thing)
+        found = next((branch for branch in (*within, *shown) if token
+                      and branch.get(ID_KEY) == token), within[0] if within else None)
+        if found is not None:
+            return found
         thing = thing.parent
     return None
 
 
+def parts_of(branch: bpy.types.Collection) -> dict[str, bpy.types.Object]:
+    """Return the objects of a branch by their id, in whichever collection the user has put them."""
+    token = branch.get(ID_KEY, "")
+    found = [thing for thing in bpy.data.objects
+             if thing.library == branch.library and token_of(thing) == token and token]
+    # Of a copy and its original, the original.
+    found.sort(key=lambda thing: (branch.all_objects.get(thing.name) != thing, thing.session_uid))
+    return {thing[ID_KEY]: thing for thing in reversed(found)}
+
+
 def surface_of(branch: bpy.types.Collection) -> bpy.types.Object | None:
     """Return the surface of a branch; None if the user has removed it."""
-    return next((thing for thing in branch.objects if INFO_KEY in thing), None)
+    thing = part_of(branch, "surface")
+    return thing if thing is not None and any(
+        is_in(scene, thing) for scene in bpy.data.scenes) else None
+
+
+def is_in(scene: bpy.types.Scene, thing: bpy.types.Object) -> bool:
+    """Whether a scene has an object; one linked from another file may have the same name."""
+    found = scene.objects.get(thing.name)
+    return found == thing or (found is not None and thing in scene.objects[:])
+
+
+def part_of(branch: bpy.types.Collection, kind: str) -> bpy.types.Object | None:
+    """Return the object of a branch that shows something of which it has one; None without."""
+    # Mostly in its collection: panels ask often, and a file may have thousands of objects.
+    return next((thing for things in (branch.all_objects, bpy.data.objects) for thing in sorted(
+        (thing for thing in things if thing.get(SHOWS_KEY) == kind and ID_KEY in branch
+         and token_of(thing) == branch[ID_KEY]), key=lambda thing: thing.session_uid)), None)
 
 
 def info_of(surface: bpy.types.Object) -> dict[str, Any]:
@@ -184,8 +213,10 @@ def _path_of_active(scene: bpy.types.Scene) -> str:
 
 def _shown_from(scene: bpy.types.Scene, path: str) -> bpy.types.Collection | None:
     """Return the branch that shows the folder ``path``, with its surface; None without."""
-    return next((branch for branch in reversed(branches(scene)) if surface_of(branch) is not None
-                 and _is_same_folder(branch[FOLDER_KEY], path)), None)
+    shown = [branch for branch in branches(scene)
+             if _is_same_folder(branch[FOLDER_KEY], path) and surface_of(branch) is not None]
+    # Rather one that can be changed here than one linked from another file.
+    return max(reversed(shown), key=lambda branch: branch.library is None, default=None)
 
 
 def _is_same_folder(one: str, other: str) -> bool:
@@ -219,18 +250,14 @@ def skeleton_from(scene: bpy.types.Scene, folder: Path) -> bpy.types.Object | No
 
 
 def _skeleton_in(branch: bpy.types.Collection | None) -> bpy.types.Object | None:
-    return None if branch is None else next(
-        (thing for thing in branch.objects
-         if thing.type == "MESH" and skeletons.NODES_KEY in thing.data), None)
+    return None if branch is None else part_of(branch, "skeleton")
 
 
 def put_skeleton_back(thing: bpy.types.Object) -> None:
     """Reset a skeleton to the nodes that the worker gave."""
-    before = thing.data
     if thing.mode == "EDIT":
         bpy.ops.object.mode_set(mode="OBJECT")
-    thing.data = skeletons.as_it_was(before)
-    bpy.data.meshes.remove(before)
+    skeletons.put_back(thing.data)
 
 
 def add_object(collection: bpy.types.Collection, name: str, data: bpy.types.ID,

@@ -38,16 +38,23 @@ def use_nodes(thing: bpy.types.Material | bpy.types.World) -> None:
         thing.use_nodes = True
 
 
-def fcurves_of(thing: bpy.types.Object) -> list[bpy.types.FCurve]:
-    """Return the curves of an object's animation; from 5.0 on they are those of its slot."""
+def curve_lists(thing: bpy.types.Object) -> list:
+    """Return the lists of an object's animation that hold its curves; from 5.0 on those of its
+    slot.
+    """
     data = thing.animation_data
     if data is None or data.action is None:
         return []
     if hasattr(data.action, "fcurves"):
-        return list(data.action.fcurves)
+        return [data.action.fcurves]
     bags = (strip.channelbag(data.action_slot) for layer in data.action.layers
             for strip in layer.strips)
-    return [curve for bag in bags if bag is not None for curve in bag.fcurves]
+    return [bag.fcurves for bag in bags if bag is not None]
+
+
+def fcurves_of(thing: bpy.types.Object) -> list[bpy.types.FCurve]:
+    """Return the curves of an object's animation."""
+    return [curve for curves in curve_lists(thing) for curve in curves]
 
 
 def flush_native_output() -> None:

@@ -10,8 +10,9 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
-from .branches import SCALE_KEY, SHOWS_KEY, ShownBranch, add_object
+from .branches import SCALE_KEY, part_of
 from .bridge import meshes
+from .parts import ShownBranch
 from .scene_data import SceneData
 
 _GRID_KEY = "limber_grid"
@@ -39,17 +40,17 @@ def add(shown: ShownBranch, data: SceneData) -> None:
     meshes.set_integers(mesh, _PLACE, trusted)
     meshes.set_scalars(mesh, "energy_j", energies.ravel()[trusted])
     meshes.set_colors(mesh, "color", colours[trusted])
-    thing = add_object(shown.collection, "Energy field", mesh)
+    thing, is_new = shown.put("energy_field", "Energy field", mesh)
     thing[_GRID_KEY] = list(energies.shape)
     thing[_BOX_KEY] = [*about["low_m"], *about["high_m"]]
     thing[SCALE_KEY] = json.dumps(about["scale"])
-    thing.hide_viewport = thing.hide_render = True
-    shown.objects["energy_field"] = [thing]
+    if is_new:
+        thing.hide_viewport = thing.hide_render = True
 
 
 def of(branch: bpy.types.Collection) -> bpy.types.Object | None:
     """Return the grid of a branch; None without."""
-    return next((thing for thing in branch.objects if thing.get(SHOWS_KEY) == "energy_field"), None)
+    return part_of(branch, "energy_field")
 
 
 def is_sliced(scene: bpy.types.Scene) -> bool:

@@ -6,7 +6,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from . import frame_values
-from .branches import FOLDER_KEY, FRAME_SCALAR_KEY, branch_of, info_of
+from .branches import FOLDER_KEY, FRAME_SCALAR_KEY, branch_of, info_of, token_of
 from .bridge import animation, materials, meshes
 from .frame_values import FrameValues
 from .scene_data import SceneData
@@ -40,17 +40,19 @@ def changing(surface: bpy.types.Object) -> set[str]:
         & set(info_of(surface).get("frame_scalars") or ()))
 
 
-def show(surface: bpy.types.Object, name: str, frame: float) -> None:
-    """Colour ``surface`` by a value that changes; KeyError if no value has that name."""
+def show(surface: bpy.types.Object, name: str, frame: float, *, is_asked: bool = True) -> None:
+    """Colour ``surface`` by a value that changes; KeyError if no value has that name.
+
+    A material of the user is replaced if this ``is_asked`` for.
+    """
     if name not in changing(surface):
         raise KeyError(name)
     scale = info_of(surface)["frame_scalars"][name]
     surface[FRAME_SCALAR_KEY] = name
-    label = f"{surface.name} {scale['title']}, each frame"
-    material = bpy.data.materials.get(label) or materials.scalar_material(
-        label, _NOW, low=scale["low"], high=scale["high"], log=scale["log"], stops=scale["stops"])
-    surface.data.materials.clear()
-    surface.data.materials.append(material)
+    materials.wear(surface, materials.scalar_material(
+        f"{surface.name} {scale['title'].partition(' (')[0]}, each frame", _NOW, low=scale["low"],
+        high=scale["high"], log=scale["log"], stops=scale["stops"],
+        owner=f"{token_of(surface)} {name}"), is_asked=is_asked)
     _write(surface, frame)
 
 

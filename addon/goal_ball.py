@@ -4,12 +4,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import bpy
+import numpy as np
 from bpy.app.handlers import persistent
 from mathutils import Vector
 
-from . import branches
-from .branches import GRASP_KEY, SHOWS_KEY, ShownBranch, add_object
+from . import branches, parts
+from .branches import GRASP_KEY
 from .bridge import materials, meshes
+from .parts import ShownBranch
 from .properties import OPEN
 
 _PLACE_KEY = "limber_goal_m"
@@ -22,6 +24,8 @@ _FIELDS = {"grasp": "goal", "tip": "tip_goal", "target": "tip_goal"}
 """Field of the plan for each kind of goal."""
 _KINDS = ("goal", "tip_goal", "target_box", "goal_seed")
 """A plan takes one of these."""
+_GIVEN_KEY = "limber_goal_shown"
+"""The goal of the result that is shown; missing for a ball that was put by hand."""
 _KEYS = (_PLACE_KEY, _FIELD_KEY, TARGET_KEY)
 
 
@@ -30,11 +34,11 @@ def add(shown: ShownBranch, kind: str, place: list[float], radius: float) -> bpy
     ball = meshes.new_sphere("Goal", radius)
     meshes.set_one_color(ball, COLOUR)
     material = materials.plain_material("Goal", COLOUR, alpha=0.3)
-    thing = add_object(shown.collection, "Goal", ball, material)
-    thing.location = place
-    thing[_PLACE_KEY], thing[_FIELD_KEY] = list(thing.location), _FIELDS.get(kind, "goal")
-    thing[SHOWS_KEY] = "goal"
-    shown.objects["goal"] = [thing]
+    thing, _ = shown.put("goal", "Goal", ball, material)
+    if thing.get(_GIVEN_KEY) != (given := f"{kind} {np.float32(place).tolist()}"):
+        # Else the user may have moved it to the next goal.
+        thing.location, thing[_GIVEN_KEY] = place, given
+        thing[_PLACE_KEY], thing[_FIELD_KEY] = list(thing.location), _FIELDS.get(kind, "goal")
     return thing
 
 
@@ -42,15 +46,34 @@ def add_by_hand(surface: bpy.types.Object, place: list[float]) -> bpy.types.Obje
     """Show the ball of a new goal of the grasp, at ``place`` in the branch's frame [m]."""
     marked = surface.get(GRASP_KEY)
     radius = max(surface.dimensions) / 50 if marked is None else 1.6 * marked[3]
-    ball = add(ShownBranch(branches.branch_of(surface), surface), "grasp", place, radius)
-    ball.delta_location = surface.delta_location
+    shown = ShownBranch(branches.branch_of(surface), surface, place=surface.delta_location)
+    ball = add(shown, "grasp", place, radius)
+    del ball[_GIVEN_KEY]
     return ball
+
+
+def keep_moved(shown: ShownBranch) -> None:
+    """Keep a ball that the user has put or moved by hand, though the result has no goal."""
+    ball = shown.find("goal")
+    if ball is not None and _is_by_hand(ball):
+        shown.before.pop(ball[branches.ID_KEY])
+
+
+def tell_again(scene: bpy.types.Scene) -> None:
+    """Set the plan's goal to a ball that was put by hand: a plan to it has not been made yet."""
+    surface = branches.find_surface(scene)
+    ball = None if surface is None else of(branches.branch_of(surface))
+    if ball is not None and _is_by_hand(ball):
+        _tell(scene.limber.plan, ball)
+
+
+def _is_by_hand(ball: bpy.types.Object) -> bool:
+    return ball.get(_GIVEN_KEY, "").partition(" ")[2] != str([*ball.location])
 
 
 def of(branch: bpy.types.Collection | None) -> bpy.types.Object | None:
     """Return the ball of a branch; None without."""
-    return None if branch is None else next(
-        (thing for thing in branch.objects if _PLACE_KEY in thing), None)
+    return None if branch is None else branches.part_of(branch, "goal")
 
 
 def place_of(thing: bpy.types.Object) -> Vector | None:
@@ -121,7 +144,7 @@ class Before:
     def put_back(self, scene: bpy.types.Scene, branch: bpy.types.Collection) -> None:
         ball = of(branch)
         if self.place is None and ball is not None:
-            bpy.data.objects.remove(ball)
+            parts.remove(ball)
         elif ball is not None:
             ball.location = self.place
             for key in _KEYS:

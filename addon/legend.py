@@ -9,8 +9,9 @@ import textwrap
 import bpy
 from mathutils import Vector
 
-from .branches import ShownBranch, add_object
+from .branches import add_object
 from .bridge import materials, meshes
+from .parts import ShownBranch
 from .scene import COLORS
 from .scene_data import SceneData
 from .studio import LEGEND_SHARE, PAPER
@@ -116,13 +117,20 @@ def add_legend(scene: bpy.types.Scene, camera: bpy.types.Object, data: SceneData
         sheet.y += _LINE
     sheet.y += 0.6 * _LINE
     for name, scale in data.info["scalars"].items():
-        if shown.surface.data.materials[0].name.endswith(scale["title"]):
+        if name == _shown_scalar(shown.surface):
             _add_color_bar(sheet, name, scale)
     _add_keys(sheet, data, shown)
     sheet.fit()
     if "robot" in shown.objects:
         sheet.ground()
     return sheet.collection
+
+
+def _shown_scalar(surface: bpy.types.Object) -> str:
+    """Return the scalar that a picture of the branch shows; empty under a material of the user."""
+    first = surface.material_slots[0].material if surface.material_slots else None
+    return surface.data.color_attributes.active_color_name.removesuffix("_color") if (
+        first is not None and materials.KEY in first) else ""
 
 
 def _add_color_bar(sheet: _Sheet, name: str, scale: dict) -> None:

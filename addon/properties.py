@@ -66,7 +66,10 @@ def _branches_to_choose(settings: bpy.types.PropertyGroup, _context) -> list:
              for branch in branches.branches(scene) if branches.surface_of(branch) is not None]
     if branches.find_surface(scene) is None:
         shown.insert(0, (_NOT_SHOWN, f"{branches.current_name(scene) or 'none'} (not shown)", ""))
-    _branch_items[:] = [(*item, "NONE", number) for number, item in enumerate(shown)]
+    items = [(*item, "NONE", number) for number, item in enumerate(shown)]
+    if items != _branch_items:
+        # Else the very texts stay that Blender is about to show.
+        _branch_items[:] = items
     return _branch_items
 
 

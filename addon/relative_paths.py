@@ -14,6 +14,7 @@ from bpy.app.handlers import persistent
 
 from .branches import FOLDER_KEY
 from .bridge import animation
+from .parts import release_copies
 
 
 @persistent
@@ -21,8 +22,9 @@ def _before_saving(path: str, *_) -> None:
     if not path:
         # The startup file: it has no path of its own.
         return
+    release_copies()
     for thing in bpy.data.objects:
-        modifier = thing.modifiers.get(animation.MODIFIER)
+        modifier = animation.motion_of(thing)
         if modifier is not None:
             modifier.filepath = animation.relative_path(modifier.filepath, Path(path).parent)
     for holder in (*bpy.data.collections, *bpy.data.objects, *bpy.data.scenes):

@@ -2,32 +2,44 @@
 
 import json
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
-from . import annotations, energy_field, goal_ball
+from . import annotations, energy_field, frame_colours, goal_ball, parts
 from .branches import (
     ENERGY_KEY,
     FOLDER_KEY,
     FRAME_SCALAR_KEY,
     GRASP_KEY,
+    ID_KEY,
     INFO_KEY,
     NAME_KEY,
     OFFSET_KEY,
     SCAN_KEY,
-    SHOWS_KEY,
     UUID_KEY,
     VIEW_KEY,
-    ShownBranch,
-    add_object,
+    branches,
+    info_of,
+    layer_of,
+    token_of,
 )
 from .bridge import animation, colour_nodes, curves, materials, meshes, skeletons
+from .parts import ShownBranch
 from .scene_data import SceneData
 from .skeleton_edits import Skeleton
+
+_RANGE_KEY = "limber_range"
+"""Key of a scene: the frame range that was set for a motion, until the user sets another."""
+_DEFAULT_RANGE = [1, 250]
+_CHOICE_KEY = "limber_colour"
+"""Key of a surface: the scalar that was asked for, and the one that a result had instead."""
+_SPEED_KEY = "limber_own_speed"
+"""Key of a surface: frames of its motion per frame of the scene, in the motion's own time."""
+_ALIGNMENT_KEY = "limber_alignment"
+"""Key of a scan: the matrix by which it was put to its branch."""
 
 # Linear colours. Those of the marks are distinct from the colour map of the branch.
 COLORS = {
@@ -46,25 +58,33 @@ COLORS = {
 
 def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = None,
                 ) -> ShownBranch:
-    """Put the branch into a collection of ``scene``; an earlier one from that folder is removed.
+    """Show the branch in ``scene``: its objects are changed in place, those it lacks are made.
 
     Args:
         scene: Target scene.
         data: Data that the worker found in the branch folder.
-        scalar: Meaning of the colours: a name of ``data.info["scalars"]``, the first by default.
+        scalar: Meaning of the colours: a name of ``data.info["scalars"]``; by default the user's
+            choice, at first the first.
 
     Raises:
-        bridge.animation.CacheError: the frames cannot move this surface.
+        bridge.animation.CacheError: the frames cannot move this surface; nothing has changed.
     """
-    if bpy.context.mode != "OBJECT":
-        # The object in Edit Mode may be the one shown again.
-        bpy.ops.object.mode_set(mode="OBJECT")
-    before = _remove_shown(scene, data)
-    shown = _new_branch(scene, data, scalar)
-    scene[FOLDER_KEY] = shown.collection[FOLDER_KEY]
+    frames = data.info.get("frames")
+    if frames:
+        animation.check_cache(data.folder / frames["file"], len(data.arrays["vertices"]))
+    parts.release_copies()
+    uuid = str(data.info.get("uuid") or "")
+    shown = parts.begin(scene, _shown_before(scene, data), data.info["name"], uuid)
+    collection = shown.collection
+    collection[FOLDER_KEY] = scene[FOLDER_KEY] = animation.shown_path(data.folder)
+    collection[NAME_KEY] = data.info["name"]
+    if uuid:
+        collection[UUID_KEY] = uuid
+    edited = _leave_mode(scene, shown)
+    is_new = _put_surface(shown, data)
     _add_paths(shown, data)
     _add_trees(shown, data)
-    _add_skeleton(shown, data, before)
+    _add_skeleton(shown, data)
     _add_points(shown, data)
     _add_goal(shown, data)
     _add_base(shown, data)
@@ -73,11 +93,13 @@ def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = No
     annotations.add_hemisphere(shown, data)
     energy_field.add(shown, data)
     _add_motion(scene, shown, data)
-    for kind, things in shown.objects.items():
-        for thing in things:
-            thing[SHOWS_KEY] = kind
-            thing.delta_location = before.place
-    shown.surface.delta_location = before.place
+    _colour(scene, shown, scalar, is_asked=is_new)
+    goal_ball.keep_moved(shown)
+    shown.end()
+    if shown.is_first:
+        fit_range(scene, shown.surface)
+    if edited is not None and layer_of(scene).objects.active is not None:
+        bpy.ops.object.mode_set(mode=edited)
     return shown
 
 
@@ -85,7 +107,7 @@ def place_scans(scene: bpy.types.Scene, data: SceneData) -> int:
     """Move imported scans to the branch made from them, which was set upright and to 0.
 
     Returns:
-        Number of scans.
+        Number of scans that were not there yet; where the user has moved them since, they stay.
     """
     count = 0
     for thing in scene.objects:
@@ -93,84 +115,104 @@ def place_scans(scene: bpy.types.Scene, data: SceneData) -> int:
             # In double precision: offset and alignment subtract large coordinates from each other.
             matrix = np.array(data.info["alignment"], float)
             matrix[:3, 3] += matrix[:3, :3] @ np.array(thing.get(OFFSET_KEY, (0.0,) * 3))
+            if list(thing.get(_ALIGNMENT_KEY, ())) == matrix.ravel().tolist():
+                continue
+            thing[_ALIGNMENT_KEY] = matrix.ravel().tolist()
             thing.matrix_world = Matrix(matrix.tolist())
             count += 1
     return count
 
 
-def color_by(surface: bpy.types.Object, name: str) -> None:
+def color_by(surface: bpy.types.Object, name: str, *, is_asked: bool = True) -> None:
     """Colour ``surface`` by scalar ``name``, in Solid mode and in rendering.
+
+    Args:
+        surface: The branch.
+        name: A scalar of its description.
+        is_asked: Whether a material of the user is replaced.
 
     Raises:
         KeyError: the branch has no such scalar.
     """
-    scale = json.loads(surface[INFO_KEY])["scalars"][name]
-    label = f"{surface.name} {scale['title']}"
-    material = bpy.data.materials.get(label) or materials.scalar_material(
-        label, name, low=scale["low"], high=scale["high"], log=scale["log"],
-        stops=scale["stops"])
-    surface.data.materials.clear()
-    surface.data.materials.append(material)
-    if FRAME_SCALAR_KEY in surface:
-        del surface[FRAME_SCALAR_KEY]
-    color = f"{name}_color"
-    surface.data.color_attributes.active_color = surface.data.color_attributes[color]
+    scale = info_of(surface)["scalars"][name]
+    # Without a remark such as "(assumed)": it may not hold for the next result.
+    title = f"{surface.name} {scale['title'].partition(' (')[0]}"
+    materials.wear(surface, materials.scalar_material(
+        title, name, low=scale["low"], high=scale["high"], log=scale["log"], stops=scale["stops"],
+        owner=token_of(surface)), is_asked=is_asked)
+    surface.pop(FRAME_SCALAR_KEY, None)
+    surface[_CHOICE_KEY] = f"{name} {name}"
+    surface.data.color_attributes.active_color = surface.data.color_attributes[f"{name}_color"]
 
 
-def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> ShownBranch:
+def _colour(scene: bpy.types.Scene, shown: ShownBranch, scalar: str | None, *, is_asked: bool,
+            ) -> None:
+    """Colour the surface as the user had it, else by its first scalar."""
+    surface = shown.surface
+    scalars, each = info_of(surface)["scalars"], surface.get(FRAME_SCALAR_KEY)
+    if each is not None and each in frame_colours.changing(surface):
+        frame_colours.show(surface, each, scene.frame_current_final, is_asked=is_asked)
+        return
+    active = surface.data.color_attributes.active_color_name
+    before = each or active.removesuffix("_color")
+    choice, _, last = surface.get(_CHOICE_KEY, "").partition(" ")
+    if before != last and f"{last}_color" in surface.data.color_attributes:
+        # Chosen by the user among the attributes of the mesh.
+        choice = before
+    choice = scalar or choice
+    name = next((name for name in (choice, before, *scalars) if name in scalars), None)
+    if name is not None and (scalar or each or not active or before in scalars
+                            or active in surface.data[meshes.GIVEN_KEY]):
+        color_by(surface, name, is_asked=is_asked)
+        # A result may lack what the user has asked for; the next one may have it again.
+        surface[_CHOICE_KEY] = f"{choice or name} {name}"
+
+
+def _shown_before(scene: bpy.types.Scene, data: SceneData) -> bpy.types.Collection | None:
+    """Return the collection that shows the branch: in this scene, else in the file."""
+    return next((branch for branch in (*branches(scene), *bpy.data.collections)
+                 if branch.library is None and branch.override_library is None
+                 and ID_KEY in branch and FOLDER_KEY in branch and _is_same(branch, data)),
+                None)
+
+
+def _leave_mode(scene: bpy.types.Scene, shown: ShownBranch) -> str | None:
+    """Leave Edit Mode and the like if a part of the branch is in it; return which, to go back."""
+    active = layer_of(scene).objects.active
+    if active is None or all(thing.mode == "OBJECT" for thing in shown.before.values()):
+        return None
+    mode = active.mode
+    bpy.ops.object.mode_set(mode="OBJECT")
+    return mode
+
+
+def _put_surface(shown: ShownBranch, data: SceneData) -> bool:
+    """Show the branch itself; returns whether it is new."""
+    before = shown.find("surface")
+    if before is not None:
+        shown.place = np.array(before.delta_location)
     name = data.info["name"]
-    collection = bpy.data.collections.new(name)
-    collection[FOLDER_KEY], collection[NAME_KEY] = animation.shown_path(data.folder), name
-    if data.info.get("uuid"):
-        collection[UUID_KEY] = str(data.info["uuid"])
-    scene.collection.children.link(collection)
     mesh = meshes.new_mesh(name, data.arrays["vertices"], data.arrays["faces"])
-    surface = add_object(collection, name, mesh)
-    # Not the folder: it may move, and the file with it.
-    surface[INFO_KEY] = json.dumps({**data.info, "folder": None})
-    surface[VIEW_KEY] = data.arrays["view_direction"].tolist()
-    if "map_offset" in data.info:
-        surface[OFFSET_KEY] = [float(value) for value in data.info["map_offset"]]
-    if "grasp" in data.arrays:
-        surface[GRASP_KEY] = [*data.arrays["grasp"][0].tolist(),
-                              float(data.arrays["grasp_radius"][0])]
     for key, scale in data.info["scalars"].items():
         colour_nodes.colour_group(scale["colours"], scale["stops"])
         meshes.set_scalars(mesh, key, data.arrays[f"scalar:{key}"])
         meshes.set_colors(mesh, f"{key}_color", data.arrays[f"color:{key}"])
-    names = list(data.info["scalars"])
-    if names:
-        color_by(surface, scalar if scalar in names else names[0])
-    return ShownBranch(collection, surface)
-
-
-@dataclass
-class _Before:
-    """State kept from a branch that is shown again: its skeleton with edits not applied yet, and
-    its position beside others [m].
-    """
-
-    edited: bpy.types.Mesh | None = None
-    has_skeleton_in_sight: bool = False
-    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-def _remove_shown(scene: bpy.types.Scene, data: SceneData) -> _Before:
-    """Remove earlier objects of this branch, also when its folder has moved since."""
-    found = _Before()
-    for collection in list(scene.collection.children):
-        if FOLDER_KEY not in collection or not _is_same(collection, data):
-            continue
-        for thing in list(collection.objects):
-            mesh = thing.data if thing.type == "MESH" else None
-            if INFO_KEY in thing:
-                found.place = tuple(thing.delta_location)
-            if mesh is not None and skeletons.NODES_KEY in mesh:
-                found.has_skeleton_in_sight = not thing.hide_viewport
-                found.edited = mesh if skeletons.is_edited(thing) else None
-            bpy.data.objects.remove(thing)
-        bpy.data.collections.remove(collection)
-    return found
+    surface, is_new = shown.put("surface", name, mesh)
+    shown.surface = surface
+    # Not the folder: it may move, and the file with it.
+    surface[INFO_KEY] = json.dumps({**data.info, "folder": None})
+    surface[VIEW_KEY] = data.arrays["view_direction"].tolist()
+    grasp = [*data.arrays["grasp"][0].tolist(), float(data.arrays["grasp_radius"][0])] if (
+        "grasp" in data.arrays) else None
+    energy = data.arrays.get("frame_energy") if data.info.get("frames") else None
+    for key, values in ((OFFSET_KEY, data.info.get("map_offset")), (GRASP_KEY, grasp),
+                        (ENERGY_KEY, energy)):
+        surface.pop(key, None)
+        if values is not None:
+            surface[key] = [float(value) for value in values]
+    if is_new and data.info["scalars"]:
+        mesh.color_attributes.active_color_name = f"{next(iter(data.info['scalars']))}_color"
+    return is_new
 
 
 def _is_same(collection: bpy.types.Collection, data: SceneData) -> bool:
@@ -193,17 +235,18 @@ def _add_paths(shown: ShownBranch, data: SceneData) -> None:
         tube = curves.new_tube(title, data.arrays[name], share * data.info["size_m"])
         meshes.set_one_color(tube, COLORS[name])
         material = materials.plain_material(title, COLORS[name], roughness=0.4)
-        shown.objects[name] = [add_object(shown.collection, f"{title} path", tube, material)]
+        shown.put(name, f"{title} path", tube, material)
 
 
 def _add_trees(shown: ShownBranch, data: SceneData) -> None:
     """Add the planners' search trees as lines; hidden, since they cover all of the space."""
     for key, about in (data.info.get("trees") or {}).items():
-        mesh = _lines(f"{about['title']} tree", data, f"tree:{key}", f"tree_parent:{key}")
-        thing = add_object(shown.collection, f"{about['title']} tree", mesh)
-        thing.color = (*COLORS[f"path:{key}"], 1.0)
-        thing.hide_viewport = thing.hide_render = True
-        shown.objects[f"tree:{key}"] = [thing]
+        title = f"{about['title']} tree"
+        mesh = _lines(title, data, f"tree:{key}", f"tree_parent:{key}")
+        thing, is_new = shown.put(f"tree:{key}", title, mesh)
+        if is_new:
+            thing.color = (*COLORS[f"path:{key}"], 1.0)
+            thing.hide_viewport = thing.hide_render = True
 
 
 def _lines(name: str, data: SceneData, nodes: str, parents: str) -> bpy.types.Mesh:
@@ -213,7 +256,7 @@ def _lines(name: str, data: SceneData, nodes: str, parents: str) -> bpy.types.Me
     return meshes.new_lines(name, data.arrays[nodes], np.column_stack([parent[hung], hung]))
 
 
-def _add_skeleton(shown: ShownBranch, data: SceneData, before: _Before) -> None:
+def _add_skeleton(shown: ShownBranch, data: SceneData) -> None:
     """Add the centreline with its radii, hidden at first: it is inside the branch.
 
     Edits that are not applied yet stay if it is the same skeleton.
@@ -222,42 +265,35 @@ def _add_skeleton(shown: ShownBranch, data: SceneData, before: _Before) -> None:
         return
     skeleton = Skeleton(data.arrays["skeleton"], data.arrays["skeleton_radius"],
                         data.arrays["skeleton_parent"])
-    mesh = before.edited
-    if mesh is not None and not skeletons.is_of(mesh, skeleton):
-        data.info["notes"].append("The skeleton was made again. Edits that were not applied are "
-                                  "lost")
-        bpy.data.meshes.remove(mesh)
-        mesh = None
-    if mesh is None:
-        mesh = skeletons.new_skeleton("Skeleton", skeleton, data.arrays["skeleton_flags"])
-        meshes.set_scalars(mesh, "radius_sigma", data.arrays["skeleton_radius_sigma"])
-        if "skeleton_probability" in data.arrays:
-            meshes.set_scalars(mesh, "probability", data.arrays["skeleton_probability"])
-    thing = add_object(shown.collection, "Skeleton", mesh)
-    thing.hide_viewport = not before.has_skeleton_in_sight
-    thing.hide_render = True
-    thing.show_in_front = True
-    shown.objects["skeleton"] = [thing]
+    before = shown.find("skeleton")
+    if before is not None and skeletons.is_skeleton(before) and (
+            not skeletons.is_of(before.data, skeleton) and skeletons.is_edited(before)):
+        shown.notes.append("The skeleton was made again. Edits that were not applied are lost")
+    mesh = skeletons.new_skeleton("Skeleton", skeleton, data.arrays["skeleton_flags"])
+    meshes.set_scalars(mesh, "radius_sigma", data.arrays["skeleton_radius_sigma"])
+    if "skeleton_probability" in data.arrays:
+        meshes.set_scalars(mesh, "probability", data.arrays["skeleton_probability"])
+    thing, is_new = shown.put("skeleton", "Skeleton", mesh)
+    if is_new:
+        thing.hide_viewport = thing.hide_render = thing.show_in_front = True
 
 
 def _add_points(shown: ShownBranch, data: SceneData) -> None:
-    for name, title in (("control_points", "Control point"), ("grasp", "Grasp"),
+    for kind, title in (("control_points", "Control point"), ("grasp", "Grasp"),
                         ("targets", "Target")):
-        points = data.arrays.get(name, np.empty((0, 3)))
+        points = data.arrays.get(kind, np.empty((0, 3)))
         if len(points) == 0:
             continue
         ball = meshes.new_sphere(title, 1.0)
-        meshes.set_one_color(ball, COLORS[name])
-        material = materials.plain_material(title, COLORS[name], roughness=0.35)
-        shown.objects[name] = []
+        meshes.set_one_color(ball, COLORS[kind])
+        material = materials.plain_material(title, COLORS[kind], roughness=0.35)
         for number, point in enumerate(points):
-            named = data.info["targets"][number] if name == "targets" else number + 1
-            thing = add_object(shown.collection, f"{title} {named}", ball, material)
-            thing.location = point
-            thing.scale = [data.arrays[f"{name}_radius"][number]] * 3
-            if name == "targets":
+            named = data.info["targets"][number] if kind == "targets" else number + 1
+            thing, _ = shown.put(kind, f"{title} {named}", ball, material, str(named))
+            thing.delta_location = point + shown.place
+            thing.delta_scale = [data.arrays[f"{kind}_radius"][number]] * 3
+            if kind == "targets":
                 thing[goal_ball.TARGET_KEY] = named
-            shown.objects[name].append(thing)
 
 
 def _add_goal(shown: ShownBranch, data: SceneData) -> None:
@@ -280,30 +316,31 @@ def _add_base(shown: ShownBranch, data: SceneData) -> None:
     block = meshes.new_cylinder("Fixed base", max(2.2 * base["radius_m"], 0.03 * size), height)
     meshes.set_one_color(block, COLORS["base"])
     material = materials.plain_material("Fixed base", COLORS["base"], roughness=0.8)
-    thing = add_object(shown.collection, "Fixed base", block, material)
-    thing.location = (*base["centre_m"][:2], bottom + height / 2)
-    shown.objects["base"] = [thing]
+    thing, _ = shown.put("base", "Fixed base", block, material)
+    thing.delta_location = np.array([*base["centre_m"][:2], bottom + height / 2]) + shown.place
 
 
-def _add_robot(shown: ShownBranch, data: SceneData, speed: float) -> None:
+def _add_robot(shown: ShownBranch, data: SceneData) -> None:
     """Add arm and gripper, one capsule per link, moving along with the frames."""
     if "robot_starts" not in data.arrays:
         return
-    starts, ends = data.arrays["robot_starts"], data.arrays["robot_ends"]
+    starts = data.arrays["robot_starts"] + shown.place
+    ends = data.arrays["robot_ends"] + shown.place
     title = f"Robot {data.info['robot']['name']}"
     material = materials.plain_material(title, COLORS["robot"], roughness=0.5)
-    shown.objects["robot"] = []
     for number, radius in enumerate(data.arrays["robot_radii"].tolist()):
         reach = starts[:, number], ends[:, number]
         length = math.dist(reach[0][0], reach[1][0])
         if length < radius / 4:
             # Two joints with intersecting axes: only the adjacent round ends are visible.
             continue
-        rod = meshes.new_capsule(f"{title} link {number + 1}", radius, length)
+        link = f"{title} link {number + 1}"
+        rod = meshes.new_capsule(link, radius, length)
         meshes.set_one_color(rod, COLORS["robot"])
-        thing = add_object(shown.collection, f"{title} link {number + 1}", rod, material)
-        animation.move_between(thing, *reach, speed=speed)
-        shown.objects["robot"].append(thing)
+        thing, is_new = shown.put("robot", link, rod, material, str(number + 1))
+        if is_new:
+            thing.rotation_mode = "QUATERNION"
+        animation.move_between(thing, *reach, shown.start, speed=shown.speed)
 
 
 def own_speed(scene: bpy.types.Scene, frames: dict) -> float:
@@ -315,35 +352,51 @@ def own_speed(scene: bpy.types.Scene, frames: dict) -> float:
         frames["is_timed"]) else 1.0
 
 
-def last_frame(first: int, count: int, speed: float) -> int:
+def last_frame(first: float, count: int, speed: float) -> int:
     """Return the scene's frame in which the last of ``count`` frames is shown."""
-    return max(first, first + math.ceil((count - 1) / speed - 1e-6))
+    return max(math.ceil(first), math.ceil(first + (count - 1) / speed - 1e-6))
+
+
+def fit_range(scene: bpy.types.Scene, surface: bpy.types.Object) -> None:
+    """Set the scene's frame range to the motion of a branch, unless the user has set a range."""
+    motion, frames = animation.motion_of(surface), info_of(surface).get("frames")
+    now = [scene.frame_start, scene.frame_end]
+    if motion is None or not frames or now not in (_DEFAULT_RANGE, [*scene.get(_RANGE_KEY, ())]):
+        return
+    start, speed = animation.timing_of(motion)
+    scene.frame_start = min(1, math.floor(start))
+    scene.frame_end = last_frame(start, frames["count"], speed)
+    scene[_RANGE_KEY] = [scene.frame_start, scene.frame_end]
 
 
 def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> None:
-    frames = data.info.get("frames")
+    frames, before = data.info.get("frames"), animation.motion_of(shown.surface)
     if not frames:
+        if before is not None:
+            shown.surface.modifiers.remove(before)
         return
     rest = meshes.new_mesh("Rest shape", data.arrays["vertices"], data.arrays["faces"])
     material = materials.plain_material("Rest shape", COLORS["rest"], alpha=0.25)
-    ghost = add_object(shown.collection, "Rest shape", rest, material)
-    # In the viewport, lines, and on demand: they cover colours that show numbers.
-    ghost.display_type = "WIRE"
-    ghost.hide_viewport = True
-    shown.objects["rest"] = [ghost]
-    speed = own_speed(scene, frames)
-    header = animation.attach_cache(shown.surface, data.folder / frames["file"], speed=speed)
+    ghost, is_new = shown.put("rest", "Rest shape", rest, material)
+    if is_new:
+        # In the viewport, lines, and on demand: they cover colours that show numbers.
+        ghost.display_type = "WIRE"
+        ghost.hide_viewport = True
+    shown.speed = own = own_speed(scene, frames)
+    if before is not None and before.frame_scale:
+        # The user may have set another start and speed.
+        shown.start, speed = animation.timing_of(before)
+        shown.speed *= speed / shown.surface.get(_SPEED_KEY, speed)
+    shown.surface[_SPEED_KEY] = own
+    header = animation.attach_cache(shown.surface, data.folder / frames["file"], shown.start,
+                                    speed=shown.speed)
     shown.frame_count = header.frame_count
-    scene.frame_start = 1
-    scene.frame_end = last_frame(1, header.frame_count, speed)
-    if "grasp_motion" in data.arrays and "grasp" in shown.objects:
-        animation.move_along(shown.objects["grasp"][0], data.arrays["grasp_motion"], speed=speed)
-    for name in ("control_points", "targets"):
-        for number, thing in enumerate(shown.objects.get(name, ())):
-            animation.move_along(thing, data.arrays[f"{name}_motion"][:, number], speed=speed)
-    _add_robot(shown, data, speed)
-    annotations.add_measured(shown, data, speed)
-    # Last: keyed objects are then at the first frame, not at their last key.
-    scene.frame_set(1)
-    if "frame_energy" in data.arrays:
-        shown.surface[ENERGY_KEY] = [float(value) for value in data.arrays["frame_energy"]]
+    for kind in ("grasp", "control_points", "targets"):
+        motion = data.arrays.get(f"{kind}_motion")
+        if motion is None:
+            continue
+        motion = motion.reshape(len(motion), -1, 3) + shown.place
+        for number, thing in enumerate(shown.objects.get(kind, ())):
+            animation.move_along(thing, motion[:, number], shown.start, speed=shown.speed)
+    _add_robot(shown, data)
+    annotations.add_measured(shown, data)

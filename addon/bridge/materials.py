@@ -1,16 +1,26 @@
 """Materials: one colour, or a number on the vertices shown by a colour ramp."""
 
+import json
 import math
 
 import bpy
 
 from .. import compat
 
+KEY = "limber_material"
+"""Key of a material of ours: what it shows. It is made once a file, and then left to the user."""
+_SCALE_KEY = "limber_scale"
+_AXIS, _RANGE, _COLOURS = "Limber Axis", "Limber Range", "Limber Colours"
+"""Names of the nodes that hold the scale of a scalar's material."""
+
 
 def plain_material(name: str, color: tuple[float, float, float], *, alpha: float = 1.0,
                    roughness: float = 0.5) -> bpy.types.Material:
-    """Make a material of one linear colour; ``alpha`` below 1 is transparent."""
-    material, shader = _new(name)
+    """Return the material of one linear colour; ``alpha`` below 1 is transparent."""
+    key = f"{name} {tuple(color)} {alpha} {roughness}"
+    if (known := _known(key)) is not None:
+        return known
+    material, shader = _new(name, key)
     shader.inputs["Base Color"].default_value = (*color, 1.0)
     shader.inputs["Roughness"].default_value = roughness
     shader.inputs["Alpha"].default_value = alpha
@@ -19,8 +29,11 @@ def plain_material(name: str, color: tuple[float, float, float], *, alpha: float
 
 
 def vertex_color_material(name: str, attribute: str) -> bpy.types.Material:
-    """Make a material that shows the colours of attribute ``attribute`` of the mesh."""
-    material, shader = _new(name)
+    """Return the material that shows the colours of attribute ``attribute`` of the mesh."""
+    key = f"{name} {attribute}"
+    if (known := _known(key)) is not None:
+        return known
+    material, shader = _new(name, key)
     nodes, links = material.node_tree.nodes, material.node_tree.links
     color = nodes.new("ShaderNodeAttribute")
     color.attribute_name = attribute
@@ -30,8 +43,11 @@ def vertex_color_material(name: str, attribute: str) -> bpy.types.Material:
 
 
 def flat_material(name: str, color: tuple[float, float, float]) -> bpy.types.Material:
-    """Make a material that shows its linear colour independent of the light: for a legend."""
-    material, shader = _new(name)
+    """Return the material that shows its linear colour independent of the light: for a legend."""
+    key = f"{name} {tuple(color)} flat"
+    if (known := _known(key)) is not None:
+        return known
+    material, shader = _new(name, key)
     _make_flat(material, shader)
     material.node_tree.nodes["Emission"].inputs["Color"].default_value = (*color, 1.0)
     material.diffuse_color = (*color, 1.0)
@@ -39,8 +55,9 @@ def flat_material(name: str, color: tuple[float, float, float]) -> bpy.types.Mat
 
 
 def scalar_material(name: str, attribute: str, *, low: float, high: float, log: bool,
-                    stops: list[list[float]], flat: bool = False) -> bpy.types.Material:
-    """Make a material that shows FLOAT attribute ``attribute`` by colour.
+                    stops: list[list[float]], flat: bool = False, owner: str = "",
+                    ) -> bpy.types.Material:
+    """Return the material that shows FLOAT attribute ``attribute`` by colour, with this scale.
 
     Args:
         name: Name of the material.
@@ -50,24 +67,53 @@ def scalar_material(name: str, attribute: str, *, low: float, high: float, log: 
         log: Whether the colours are spread over the logarithm.
         stops: Rows ``[position 0..1, red, green, blue]``, linear.
         flat: Whether it is independent of the light.
+        owner: What the scale belongs to, by default the name: another has a material of its own.
     """
-    material, shader = _new(name)
-    nodes, links = material.node_tree.nodes, material.node_tree.links
-    value = nodes.new("ShaderNodeAttribute")
-    value.attribute_name = attribute
-    output = value.outputs["Fac"]
+    key = f"{owner or name} {attribute} {flat}"
+    found = _all_known(key) or [_new_scalar_material(name, key, attribute, flat=flat)]
     if log:
-        logarithm = nodes.new("ShaderNodeMath")
-        logarithm.operation = "LOGARITHM"
-        logarithm.inputs[1].default_value = 10.0
-        links.new(output, logarithm.inputs[0])
-        output, low, high = logarithm.outputs[0], math.log10(low), math.log10(high)
-    place = nodes.new("ShaderNodeMapRange")
-    place.inputs["From Min"].default_value = low
-    place.inputs["From Max"].default_value = high
-    links.new(output, place.inputs["Value"])
-    ramp = nodes.new("ShaderNodeValToRGB")
-    set_stops(ramp.color_ramp, stops)
+        low, high = math.log10(low), math.log10(high)
+    scale = json.dumps([low, high, log, stops])
+    for material in [material for material in found if material.get(_SCALE_KEY) != scale]:
+        material[_SCALE_KEY] = scale
+        nodes = material.node_tree.nodes
+        # The user may have removed one.
+        if (axis := nodes.get(_AXIS)) is not None:
+            axis.operation = "LOGARITHM" if log else "MULTIPLY"
+            axis.inputs[1].default_value = 10.0 if log else 1.0
+        if (place := nodes.get(_RANGE)) is not None:
+            place.inputs["From Min"].default_value = low
+            place.inputs["From Max"].default_value = high
+        if (ramp := nodes.get(_COLOURS)) is not None:
+            set_stops(ramp.color_ramp, stops)
+    return found[0]
+
+
+def wear(thing: bpy.types.Object, material: bpy.types.Material, *, is_asked: bool = False) -> None:
+    """Put a material of ours into the first slot of an object.
+
+    Only instead of one of ours that shows something else, unless the user has asked for it.
+    """
+    if not thing.material_slots:
+        if is_asked:
+            thing.data.materials.append(material)
+        return
+    slot = thing.material_slots[0]
+    before = None if slot.material is None else slot.material.get(KEY)
+    if before != material[KEY] and (before is not None or is_asked):
+        slot.material = material
+
+
+def _new_scalar_material(name: str, key: str, attribute: str, *, flat: bool,
+                         ) -> bpy.types.Material:
+    material, shader = _new(name, key)
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    value, axis = nodes.new("ShaderNodeAttribute"), nodes.new("ShaderNodeMath")
+    value.attribute_name = attribute
+    place, ramp = nodes.new("ShaderNodeMapRange"), nodes.new("ShaderNodeValToRGB")
+    axis.name, place.name, ramp.name = _AXIS, _RANGE, _COLOURS
+    links.new(value.outputs["Fac"], axis.inputs[0])
+    links.new(axis.outputs[0], place.inputs["Value"])
     links.new(place.outputs["Result"], ramp.inputs["Fac"])
     if flat:
         _make_flat(material, shader)
@@ -81,8 +127,19 @@ def scalar_material(name: str, attribute: str, *, low: float, high: float, log: 
     return material
 
 
-def _new(name: str) -> tuple[bpy.types.Material, bpy.types.Node]:
+def _known(key: str) -> bpy.types.Material | None:
+    return next(iter(_all_known(key)), None)
+
+
+def _all_known(key: str) -> list[bpy.types.Material]:
+    """Return a material of ours with the copies that the user has made of it."""
+    return [material for material in bpy.data.materials
+            if material.get(KEY) == key and material.library is None]
+
+
+def _new(name: str, key: str) -> tuple[bpy.types.Material, bpy.types.Node]:
     material = bpy.data.materials.new(name)
+    material[KEY] = key
     compat.use_nodes(material)
     nodes = material.node_tree.nodes
     shader = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")

@@ -1,8 +1,18 @@
 """Meshes and their named attributes, to and from arrays."""
 
+import hashlib
+
 import bmesh
 import bpy
 import numpy as np
+from mathutils.kdtree import KDTree
+
+GIVEN_KEY = "limber_given"
+"""Key of a mesh of ours: a digest of its faces, and of each attribute that was given to it."""
+_FACES = "faces"
+_VALUES = {"FLOAT": ("value", np.float32, 1), "INT": ("value", np.int32, 1),
+           "FLOAT_VECTOR": ("vector", np.float32, 3), "FLOAT_COLOR": ("color", np.float32, 4)}
+"""Property, type and length of an attribute's values, by its type."""
 
 
 def new_mesh(name: str, vertices: np.ndarray, faces: np.ndarray | None = None) -> bpy.types.Mesh:
@@ -137,6 +147,116 @@ def set_screen_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> No
 def set_one_color(mesh: bpy.types.Mesh, color: tuple[float, float, float]) -> None:
     """Give all vertices one linear colour: Solid mode then shows it beside coloured surfaces."""
     set_colors(mesh, "color", np.tile((*color, 1.0), (len(mesh.vertices), 1)))
+
+
+def is_given(mesh: bpy.types.ID) -> bool:
+    """Whether data of an object is a mesh of ours."""
+    return isinstance(mesh, bpy.types.Mesh) and GIVEN_KEY in mesh
+
+
+def note_given(mesh: bpy.types.Mesh) -> None:
+    """Note that a mesh just made is one of ours."""
+    mesh[GIVEN_KEY] = _digests(mesh)
+
+
+def give(mesh: bpy.types.Mesh, new: bpy.types.Mesh, *, is_edited_kept: bool = False) -> None:
+    """Give a mesh of ours what a mesh just made has, where that is not what it was given last.
+
+    What the user has added or painted stays where the faces are the same.
+
+    Args:
+        mesh: The mesh to change.
+        new: A mesh just made; it stays.
+        is_edited_kept: Whether vertices that the user has removed or added are kept too.
+    """
+    before, now = mesh[GIVEN_KEY].to_dict(), _digests(new)
+    if is_edited_kept and before == now:
+        return
+    if before[_FACES] != now[_FACES] or not has_same_faces(mesh, new):
+        replace(mesh, new)
+    else:
+        for name in before.keys() - now.keys():
+            if name in mesh.attributes:
+                mesh.attributes.remove(mesh.attributes[name])
+        for name in now.keys() - {_FACES}:
+            if before.get(name) != now[name] or name not in mesh.attributes:
+                _copy_attribute(mesh, new.attributes[name])
+        mesh.update()
+    mesh[GIVEN_KEY] = now
+
+
+def replace(mesh: bpy.types.Mesh, new: bpy.types.Mesh) -> None:
+    """Replace vertices, faces and attributes of a mesh by those of another."""
+    active = mesh.color_attributes.active_color_name
+    builder = bmesh.new()
+    try:
+        builder.from_mesh(new)
+        builder.to_mesh(mesh)
+    finally:
+        builder.free()
+    for key in new.keys():
+        # Blender writes an array into a longer one that is there, whose end stays.
+        mesh.pop(key, None)
+        mesh[key] = new[key]
+    colours = [name for name in (active, new.color_attributes.active_color_name)
+               if name in mesh.color_attributes]
+    if colours:
+        mesh.color_attributes.active_color_name = colours[0]
+    mesh.update()
+
+
+class Weights:
+    """The vertex groups of an object, to be given to its next mesh."""
+
+    def __init__(self, thing: bpy.types.Object):
+        self._weights = [[(one.group, one.weight) for one in vertex.groups]
+                         for vertex in thing.data.vertices]
+        self._tree = KDTree(len(self._weights))
+        for number, place in enumerate(positions(thing.data)):
+            self._tree.insert(place, number)
+        self._tree.balance()
+
+    def put_back(self, thing: bpy.types.Object) -> None:
+        """Give each vertex the weights of the one that was nearest to it."""
+        for number, place in enumerate(positions(thing.data)):
+            _, nearest, _ = self._tree.find(place)
+            for group, weight in self._weights[nearest]:
+                thing.vertex_groups[group].add([number], weight, "REPLACE")
+
+
+def has_same_faces(mesh: bpy.types.Mesh, other: bpy.types.Mesh) -> bool:
+    """Whether two meshes have the same vertices, edges and faces, apart from their positions."""
+    return _faces_digest(mesh) == _faces_digest(other)
+
+
+def _faces_digest(mesh: bpy.types.Mesh) -> str:
+    """Return a digest of how the vertices of a mesh are joined."""
+    found = hashlib.sha256(str(len(mesh.vertices)).encode())
+    for parts, name, length in ((mesh.edges, "vertices", 2), (mesh.loops, "vertex_index", 1),
+                                (mesh.polygons, "loop_total", 1)):
+        values = np.empty(length * len(parts), np.int32)
+        parts.foreach_get(name, values)
+        found.update(values.tobytes())
+    return found.hexdigest()
+
+
+def _digests(mesh: bpy.types.Mesh) -> dict[str, str]:
+    found = {attribute.name: hashlib.sha256(_values(attribute).tobytes()).hexdigest()
+             for attribute in mesh.attributes
+             if attribute.domain == "POINT" and attribute.data_type in _VALUES}
+    return found | {_FACES: _faces_digest(mesh)}
+
+
+def _values(attribute: bpy.types.Attribute) -> np.ndarray:
+    name, kind, length = _VALUES[attribute.data_type]
+    values = np.empty(length * len(attribute.data), kind)
+    attribute.data.foreach_get(name, values)
+    return values
+
+
+def _copy_attribute(mesh: bpy.types.Mesh, source: bpy.types.Attribute) -> None:
+    _attribute(mesh, source.name, source.data_type, len(source.data)).data.foreach_set(
+        _VALUES[source.data_type][0], _values(source))
 
 
 def new_sphere(name: str, radius: float) -> bpy.types.Mesh:

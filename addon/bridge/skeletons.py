@@ -56,6 +56,11 @@ def flags_of(mesh: bpy.types.Mesh) -> np.ndarray:
     return np.array(mesh[_FLAGS_KEY], int)
 
 
+def is_skeleton(thing: bpy.types.Object) -> bool:
+    """Whether an object still has the mesh of a skeleton."""
+    return thing.type == "MESH" and NODES_KEY in thing.data
+
+
 def is_of(mesh: bpy.types.Mesh, skeleton: Skeleton) -> bool:
     """Whether the mesh was made of this skeleton."""
     given = as_given(mesh)
@@ -72,9 +77,11 @@ def is_edited(thing: bpy.types.Object) -> bool:
         return True
 
 
-def as_it_was(mesh: bpy.types.Mesh) -> bpy.types.Mesh:
-    """Return a new mesh of the skeleton as the worker gave it."""
-    return new_skeleton(mesh.name, as_given(mesh), flags_of(mesh))
+def put_back(mesh: bpy.types.Mesh) -> None:
+    """Reset a mesh to the skeleton as the worker gave it."""
+    fresh = new_skeleton(mesh.name, as_given(mesh), flags_of(mesh))
+    meshes.replace(mesh, fresh)
+    bpy.data.meshes.remove(fresh)
 
 
 def nodes_of(thing: bpy.types.Object) -> Nodes:

@@ -11,7 +11,7 @@ from .seeing import things_of
 class CarriedMarks:
     """The marks on a branch, each carried by the vertex that is nearest to it at rest.
 
-    They move by their delta location: their own is keyed where the branch has a motion.
+    They move by their delta location, which is keyed where the branch has a motion.
 
     Args:
         surface: Surface of the branch.
@@ -24,15 +24,16 @@ class CarriedMarks:
         self._marks = [
             (thing, thing.delta_location.copy(), _at_rest(thing))
             for group in ("control_points", "marks") for thing in things_of(branch, group)]
-        self._nearest = [int(((rest - np.array(place)) ** 2).sum(axis=1).argmin())
+        self._nearest = [int(((rest + surface.delta_location - np.array(place)) ** 2).sum(
+            axis=1).argmin())
                          for _, _, place in self._marks]
 
     def show(self, positions: np.ndarray) -> None:
         """Carry them to the branch's present ``positions`` [m], shape [v, 3]."""
         turn = self._surface.matrix_world.to_3x3()
-        for (thing, before, place), vertex in zip(self._marks, self._nearest, strict=True):
+        for (thing, _, place), vertex in zip(self._marks, self._nearest, strict=True):
             moved = Vector((positions[vertex] - self._rest[vertex]).tolist())
-            thing.delta_location = before + (place - thing.location) + turn @ moved
+            thing.delta_location = place + turn @ moved
 
     def end(self) -> None:
         """Put them back; one that the user has removed is skipped."""
@@ -44,9 +45,9 @@ class CarriedMarks:
 
 
 def _at_rest(thing: bpy.types.Object) -> Vector:
-    """Return an object's location before its motion begins, if it has one."""
-    place = thing.location.copy()
+    """Return an object's delta location before its motion begins, if it has one."""
+    place = thing.delta_location.copy()
     for curve in compat.fcurves_of(thing):
-        if curve.data_path == "location" and len(curve.keyframe_points):
+        if curve.data_path == "delta_location" and len(curve.keyframe_points):
             place[curve.array_index] = curve.keyframe_points[0].co[1]
     return place

@@ -79,7 +79,9 @@ class LIMBER_OT_drag_goal(NeedsBranchInObjectMode, bpy.types.Operator):
         """Note where everything is; reports why nothing can be dragged."""
         self._surface = branches.find_surface(context.scene)
         self._branch = branches.branch_of(self._surface)
-        thing = self._branch.objects.get(self.mark) if self.mark else goal_ball.of(self._branch)
+        things = branches.parts_of(self._branch).values()
+        thing = next((thing for thing in things if thing.name == self.mark), None) if (
+            self.mark) else goal_ball.of(self._branch)
         if thing is None:
             self.report({"ERROR"}, f"The branch has no {self.mark}." if self.mark else
                                    "There is no goal. Press Move the Goal by Hand first.")
@@ -156,7 +158,7 @@ def handles(context: bpy.types.Context) -> dict[str, tuple]:
         return {}
     branch = branches.branch_of(surface)
     found = {} if (ball := goal_ball.of(branch)) is None else {"": (ball, goal_ball.COLOUR)}
-    for thing in branch.objects:
+    for thing in branches.parts_of(branch).values():
         kind = thing.get(branches.SHOWS_KEY)
         if kind in (_GRASP, _TARGETS):
             found[thing.name] = (thing, scene.COLORS[kind])

@@ -85,7 +85,8 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         except ReferenceError:
             self._surface = None
             self._end(context)
-            self.report({"ERROR"}, "The branch was removed while it was held.")
+            self.report({"ERROR"}, "The branch was removed, or another mesh of it was shown, while "
+                                   "it was held.")
             return {"CANCELLED"}
 
     def cancel(self, context):
@@ -102,7 +103,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         self._is_ready, self._waits_for, self._rate = False, "", FrameRate()
         self._lighter = LighterView(context.preferences)
         self._mouse = self._waiting = None
-        motion = self._surface.modifiers.get(animation.MODIFIER)
+        motion = animation.motion_of(self._surface)
         self._had_motion = motion is not None and motion.show_viewport
         if self._had_motion:
             motion.show_viewport = False
@@ -119,6 +120,9 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
 
     def _modal(self, context, event):
         self._surface.name  # noqa: B018 (a ReferenceError here, not in the middle of something)
+        if len(self._surface.data.vertices) != len(self._rest):
+            self._show_motion()
+            raise ReferenceError("another mesh")
         if event.type == "TIMER":
             return self._answered(context)
         if event.type in _NAVIGATION or event.type.startswith(("NUMPAD", "NDOF")):
@@ -320,9 +324,13 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             self._tint.show(False)
             meshes.set_positions(self._surface.data, self._rest)
             self._marks.end()
-            if self._had_motion:
-                self._surface.modifiers[animation.MODIFIER].show_viewport = True
+            self._show_motion()
         self._area.tag_redraw()
+
+    def _show_motion(self) -> None:
+        motion = animation.motion_of(self._surface)
+        if self._had_motion and motion is not None:
+            motion.show_viewport = True
 
     def _in_region(self, event) -> tuple[int, int]:
         return event.mouse_x - self._region.x, event.mouse_y - self._region.y

@@ -9,7 +9,7 @@ from .. import branch_folder, branches, deleted_points, scans
 from ..branches import FOLDER_KEY, OFFSET_KEY, SCAN_KEY, add_object
 from ..bridge import meshes
 from ..overlays.cloud import COLOUR
-from .viewing import clear_view, look_at
+from .viewing import clear_view, look_at, push_undo
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "um": 1e-6}
 _INTERVAL_SECONDS = 0.05
@@ -97,6 +97,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         settings.show_scan = True
         hidden = clear_view(context.scene)
         look_at(context, cloud)
+        push_undo(context)
         unit = settings.reconstruct.unit
         size = f"{scan.extent:.4g} {unit} across"
         if guessed:

@@ -6,10 +6,18 @@ from pathlib import Path
 
 import bpy
 
-from .. import branch_folder, branches, frame_colours, properties, scene, scene_data
+from .. import (
+    branch_folder,
+    branches,
+    frame_colours,
+    goal_ball,
+    properties,
+    scene,
+    scene_data,
+)
 from ..stages import stages
 from .needs_result import folder_to_open
-from .viewing import clear_view, look_at
+from .viewing import clear_view, look_at, push_undo
 from .worker_operator import WorkerOperator
 
 
@@ -60,10 +68,12 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
                 raise ValueError("The worker succeeded but wrote nothing to show. Its output was: "
                                  f"{json.dumps(result)} {' '.join(self._job.log)}")
             data = scene_data.read_scene_data(self._data_path)
-        shown = scene.show_branch(context.scene, data)
-        branches.use_folder(context.scene, shown.collection[branches.FOLDER_KEY])
+        before = branches.current_folder(context.scene)
         if trouble := frame_colours.keep(data):
             self.report({"WARNING"}, trouble)
+        shown = scene.show_branch(context.scene, data)
+        if before is None or before.resolve() != data.folder.resolve():
+            branches.use_folder(context.scene, shown.collection[branches.FOLDER_KEY])
         if scene.place_scans(context.scene, data):
             # It would hide the branch; a switch in the panel shows it again.
             context.scene.limber.show_scan = False
@@ -73,9 +83,12 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
             # The visible plan is the one that a robot would follow.
             context.scene.limber.execute.name = data.info["plan"]
         self._take_over_settings(context, data.folder)
-        hidden = clear_view(context.scene)
-        look_at(context, shown.surface)
-        told = [*data.info["notes"], *([hidden] if hidden else [])]
+        goal_ball.tell_again(context.scene)
+        told = [*data.info["notes"], *shown.notes]
+        if shown.is_first:
+            told += filter(None, [clear_view(context.scene)])
+            look_at(context, shown.surface)
+        push_undo(context)
         self.report({"INFO"}, f"{data.info['name']}: {'; '.join(told)}")
 
     def _take_over_settings(self, context, folder: Path) -> None:

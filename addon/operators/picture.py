@@ -6,8 +6,9 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
-from .. import branches, legend, scale_bar, studio
-from ..branches import SHOWS_KEY, VIEW_KEY, ShownBranch
+from .. import branches, legend, parts, scale_bar, scene, studio
+from ..branches import SHOWS_KEY, VIEW_KEY
+from ..parts import ShownBranch
 from ..scene_data import SceneData
 from .needs_result import NeedsBranchInObjectMode
 
@@ -29,6 +30,7 @@ class LIMBER_OT_set_up_picture(NeedsBranchInObjectMode, bpy.types.Operator):
 
     def execute(self, context):
         current, surface = context.scene, branches.find_surface(context.scene)
+        scene.fit_range(current, surface)
         _remove_earlier()
         before = set(bpy.data.collections)
         branch = branches.branch_of(surface)
@@ -43,9 +45,9 @@ class LIMBER_OT_set_up_picture(NeedsBranchInObjectMode, bpy.types.Operator):
                       info["size_m"])
         legend.add_legend(current, camera, data, _shown(branch, surface))
         made = set(bpy.data.collections) - before
-        for collection in made:
-            collection[_KEY] = True
         ours = {thing for collection in made for thing in collection.objects}
+        for each in (*made, *ours):
+            each[_KEY] = True
         for thing in current.objects:
             if thing.type == "LIGHT" and thing not in ours:
                 thing.hide_render = True
@@ -61,7 +63,7 @@ def _seen(scene: bpy.types.Scene, branch: bpy.types.Collection) -> np.ndarray:
     for each in {scene.frame_start, (scene.frame_start + scene.frame_end) // 2, scene.frame_end}:
         scene.frame_set(each)
         graph = bpy.context.evaluated_depsgraph_get()
-        for thing in branch.objects:
+        for thing in branches.parts_of(branch).values():
             if thing.hide_render or thing.hide_viewport or thing.type not in ("MESH", "CURVE"):
                 continue
             shape = thing.evaluated_get(graph)
@@ -72,8 +74,8 @@ def _seen(scene: bpy.types.Scene, branch: bpy.types.Collection) -> np.ndarray:
 
 def _shown(branch: bpy.types.Collection, surface: bpy.types.Object) -> ShownBranch:
     shown = ShownBranch(branch, surface)
-    for thing in branch.objects:
-        if SHOWS_KEY in thing and not thing.hide_render:
+    for thing in branches.parts_of(branch).values():
+        if not thing.hide_render:
             shown.objects.setdefault(thing[SHOWS_KEY], []).append(thing)
     return shown
 
@@ -89,8 +91,14 @@ def _look_through_it(context: bpy.types.Context) -> None:
 def _remove_earlier() -> None:
     for collection in [each for each in bpy.data.collections if _KEY in each]:
         for thing in list(collection.objects):
-            bpy.data.objects.remove(thing)
-        bpy.data.collections.remove(collection)
+            if _KEY in thing:
+                parts.remove(thing)
+        if collection.all_objects or collection.children:
+            # The user has put something in: it is the user's now.
+            del collection[_KEY]
+        else:
+            bpy.data.collections.remove(collection)
+    parts.remove_unused()
 
 
 def register() -> None:

@@ -20,6 +20,7 @@ class LIMBER_OT_play(NeedsBranch, bpy.types.Operator):
         if trouble:
             self.report({"ERROR"}, trouble)
             return {"CANCELLED"}
+        scene.fit_range(context.scene, branches.find_surface(context.scene))
         if not context.screen or not context.screen.is_animation_playing:
             context.scene.frame_set(context.scene.frame_start)
         if not bpy.app.background:
@@ -52,7 +53,9 @@ class LIMBER_OT_retime(NeedsBranch, bpy.types.Operator):
         frames = branches.info_of(surface)["frames"]
         own = scene.own_speed(current, frames)
         branch = branches.branch_of(surface)
-        animation.retime(branch.objects, surface, self.frame_start, own * self.speed)
+        animation.retime(branches.parts_of(branch).values(), surface, self.frame_start,
+                         own * self.speed)
+        scene.fit_range(current, surface)
         current.frame_end = max(current.frame_end, scene.last_frame(
             self.frame_start, frames["count"], own * self.speed))
         current.frame_set(current.frame_current)

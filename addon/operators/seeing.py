@@ -31,7 +31,8 @@ NO_FRAMES = ("The values of each frame are missing from the branch folder, so th
 def things_of(branch: bpy.types.Collection, group: str) -> list[bpy.types.Object]:
     """Return the objects of a branch that belong to a group."""
     kinds = GROUPS[group][1]
-    return [thing for thing in branch.objects if thing.get(branches.SHOWS_KEY) in kinds]
+    return [thing for thing in branches.parts_of(branch).values()
+            if thing[branches.SHOWS_KEY] in kinds]
 
 
 class LIMBER_OT_show(NeedsBranch, bpy.types.Operator):

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import bpy
+from mathutils import Vector
 
 from .. import branch_folder, branches
 from ..bridge import animation
@@ -55,8 +56,9 @@ class LIMBER_OT_side_by_side(NeedsBranch, bpy.types.Operator):
             if number and not self.back:
                 place = end + gap - low
                 end = place + high
-            for thing in branch.objects:
-                thing.delta_location = (place, 0.0, 0.0)
+            by = Vector((place, 0.0, 0.0)) - branches.surface_of(branch).delta_location
+            for thing in branches.parts_of(branch).values():
+                animation.shift(thing, by)
         return {"FINISHED"}
 
 
@@ -98,8 +100,9 @@ class LIMBER_OT_relink(NeedsBranch, bpy.types.Operator):
             return {"CANCELLED"}
         _set_folder(branch, folder)
         branches.use_folder(context.scene, branch[branches.FOLDER_KEY])
-        trouble = animation.cache_trouble(branches.surface_of(branch))
-        if animation.MODIFIER in branches.surface_of(branch).modifiers and trouble:
+        surface = branches.surface_of(branch)
+        trouble = animation.cache_trouble(surface)
+        if animation.motion_of(surface) is not None and trouble:
             self.report({"WARNING"}, trouble)
         self.report({"INFO"}, f"{branch.name}: {folder}")
         return {"FINISHED"}
@@ -117,8 +120,8 @@ def is_lost(branch: bpy.types.Collection) -> bool:
 def _set_folder(branch: bpy.types.Collection, folder: Path) -> None:
     """Set another folder for a branch and its motion."""
     branch[branches.FOLDER_KEY] = animation.shown_path(folder)
-    for thing in branch.objects:
-        modifier = thing.modifiers.get(animation.MODIFIER)
+    for thing in branches.parts_of(branch).values():
+        modifier = animation.motion_of(thing)
         if modifier is not None:
             frames = Path(bpy.path.abspath(modifier.filepath)).name
             modifier.filepath = animation.shown_path(folder / "frames" / frames)

@@ -7,11 +7,13 @@ from typing import ClassVar
 import bpy
 from mathutils import Vector
 
-from .. import branches
+from .. import branches, parts
 from .needs_result import NeedsBranchInObjectMode
 
 _KINDS = (".abc", ".usd", ".usda", ".usdc", ".usdz")
 RIG = "Turntable"
+_KEY = "limber_turntable"
+"""Key of the objects that the turntable made: pressed again, it makes them again."""
 
 
 class LIMBER_OT_export_motion(NeedsBranchInObjectMode, bpy.types.Operator):
@@ -47,7 +49,8 @@ class LIMBER_OT_export_motion(NeedsBranchInObjectMode, bpy.types.Operator):
                                    f"{'Alembic' if kind == '.abc' else 'USD'}.")
             return {"CANCELLED"}
         surface = branches.find_surface(context.scene)
-        things = list(branches.branch_of(surface).objects) if self.whole else [surface]
+        things = [surface] if not self.whole else list(
+            branches.parts_of(branches.branch_of(surface)).values())
         before = (context.view_layer.objects.active, list(context.selected_objects))
         try:
             _select(context, [thing for thing in things if thing.visible_get()], surface)
@@ -98,6 +101,7 @@ class LIMBER_OT_turntable(NeedsBranchInObjectMode, bpy.types.Operator):
         camera = bpy.data.objects.new(f"{RIG} camera", lens)
         for thing in (pivot, camera):
             rig.objects.link(thing)
+            thing[_KEY] = True
         pivot.location, camera.parent = middle, pivot
         pivot.empty_display_size = 0.1 * radius
         distance = 1.15 * radius / math.sin(_half_angle(current.render, lens))
@@ -134,11 +138,12 @@ def _bounds(surface: bpy.types.Object) -> tuple[Vector, float]:
 
 
 def _remove_rig() -> None:
-    rig = bpy.data.collections.get(RIG)
-    if rig is not None:
-        for thing in list(rig.objects):
-            bpy.data.objects.remove(thing)
-        bpy.data.collections.remove(rig)
+    for thing in [thing for thing in bpy.data.objects if _KEY in thing]:
+        homes = thing.users_collection
+        parts.remove(thing)
+        for home in homes:
+            if home.name.startswith(RIG) and not home.all_objects and not home.children:
+                bpy.data.collections.remove(home)
 
 
 def _select(context: bpy.types.Context, things: list[bpy.types.Object],

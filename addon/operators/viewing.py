@@ -15,7 +15,7 @@ def clear_view(scene: bpy.types.Scene) -> str:
 
 
 def look_at(context: bpy.types.Context, thing: bpy.types.Object) -> None:
-    """Make ``thing`` active, and show it whole in the 3D views, in its colours; one undo step.
+    """Make ``thing`` active, and show it whole in the 3D views, in its colours.
 
     Not selected: an outline would cover the colours of thin twigs. Without a window there is no
     view to set.
@@ -32,4 +32,9 @@ def look_at(context: bpy.types.Context, thing: bpy.types.Object) -> None:
         with context.temp_override(area=area, region=region):
             bpy.ops.view3d.view_selected()
     thing.select_set(False)
-    bpy.ops.ed.undo_push(message="Limber")
+
+
+def push_undo(context: bpy.types.Context) -> None:
+    """Make what was shown one undo step; without a window there is none."""
+    if not bpy.app.background and context.window is not None:
+        bpy.ops.ed.undo_push(message="Limber")

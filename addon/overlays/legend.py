@@ -23,7 +23,7 @@ def shown_scales(surface: bpy.types.Object) -> list[dict]:
     """
     scales = [frame_colours.shown_scale(surface) or _scale_at_rest(surface)]
     branch = branches.branch_of(surface)
-    for thing in branch.objects:
+    for thing in branches.parts_of(branch).values():
         is_seen = thing.visible_get() or (energy_field.is_sliced(bpy.context.scene)
                                           and thing == energy_field.of(branch))
         if branches.SCALE_KEY in thing and is_seen:

@@ -16,7 +16,7 @@ class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
     @classmethod
     def poll(cls, context):
         surface = branches.find_surface(context.scene)
-        return surface is not None and animation.MODIFIER in surface.modifiers
+        return surface is not None and animation.motion_of(surface) is not None
 
     def draw_header_preset(self, context):
         guide.draw(self.layout, "play")

@@ -156,7 +156,7 @@ def test_the_grasp_is_dragged_to_a_goal(bpy, registered, bare_beam):
     bpy.context.view_layer.update()
     before = goal_ball.Before.of(scene, branch)
     assert bpy.ops.limber.drag_goal(mark="Grasp 1", move=(0.05, 0.0, -0.01)) == {"FINISHED"}
-    grasp = branch.objects["Grasp 1"].location
+    grasp = branch.objects["Grasp 1"].delta_location
     wanted = [grasp.x + 0.05, grasp.y, grasp.z - 0.01]
     assert list(goal_ball.of(branch).location) == pytest.approx(wanted, abs=1e-6)
     assert scene.limber.plan.use_goal
@@ -181,7 +181,7 @@ def test_a_target_is_dragged_to_a_goal(bpy, ball, beam):
     place = part("goal_ball").of(branch).location.copy()
     assert bpy.ops.limber.drag_goal(mark=mark.name, move=(0.0, 0.1, 0.0)) == {"FINISHED"}
     assert (plan.use_tip_goal, plan.use_goal, plan.target) == (True, False, "bud")
-    wanted = [mark.location.x, mark.location.y + 0.1, mark.location.z]
+    wanted = [mark.delta_location.x, mark.delta_location.y + 0.1, mark.delta_location.z]
     assert list(plan.tip_goal) == pytest.approx(wanted, abs=1e-6)
     before.put_back(scene, branch)
     bpy.context.view_layer.update()

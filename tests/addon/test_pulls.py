@@ -67,7 +67,7 @@ def test_what_was_measured_follows_the_frames(bpy, opened, tmp_path):
 
     def seen_at(seconds):
         bpy.context.scene.frame_set(1 + round(24 * seconds))
-        return [*_mark(bpy).matrix_world.translation, _mark(bpy).scale.x > 0]
+        return [*_mark(bpy).matrix_world.translation, _mark(bpy).delta_scale.x > 0]
     assert seen_at(0.0) == pytest.approx([0, 0, 0.5, True])
     assert seen_at(1.5) == pytest.approx([0.12, 0, 0.5, True], abs=1e-6)
     assert seen_at(2.5) == pytest.approx([0.2, 0, 0.5, True], abs=1e-6)

@@ -160,6 +160,24 @@ def test_the_first_view(run, blender, environment, tmp_path):
 
 
 @pytest.mark.slow
+def test_things_of_the_users_stay(run, blender, environment, beam, tmp_path):
+    """From Blender's start, with things of one's own: results of stages leave them, undone too."""
+    require_screen()
+    seen = driven("drive_own_things.py", blender, environment, tmp_path)
+    before = seen["before"]
+    assert seen["first_range"] == [1, len(beam.frames)]
+    assert before["modifiers"] == ["MESH_CACHE", "SUBSURF"] and before["materials"] == ["mine"]
+    # A target is a mark more, with a mesh.
+    assert seen["opened"] == before
+    assert seen["target target"] and seen["target"] == before | {"meshes": before["meshes"] + 1}
+    assert seen["simulated cache"] == "mine.pc2" and before["range"] == [2, 90, 4]
+    for name in ("simulated", "redone", "again"):
+        assert seen[name] | {"meshes": 0} == before | {"meshes": 0}
+    assert seen["simulated"]["meshes"] == seen["again"]["meshes"]
+    assert seen["undone cache"] == "to-goal.pc2"
+
+
+@pytest.mark.slow
 def test_a_picture_by_an_example(run, beam, tmp_path):
     """At factory start, beside the cube: the branch is in the picture; a failure has a code."""
     example = FOLDER.parents[1] / "addon" / "examples" / "colour_and_render.py"

@@ -93,25 +93,25 @@ def test_content(bpy, addon, beam, tmp_path):
         (k, k + 1) for k in range(len(beam.path) - 1)]
     assert len(shown.objects["control_points"]) == 4
     bpy.context.scene.frame_set(1)
-    heights = [thing.location.z for thing in shown.objects["control_points"]]
+    heights = [thing.delta_location.z for thing in shown.objects["control_points"]]
     np.testing.assert_allclose(heights, [0.12, 0.24, 0.36, 0.48], atol=0.03)
     np.testing.assert_allclose(objects["Goal"].location, beam.path[-1], atol=1e-6)
     assert objects["Goal"].dimensions.x == pytest.approx(0.04, rel=0.02)
     bpy.context.scene.frame_set(6)
     for thing in shown.objects["control_points"]:
         # Bent towards x by the square of the height: the points go with the branch.
-        assert thing.location.x == pytest.approx(thing.location.z ** 2, abs=0.01)
-    np.testing.assert_allclose(objects["Grasp 1"].location, beam.path[-1], atol=1e-6)
-    assert objects["Fixed base"].location.z < 0.01
+        assert thing.delta_location.x == pytest.approx(thing.delta_location.z ** 2, abs=0.01)
+    np.testing.assert_allclose(objects["Grasp 1"].delta_location, beam.path[-1], atol=1e-6)
+    assert objects["Fixed base"].delta_location.z < 0.01
 
 
 def test_marks_stand_at_their_first_place_on_the_first_frame(bpy, addon, beam, tmp_path):
     """Opened, without a frame played: control points and grasp are at rest, not at the end."""
     shown = _scene_in_process(addon, beam.folder, tmp_path / "scene.blend", bpy)
     assert bpy.context.scene.frame_current == 1
-    np.testing.assert_allclose(shown.objects["grasp"][0].location, beam.path[0], atol=1e-6)
+    np.testing.assert_allclose(shown.objects["grasp"][0].delta_location, beam.path[0], atol=1e-6)
     for thing in shown.objects["control_points"]:
-        assert abs(thing.location.x) < 1e-3
+        assert abs(thing.delta_location.x) < 1e-3
 
 
 @pytest.mark.slow
@@ -123,11 +123,12 @@ def test_a_motion_starts_and_runs_as_it_is_told(bpy, worker_here, beam, position
     assert scene.frame_end == 11 + 2 * (len(beam.frames) - 1)
     for number, frame in enumerate(beam.frames):
         np.testing.assert_allclose(positions("beam", 11 + 2 * number), frame, atol=1e-6)
-        np.testing.assert_allclose(scene.objects["Grasp 1"].location, beam.path[number], atol=1e-6)
+        place = scene.objects["Grasp 1"].delta_location
+        np.testing.assert_allclose(place, beam.path[number], atol=1e-6)
     np.testing.assert_allclose(positions("beam", 5), beam.frames[0], atol=1e-6)
     bpy.ops.limber.retime()
     np.testing.assert_allclose(positions("beam", 3), beam.frames[2], atol=1e-6)
-    np.testing.assert_allclose(scene.objects["Grasp 1"].location, beam.path[2], atol=1e-5)
+    np.testing.assert_allclose(scene.objects["Grasp 1"].delta_location, beam.path[2], atol=1e-5)
 
 
 @pytest.mark.parametrize("fps", [24, 60, 25])
@@ -149,7 +150,7 @@ def test_a_motion_plays_in_its_own_time(bpy, addon, beam, write_pc2, positions, 
         whole = int(frame + 1e-9)
         found = positions("beam", whole, frame - whole)
         np.testing.assert_allclose(found, beam.frames[number], atol=1e-5)
-        grasp = shown.objects["grasp"][0].location
+        grasp = shown.objects["grasp"][0].delta_location
         assert grasp.x == pytest.approx(beam.path[number][0], abs=4e-3), "carried, and in step"
     assert scene.frame_end >= 1 + times[-1] * fps > scene.frame_end - 1
 
@@ -167,9 +168,10 @@ def test_targets_go_with_the_branch(bpy, addon, beam, tmp_path):
     shown = scenes.show_branch(bpy.context.scene, reader.read_scene_data(tmp_path / "data.npz"))
     (thing,) = shown.objects["targets"]
     assert thing.name == "Target flower"
-    np.testing.assert_allclose(thing.location, flower.position, atol=1e-4)
+    np.testing.assert_allclose(thing.delta_location, flower.position, atol=1e-4)
     bpy.context.scene.frame_set(6)
-    assert thing.location.x == pytest.approx(0.25, abs=0.02), "bent by the square of its height"
+    assert thing.delta_location.x == pytest.approx(0.25, abs=0.02), (
+        "bent by the square of its height")
 
 
 def test_skeleton_is_drawn_with_its_radii(bpy, addon, beam, tmp_path):
