@@ -10,7 +10,7 @@ import time
 import pytest
 
 from limber.core.errors import Cancelled
-from limber.core.progress import JsonSink, Progress
+from limber.core.progress import JsonSink, LogSink, Progress
 
 
 def test_parts_map_onto_their_span():
@@ -65,3 +65,14 @@ def test_a_sign_of_life_says_what_was_computed():
     assert count >= 2 and beats[-1]["cpu_s"] - beats[0]["cpu_s"] > 0.01
     time.sleep(0.12)
     assert len(stream.getvalue().splitlines()) == count, "it ends with the work"
+
+
+def test_without_a_terminal_a_line_says_what_goes_on():
+    """It comes during a long step too, in which nothing is reported."""
+    stream = io.StringIO()
+    with LogSink("estimate", stream, interval_seconds=0.02) as sink:
+        sink(0.25, "fitting", {"simulations": 4, "loss_m2": 0.5})
+        time.sleep(0.1)
+    lines = stream.getvalue().splitlines()
+    assert len(lines) >= 2
+    assert lines[-1] == "estimate: 0 s, 25 % fitting simulations 4 loss_m2 0.5"

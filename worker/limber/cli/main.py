@@ -34,7 +34,7 @@ from limber.cli.terminal import (
 from limber.core.errors import LimberError, PartlyFailedError, SafetyStop
 from limber.core.machine_errors import machine_error
 from limber.core.processes.heartbeat import Heartbeat
-from limber.core.progress import BarSink, JsonSink, Progress, Sink, report_damage_to
+from limber.core.progress import BarSink, JsonSink, LogSink, Progress, Sink, report_damage_to
 from limber.stages.registry import stage_description, stage_module, stage_schema, stage_summaries
 from limber.version import VERSION
 
@@ -151,8 +151,8 @@ def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.
         decorated = click.option(
             "--progress", "progress_style", type=click.Choice(["auto", "bar", "json", "none"]),
             default="auto", show_default=True,
-            help="auto: a bar on a terminal. json: one JSON object per line on standard "
-                 "output.")(body)
+            help="auto: a bar on a terminal, otherwise a line every ten seconds. json: one JSON "
+                 "object per line on standard output.")(body)
         decorated = click.option(
             "-v", "--verbose", is_flag=True,
             help="Print every value of the result.")(decorated)
@@ -271,7 +271,7 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
              progress_style: str, options: dict[str, Any]) -> int:
     started = time.perf_counter()
     if progress_style == "auto":
-        progress_style = "bar" if sys.stderr.isatty() else "none"
+        progress_style = "bar" if sys.stderr.isatty() else "log"
     outcome: dict[str, Any] = {"command": name, "status": "done", "error": None}
     result: dict[str, Any] = {}
     lines = JsonSink() if progress_style == "json" else None
@@ -282,6 +282,8 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
             if progress_style == "bar":
                 bar = around.enter_context(BarSink(name))
                 state = Run(bar, bar.say)
+            elif progress_style == "log":
+                state = Run(around.enter_context(LogSink(name)), _say)
             elif lines is not None:
                 around.enter_context(Heartbeat(lines.say))
             around.enter_context(report_damage_to(state.progress.warn))

@@ -150,12 +150,47 @@ class BarSink:
         self._bar.stop()
 
     def __call__(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
-        figures = " ".join(f"{name} {_short(value)}" for name, value in numbers.items())
-        self._bar.update(self._task, completed=fraction, description=f"{message} {figures}".strip())
+        self._bar.update(self._task, completed=fraction,
+                         description=f"{message} {_figures(numbers)}".strip())
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""
         self._bar.console.print(line, markup=False, highlight=False)
+
+
+class LogSink:
+    """Writes a line to standard error every ten seconds: for a log, where no bar can be drawn.
+
+    A thread writes it, so that it comes during a long step too.
+    """
+
+    def __init__(self, title: str, stream: TextIO | None = None, *,
+                 interval_seconds: float = 10.0):
+        self._title, self._interval = title, interval_seconds
+        self._stream = stream or sys.stderr
+        self._last = (0.0, "", "")
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._write, name="progress log", daemon=True)
+
+    def __enter__(self) -> "LogSink":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def __call__(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
+        self._last = fraction, message, _figures(numbers)
+
+    def _write(self) -> None:
+        start = time.perf_counter()
+        while not self._ended.wait(self._interval):
+            fraction, message, figures = self._last
+            seconds = time.perf_counter() - start
+            text = f"{self._title}: {seconds:.0f} s, {100 * fraction:.0f} % {message} {figures}"
+            self._stream.write(text.strip() + "\n")
+            self._stream.flush()
 
 
 class LineSink:
@@ -187,6 +222,10 @@ class LineSink:
         self._stream.write("\r" + text.ljust(len(self._shown)))
         self._stream.flush()
         self._shown = text
+
+
+def _figures(numbers: dict[str, Any]) -> str:
+    return " ".join(f"{name} {_short(value)}" for name, value in numbers.items())
 
 
 def _short(value: Any) -> str:
