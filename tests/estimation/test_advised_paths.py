@@ -43,7 +43,7 @@ def followed(bench, small, pull, young=None, **settings):
         subject = replace(subject, start=replace(subject.start, young=np.full(4, young)))
     try:
         found = fit_branch([pull], subject, chosen, log=EvaluationLog(None, ""))
-        require_result(found)
+        require_result(found, subject.skeleton)
     except LimberError:
         return None
     judge_model(found, subject, pull.entry.grasp, chosen, axes=None, cloud=None)

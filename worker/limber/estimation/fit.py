@@ -5,6 +5,7 @@
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,9 @@ from limber.estimation.uncertainty.profile_likelihood import profiled
 from limber.recordings.cell_errors import calibration_of
 from limber.recordings.recording import Pull
 from limber.recordings.sensor_checks import force_unit_suspicion
+
+FAR_FROM_FOLDING = 0.25
+"""Factor on the moduli under which a branch still stands if its weight matters little. Chosen."""
 
 
 class _ForceLeadsNowhereError(WorkError):
@@ -168,7 +172,10 @@ def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
     try:
         heavy = fitted(subject)
         sound = heavy.uncertainty.variance_factor < MISFIT_FACTOR
-        if heavy.stopped or (sound and subject.carries_itself(heavy.values)):
+        # A much softer branch would carry the weight too: then it is no cause of a misfit.
+        margin = 1.0 if sound else FAR_FROM_FOLDING
+        if heavy.stopped or subject.carries_itself(
+                replace(heavy.values, young=margin * heavy.values.young)):
             return heavy
     except (WorkError, NotPositiveDefiniteError) as error:
         failure = error
@@ -246,13 +253,17 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
 
 
 def complete(found: Estimate, settings: EstimateSettings, progress: Progress = SILENT) -> None:
-    """Compute the intervals of a quick fit by the profile of its likelihood, and judge it."""
-    if not found.stopped:
+    """Compute the intervals of a quick fit by the profile of its likelihood, and judge it.
+
+    A fit without a valid result has no intervals.
+    """
+    is_sound = not found.stopped and found.is_bad is None
+    if is_sound:
         found.uncertainty = profiled(found.uncertainty, found.fit.evaluation, found.objective,
                                      progress)
     judge_fit(found, progress)
-    if settings.hold_out and len(found.objective.forwards) > 1 and not found.stopped:
-        hold_out(found, settings)
+    if settings.hold_out and len(found.objective.forwards) > 1 and is_sound:
+        hold_out(found, progress)
 
 
 def _standing(objective: Objective, start: Values, settings: EstimateSettings, progress: Progress,
@@ -262,7 +273,7 @@ def _standing(objective: Objective, start: Values, settings: EstimateSettings, p
     if reduction is not None and reduction.is_built:
         start = reduction.around(start)
         judged_on = reduction.objective(objective, start)
-    elif settings.young is None:
+    else:
         start = scaled_start(objective, start)
         if any(forward.uses_force for forward in objective.forwards):
             suspicion = force_unit_suspicion(float(np.mean(start.young)))

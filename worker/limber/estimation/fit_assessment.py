@@ -1,5 +1,6 @@
 """Result of an estimate, its fit to the pulls, and its uncertainty."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from limber.estimation.fitting.nuisances import CREEP, in_words, nuisance_record
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton
 from limber.estimation.forward.forward_model import Forward
+from limber.estimation.forward.observed_path import AT_REST_M
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.bending_stiffness import SectionMean, strain_energy
@@ -38,7 +40,9 @@ from limber.estimation.uncertainty.path_error import path_error, path_prescribed
 from limber.estimation.uncertainty.shape_error import hung_error, shape_error
 from limber.estimation.uncertainty.shape_sensitivity import grip_error
 from limber.estimation.uncertainty.variance_parts import largest, variance_parts
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.materials.layered_section import LayeredSection
+from limber.recordings.cell_errors import calibration_of
 from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry, Pull
 
@@ -58,6 +62,11 @@ AS_LIKELY = 8.0
 """Difference of the objectives below which two fits explain the pulls as well: one is then 3,000
 times as likely as the other, about as much as priors that are stated roughly may be wrong.
 """
+FAR_OFF = 2.0
+"""Assumed errors of a point's place on the branch beyond which it is named where a fit fails."""
+NECK = 0.5
+"""Radius over a larger one farther out that is named where a fit fails: a sixteenth of the
+stiffness."""
 WIDE = 0.15
 """Standard deviation of a log E above which advice on narrowing it is given."""
 
@@ -164,19 +173,22 @@ class Estimate:
                          self.values.young)
 
     @property
+    def scale_deviation(self) -> float:
+        """Standard deviation of the common log E at the end of the fit."""
+        return identifiability(self.fit.evaluation, self.objective.space).scale_deviation
+
+    @property
     def is_bad(self) -> str | None:
         """Reason why the fit gives no valid result; None if it does."""
         space = self.objective.space
         bound = [name for name in space.on_bound(self.fit.evaluation.free)
                  if name not in {prior for prior, _, _ in space.priors}]
         if bound:
-            return (f"{', '.join(bound)} reached a bound. The data require a value beyond it. "
-                    "Typical causes are a wrong unit, grasp point or frame of reference, and "
-                    "markers that are mirrored or interchanged.")
+            return f"{', '.join(bound)} reached a bound. The data require a value beyond it."
         if error := unlikely(self.cell_errors):
             return error
-        scale = identifiability(self.fit.evaluation, space).scale_deviation
-        if not np.isfinite(scale) or scale > SCALE_DEVIATION:
+        scale = self.scale_deviation
+        if not scale <= SCALE_DEVIATION:
             return ("The data do not determine the moduli: their common scale is known only to "
                     f"within a factor of {np.exp(min(2 * scale, 20)):.2g}.")
         if not self.fit.converged:
@@ -224,12 +236,16 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
         progress.warn(f"Outliers: {worst}{' ...' if len(named) > 4 else ''}.")
 
 
-def hold_out(found: Estimate, settings: EstimateSettings) -> None:
+def hold_out(found: Estimate, progress: Progress) -> None:
     """Score the prediction of each pull by a fit without it, into ``found.held_out``."""
     for index, forward in enumerate(found.objective.forwards):
         rest = without(found.objective, index)
-        fit = gauss_newton(rest, found.fit.evaluation.free, evaluation_limit=15)
-        distance, force = held_out(found.objective, fit.evaluation.free, index)
+        try:
+            fit = gauss_newton(rest, found.fit.evaluation.free, evaluation_limit=15)
+            distance, force = held_out(found.objective, fit.evaluation.free, index)
+        except WorkError as error:
+            progress.warn(str(error))
+            continue
         found.held_out[forward.name] = _score(forward, distance, force, in_fit=True)
 
 
@@ -261,18 +277,52 @@ def score_unused(pull: Pull, subject: Subject, found: Estimate, settings: Estima
     found.held_out[pull.name] = _score(forward[0], distance, force, in_fit=False)
 
 
-def require_result(found: Estimate) -> None:
+def require_result(found: Estimate, skeleton: Skeleton) -> None:
     """Reject a fit without a valid result.
 
     Raises:
         WorkError: the fit has no valid result; states the reason.
     """
     reason = found.is_bad
-    if reason is not None:
-        young = ", ".join(f"{value / 1e6:.4g}" for value in found.values.young)
-        raise WorkError("The pulls give no estimate.", reason,
-                        f"The fit ended at {young} MPa. Nothing was written. Check the warnings "
-                        "about the recording, or use more pulls.")
+    if reason is None:
+        return
+    young = ", ".join(f"{value / 1e6:.4g}" for value in found.values.young)
+    ended = f"The fit ended at {young} MPa. Nothing was written."
+    seen = [*_points_off(found.objective.forwards), *_neck(skeleton)]
+    if seen:
+        raise WorkError("The pulls give no estimate.", " ".join([reason, *seen]),
+                        f"{ended} Correct the reconstruction (`limber skeleton`, or a scan from "
+                        "more sides), and check that the points are where they should be on it.")
+    raise WorkError("The pulls give no estimate.", reason,
+                    f"{ended} Check units, grasp point, frame of reference and the markers' order, "
+                    "and the warnings about the recording. Or use more pulls.")
+
+
+def _points_off(forwards: Sequence[Forward]) -> list[str]:
+    """A sentence if points are at rest far from their places on the branch."""
+    worst, name = 0.0, ""
+    for forward in forwards:
+        poses, known = forward.frames.poses, calibration_of(forward.entry)
+        at_rest = np.linalg.norm(poses[:, :3] - forward.entry.grasp.point_m, axis=1) < AT_REST_M
+        off = np.linalg.norm(forward.frames.positions[at_rest] - forward.rest_points, axis=2)
+        allowed = FAR_OFF * np.hypot(known.point_sigma_m, forward.entry.sensor.position_sigma_m)
+        if np.isfinite(off).any() and np.nanmax(off) > max(worst, allowed):
+            worst, name = float(np.nanmax(off)), forward.name
+    return [f"In {name}, the points at rest are up to {1e3 * worst:.0f} mm away from their places "
+            "on the reconstructed branch."] if name else []
+
+
+def _neck(skeleton: Skeleton) -> list[str]:
+    """A sentence if the main path is much thinner somewhere than farther out."""
+    path = skeleton.main_path()
+    radius, along = skeleton.radius[path], skeleton.arc_length[path]
+    beyond = np.maximum.accumulate(radius[::-1])[::-1]
+    thin = int(np.argmin(radius / beyond))
+    if radius[thin] > NECK * beyond[thin]:
+        return []
+    return [f"The reconstructed branch has a radius of {1e3 * radius[thin]:.1f} mm at "
+            f"{1e3 * along[thin]:.0f} mm from its base, but {1e3 * beyond[thin]:.1f} mm farther "
+            "out. Its stiffness goes with the fourth power of the radius."]
 
 
 def require_one_explanation(free: Estimate, as_stated: Estimate) -> None:

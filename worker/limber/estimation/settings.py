@@ -57,7 +57,7 @@ class EstimateSettings(Settings):
         False, description="Fit the frame of the observed points freely, to 10 cm and 17 degrees, "
         "instead of within the pull's calibration. The result states what that costs.")
     young: float | None = Field(
-        None, gt=0, description="Initial Young's modulus [Pa]. Default: from the measured force.")
+        None, gt=0, description="Initial Young's modulus [Pa] where no measured force gives one.")
     poisson: float | None = Field(
         None, ge=0, lt=0.495, description="Poisson's ratio; constant unless --fit-poisson is "
             "given.")

@@ -12,11 +12,14 @@ from limber.core.json_lines import json_object
 
 @dataclass(frozen=True)
 class EvaluationEntry:
-    """One evaluation: free vector, objective, the paper's loss [m^2] and time [s]."""
+    """One evaluation: free vector, objective, the paper's loss [m^2] and time [s].
+
+    Objective and loss are None if the simulation found no equilibrium.
+    """
 
     parameters: tuple[float, ...]
-    objective: float
-    loss: float
+    objective: float | None
+    loss: float | None
     seconds: float
 
 
@@ -38,18 +41,19 @@ class EvaluationLog:
 
     @property
     def best(self) -> EvaluationEntry | None:
-        """The entry of the smallest objective."""
-        found = [*self.entries, *self._known.values()]
-        return min(found, key=lambda entry: entry.objective, default=None)
+        """The entry of the smallest objective; None: no evaluation had an equilibrium."""
+        found = [(entry.objective, number, entry) for number, entry in enumerate(
+            [*self.entries, *self._known.values()]) if entry.objective is not None]
+        return min(found)[2] if found else None
 
     def find(self, parameters: np.ndarray) -> EvaluationEntry | None:
         """Return the entry of an earlier run with exactly these parameters."""
         return self._known.get(_key(parameters))
 
-    def add(self, parameters: np.ndarray, objective: float, loss: float) -> None:
+    def add(self, parameters: np.ndarray, objective: float | None, loss: float | None) -> None:
         """Add an evaluation. Its line is on disk when this returns."""
-        entry = EvaluationEntry(tuple(float(x) for x in parameters), float(objective),
-                                float(loss), round(time.perf_counter() - self._started, 4))
+        entry = EvaluationEntry(tuple(float(x) for x in parameters), objective, loss,
+                                round(time.perf_counter() - self._started, 4))
         self.entries.append(entry)
         if self._path is not None:
             with open(self._path, "a", encoding="utf-8") as stream:

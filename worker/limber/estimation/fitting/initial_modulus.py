@@ -7,7 +7,6 @@ import numpy as np
 from limber.core.errors import WorkError
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.fitting.optimise import gauss_newton
-from limber.estimation.forward.forward_model import Forward
 from limber.estimation.forward.observed_path import ObservedPathForward, is_path_observed
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, ParameterSpace, Values
 
@@ -28,6 +27,10 @@ RAN_OFF = 4.0
 fits that led to the solution ended at 0.9 to 1.8, diverged ones at 11 to 16, with moduli up to
 fiftyfold wrong, under which a branch folds up and each simulation takes long.
 """
+STIFFER = 2.0
+"""Factor by which a branch that does not carry its own weight is stiffened at a time."""
+MOST_DECADES = 6.0
+"""Farthest search for the scale of the moduli where no force gives it."""
 WORSE = 2.0
 """Increase of the objective by which following the force counts as misled by its linearisation: 20
 times in the one fit seen, where a branch folded up; otherwise it decreases.
@@ -35,10 +38,10 @@ times in the one fit seen, where a branch folded up; otherwise it decreases.
 
 
 def scaled_start(objective: Objective, values: Values) -> Values:
-    """Return ``values`` with all moduli scaled to the measurements.
+    """Return ``values`` with all moduli scaled to the measurements, and so that the branch stands.
 
-    The displacement under a force depends on force over modulus alone, so a few solutions give the
-    scale. If a force or gravity drives, a few decades are tried instead.
+    The displacement under a force depends on force over modulus alone: the linear response at rest
+    gives the scale, whatever the moduli were. Without measured force some decades are tried.
     """
     if any(forward.is_dynamic for forward in objective.forwards):
         return _step_by_step(objective, values)
@@ -120,14 +123,21 @@ def _followed(
 
 
 def _scaled(objective: Objective, values: Values) -> Values:
-    factors = [factor for forward in objective.forwards
-               if (factor := _force_ratio(forward, values)) is not None]
+    factors = [factor for forward in objective.forwards if forward.uses_force
+               and (factor := forward.force_ratio(values)) is not None]
     if factors:
         young = values.young * float(np.exp(np.mean(np.log(factors))))
-        return replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA))
-    if all(forward.drive == "force" for forward in objective.forwards):
-        return _from_the_stiff_side(objective, values)
-    return _scanned(objective, values)
+        return standing(objective, replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA)))
+    return _scanned(objective, standing(objective, values))
+
+
+def standing(objective: Objective, values: Values) -> Values:
+    """Return the values with all moduli so much stiffer that the branch carries its own weight."""
+    while not all(forward.stands(values) for forward in objective.forwards):
+        if values.young.max() >= YOUNG_BOUNDS_PA[1]:
+            break
+        values = replace(values, young=np.clip(STIFFER * values.young, *YOUNG_BOUNDS_PA))
+    return values
 
 
 def _step_by_step(objective: Objective, values: Values) -> Values:
@@ -152,61 +162,32 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
     return values
 
 
-def _force_ratio(forward: Forward, values: Values) -> float | None:
-    usable = forward.uses_force and (forward.drive == "pose" or forward.watches_pose)
-    return forward.force_ratio(values) if usable else None
-
-
-def _from_the_stiff_side(objective: Objective, values: Values) -> Values:
-    """Scale the moduli by the displacement under a known force: simulated over observed.
-
-    It starts with small motions, where displacements are proportional to force over modulus. A
-    branch that is far too soft folds up, and its equilibrium takes minutes to find, or does not
-    exist.
-    """
-    young = values.young
-    for _ in range(12):
-        trial = replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA))
-        found = objective.evaluate(objective.space.pack(trial))
-        if found is None:
-            young = 10 * young
-            continue
-        moved, seen = [], []
-        for forward, pull in zip(objective.forwards, found.pulls, strict=True):
-            known = np.isfinite(forward.frames.positions)
-            moved.append((pull.positions - forward.rest_points)[known])
-            seen.append((forward.frames.positions - forward.rest_points)[known])
-        ratio = float(np.linalg.norm(np.concatenate(moved))
-                      / max(float(np.linalg.norm(np.concatenate(seen))), 1e-12))
-        # A small step to the soft side: a bent branch stiffens, so the ratio overshoots.
-        young = young * np.clip(ratio, 0.2, 1e4)
-        if abs(ratio - 1) < 0.05 or ratio <= 0:
-            break
-    return replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA))
-
-
 def _scanned(objective: Objective, values: Values) -> Values:
-    """Descend over decades, then halve the step: the objective has one valley along the scale."""
-    best = (np.inf, 0.0)
-    tried: dict[float, float] = {}
+    """Descend over decades, then halve the step: the objective has one valley along the scale.
 
-    def cost(shift: float) -> float:
+    Moduli without equilibrium are too soft: the search begins at the first with one.
+    """
+    tried: dict[float, float | None] = {}
+
+    def scaled(shift: float) -> Values:
+        return replace(values, young=np.clip(values.young * 10**shift, *YOUNG_BOUNDS_PA))
+
+    def cost(shift: float) -> float | None:
         if shift not in tried:
-            scaled = replace(values, young=np.clip(values.young * 10**shift, *YOUNG_BOUNDS_PA))
-            found = objective.evaluate(objective.space.pack(scaled))
-            tried[shift] = np.inf if found is None else found.objective
+            found = objective.evaluate(objective.space.pack(scaled(shift)))
+            tried[shift] = None if found is None else found.objective
         return tried[shift]
 
     centre, step = 0.0, 1.0
-    while step >= 0.25:
-        around = [(cost(shift), shift) for shift in (centre, centre - step, centre + step)]
-        best = min(around)
-        if best[1] == centre:
-            step /= 2
-        centre = best[1]
-        if abs(centre) > 6:
-            break
-    return replace(values, young=np.clip(values.young * 10**centre, *YOUNG_BOUNDS_PA))
+    while cost(centre) is None:
+        if scaled(centre).young.max() >= YOUNG_BOUNDS_PA[1]:
+            return values
+        centre += step
+    while step >= 0.25 and abs(centre) <= MOST_DECADES:
+        best = min((known, shift) for shift in (centre, centre - step, centre + step)
+                   if (known := cost(shift)) is not None)[1]
+        step, centre = step / 2 if best == centre else step, best
+    return scaled(centre)
 
 
 def standing_start(objective: Objective, start: Values, uniform: Values, *, explains: bool = True,

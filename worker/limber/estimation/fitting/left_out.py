@@ -2,16 +2,23 @@
 
 import numpy as np
 
+from limber.core.errors import WorkError
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.residuals import seen_in
 
 
 def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float, float]:
-    """RMS distance [m] of points and RMS force error [N] of one pull that was not used in a fit."""
+    """RMS distance [m] of points and RMS force error [N] of one pull that was not used in a fit.
+
+    Raises:
+        WorkError: the pull has no equilibrium under these values.
+    """
     forward = objective.forwards[index]
     simulated = forward.simulate(objective.space.unpack(free), (), False)
     if simulated is None:
-        return np.inf, np.inf
+        raise WorkError(f"{forward.name} cannot be predicted: the simulation finds no equilibrium.",
+                        "The moduli of the other pulls do not carry its forces.",
+                        "Check this pull's grasp point, frame of reference and units.")
     simulated = forward.under_readings(simulated)
     off = (simulated.positions - forward.frames.positions)[seen_in(forward.frames)]
     force = simulated.forces - forward.frames.wrenches[:, :3]

@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +17,6 @@ from limber.estimation.forward.forward_model import Forward, Simulated
 from limber.estimation.forward.observed_path import ObservedPathForward, is_path_observed
 from limber.estimation.parameters import ParameterSpace, Values
 
-FAILED_OBJECTIVE = 1e12
-"""Objective of parameters under which the simulation finds no equilibrium."""
 SETTLING_ROUNDS = 12
 LONGEST_MOVE = 0.05
 """Largest motion of the gripper per change of its force, as a fraction of the branch's size; a
@@ -165,23 +164,30 @@ class Objective:
                 not jacobian or last.jacobian is not None):
             return last
         values = self.space.unpack(free)
+        young = " ".join(f"{each / 1e6:.3g}" for each in values.young)
         try:
+            self._report("simulating", young_mpa=young)
             found = self._simulated(free, values, jacobian)
             if last is None or not np.array_equal(last.free, free):
                 # The derivative at a known state does not count as a simulation.
                 self.forward_count += 1
-                self.log.add(free, found.objective if found else FAILED_OBJECTIVE,
-                             found.loss if found else np.inf)
-            best = present(self.log.best, "evaluation in the log")
-            self._progress(min(self.forward_count / self._expected, 0.99), "fitting",
-                           loss_m2=found.loss if found else np.inf, best_m2=best.loss,
-                           young_mpa=" ".join(f"{young / 1e6:.3g}" for young in values.young),
-                           **_known_so_far(found, self.space))
+                self.log.add(free, *((found.objective, found.loss) if found else (None, None)))
+            if found is None:
+                self._report("no equilibrium", young_mpa=young)
+            else:
+                self._report("fitting", loss_m2=found.loss, young_mpa=young,
+                             **_known_so_far(found, self.space))
         except (KeyboardInterrupt, Cancelled) as stop:
             raise Stopped("The estimate was stopped.") from stop
         if found is not None:
             self._last = found
         return found
+
+    def _report(self, message: str, **numbers: Any) -> None:
+        best = self.log.best
+        self._progress(min(self.forward_count / self._expected, 0.99), message,
+                       simulations=self.forward_count, **numbers,
+                       **({} if best is None else {"best_m2": best.loss}))
 
     def standardised(self, evaluation: Evaluation) -> list[tuple[np.ndarray, np.ndarray]]:
         """Per pull: residuals over deviations of points [f, m, 3] and force [f, 3]; NaN: none."""
@@ -258,7 +264,7 @@ class Objective:
                 forward.is_settled_for(known) for forward in settling.values()):
             return {}
         step = np.r_[self.space.membership @ step[:count], step[count:]]
-        found = self._compare(free, [pull.moved(step) for pull in pulls])
+        found = self.compare(free, [pull.moved(step) for pull in pulls])
         return {index: self._residuals[index].force_change(found.pulls[index])
                 for index in settling}
 
@@ -282,9 +288,10 @@ class Objective:
             return None
         if jacobian:
             self._linear = free, pulls
-        return self._compare(free, pulls)
+        return self.compare(free, pulls)
 
-    def _compare(self, free: np.ndarray, pulls: list[Simulated]) -> Evaluation:
+    def compare(self, free: np.ndarray, pulls: list[Simulated]) -> Evaluation:
+        """Return the evaluation of pulls that were simulated with a free vector."""
         residuals, jacobians, columns, slopes, unknown_count = [], [], [], [], 0
         with_errors = self.cell_errors.count > 0
         for index, simulated in enumerate(pulls):

@@ -8,12 +8,14 @@ import numpy as np
 import scipy
 
 from limber.core.errors import Cancelled, WorkError
-from limber.estimation.fitting.objective import FAILED_OBJECTIVE, Evaluation, Objective
+from limber.estimation.fitting.objective import Evaluation, Objective
 
 EVALUATION_LIMIT = 400
 """Forward simulations of all pulls, after which a fit that still moves is given up."""
 FIRST_STEP = 1.5
 """Longest first step of Gauss-Newton in log E: a factor of 4.5. Chosen, not measured."""
+LONGEST_STEP = 1.1
+"""Longest step of Gauss-Newton in a log E, a factor of three: beyond it no linearisation holds."""
 OUTLYING = 3.0
 """Standard deviations beyond which residuals count linearly in a robust fit."""
 SETTLED_ITERATIONS = 4
@@ -135,7 +137,7 @@ class _Search:
         start = np.clip(start, self._lower + 1e-6, self._upper - 1e-6)
         self._size = len(_required(objective, start).residual)
         self._shift = start - FIRST_STEP / np.sqrt(len(start))
-        self.begin = start - self._shift
+        self.begin = self._accepted = start - self._shift
         settles = any(forward.watches_pose for forward in objective.forwards)
         self._shortest = max(WANDERING_STEP if settles else 0.0, shortest)
 
@@ -146,7 +148,11 @@ class _Search:
     def minimised(self, moved: np.ndarray, loss: str,
                   ending: float) -> "scipy.optimize.OptimizeResult":
         """Return scipy's result from ``moved`` with a loss, to a relative change of cost."""
+        self._accepted = moved
+
         def jacobian(moved: np.ndarray) -> np.ndarray:
+            # Asked at each accepted vector.
+            self._accepted = moved.copy()
             found = self.at(moved)
             step, length = _wanted_step(found, loss)
             aim = moved + self._shift + step
@@ -167,11 +173,15 @@ class _Search:
 
     def _residual(self, moved: np.ndarray) -> np.ndarray:
         # Nearly every step is accepted, and its derivative is cheapest right after the solve.
-        found = self._objective.evaluate(moved + self._shift, jacobian=True)
-        if found is None:
-            # Larger than any other: the trust region shrinks.
-            return np.full(self._size, np.sqrt(FAILED_OBJECTIVE / self._size))
-        return found.residual
+        found = None if self._is_far(moved) else self._objective.evaluate(
+            moved + self._shift, jacobian=True)
+        # What is not finite has no value for scipy: the trust region shrinks.
+        return np.full(self._size, np.nan) if found is None else found.residual
+
+    def _is_far(self, moved: np.ndarray) -> bool:
+        """Whether a step from the last accepted vector changes a modulus too much to be tried."""
+        count = self._objective.space.group_count
+        return bool(np.abs(moved - self._accepted)[:count].max() > LONGEST_STEP)
 
 
 class _SettledError(Exception):
@@ -218,13 +228,10 @@ def nelder_mead(objective: Objective, start: np.ndarray, *,
 
     def cost(free: np.ndarray) -> float:
         rule.count += 1
-        known = objective.log.find(free)
-        if known is not None:
-            rule.seen(known.objective, known.loss)
-            return known.objective
-        found = objective.evaluate(free)
-        if found is None:
-            return FAILED_OBJECTIVE
+        found = objective.log.find(free) or objective.evaluate(free)
+        if found is None or found.objective is None or found.loss is None:
+            # The simplex only asks which of its corners is worse.
+            return np.inf
         rule.seen(found.objective, found.loss)
         return found.objective
 

@@ -63,9 +63,9 @@ class CorrectedForward(Forward):
         return self._full.with_prescribed_poses(poses)
 
     @property
-    def reduction_error(self) -> tuple[float, float]:
+    def reduction_error(self) -> tuple[float, float] | None:
         if self._correction is None:
-            return np.inf, np.inf
+            return None
         force = self.frames.wrenches[:, :3]
         size = float(np.nanmax(np.linalg.norm(force, axis=1), initial=0.0)) or np.inf
         return (float(np.linalg.norm(self._correction.positions, axis=2).max(initial=0.0)),

@@ -7,7 +7,12 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.core.not_none import present
 from limber.estimation.forward.force_motion import motion_response
-from limber.estimation.forward.forward_model import Forward, Simulated, under_its_weight
+from limber.estimation.forward.forward_model import (
+    Forward,
+    Simulated,
+    carries_its_weight,
+    under_its_weight,
+)
 from limber.estimation.forward.input_force import Response, nodal_loads
 from limber.estimation.interpolation_prior import YoungField
 from limber.estimation.parameters import Values, mechanics_names
@@ -64,9 +69,7 @@ class DynamicForward(Forward):
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
-        model = self._model.with_parameters(
-            young=self.field.young(values), poisson=values.poisson, density=values.density,
-            damping=RayleighDamping(*values.damping))
+        model = self._model_with(values)
         frames, by_pose = self.frames, self.drive == "pose"
         drive = ({"poses": np.array([pose_on(self.grasp, self.entry.grasp, pose)
                                      for pose in frames.poses])} if by_pose
@@ -99,6 +102,14 @@ class DynamicForward(Forward):
         d_positions = np.stack([(self._near @ frame).reshape(-1, 3, count) for frame in flat])
         d_forces = slopes.reaction_force if by_pose else np.zeros((len(frames), 3, count))
         return Simulated(positions, forces, d_positions * scale, d_forces * scale)
+
+    def _model_with(self, values: Values) -> BranchModel:
+        return self._model.with_parameters(
+            young=self.field.young(values), poisson=values.poisson, density=values.density,
+            damping=RayleighDamping(*values.damping))
+
+    def stands(self, values: Values) -> bool:
+        return carries_its_weight(self._model_with(values))
 
     def until(self, count: int) -> "DynamicForward":
         """Return the first ``count`` frames, driven by force if that is known.

@@ -9,7 +9,9 @@ from limber.estimation.forward.input_force import Response
 from limber.estimation.forward.point_directions import PointDirections
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.loads.loaded_branch import is_stable
 from limber.mechanics.model import BranchModel
+from limber.mechanics.statics.solve import StaticSettings, solve_static
 from limber.recordings.cell_errors import calibration_of
 from limber.recordings.recording import PullEntry
 from limber.recordings.synchronisation import Frames
@@ -71,6 +73,15 @@ def under_its_weight(model: BranchModel, entry: PullEntry) -> BranchModel:
     if entry.gravity_m_s2 is not None:
         return model.with_parameters(gravity=entry.gravity_m_s2)
     return model.with_parameters(gravity=(0.0, 0.0, 0.0)) if entry.weightless else model
+
+
+def carries_its_weight(model: BranchModel) -> bool:
+    """Whether a branch is stable under its weight, in the scanned shape or sagging from it."""
+    if not model.gravity.any():
+        return True
+    if model.prestress is not None:
+        return is_stable(model)
+    return solve_static(model, settings=StaticSettings(snap=False)).converged
 
 
 class Forward(ABC):
@@ -169,7 +180,7 @@ class Forward(ABC):
     @property
     def reduction_error(self) -> tuple[float, float] | None:
         """Largest error of the reduced model relative to the full one, in position [m] and in force
-        over the largest force; None if the full model itself is simulated.
+        over the largest force; None if the full model itself is simulated, or could not be.
         """
         return None
 
@@ -186,10 +197,14 @@ class Forward(ABC):
         return simulated
 
     def force_ratio(self, values: Values) -> float | None:
-        """Measured force over the force that moves a branch of these ``values`` equally far; None
-        if the pull does not determine it, or not uniquely.
+        """Measured force over the force that moves a branch of these ``values`` equally far, by
+        its linear response at rest; None if the pull does not determine it.
         """
         return None
+
+    def stands(self, values: Values) -> bool:
+        """Whether the branch carries its own weight under these values."""
+        return True
 
     def thinning_error(self, values: Values) -> float:
         """Largest distance [m] between simulated and interpolated frames."""

@@ -17,14 +17,18 @@ import scipy
 from limber.core.errors import WorkError
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.progress import SILENT, Progress
+from limber.estimation.forward.input_force import compliance
 from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
 from limber.mechanics.dynamics.motion import DynamicResult
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
-from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
-from limber.recordings.synchronisation import Frames
+from limber.mechanics.statics.solve import StaticSettings, solve_static
 
 SETTINGS = StaticSettings(tolerance=1e-8)
+_FORCES = 20
+"""Most forces that are tried for a travel."""
+_TRIAL = StaticSettings(total_iterations=100, way_back=False)
+"""An equilibrium under a force takes some tens of iterations; a branch that folds, hundreds."""
 TURNED_PART = 0.7
 """Fraction of the free rotation that a clamping gripper allows."""
 WAY_STATES = 12
@@ -217,73 +221,43 @@ def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, tr
     """Return the factor of ``direction`` [N] that moves the grasp by ``travel`` [m], to 3 %.
 
     Raises:
-        WorkError: there is no such factor.
+        WorkError: there is no such factor, or the branch does not carry its own weight.
     """
-    def pulled(size: float, start: StaticResult | None) -> tuple[float, StaticResult]:
-        result = solve_static(model, grasp=grasp, grasp_force=size * direction, start=start)
-        if not result.converged:
-            return np.inf, result
-        shift = grasp.weights @ result.displacement[grasp.nodes] - _shift_at_rest(model, grasp)
-        return float(np.linalg.norm(shift)), result
-
-    probe = 1e-6
-    while (found := pulled(probe, None))[0] < 1e-4 * travel and probe < 1e6:
-        probe *= 10
-    ratio = travel / max(found[0], 1e-12)
-    size = probe * min(ratio, max(50.0, 0.1 * ratio))
-    low, high = 0.0, np.inf
-    result = None
-    for _ in range(14):
-        distance, tried = pulled(size, result)
-        if abs(distance - travel) < 0.03 * travel:
-            return size
-        if distance < travel:
-            low, result = size, tried
+    rest = solve_static(model).require().displacement
+    load = np.zeros_like(rest)
+    load[grasp.nodes] = grasp.weights[:, None] * direction
+    response = compliance(model, rest, load[None])[0]
+    slope = float(np.linalg.norm(grasp.weights @ response[grasp.nodes]))
+    if not slope > 0:
+        raise WorkError("No sideways force moves the grasp.", "It is where the branch is held.",
+                        "Hold the branch farther out.")
+    size, near, distance = travel / slope, None, 0.0
+    low, high, longest = 0.0, np.inf, 0.0
+    for _ in range(_FORCES):
+        result = solve_static(model, grasp=grasp, grasp_force=size * direction, start=near,
+                              settings=_TRIAL)
+        if result.converged:
+            shift = grasp.weights @ (result.displacement - rest)[grasp.nodes]
+            distance = float(np.linalg.norm(shift))
+            if abs(distance - travel) < 0.03 * travel:
+                return size
+        if result.converged and distance < travel:
+            low, near, longest = size, result, max(longest, distance)
         else:
+            # Beyond its last equilibrium a branch folds: there is less force, not more travel.
             high = size
-        if np.isinf(high):
-            # Up to a tenth of the path the response is linear; beyond it the branch stiffens.
-            size *= min(max(travel / distance, 1.2), max(3.0, 0.1 * travel / distance))
-        elif np.isfinite(distance):
+        if high - low < 0.01 * high:
+            break
+        if not result.converged:
+            size = (low + high) / 2
+        elif np.isinf(high):
+            # Bent, the branch stiffens.
+            size *= np.clip(travel / max(distance, 1e-12), 1.2, 3.0)
+        else:
             size = np.clip(size * travel / distance, low + 0.1 * (high - low),
                            high - 0.1 * (high - low))
-        else:
-            size = (low + high) / 2
-    if low > 0:
-        return low
-    raise WorkError(f"No sideways force moves the grasp by {travel:.3g} m.",
-                    "The branch is too short or too stiff at the grasp.", "Reduce --reach.")
-
-
-def _shift_at_rest(model: BranchModel, grasp: Grasp) -> np.ndarray:
-    if not np.any(model.gravity):
-        return np.zeros(3)
-    at_rest = solve_static(model).require()
-    return grasp.weights @ at_rest.displacement[grasp.nodes]
-
-
-def measured_over_simulated(model: BranchModel, grasp: Grasp, frames: Frames, zero: np.ndarray,
-                            ) -> float | None:
-    """Return the measured force over the one that moves the model equally far; None if unknown.
-
-    The grasp point is not prescribed: at the recorded poses a branch with other ratios of E would
-    be stretched, and a slender branch responds to that with a thousandfold force.
-
-    Args:
-        model: The branch.
-        grasp: The recorded grasp on it.
-        frames: The recording.
-        zero: Zero of the force [N], shape [3].
-    """
-    known = np.flatnonzero(np.isfinite(frames.wrenches[:, :3]).all(axis=1))
-    travel = np.linalg.norm(frames.poses[:, :3] - frames.poses[0, :3], axis=1)[known]
-    row = known[int(np.argmin(np.abs(travel - 0.6 * travel.max())))]
-    force = frames.wrenches[row, :3] - zero
-    size = float(np.linalg.norm(force))
-    moved = float(np.linalg.norm(frames.poses[row, :3] - frames.poses[0, :3]))
-    if size <= 0 or moved <= 0:
-        return None
-    try:
-        return float(size / force_for_travel(model, grasp, force / size, moved))
-    except WorkError:
-        return None
+    raise WorkError(
+        f"No sideways force moves the grasp by {travel:.3g} m.",
+        f"With the largest force for which an equilibrium was found, it moves {longest:.3g} m. "
+        "Farther out the branch would fold, or it is too short or too stiff at the grasp.",
+        "Pull less far.")

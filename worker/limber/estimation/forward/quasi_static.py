@@ -6,11 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, WorkError
 from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
-from limber.estimation.forward.forward_model import Forward, Simulated, under_its_weight
-from limber.estimation.forward.gripper_path import measured_over_simulated
+from limber.estimation.forward.forward_model import (
+    Forward,
+    Simulated,
+    carries_its_weight,
+    under_its_weight,
+)
 from limber.estimation.forward.gripper_torque import require_torque, torque_slopes, uses_torque
 from limber.estimation.forward.input_force import (
     Course,
@@ -35,13 +39,12 @@ from limber.recordings.recording import PullEntry
 from limber.recordings.synchronisation import Frames
 
 SETTINGS = StaticSettings(tolerance=1e-8, total_iterations=200, way_back=False, keeps_factor=True)
-"""From the previous state, an equilibrium takes 3 to 10 iterations, from rest some tens. A branch
-with far too soft moduli folds up: no useful step of a fit, and minutes of solving."""
 NEAR = replace(SETTINGS, total_iterations=40, snap=False)
 """From a state near a recorded path: without equilibrium nearby, the branch folds or snaps away."""
-ITERATIONS_A_KEY = 20
-"""Most iterations per simulated frame, in addition to those of a single solve. Branches that did
-not fold needed at most 12 until the force had settled, 4 in one simulation; folding ones, hundreds.
+ITERATIONS_A_KEY, ITERATIONS_FROM_REST = 12, 40
+"""Most iterations of a simulation per simulated frame, and in addition if no state is known yet.
+Branches that did not fold needed at most 12 until the force had settled, 4 in one simulation;
+folding ones hundreds. So a simulation that fails costs about as much as three that do not.
 """
 FEW_KEYS = 4
 """Simulated frames for the difference of two pulls: with 4, 6 and 12, moduli agreed to 1.5 %."""
@@ -137,7 +140,8 @@ class QuasiStaticForward(Forward):
     @property
     def iteration_limit(self) -> int:
         """Iterations after which a simulation counts as failed."""
-        return int(SETTINGS.total_iterations) + ITERATIONS_A_KEY * len(self.keys)
+        from_rest = any(memory is None for memory in self._memory)
+        return ITERATIONS_A_KEY * len(self.keys) + (ITERATIONS_FROM_REST if from_rest else 0)
 
     @property
     def mesh(self) -> TetMesh:
@@ -317,9 +321,41 @@ class QuasiStaticForward(Forward):
         self._hints = displacements
 
     def force_ratio(self, values: Values) -> float | None:
-        """Measured force over the force that moves a branch of these ``values`` equally far."""
-        return measured_over_simulated(self.model_with(values), self.grasp, self.frames,
-                                       self._zero[:3])
+        """As in the base class: a bent branch is stiffer, so the ratio errs to the stiff side,
+        where a branch does not fold.
+        """
+        change, at, seen = self.linear_motion(values)
+        moved = np.where(np.isfinite(seen), change @ at, 0.0)
+        along = float(np.sum(moved * np.nan_to_num(seen)))
+        return float(np.sum(moved**2)) / along if along > 0 else None
+
+    def linear_motion(self, values: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Measured forces and motions, and the linear response between them.
+
+        It is that of the branch at rest without weight, which exists for every modulus.
+
+        Returns:
+            Forces (and torques) [N, N m], shape [n, c]; response [m/N], shape [c, d]; motions [m],
+            shape [n, d]: of the gripper, in changes since the first frame, or of the points since
+            rest if the force drives.
+        """
+        frames = self.frames
+        known = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
+        components = 6 if self.uses_torque else 3
+        model = self.model_with(values).with_parameters(gravity=(0.0, 0.0, 0.0))
+        loads = nodal_loads(self.grasp, self.entry.grasp, frames.poses[0], self.mesh.nodes,
+                            components)
+        responses = compliance(model, np.zeros_like(self.mesh.nodes), loads)
+        forces = frames.wrenches[known, :components]
+        if self.entry.drive == "pose":
+            at = responses[:, self.grasp.nodes].swapaxes(1, 2) @ self.grasp.weights
+            place = frames.poses[known, :3]
+            return forces - forces[0], at, place - place[0]
+        at = np.array([self._observed(each).ravel() for each in responses])
+        return forces, at, (frames.positions[known] - self.rest_points).reshape(len(forces), -1)
+
+    def stands(self, values: Values) -> bool:
+        return carries_its_weight(self.model_with(values))
 
     def states(self) -> list[_Memory]:
         """The states of all key frames, all simulated, under the last parameters."""
@@ -335,7 +371,9 @@ class QuasiStaticForward(Forward):
             return 0.0
         known = self.simulate(values, (), False)
         if known is None:
-            return np.inf
+            raise WorkError(f"{self.name}: the simulation finds no equilibrium at the end of the "
+                            "fit.", "It was found from another state during the fit.",
+                            "Simulate more frames (--key-frames).")
         model, worst = self.model_with(values), 0.0
         states = [state.displacement for state in self.states()]
         for first, second in zip(self.keys[:-1], self.keys[1:], strict=True):
@@ -360,11 +398,13 @@ class QuasiStaticForward(Forward):
         return (self._operator @ displacement.ravel()).reshape(-1, 3)
 
     def _solve(self, model: BranchModel, drive: np.ndarray, start: np.ndarray | None,
-               ) -> StaticResult | None:
+               left: float = np.inf) -> StaticResult | None:
+        """Return the equilibrium, or None; after ``left`` iterations there is none."""
         loads = ({"grasp": self.grasp, "pose": drive} if self.drive == "pose"
                  else {"nodal_forces": drive})
         settings = NEAR if self.watches_pose and start is not None else SETTINGS
-        result = solve_static(model, start=start, settings=settings, **loads)
+        result = solve_static(model, start=start, settings=replace(
+            settings, total_iterations=min(settings.total_iterations, left)), **loads)
         self.iteration_count += result.iterations
         return result if result.converged else None
 
@@ -381,10 +421,11 @@ class QuasiStaticForward(Forward):
         starts += [before] if before is not None else []
         starts += [] if starts and self.watches_pose else [None]
         for begin in starts:
-            if self.iteration_count > self.iteration_limit:
+            left = self.iteration_limit - self.iteration_count
+            if left <= 0:
                 break
             try:
-                result = self._solve(model, drive, begin)
+                result = self._solve(model, drive, begin, left)
             except NotPositiveDefiniteError:
                 continue
             if result is not None:

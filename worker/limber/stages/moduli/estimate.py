@@ -121,7 +121,7 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
                            progress=heard.part(0.2, 0.9))
     found.warnings = warnings
     if not found.stopped:
-        require_result(found)
+        require_result(found, subject.skeleton)
         judge_model(found, subject, pulls[0].entry.grasp, settings,
                     axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None,
                     cloud=_cloud(branch), progress=heard.part(0.9, 0.95))

@@ -118,5 +118,5 @@ def _fitted(graph: _Graph, found: Estimate, branch: Branch, pulls: Sequence[Pull
         subject = subject.without_weight()
     other = fit_branch(list(pulls), subject, settings, log=EvaluationLog(None, ""), quick=True,
                        near=replace(found.values, form=()))
-    require_result(other)
+    require_result(other, skeleton)
     return other

@@ -1,0 +1,137 @@
+"""A fit's start: a branch that stands and answers its force; failures are not numbers."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.paper_branches import measured
+from limber.core.errors import WorkError
+from limber.core.progress import Progress
+from limber.estimation.fitting.evaluations import EvaluationLog
+from limber.estimation.fitting.initial_modulus import scaled_start
+from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.fitting.optimise import LONGEST_STEP, gauss_newton
+from limber.estimation.forward.gripper_path import force_for_travel
+from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
+from limber.estimation.settings import EstimateSettings
+from limber.mechanics.grasp import Grasp
+
+SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=4)
+TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
+
+
+@pytest.fixture(scope="module")
+def pull(small_pull):
+    """A recorded pull that does not state its cell: the path is observed."""
+    entry = small_pull.entry.model_copy(update={"calibration": None})
+    return replace(measured(small_pull, 3), entry=entry)
+
+
+@pytest.fixture(scope="module")
+def objective(small_bench, pull):
+    return small_bench.objective([pull], SETTINGS)
+
+
+def with_force(pull, change):
+    """The same pull with other readings of the force; ``change`` maps [n, 3]."""
+    wrenches = pull.wrenches.copy()
+    wrenches[:, :3] = change(wrenches[:, :3])
+    return replace(pull, wrenches=wrenches)
+
+
+@pytest.mark.parametrize("young", [1e3, 6e5, 1e8, 1e11])
+def test_a_measured_force_gives_the_start_whatever_the_modulus_was(objective, young):
+    start = scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
+    expected = scaled_start(objective, Values(np.full(4, 1e7), 0.36, 900.0))
+    assert start.young == pytest.approx(expected.young, rel=1e-6)
+    assert 0.3 * TRUTH.min() < start.young[0] < 3 * TRUTH.max()
+
+
+@pytest.mark.parametrize("young", [1e3, 1e6])
+def test_a_start_carries_the_weight(small_bench, pull, young):
+    """A reading near zero says a modulus under which the branch would fold: it is stiffened."""
+    weak = with_force(pull, lambda force: 1e-6 * force)
+    objective = small_bench.objective([weak], SETTINGS)
+    forward = objective.forwards[0]
+    forward._model = forward._model.with_parameters(gravity=(0.0, 0.0, -9.81)).as_scanned()
+    start = scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
+    assert forward.stands(start)
+    assert not forward.stands(replace(start, young=0.25 * start.young))
+
+
+def test_decades_without_equilibrium_are_no_minimum(objective, monkeypatch):
+    """Without force the scale is searched; what fails there is too soft."""
+    def evaluate(self, free, **_options):
+        known = None if free[0] < np.log(1e7) else Evaluation(
+            free, np.array([1.0 + abs(free[0] - np.log(1e8))]), None, 0.0, ())
+        return known
+
+    monkeypatch.setattr(Objective, "evaluate", evaluate)
+    monkeypatch.setattr(type(objective.forwards[0]), "force_ratio", lambda *_: None)
+    for young in (1e4, 1e8, 1e10):
+        start = scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
+        assert start.young == pytest.approx(1e8, rel=0.3)
+
+
+def test_a_branch_that_cannot_stand_is_refused_not_divided_by(small_bench):
+    """No force is asked to move what falls by itself; before, its travel of zero was a divisor."""
+    model = small_bench.model.with_parameters(young=1e4, gravity=(0.0, 0.0, -9.81)).as_scanned()
+    tip = model.mesh.nodes[np.argmax(model.mesh.nodes[:, 2])]
+    grasp = Grasp.at(model.mesh, tip, 0.012, "pinned")
+    with pytest.raises(WorkError, match="equilibrium"):
+        force_for_travel(model, grasp, np.array([1.0, 0.0, 0.0]), 0.02)
+    sound = model.with_parameters(young=5e8)
+    size = force_for_travel(sound, grasp, np.array([1.0, 0.0, 0.0]), 0.05)
+    assert force_for_travel(sound.with_parameters(young=1e9), grasp, np.array([1.0, 0.0, 0.0]),
+                            0.05) == pytest.approx(2 * size, rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_travel_beyond_reach_is_refused(small_bench):
+    """Before, the force of the farthest state was returned as if it moved that far."""
+    model = small_bench.model
+    tip = model.mesh.nodes[np.argmax(model.mesh.nodes[:, 2])]
+    with pytest.raises(WorkError, match="No sideways force"):
+        force_for_travel(model, Grasp.at(model.mesh, tip, 0.012, "pinned"),
+                         np.array([1.0, 0.0, 0.0]), 1.0)
+
+
+def test_a_failed_simulation_is_cheap_and_has_no_objective(small_bench, pull, tmp_path):
+    """Its budget is counted in iterations; log and progress state no number for it."""
+    lines = []
+    plain = small_bench.objective([pull], SETTINGS)
+    objective = Objective(plain.forwards, plain.space,
+                          log=EvaluationLog(tmp_path / "log.jsonl", "p"),
+                          progress=Progress(lambda *each: lines.append(each)))
+    forward = objective.forwards[0]
+    forward._model = forward._model.with_parameters(gravity=(0.0, 0.0, -9.81)).as_scanned()
+    assert objective.evaluate(np.log(YOUNG_BOUNDS_PA[0]) * np.ones(4)) is None
+    # The last solve may end its step.
+    assert forward.iteration_count <= forward.iteration_limit + 20
+    assert objective.log.best is None
+    found = objective.evaluate(np.log(TRUTH))
+    assert objective.log.best.objective == found.objective
+    again = EvaluationLog(tmp_path / "log.jsonl", "p")
+    assert again.resumed_count == 2 and again.best.objective == found.objective
+    assert [message for _, message, _ in lines] == [
+        "simulating", "no equilibrium", "simulating", "fitting"]
+    json.dumps([numbers for *_, numbers in lines], allow_nan=False)
+
+
+@pytest.mark.slow
+def test_a_modulus_changes_at_most_threefold_a_step(small_bench, small_pull, monkeypatch):
+    objective = small_bench.objective([small_pull], SETTINGS)
+    evaluate, tried = Objective.evaluate, []
+
+    def kept(self, free, **options):
+        tried.append(free[:4].copy())
+        return evaluate(self, free, **options)
+
+    monkeypatch.setattr(Objective, "evaluate", kept)
+    fit = gauss_newton(objective, np.log(40 * TRUTH))
+    assert np.exp(fit.evaluation.free[:4]) == pytest.approx(TRUTH, rel=0.1)
+    for number, free in enumerate(tried[1:], 1):
+        assert min(np.abs(free - earlier).max()
+                   for earlier in tried[:number]) <= LONGEST_STEP + 1e-9
