@@ -57,6 +57,7 @@ def test_inertia_gives_the_scale_without_force(shaken):
     """With the density known, motion alone tells how stiff the branch is."""
     objective = Objective([shaken], ParameterSpace.separate(replace(TRUE, young=2.0 * YOUNG)))
     start = objective.space.pack(objective.space.base)
-    require_scale(identifiability(objective.evaluate(start, jacobian=True), objective.space))
+    evaluation = objective.evaluate(start, jacobian=True)
+    require_scale(identifiability(evaluation, objective.space), objective, evaluation)
     fit = gauss_newton(objective, start, robust=False)
     assert np.abs(np.exp(fit.evaluation.free) / YOUNG - 1).max() < 0.01

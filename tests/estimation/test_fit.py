@@ -120,7 +120,7 @@ def test_positions_alone_are_refused(small_bench, noisy):
     judged = identifiability(evaluation, objective.space)
     assert judged.singular_values[-1] < 1e-6 * judged.singular_values[0]
     with pytest.raises(InputError, match="overall scale"):
-        require_scale(judged)
+        require_scale(judged, objective, evaluation)
 
 
 def test_gravity_makes_the_scale_known(small_bench, noisy):
@@ -131,7 +131,7 @@ def test_gravity_makes_the_scale_known(small_bench, noisy):
     require_scale_in_principle(objective.forwards)
     evaluation = objective.evaluate(np.log(TRUTH), jacobian=True)
     judged = identifiability(evaluation, objective.space)
-    require_scale(judged)
+    require_scale(judged, objective, evaluation)
 
 
 def test_what_lies_beyond_the_grasp_is_linked(at_truth, objective):

@@ -60,6 +60,7 @@ from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.creep import with_creep
+from limber.estimation.uncertainty.force_checks import require_own_frame
 from limber.estimation.uncertainty.identifiability import (
     force_is_measured,
     identifiability,
@@ -212,6 +213,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
             :class:`limber.estimation.fitting.reduced_fit.Reduction`.
     """
     require_scale_in_principle(objective.forwards)
+    require_own_frame(objective, start)
     reduction = (Reduction(objective.forwards, cache, digest) if settings.forward == "reduced"
                  else None)
     first = None if near is None else objective.evaluate(objective.space.pack(near),
@@ -225,7 +227,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
         _require_stable(objective, start)
     judged = identifiability(first, objective.space)
     if not force_is_measured(objective):
-        require_scale(judged)
+        require_scale(judged, objective, first)
     # Whether to warn is decided at the end: the data determine a modulus better once it is soft.
     space, _ = link_unresolved(first, objective.space)
     if space.links:

@@ -23,6 +23,7 @@ from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.bending_stiffness import SectionMean, strain_energy
 from limber.estimation.uncertainty.covariance import Uncertainty, outliers
 from limber.estimation.uncertainty.creep import creep_sentence
+from limber.estimation.uncertainty.force_checks import too_little_said
 from limber.estimation.uncertainty.identifiability import (
     SCALE_DEVIATION,
     Identifiability,
@@ -282,10 +283,14 @@ def require_result(found: Estimate, skeleton: Skeleton) -> None:
 
     Raises:
         WorkError: the fit has no valid result; states the reason.
+        InputError: the measured force is too uncertain for the scale of the moduli.
     """
     reason = found.is_bad
     if reason is None:
         return
+    if not found.scale_deviation <= SCALE_DEVIATION and any(
+            forward.uses_force for forward in found.objective.forwards):
+        raise too_little_said(found.objective, found.fit.evaluation, SCALE_DEVIATION)
     young = ", ".join(f"{value / 1e6:.4g}" for value in found.values.young)
     ended = f"The fit ended at {young} MPa. Nothing was written."
     seen = [*_points_off(found.objective.forwards), *_neck(skeleton)]

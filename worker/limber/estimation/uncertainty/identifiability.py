@@ -7,6 +7,7 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.parameters import ParameterSpace
+from limber.estimation.uncertainty.force_checks import too_little_said
 
 UNRESOLVED_DEVIATION = 0.5
 """Deviation of a log E above which the modulus is linked to its neighbour. Chosen."""
@@ -43,14 +44,19 @@ def identifiability(evaluation: Evaluation, space: ParameterSpace) -> Identifiab
                            float(information**-0.5) if information > 0 else np.inf)
 
 
-def require_scale(found: Identifiability) -> None:
+def require_scale(found: Identifiability, objective: Objective, evaluation: Evaluation) -> None:
     """Reject data that do not determine the overall scale of Young's modulus.
+
+    Args:
+        evaluation: With derivatives.
 
     Raises:
         InputError: the data do not determine it; states the reason.
     """
     if found.scale_deviation <= SCALE_DEVIATION:
         return
+    if any(forward.uses_force for forward in objective.forwards):
+        raise too_little_said(objective, evaluation, SCALE_DEVIATION)
     raise InputError(
         "These pulls do not determine the overall scale of Young's modulus: twice as large moduli "
         f"would change the measurements by only {0.7 / found.scale_deviation:.1g} standard "

@@ -1,0 +1,80 @@
+"""Forces that were recorded but do not determine the moduli: the reason is computed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.paper_branches import measured
+from limber.core.errors import InputError
+from limber.estimation.parameters import Values
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.uncertainty.force_checks import other_frame, require_own_frame
+from limber.estimation.uncertainty.identifiability import identifiability, require_scale
+
+SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=4)
+TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
+
+
+@pytest.fixture(scope="module")
+def pull(small_pull):
+    """A recorded pull that does not state its cell."""
+    entry = small_pull.entry.model_copy(update={"calibration": None})
+    return replace(measured(small_pull, 3), entry=entry)
+
+
+@pytest.fixture(scope="module")
+def objective(small_bench, pull):
+    return small_bench.objective([pull], SETTINGS)
+
+
+def with_force(pull, change):
+    """The same pull with other readings of the force; ``change`` maps [n, 3]."""
+    wrenches = pull.wrenches.copy()
+    wrenches[:, :3] = change(wrenches[:, :3])
+    return replace(pull, wrenches=wrenches)
+
+
+def test_a_small_force_is_named_with_its_assumed_errors(small_bench, pull):
+    """It was recorded: the errors assumed for it are why it says nothing, and what would do."""
+    weak = with_force(pull, lambda force: 0.2 * force / np.abs(force).max())
+    objective = small_bench.objective([weak], SETTINGS)
+    evaluation = objective.evaluate(np.log(TRUTH), jacobian=True)
+    judged = identifiability(evaluation, objective.space)
+    judged = replace(judged, scale_deviation=max(judged.scale_deviation, 2.0))
+    with pytest.raises(InputError, match=r"up to 0\.2") as error:
+        require_scale(judged, objective, evaluation)
+    text = str(error.value)
+    assert "zero 1 N, drift 1 N" in text and "force_bias_sigma_n" in text
+    assert "Record the gripper's force" not in text
+    none = with_force(pull, lambda force: 0 * force)
+    objective = small_bench.objective([none], SETTINGS)
+    with pytest.raises(InputError, match="zero in all frames"):
+        require_scale(judged, objective, evaluation)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1)])
+def test_a_force_in_another_frame_is_named(small_bench, pull, axis):
+    """Turned by a right angle it explains the motion; as given it does not."""
+    turn = Rotation.from_rotvec(np.pi / 2 * np.array(axis))
+    turned = with_force(pull, turn.inv().apply)
+    forward = small_bench.objective([turned], SETTINGS).forwards[0]
+    values = Values(TRUTH, 0.36, 900.0)
+    found = other_frame(forward, values)
+    change, at, seen = small_bench.objective([pull], SETTINGS).forwards[0].linear_motion(values)
+    across = turn.inv().apply(change) @ at
+    if np.sum(across * seen) < 0.5 * np.linalg.norm(across) * np.linalg.norm(seen):
+        assert f"90 degrees about {'xyz'[int(np.argmax(axis))]}" in found
+        loud = with_force(turned, lambda force: 50 * force / np.abs(force).max())
+        with pytest.raises(InputError, match="does not belong to the motion"):
+            require_own_frame(small_bench.objective([loud], SETTINGS), values)
+    else:
+        assert found is None
+
+
+def test_a_force_in_its_own_frame_is_left_alone(objective, small_bench, pull):
+    values = Values(np.full(4, 1e7), 0.36, 900.0)
+    assert other_frame(objective.forwards[0], values) is None
+    loud = with_force(pull, lambda force: 50 * force / np.abs(force).max())
+    require_own_frame(small_bench.objective([loud], SETTINGS), values)
