@@ -1,4 +1,4 @@
-"""Forces that were recorded but do not determine the moduli: the reason is computed."""
+"""Why pulls give no estimate: the reason is computed."""
 
 from dataclasses import replace
 
@@ -7,9 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.paper_branches import measured
-from limber.core.errors import InputError
+from limber.core.errors import InputError, WorkError
+from limber.estimation.fit_assessment import Estimate, require_result
+from limber.estimation.fitting.optimise import Fit, FitStatus
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.force_checks import other_frame, require_own_frame
 from limber.estimation.uncertainty.identifiability import identifiability, require_scale
 
@@ -78,3 +81,20 @@ def test_a_force_in_its_own_frame_is_left_alone(objective, small_bench, pull):
     assert other_frame(objective.forwards[0], values) is None
     loud = with_force(pull, lambda force: 50 * force / np.abs(force).max())
     require_own_frame(small_bench.objective([loud], SETTINGS), values)
+
+
+def test_a_failed_fit_names_what_is_wrong_with_the_branch(small, small_bench, objective):
+    """A neck in the reconstruction, points far from their places, and an impossible modulus."""
+    evaluation = objective.evaluate(np.log(TRUTH * [1.0, 3e3, 1.0, 1.0]), jacobian=True)
+    fit = Fit(evaluation, FitStatus.converged, "")
+    found = Estimate(fit, objective, uncertainty(evaluation, objective),
+                     identifiability(evaluation, objective.space))
+    assert "E2 would be 6.6e+10 Pa" in found.is_bad
+    skeleton = small.skeleton
+    with pytest.raises(WorkError, match="Check units") as error:
+        require_result(found, skeleton)
+    assert "radius" not in error.value.why
+    radius = skeleton.radius.copy()
+    radius[len(radius) // 2] *= 0.2
+    with pytest.raises(WorkError, match="fourth power of the radius"):
+        require_result(found, replace(skeleton, radius=radius))

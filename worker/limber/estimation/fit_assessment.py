@@ -46,6 +46,7 @@ from limber.mechanics.materials.layered_section import LayeredSection
 from limber.recordings.cell_errors import calibration_of
 from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry, Pull
+from limber.recordings.sensor_checks import PLAUSIBLE_YOUNG_PA
 
 MISFIT_FACTOR = 4.0
 """Mean squared residual over the expected one above which model and pull do not belong together:
@@ -186,6 +187,12 @@ class Estimate:
                  if name not in {prior for prior, _, _ in space.priors}]
         if bound:
             return f"{', '.join(bound)} reached a bound. The data require a value beyond it."
+        low, high = PLAUSIBLE_YOUNG_PA
+        beyond = [f"E{number} would be {young:.2g} Pa" for number, young in enumerate(
+            self.values.young, start=1) if not low <= young <= high]
+        if beyond:
+            return (f"{', '.join(beyond)}. No plant has such a modulus: they are between {low:.0e} "
+                    f"and {high:.0e} Pa.")
         if error := unlikely(self.cell_errors):
             return error
         scale = self.scale_deviation
@@ -310,6 +317,8 @@ def _points_off(forwards: Sequence[Forward]) -> list[str]:
         poses, known = forward.frames.poses, calibration_of(forward.entry)
         at_rest = np.linalg.norm(poses[:, :3] - forward.entry.grasp.point_m, axis=1) < AT_REST_M
         off = np.linalg.norm(forward.frames.positions[at_rest] - forward.rest_points, axis=2)
+        # Where a fit has moved them already, they are off by that.
+        off = np.maximum(off, np.abs(forward.point_shifts))
         allowed = FAR_OFF * np.hypot(known.point_sigma_m, forward.entry.sensor.position_sigma_m)
         if np.isfinite(off).any() and np.nanmax(off) > max(worst, allowed):
             worst, name = float(np.nanmax(off)), forward.name

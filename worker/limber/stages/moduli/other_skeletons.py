@@ -117,6 +117,7 @@ def _fitted(graph: _Graph, found: Estimate, branch: Branch, pulls: Sequence[Pull
     if found.is_weightless:
         subject = subject.without_weight()
     other = fit_branch(list(pulls), subject, settings, log=EvaluationLog(None, ""), quick=True,
-                       near=replace(found.values, form=()))
+                       near=replace(found.values, form=()),
+                       progress=progress.keeping([], silently=True))
     require_result(other, skeleton)
     return other
