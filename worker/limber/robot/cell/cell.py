@@ -137,6 +137,9 @@ class SensorEntry(_Entry):
     device: str | None = Field(None, description="Serial line of kind = \"ft300_usb\".")
     file: str | None = Field(None, description="CSV of a replay: t_s and six columns, in the "
                              "sensor's frame.")
+    topic: str | None = Field(None, min_length=1, description="Topic of its wrench in ROS "
+                              "(geometry_msgs/msg/WrenchStamped). `limber ros` takes that of the "
+                              "UR driver only for the own sensor of an e-Series arm.")
     pose: Pose = Field((0.0,) * 6, description="The sensor's frame in the flange's frame.")
     force_range_n: float = Field(100.0, gt=0)
     torque_range_nm: float = Field(10.0, gt=0)

@@ -192,14 +192,31 @@ class ReplayedSensor:
         """Nothing is open."""
 
 
+def require_sensor(cell: Cell) -> None:
+    """Refuse a cell without a force sensor that the guard can rely on.
+
+    Raises:
+        InputError: the cell names no sensor, or names a CB3's own estimate, which is no sensor.
+    """
+    if cell.sensor.kind == "none":
+        raise InputError("The cell file names no force sensor.",
+                         "The guard does not move a branch that it cannot feel.",
+                         "Set sensor.kind to ft300 or controller.")
+    if cell.sensor.kind == "controller" and not cell.arm.measures_force:
+        raise InputError(f"The cell uses the force of the {cell.arm.name}'s own controller.",
+                         "A CB3 estimates it from motor currents, with drifting errors of several "
+                         "newtons.",
+                         "Mount a force-torque sensor and set sensor.kind to ft300.")
+
+
 def open_sensor(cell: Cell) -> ForceTorqueSensor:
     """Return the cell's sensor.
 
     Raises:
-        InputError: the cell names no sensor, or names a CB3's own estimate, which is no sensor, or
-            a replay for a real robot.
+        InputError: as :func:`require_sensor`, or the cell names a replay for a real robot.
         WorkError: it does not answer.
     """
+    require_sensor(cell)
     if cell.sensor.kind == "replay":
         if not cell.robot.address.startswith("127."):
             raise InputError(f"The cell file replays forces from {cell.sensor.file}, but the "
@@ -208,19 +225,10 @@ def open_sensor(cell: Cell) -> ForceTorqueSensor:
                              "branch.", "Replay only with the virtual robot (127.0.0.x), or name "
                              "the mounted sensor.")
         return ReplayedSensor(cell, Path(cell.sensor.file))
-    if cell.sensor.kind == "none":
-        raise InputError("The cell file names no force sensor.",
-                         "The guard does not move a branch that it cannot feel.",
-                         "Set sensor.kind to ft300 or controller.")
     if cell.sensor.kind == "ft300_usb":
         return Ft300UsbSensor(cell)
     if cell.sensor.kind == "ft300":
         return Ft300Sensor(cell)
-    if not cell.arm.measures_force:
-        raise InputError(f"The cell uses the force of the {cell.arm.name}'s own controller.",
-                         "A CB3 estimates it from motor currents, with drifting errors of several "
-                         "newtons.",
-                         "Mount a force-torque sensor and set sensor.kind to ft300.")
     return ControllerSensor(cell)
 
 
