@@ -216,10 +216,11 @@ def test_standard_output_that_takes_nothing_is_told(monkeypatch, capfd):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
-@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", None)])
 def test_interrupt_ends_with_130(kind):
-    """Ctrl-C and SIGTERM end a running command with 130 and the cancelled status."""
-    program = ("import time\nfrom limber.cli import main\n"
+    """Ctrl-C, SIGTERM and a closed terminal end a command with 130 and the cancelled status."""
+    program = ("import signal, time\nfrom limber.cli import main\n"
+               "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
                "def function(run, **_):\n"
                "    'Probe.'\n"
                "    print('ready', flush=True); time.sleep(30)\n"

@@ -190,19 +190,40 @@ def test_a_topic_that_sends_nothing_is_named(monkeypatch):
 def test_joints_come_by_name_in_any_order_and_missing_numbers_are_none():
     names = ["elbow_joint", "tool_joint", *(f"{name}_joint" for name in CELL.arm.ros_joints
                                             if name != "elbow")]
-    states = JointStates(CELL, names)
-    assert states.ordered == [f"{name}_joint" for name in CELL.arm.ros_joints]
+    states = JointStates(CELL)
     message = {"header": {"stamp": {"sec": 3, "nanosec": 500000000}}, "name": names,
                "position": [HOME[2], 9.0, HOME[0], HOME[1], *HOME[3:]], "velocity": [0.1] * 7}
+    assert states.sample({**message, "name": names[1:]}, 1.0) is None
     sample = states.sample(message, 1.0)
+    assert states.ordered == [f"{name}_joint" for name in CELL.arm.ros_joints]
     assert sample.clock == 3.5 and sample.joints == pytest.approx(HOME)
     assert sample.pose == pytest.approx(pose_vectors(CELL.arm.forward(HOME) @ TOOL))
     step = CELL.arm.forward(HOME + 1e-6 * sample.joint_speeds) @ TOOL
     moved = (step[:3, 3] - sample.pose[:3]) / 1e-6
     assert sample.speed[:3] == pytest.approx(moved, abs=1e-4)
     assert np.isnan(states.sample(message | {"velocity": []}, 1.0).joint_speeds).all()
-    with pytest.raises(InputError, match="0 joints of ROS are named like elbow"):
-        JointStates(CELL, names[1:])
+    lost = states.sample(message | {"position": [None] * 7}, 1.0)
+    assert np.isnan(lost.joints).all() and np.isnan(lost.pose).all()
+
+
+def test_joint_states_of_other_nodes_are_passed_over_and_a_second_arm_is_refused():
+    states = JointStates(CELL)
+    arm = {"header": {"stamp": {"sec": 0}}, "velocity": [0.0] * 6,
+           "name": [f"{name}_joint" for name in CELL.arm.ros_joints], "position": HOME.tolist()}
+    gripper = arm | {"name": ["finger_joint"], "position": [0.4]}
+    assert states.sample(gripper, 0.0) is None and states.others == ["finger_joint"]
+    assert states.sample(arm, 0.0).joints == pytest.approx(HOME)
+    assert states.sample(gripper, 0.0) is None
+    both = arm | {"name": ["finger_joint", *arm["name"]], "position": [0.4, *HOME],
+                  "velocity": [0.0] * 7}
+    assert states.sample(both, 0.0).joints == pytest.approx(HOME)
+    second = arm | {"name": [f"second_{name}" for name in arm["name"]]}
+    both = arm | {"name": arm["name"] + second["name"], "position": [*HOME, *(HOME + 1.0)]}
+    assert states.sample(both, 0.0).joints == pytest.approx(HOME)
+    with pytest.raises(InputError, match="2 joints of ROS are named like shoulder_pan"):
+        states.sample(second, 0.0)
+    with pytest.raises(InputError, match="2 joints of ROS are named like shoulder_pan"):
+        JointStates(CELL).sample(both, 0.0)
 
 
 def test_a_goal_carries_times_and_ends_at_rest():
@@ -248,6 +269,9 @@ def test_the_example_node_stops_on_a_word_and_on_silence(monkeypatch):
     assert not watch.heard(False, 100.0) and not watch.is_silent(100.2)
     assert watch.is_silent(100.31) and not watch.is_silent(100.4)
     assert watch.heard(True, 101.0) and not watch.is_silent(102.0)
+    watch.heard(False, 103.0)
+    watch.ended()
+    assert not watch.is_silent(104.0)
     manifest = ElementTree.parse(package / "package.xml")
     declared = {each.text for each in manifest.iter("exec_depend")}
     for path in package.rglob("*.py"):
@@ -260,6 +284,9 @@ def test_the_example_node_stops_on_a_word_and_on_silence(monkeypatch):
                    for keyword in node.keywords if keyword.arg == "package"}
         assert imported | started <= declared | {"limber_stop", "setuptools"}, path
     assert guarded_robot._BEAT_SECONDS < 0.3 / 2
+    # Or rosbridge would hold back every stop while a goal runs.
+    assert '"send_action_goals_in_new_thread": True' in (
+        package / "launch" / "limber.launch.py").read_text(encoding="utf-8")
 
 
 def cloud_message(points: np.ndarray, *, big: bool = False) -> dict:

@@ -4,12 +4,16 @@ import contextlib
 import json
 import threading
 import time
+from collections import deque
 
 import numpy as np
 
 from limber.robot.ros.messages import spline
 
 STEP = 0.008
+_PROGRAM = "/io_and_status_controller/robot_program_running"
+_SCALING = "/speed_scaling_state_broadcaster/speed_scaling"
+_SUCCEEDED, _CANCELED = 4, 5  # action_msgs/msg/GoalStatus
 _LARGEST_BYTES = 10_000_000  # rosbridge_server's own limit (parameter max_message_size)
 _NAMES = [f"{name}_joint" for name in (
     "elbow", "shoulder_lift", "shoulder_pan", "wrist_1", "wrist_2", "wrist_3")]
@@ -22,25 +26,41 @@ class RosBridge:
     Attributes:
         joints: Where the arm stands, in its own order [rad], shape [6].
         wrench: What the sensor tells besides noise [N, N m], shape [6].
+        wrench_topic: Where it tells it.
         load: Returns more of that, from the joints.
         gripper_status: With which the gripper's action ends.
-        stood_at: When the last goal was cancelled, and the arm stood [s, monotonic].
+        stood_at: When the last goal ended, and the arm stood [s, monotonic].
         heard: Operations that came, each with its time.
         silent: Topics that send nothing.
         drift: Speeds at which another program moves the arm [rad/s], shape [6].
         answers: Of services that a client offers.
-        sent: Messages of topics that were sent: time of their step [s], topic, content.
+        sent: Joint states and wrenches that were sent: time of their step [s], topic, content.
+        status: What the UR driver publishes of its controller, by topic: at a subscription and
+            when it changes.
+        others: Messages that another node publishes on /joint_states in each step.
+        has_arm: Whether the arm's own are published there.
+        sticks: The arm stands whatever its goal, and nothing reports why.
+        accepts_after: Steps before the controller accepts a goal; until then a cancel is lost.
+        blocks: A running goal blocks what a stepped client sends after it, as rosbridge does by
+            default.
     """
 
     def __init__(self, joints):
         self.joints, self.speeds = np.array(joints, float), np.zeros(6)
         self.wrench, self.heard, self.silent = np.zeros(6), [], set()
+        self.wrench_topic = "/force_torque_sensor_broadcaster/wrench"
         self.followed, self.stood_at = [], None
         self.load = lambda joints: np.zeros(6)
         self.gripper_status = 4
         self.drift, self.answers, self.sent = np.zeros(6), [], []
-        self._subscribed, self._offering = set(), None
+        self.status = {"/io_and_status_controller/safety_mode": {"mode": 1},
+                       "/io_and_status_controller/robot_mode": {"mode": 7},
+                       _PROGRAM: {"data": True}, _SCALING: {"data": 100.0}}
+        self.others, self.has_arm, self.sticks = [], True, False
+        self.accepts_after, self.blocks = 0, False
+        self._subscribed, self._offering = {}, None
         self._goal, self._open = None, []
+        self._age, self._lock = 0, threading.Lock()
         self._rng = np.random.default_rng(0)
 
     def __enter__(self):
@@ -53,9 +73,25 @@ class RosBridge:
         return self
 
     def __exit__(self, *_exception):
+        self.hang_up()
+        self._server.shutdown()
+
+    def hang_up(self):
+        """Close all connections; the controller goes on with its goal."""
         for socket in self._open:
             socket.close()
-        self._server.shutdown()
+
+    def protective_stop(self):
+        """The arm stops, its goal waits: as the controller reports it, in its order."""
+        self.status[_SCALING] = {"data": 0.0}
+        self.status["/io_and_status_controller/safety_mode"] = {"mode": 3}
+        self.status[_PROGRAM] = {"data": False}
+
+    def release(self):
+        """A person releases the protective stop and starts the program again."""
+        self.status["/io_and_status_controller/safety_mode"] = {"mode": 1}
+        self.status[_PROGRAM] = {"data": True}
+        self.status[_SCALING] = {"data": 100.0}
 
     def _serve(self, socket):
         from websockets.exceptions import ConnectionClosed
@@ -66,46 +102,77 @@ class RosBridge:
         # One that only offers a service is sent nothing, and does not step the arm.
         while listening.is_alive() and socket not in self._subscribed:
             time.sleep(STEP)
-        began, count = time.monotonic(), 0
+        began, count, told = time.monotonic(), 0, {}
         try:
             while listening.is_alive():
                 count += 1
-                self._step(socket)
-                self._send(socket, "/joint_states", count, {
-                    "name": _NAMES, "position": self.joints[_ORDER].tolist(),
-                    "velocity": self.speeds[_ORDER].tolist(), "effort": []})
-                told = self.wrench + self.load(self.joints) + 0.02 * self._rng.standard_normal(6)
-                self._send(socket, "/force_torque_sensor_broadcaster/wrench", count, {"wrench": {
-                    kind: dict(zip("xyz", map(float, part), strict=True))
-                    for kind, part in (("force", told[:3]), ("torque", told[3:]))}})
+                self.turn(socket, count, told)
                 time.sleep(max(began + count * STEP - time.monotonic(), 0.0))
         except ConnectionClosed:
             return
 
-    def _send(self, socket, topic, count, message):
+    def turn(self, socket, count, told):
+        """Step the arm for the ``count``-th time, and send all that is published then.
+
+        Args:
+            told: What was last sent to this client of the status, by topic; updated.
+        """
+        with self._lock:
+            self._step(socket)
+        self._send_status(socket, told)
+        for other in self.others:
+            self._send(socket, "/joint_states", count, other, kept=False)
+        if self.has_arm:
+            self._send(socket, "/joint_states", count, {
+                "name": _NAMES, "position": self.joints[_ORDER].tolist(),
+                "velocity": self.speeds[_ORDER].tolist(), "effort": []})
+        felt = self.wrench + self.load(self.joints) + 0.02 * self._rng.standard_normal(6)
+        self._send(socket, self.wrench_topic, count, {"wrench": {
+            kind: dict(zip("xyz", map(float, part), strict=True))
+            for kind, part in (("force", felt[:3]), ("torque", felt[3:]))}})
+
+    def _send(self, socket, topic, count, message, *, kept=True):
         if topic not in self.silent:
             seconds = count * STEP
             stamp = {"sec": int(seconds), "nanosec": round(1e9 * (seconds % 1))}
             message = {"header": {"stamp": stamp, "frame_id": ""}, **message}
-            self.sent.append((seconds, topic, message))
+            if kept:
+                self.sent.append((seconds, topic, message))
             socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
+
+    def _send_status(self, socket, told):
+        """Send what has changed since ``told``, and the scaling always."""
+        for topic, message in self.status.items():
+            if topic in self._subscribed.get(socket, ()) and topic not in self.silent and (
+                    topic == _SCALING or told.get(topic) != message):
+                told[topic] = message
+                socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
+
+    @property
+    def is_busy(self):
+        """Whether a goal runs."""
+        return self._goal is not None
+
+    @property
+    def _pace(self):
+        """Of the goal's time: the controller scales it, and stands without its program."""
+        runs = self.status[_PROGRAM]["data"] and not self.sticks
+        return 0.01 * (self.status[_SCALING]["data"] or 0.0) if runs else 0.0
 
     def _step(self, socket):
         before = self.joints.copy()
         self.joints = self.joints + STEP * self.drift
-        if self._goal is not None:
-            goal, times, ways, speeds, at = self._goal
-            at = min(at + STEP, times[-1])
+        self._age += 1
+        if self._goal is not None and self._age > self.accepts_after:
+            order, times, ways, speeds, at = self._goal
+            at = min(at + STEP * self._pace, times[-1])
             first = min(int(np.searchsorted(times, at, side="right")) - 1, len(times) - 2)
             ends = slice(first, first + 2)
             self.joints = spline(at, times[ends], ways[ends], speeds[ends])
             self.followed.append(self.joints.copy())
-            self._goal = (goal, times, ways, speeds, at)
+            self._goal = (order, times, ways, speeds, at)
             if at >= times[-1]:
-                self._goal = None
-                socket.send(json.dumps({"op": "action_result", "id": goal["id"], "status": 4,
-                                        "action": goal["action"], "values": {"error_code": 0},
-                                        "result": True}))
+                self.end_goal(socket, _SUCCEEDED, error_code=0)
         self.speeds = (self.joints - before) / STEP
 
     def _listen(self, socket):
@@ -113,17 +180,29 @@ class RosBridge:
 
         with contextlib.suppress(ConnectionClosed):
             for text in socket:
-                order = json.loads(text)
-                if order["op"] == "subscribe":
-                    self._subscribed.add(socket)
-                elif order["op"] == "advertise_service":
-                    self._offering = socket
-                elif order["op"] == "service_response":
-                    self.answers.append(order)
-                else:
-                    self._hear(socket, order)
+                self.obey(socket, json.loads(text))
+
+    def obey(self, socket, order):
+        """Carry out an operation of a client."""
+        if order["op"] == "subscribe":
+            self._subscribed.setdefault(socket, set()).add(order["topic"])
+        elif order["op"] == "advertise_service":
+            self._offering = socket
+        elif order["op"] == "service_response":
+            self.answers.append(order)
+        else:
+            with self._lock:
+                self._hear(socket, order)
+
+    def end_goal(self, socket, status, **values):
+        """End the running goal with a status, as its controller decides."""
+        goal, self._goal, self.stood_at = self._goal[0], None, time.monotonic()
+        socket.send(json.dumps({"op": "action_result", "id": goal["id"], "status": status,
+                                "action": goal["action"], "values": values, "result": True}))
 
     def _hear(self, socket, order):
+        from websockets.exceptions import ConnectionClosed
+
         self.heard.append((time.monotonic(), order))
         if order["op"] == "send_action_goal" and order["action_type"].endswith("GripperCommand"):
             socket.send(json.dumps({
@@ -138,8 +217,16 @@ class RosBridge:
             self._goal = (order, np.array([
                 point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"]
                 for point in points]), ways, speeds, 0.0)
-        elif order["op"] == "cancel_action_goal":
-            self._goal, self.stood_at = None, time.monotonic()
+            self._age = 0
+        elif order["op"] == "publish":
+            # Who publishes hears it too.
+            for each, topics in list(self._subscribed.items()):
+                if order["topic"] in topics - self.silent:
+                    with contextlib.suppress(ConnectionClosed):
+                        each.send(json.dumps(order))
+        elif order["op"] == "cancel_action_goal" and self._goal is not None and (
+                self._age >= self.accepts_after):
+            self.end_goal(socket, _CANCELED)
 
     def call_service(self, name, times):
         """Call a service that a client offers, as any node may; then hang up."""
@@ -157,6 +244,80 @@ class RosBridge:
         """Publish a message to every client, as any node may."""
         for socket in self._open:
             socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
+
+
+class SteppedBridge:
+    """A client's connection to a server that takes a step whenever the client waits.
+
+    It stands for :class:`limber.robot.ros.bridge.Bridge`, and its time for the clock.
+
+    Args:
+        server: A :class:`RosBridge`, not entered.
+        plan: Called in each step with its number since the last goal came.
+
+    Attributes:
+        now: Time of the last step [s].
+    """
+
+    url = "stepped"
+
+    def __init__(self, server, plan=None):
+        self.plan, self.now = plan, 0.0
+        self._server, self._inbox = server, _Inbox()
+        self._count, self._told, self._since, self._held = 0, {}, None, []
+
+    def send(self, **order):
+        """Carry out an operation."""
+        if self._server.blocks and self._server.is_busy:
+            self._held.append(order)
+            return
+        self._server.obey(self._inbox, order)
+        if order["op"] == "send_action_goal":
+            self._since = 0
+
+    def receive(self, seconds):
+        """Return the next message, if any; before, where none waits, time passes."""
+        if not self._inbox.texts and seconds > 0.0:
+            self._step()
+        return json.loads(self._inbox.texts.popleft()) if self._inbox.texts else None
+
+    def _step(self):
+        self._count += 1
+        self.now += STEP
+        if self._since is not None:
+            self._since += 1
+            if self.plan is not None:
+                self.plan(self._since)
+        self._server.turn(self._inbox, self._count, self._told)
+        if not self._server.is_busy:
+            for order in self._held:
+                self._server.obey(self._inbox, order)
+            self._held.clear()
+
+    def end_goal(self, status, **values):
+        """Let the controller end the goal."""
+        self._server.end_goal(self._inbox, status, **values)
+
+    def subscribe(self, topic, kind):
+        """Subscribe to a topic."""
+        self.send(op="subscribe", topic=topic, type=kind)
+
+    def advertise(self, topic, kind):
+        """Advertise a topic."""
+        self.send(op="advertise", topic=topic, type=kind)
+
+    def close(self):
+        """Nothing is open."""
+
+
+class _Inbox:
+    """Keeps what a server sends."""
+
+    def __init__(self):
+        self.texts = deque()
+
+    def send(self, text):
+        self.texts.append(text)
 
 
 class ReplayedBridge(RosBridge):
@@ -178,12 +339,11 @@ class ReplayedBridge(RosBridge):
         listening.start()
         begin, first = time.monotonic(), self._messages[0][0]
         with contextlib.suppress(ConnectionClosed):
+            for topic, message in self.status.items():
+                socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
             for seconds, topic, message in self._messages:
                 time.sleep(max(begin + seconds - first - time.monotonic(), 0.0))
                 socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
             if self._goal is not None:
-                goal = self._goal[0]
-                socket.send(json.dumps({"op": "action_result", "id": goal["id"], "status": 4,
-                                        "action": goal["action"], "values": {"error_code": 0},
-                                        "result": True}))
+                self.end_goal(socket, _SUCCEEDED, error_code=0)
         listening.join()

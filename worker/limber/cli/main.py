@@ -351,11 +351,15 @@ def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], style: str,
 
 
 def _terminate_like_interrupt() -> None:
-    """Let SIGTERM end a command like Ctrl-C: with its clean-up and exit code 130."""
+    """Let SIGTERM and a closed terminal end a command like Ctrl-C: with its clean-up and exit
+    code 130."""
     def interrupt(_signal: int, _frame: Any) -> None:
         raise KeyboardInterrupt
     try:
         signal.signal(signal.SIGTERM, interrupt)
+        # nohup lets a command ignore it.
+        if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
+            signal.signal(signal.SIGHUP, interrupt)
     except ValueError:
         # Not the main thread (Blender may call from another): the default handler stays.
         return

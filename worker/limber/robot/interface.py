@@ -16,7 +16,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-_PLAYING = 2  # as RTDE reports a running program
+PLAYING = 2
+"""A running program, as RTDE reports it."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ class Sample:
     @property
     def program_runs(self) -> bool:
         """Whether a program runs on the controller."""
-        return self.runtime_state == _PLAYING
+        return self.runtime_state == PLAYING
 
 
 class ArmControl(Protocol):

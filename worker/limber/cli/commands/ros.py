@@ -39,12 +39,14 @@ def _url(function: Any) -> Any:
 @click.argument("cell_file", type=click.Path(path_type=Path))
 @_url
 def check(run: Run, cell_file: Path, url: str) -> dict[str, Any]:
-    """Read joint states and wrenches, and move nothing."""
+    """Read joint states, wrenches and the controller's modes, and move nothing."""
     from limber.robot.cell.cell import read_cell
     from limber.robot.ros.bridge import Bridge
     from limber.robot.ros.guarded_robot import RosRobot, Topics
+    from limber.robot.ros.topics import wrench_topic
 
     cell = read_cell(cell_file)
+    felt = wrench_topic(cell)
     bridge = Bridge(url)
     try:
         robot = RosRobot(cell, bridge, Topics())
@@ -52,7 +54,12 @@ def check(run: Run, cell_file: Path, url: str) -> dict[str, Any]:
     finally:
         bridge.close()
     assert robot.last is not None
-    return {"url": url, "arm": cell.arm.name, "joints_rad": robot.last.joints,
+    modes = {name: value for name, value in (
+        ("safety_mode", robot.last.safety_mode), ("robot_mode", robot.last.robot_mode),
+        ("program_runs", robot.last.program_runs), ("speed_scaling", robot.last.slider))
+        if robot.reported}
+    return {"url": url, "arm": cell.arm.name, "wrench_topic": felt, **modes,
+            "joints_rad": robot.last.joints,
             "samples_per_second": len(ages) / _SECONDS,
             "longest_gap_s": float(np.diff(ages).max()) if len(ages) > 1 else None,
             "force_without_tare_n": forces.mean(axis=0), "force_sigma_n": forces.std(axis=0)}
@@ -102,7 +109,7 @@ def scan(run: Run, cell_file: Path, topic: str, output: Path, views: int, url: s
     from limber.robot.cell.cell import read_cell
     from limber.robot.ros.bridge import Bridge
     from limber.robot.ros.cloud_topic import CloudTopic
-    from limber.robot.ros.guarded_robot import Topics
+    from limber.robot.ros.topics import Topics
 
     cell = read_cell(cell_file)
     if views > 1 and not sys.stdin.isatty():
@@ -144,14 +151,18 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
            armed: bool, confirm: str | None, url: str) -> dict[str, Any]:
     """Follow one leg of a plan by the joint trajectory controller, under the guard.
 
-    A stop cancels the goal and publishes True on /limber/stop. A websocket is no safety channel:
-    run the node of scripts/examples/ros2 beside the controller; it also acts on silence.
+    A stop, an error and Ctrl-C cancel the goal and publish True on /limber/stop. A websocket is no
+    safety channel: run the node of scripts/examples/ros2 beside the controller; it also acts on
+    silence.
     """
     from limber.core.errors import InputError, SafetyStop
     from limber.robot.cell.cell import read_cell
+    from limber.robot.ros.bridge import SECONDS
+    from limber.robot.ros.topics import wrench_topic
     from limber.robot.weighing import require_weighed
     from limber.stages.paths.execute import ExecuteSettings, planned_motion
 
+    wrench_topic(read_cell(cell_file))
     if armed:
         require_weighed(read_cell(cell_file))
     planned = planned_motion(
@@ -174,7 +185,7 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
                "followed_s": time.monotonic() - began}
     if not result["reached"]:
         raise SafetyStop(f"The robot was stopped: {event['reason']}.", "" if event.get("stands")
-                         else "It did not stand within a second.", "Check the branch and the "
+                         else f"It did not stand within {SECONDS:g} s.", "Check the branch and the "
                          "robot before anything moves.", result=result)
     return result
 
@@ -194,8 +205,10 @@ def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: st
     from limber.core.errors import InputError, SafetyStop
     from limber.robot.cell.cell import read_cell
     from limber.robot.motion.followed_path import followed_path
+    from limber.robot.ros.topics import wrench_topic
 
     cell = read_cell(cell_file)
+    wrench_topic(cell)
     followed = followed_path(cell, "Open the gripper, and free the branch by hand.")
     result: dict[str, Any] = {"armed": armed, "tare_known": followed.bias is not None,
                               "places": len(followed.poses)}
@@ -232,9 +245,11 @@ def serve(run: Run, cell_file: Path, service: str, armed: bool, confirm: str | N
     from limber.core.errors import InputError, SafetyStop
     from limber.robot.cell.cell import read_cell
     from limber.robot.ros.bridge import Bridge
+    from limber.robot.ros.topics import wrench_topic
     from limber.robot.ros.trigger_service import TriggerService
 
     cell = read_cell(cell_file)
+    wrench_topic(cell)
     if armed and confirm != "retreat":
         raise InputError("Nobody confirmed that the robot may move.", "Whoever calls the service "
                          "moves it.", "Give --confirm retreat, with a hand at the emergency stop.")
@@ -332,6 +347,7 @@ def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, 
         try:
             robot = RosRobot(cell, bridge, Topics())
             around.callback(robot.close)
+            around.callback(_warn, run, robot.warnings)
             if trajectory is None or is_held:
                 robot.recall_tare()
             else:
@@ -346,9 +362,12 @@ def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, 
         except ConnectionError as error:
             raise SafetyStop(f"{error}.", "Whether the arm stands is not known.",
                              "Check the robot; its stop node acts on silence.") from error
-    for text in robot.warnings:
-        run.progress.warn(text)
     return event
+
+
+def _warn(run: Run, texts: list[str]) -> None:
+    for text in texts:
+        run.progress.warn(text)
 
 
 for each in (check, describe, scan, follow, gripper, retreat, serve):

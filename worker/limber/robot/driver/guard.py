@@ -156,7 +156,7 @@ class Guard:
         """
         last, self._memory.grasp = self._memory.grasp, grasp
         self._memory.travel = None if last is None or grasp is None else grasp - last
-        for check in (self._check_clock(sample), self._check_modes(sample),
+        for check in (self._check_clock(sample), self.modes(sample),
                       self._check_wrench(sample, wrench, raw), self._check_settings(sample),
                       self._check_position(sample, grasp, sent),
                       self._check_expected(wrench, expected, uncertainty)):
@@ -208,14 +208,19 @@ class Guard:
                               self._settings.longest_silence)
         return GO
 
-    def _check_modes(self, sample: Sample) -> Decision:
+    def modes(self, sample: Sample) -> Decision:
+        """Judge what the controller reports of itself: it may arrive between two samples."""
         if sample.safety_mode != _NORMAL:
             return self._stop(SAFETY_MODES.get(sample.safety_mode,
                                                f"safety mode {sample.safety_mode}"))
         if sample.robot_mode != _RUNNING:
             return self._stop(f"robot mode {sample.robot_mode}: the robot is not running")
-        if self.state in (State.MOVING, State.PAUSED) and not sample.program_runs:
+        if self.state not in (State.MOVING, State.PAUSED):
+            return GO
+        if not sample.program_runs:
             return self._stop("the program on the controller was stopped")
+        if not sample.slider > 0.0:
+            return self._stop("the controller scales the speed to 0: its slider, or a pause")
         return GO
 
     def _check_wrench(self, sample: Sample, wrench: np.ndarray, raw: np.ndarray) -> Decision:

@@ -117,5 +117,6 @@ class GuardMemory:
 SAFETY_MODES = {
     2: "reduced mode: the controller holds other limits", 3: "protective stop", 4: "recovery mode",
     5: "safeguard stop", 6: "emergency stop", 7: "emergency stop", 8: "safety violation",
-    9: "safety fault"}
+    9: "safety fault", 10: "joints to be identified", 11: "undefined safety mode",
+    12: "safeguard stop of the automatic mode", 13: "three-position enabling stop"}
 """Names of the controller's safety modes in which nothing may move."""

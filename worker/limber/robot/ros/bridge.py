@@ -43,7 +43,8 @@ class Bridge:
             raise WorkError(f"No rosbridge answers at {url} ({error}).",
                             "Limber reaches ROS 2 through it.",
                             "Start it: ros2 launch rosbridge_server rosbridge_websocket_launch.xml "
-                            "(see scripts/examples/ros2).") from error
+                            "send_action_goals_in_new_thread:=true (see scripts/examples/ros2).",
+                            ) from error
 
     def send(self, **content: Any) -> None:
         """Send an operation.

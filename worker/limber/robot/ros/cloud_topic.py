@@ -34,7 +34,7 @@ class CloudTopic:
                              "frame.", "Add [camera] with pose and mount.")
         self._cell, self._bridge, self._topic = cell, bridge, topic
         self._joint_states = joint_states
-        self._states: JointStates | None = None
+        self._states = JointStates(cell)
         self._flange: np.ndarray | None = None
         self._moves = False
         bridge.subscribe(topic, CLOUD)
@@ -68,9 +68,9 @@ class CloudTopic:
             self._flange is not None and not self._moves)
 
     def _follow(self, message: dict) -> None:
-        if self._states is None:
-            self._states = JointStates(self._cell, message["name"])
         sample = self._states.sample(message, time.monotonic())
+        if sample is None:
+            return
         self._moves = not float(np.abs(sample.joint_speeds).max()) < _STANDS_RAD_S
         self._flange = self._cell.arm.forward(sample.joints)
 

@@ -1,14 +1,16 @@
 """A robot behind a rosbridge, moved by trajectories under the guard.
 
 The controller in ROS follows the whole trajectory itself (FollowJointTrajectory). The guard reads
-joint states and wrenches as they arrive. If it stops the motion, the goal is cancelled and the stop
-topic is published. ``scripts/examples/ros2`` shows a node beside the controller that acts on that
-topic, and on silence: a websocket is no safety channel.
+joint states, wrenches and the controller's modes as they arrive. Whatever ends the motion before
+its end, a stop by the guard, an error or Ctrl-C, cancels the goal and publishes the stop topic.
+``scripts/examples/ros2`` shows a node beside the controller that acts on that topic, and on
+silence: a websocket is no safety channel.
 """
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,13 @@ from limber.robot.cell.cell import Cell
 from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import Reading, WrenchChain
 from limber.robot.driver.guard import Guard
-from limber.robot.driver.guard_states import Decision, GuardSettings, Verdict
+from limber.robot.driver.guard_states import (
+    GO,
+    SAFETY_MODES,
+    Decision,
+    GuardSettings,
+    Verdict,
+)
 from limber.robot.driver.real_time import spare_what_is_loaded
 from limber.robot.interface import Sample
 from limber.robot.motion.followed_path import FollowedPathFile, read_followed_path
@@ -30,33 +38,29 @@ from limber.robot.motion.trajectory import Trajectory
 from limber.robot.pull_plausibility import PullPlausibility
 from limber.robot.ros.bridge import SECONDS, Bridge
 from limber.robot.ros.messages import (
+    END,
     FOLLOW,
     JOINT_STATE,
+    RUNNING,
+    STATUS_KINDS,
     STOP,
     WRENCH,
     JointStates,
     goal_of,
+    status_of,
     wrench_of,
 )
+from limber.robot.ros.topics import Topics, wrench_topic
 
 _LISTEN_SECONDS = 0.01
 _BEAT_SECONDS = 0.1
+_MOST_UNHEARD = 3  # beats that do not come back; the node beside the controller bears as many
 _OLDEST_READING_SECONDS = 0.05
 _STANDS_RAD_S = 1e-3
 _SETTLE_SECONDS = 0.3
-_STILL_RAD = 1e-3  # while it settles
+_STILL_RAD = 1e-3
 _SUCCEEDED = 4  # action_msgs/msg/GoalStatus
 _OFF_PATH_M = 0.02  # a ROS controller lags its trajectory by an unknown time
-
-
-@dataclass(frozen=True)
-class Topics:
-    """Names of the robot's topics and actions; by default those of the UR driver."""
-
-    joint_states: str = "/joint_states"
-    wrench: str = "/force_torque_sensor_broadcaster/wrench"
-    stop: str = "/limber/stop"
-    trajectory: str = "/scaled_joint_trajectory_controller/follow_joint_trajectory"
 
 
 class RosRobot:
@@ -69,9 +73,12 @@ class RosRobot:
         on_sample: Called with time [s], pose [6] and smoothed wrench [6], branch frame.
 
     Attributes:
-        warnings: Delays of the loop.
+        warnings: Delays of the loop, and how a motion was broken off.
+        reported: What the controller reports of itself, by the names of :class:`.Sample`; empty
+            for an arm whose driver does not.
 
     Raises:
+        InputError: as :func:`wrench_topic`, or the joint states are of another arm.
         WorkError: a topic sends nothing.
     """
 
@@ -84,7 +91,15 @@ class RosRobot:
         self._chain = WrenchChain(cell)
         self._sensor = frame_of(np.array(cell.sensor.pose))
         self._base = frame_of(np.array(cell.base.pose))
-        self._states: JointStates | None = None
+        self._wrench_topic = wrench_topic(cell, topics.wrench)
+        self._states = JointStates(cell)
+        self._status = {getattr(topics, name): name for name in STATUS_KINDS
+                        if cell.arm.controller == "ur"}
+        self.reported: dict[str, Any] = {}
+        self._unheard = 0
+        self._stood, self._may_stand, self._stood_at, self._clock = 0.0, 0.0, np.zeros(0), 0.0
+        self._rests = np.zeros(0)
+        self._is_sent = False
         self._reading: Reading | None = None
         self._reading_at = 0.0
         self.last: Sample | None = None
@@ -95,40 +110,66 @@ class RosRobot:
         self._way = RetreatPath(cell.arm.joint_names, read_followed_path(cell), self._kept)
         self._hold_ups = HoldUps(_LISTEN_SECONDS,
                                  lambda **event: self.warnings.append(event["text"]))
-        for topic, kind in ((topics.joint_states, JOINT_STATE), (topics.wrench, WRENCH),
-                            (topics.stop, STOP)):
+        for topic, kind in ((topics.joint_states, JOINT_STATE), (self._wrench_topic, WRENCH),
+                            (topics.stop, STOP), (topics.end, END),
+                            *((topic, STATUS_KINDS[name]) for topic, name in
+                              self._status.items())):
             bridge.subscribe(topic, kind)
         bridge.advertise(topics.stop, STOP)
+        bridge.advertise(topics.end, END)
         self._require_topics()
 
     def _require_topics(self) -> None:
         end = time.monotonic() + SECONDS
-        while self.last is None or self._reading is None:
+        while self.last is None or self._reading is None or (
+                len(self.reported) < len(self._status)):
             if time.monotonic() > end:
-                silent = self._topics.joint_states if self.last is None else self._topics.wrench
-                raise WorkError(f"Nothing came on {silent} within {SECONDS:g} s.",
-                                "The guard needs joint states and wrenches.",
-                                "Check the topic's name with `ros2 topic list`, and that its node "
-                                "runs.")
+                raise self._silent()
             self._take(self._bridge.receive(_LISTEN_SECONDS))
+
+    def _silent(self) -> WorkError:
+        """The error of a topic that sent nothing of use."""
+        unheard = [topic for topic, name in self._status.items() if name not in self.reported]
+        if self.last is not None and self._reading is not None:
+            return WorkError(
+                f"Nothing came on {', '.join(unheard)} within {SECONDS:g} s.",
+                "Without it the guard does not see a protective stop, after whose release the arm "
+                "would go on.",
+                f"Start the arm's driver: ros2 launch ur_robot_driver ur_control.launch.py "
+                f"ur_type:={self._cell.arm.name} robot_ip:=ADDRESS. It starts "
+                "io_and_status_controller and speed_scaling_state_broadcaster. A driver that "
+                "publishes the modes only when they change is too old.")
+        if self.last is None and self._states.others:
+            return WorkError(
+                f"{self._topics.joint_states} does not have the joints of a "
+                f"{self._cell.arm.name}: {', '.join(self._states.others)}.",
+                f"Names with {', '.join(self._cell.arm.ros_joints)} are needed.",
+                "Check robot.model in the cell file, and that the arm's driver runs.")
+        silent = self._topics.joint_states if self.last is None else self._wrench_topic
+        return WorkError(f"Nothing came on {silent} within {SECONDS:g} s.",
+                         "The guard needs joint states and wrenches.",
+                         "Check the topic's name with `ros2 topic list`, and that its node runs.")
 
     def _take(self, message: dict[str, Any] | None) -> Sample | None:
         """Process a message; returns its sample, if it is one."""
         if message is None or message.get("op") != "publish":
             return None
         topic, content, arrived = message.get("topic"), message["msg"], time.monotonic()
-        if topic == self._topics.wrench:
+        if topic == self._wrench_topic:
             raw = wrench_of(content)
             self._reading_at = arrived
             self._reading = Reading(turned_wrench(self._sensor[:3, :3], raw, self._sensor[:3, 3]),
                                     0.0, raw)
             return None
-        if topic != self._topics.joint_states:
-            return None
-        if self._states is None:
-            self._states = JointStates(self._cell, content["name"])
-        self.last = self._states.sample(content, arrived)
-        return self.last
+        if topic == self._topics.stop:
+            self._unheard = 0
+        elif (name := self._status.get(topic)) is not None:
+            self.reported[name] = status_of(name, content)
+        elif topic == self._topics.joint_states and (sample := self._states.sample(
+                content, arrived, RUNNING | self.reported)) is not None:
+            self.last = sample
+            return sample
+        return None
 
     def watched(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         """Only read for ``seconds``: samples' arrival times [s], shape [n]; raw forces, [n, 3]."""
@@ -200,7 +241,7 @@ class RosRobot:
         Raises:
             SafetyStop: the arm is not at its start, or the guard refuses.
         """
-        assert self._states is not None and trajectory.joints is not None
+        assert trajectory.joints is not None
         # It takes a while for a long path; what arrives meanwhile is read before it is sent.
         goal = goal_of(trajectory, self._states.ordered)
         # Or a garbage collection during the motion holds up the guard for a tenth of a second.
@@ -231,7 +272,6 @@ class RosRobot:
         if not np.abs(sample.joints - before).max() <= _STILL_RAD:
             raise _moves_already()
         back = self._way.from_here(sample, self._cell.limits.acceleration_m_s2)
-        assert self._states is not None
         goal = goal_of(back, self._states.ordered)
         self.guard.begin_retreat(self.smooth)
         event = self._watched_goal(back, goal)
@@ -262,31 +302,89 @@ class RosRobot:
 
     def _watched_goal(self, trajectory: Trajectory, content: dict[str, Any],
                       check: PullPlausibility | None = None) -> dict[str, Any]:
-        """Send a trajectory as the goal ``content`` and watch it to its end."""
+        """Send a trajectory as the goal ``content`` and watch it to its end.
+
+        Whatever ends this, an error or Ctrl-C too, cancels the goal and publishes a stop.
+        """
+        if (decision := self._modes()).verdict != Verdict.GO:
+            raise SafetyStop(f"The arm cannot be moved: {decision}.", "Limber neither releases "
+                             "stops nor starts the program on the controller.",
+                             "Check the robot, and put it right at the pendant.")
         self._goals += 1
+        self._is_sent, self._rests = False, _rests(trajectory)
         goal = f"limber-{self._goals}"
-        self._bridge.send(op="send_action_goal", id=goal, action=self._topics.trajectory,
-                          action_type=FOLLOW, feedback=False, args=content)
-        place, beat = 0, 0.0
+        try:
+            return self._watch(trajectory, content, goal, check)
+        except BaseException as error:
+            self._break_off(goal, error)
+            raise
+
+    def _watch(self, trajectory: Trajectory, content: dict[str, Any], goal: str,
+               check: PullPlausibility | None) -> dict[str, Any]:
+        place, beat, is_echoed = 0, -np.inf, False
+        self._unheard = 0
         self._hold_ups.set_off()
         while True:
             if time.monotonic() - beat > _BEAT_SECONDS:
                 # Sign of life; the node beside the controller stops the arm when it ends.
                 beat = time.monotonic()
+                self._unheard += 1
                 self._bridge.send(op="publish", topic=self._topics.stop, msg={"data": False})
+            if not self._is_sent and (self._unheard == 0 or self._unheard > _MOST_UNHEARD):
+                is_echoed = self._unheard == 0
+                self._set_off(goal, content, is_echoed)
             message = self._bridge.receive(_LISTEN_SECONDS)
             if message is not None:
                 self._hold_ups.note(None if self.last is None else self.last.arrived, moving=True)
-            if (ended := self._ended(message, goal)) is not None:
+            if (ended := self._ended(message, goal, trajectory)) is not None:
                 return ended
             if (sample := self._take(message)) is not None:
                 self._way.note(sample)
                 place = self._nearest(trajectory, sample.joints, place)
                 decision = self._judge(trajectory, sample, place, check)
-            else:
+                if decision.verdict == Verdict.GO:
+                    decision = self._standstill(sample, place)
+            elif (decision := self._modes()).verdict == Verdict.GO:
                 decision = self._silence()
+            if is_echoed and self._unheard > _MOST_UNHEARD:
+                decision = self.guard.event(
+                    "rosbridge passes on nothing while the goal runs, so no stop either: start it "
+                    "with send_action_goals_in_new_thread:=true")
             if decision.verdict != Verdict.GO:
                 return self._stop(goal, decision)
+
+    def _set_off(self, goal: str, content: dict[str, Any], is_echoed: bool) -> None:
+        """Send the goal. The beat came back before: a stop will be passed on too."""
+        assert self.last is not None
+        if not is_echoed:
+            self.warnings.append(f"what Limber publishes on {self._topics.stop} does not come "
+                                 "back from rosbridge: a stop may not be passed on")
+        self._stood, self._stood_at, self._clock = 0.0, self.last.joints, self.last.clock
+        self._may_stand = SECONDS + float(self._rests[0])
+        self._is_sent = True
+        self._bridge.send(op="send_action_goal", id=goal, action=self._topics.trajectory,
+                          action_type=FOLLOW, feedback=False, args=content)
+        self._hold_ups.set_off()
+
+    def _modes(self) -> Decision:
+        """Judge what the controller reports of itself now."""
+        assert self.last is not None
+        return self.guard.modes(replace(self.last, **self.reported))
+
+    def _standstill(self, sample: Sample, place: int) -> Decision:
+        """Judge that the arm stands under its goal for longer than its path rests there.
+
+        Time counts as the controller passes it: scaled by its speed.
+        """
+        passed, self._clock = sample.clock - self._clock, sample.clock
+        if not self._is_sent or np.abs(sample.joints - self._stood_at).max() > _STILL_RAD:
+            self._stood, self._stood_at = 0.0, sample.joints
+            self._may_stand = SECONDS + float(self._rests[place])
+            return GO
+        self._stood += passed * min(sample.slider, 1.0)
+        if self._stood <= self._may_stand:
+            return GO
+        return self.guard.event(f"the arm has stood still for {self._stood:.1f} s under its goal")
 
     def _silence(self) -> Decision:
         """Judge that nothing arrived; a loop that was itself delayed listens once more."""
@@ -295,22 +393,44 @@ class RosRobot:
         held_up = self._hold_ups.has_just_woken
         return self.guard.silence(0.0 if held_up else time.monotonic() - self.last.arrived)
 
-    def _ended(self, message: dict[str, Any] | None, goal: str) -> dict[str, Any] | None:
+    def _ended(self, message: dict[str, Any] | None, goal: str, trajectory: Trajectory,
+               ) -> dict[str, Any] | None:
         """The external end of a goal: its result, or a stop by another party."""
         if message is None:
             return None
-        if message.get("op") == "action_result" and message.get("id") == goal:
-            if message.get("result") and message.get("status", _SUCCEEDED) == _SUCCEEDED:
-                self.guard.end()
-                return {"event": "reached"}
-            values = (message.get("values") or {})
-            why = values.get("error_string") if isinstance(values, dict) else str(values)
+        if _is_result(message, goal):
+            values = message.get("values")
+            told = values if isinstance(values, dict) else {"error_string": values}
+            if message.get("result") and message.get("status", _SUCCEEDED) == _SUCCEEDED and (
+                    not told.get("error_code")):
+                return self._arrived(goal, trajectory)
+            why = told.get("error_string") or "no reason was given"
             return self._stop(goal, self.guard.event(
-                f"the controller in ROS ended the motion ({why or 'no reason was given'})"))
+                f"the controller in ROS ended the motion ({why})"), is_over=True)
         if message.get("op") == "publish" and message.get("topic") == self._topics.stop and (
                 message["msg"].get("data")):
             return self._stop(goal, self.guard.event("a stop was published"))
         return None
+
+    def _arrived(self, goal: str, trajectory: Trajectory) -> dict[str, Any]:
+        """The event of a goal that the controller calls reached."""
+        assert self.last is not None
+        off = float(np.linalg.norm(self.last.pose[:3] - trajectory.poses[-1, :3]))
+        if not off <= _OFF_PATH_M:
+            return self._stop(goal, self.guard.event(
+                f"the controller in ROS calls its goal reached, but the arm is {1000 * off:.0f} mm "
+                "away from its end"), is_over=True)
+        self.guard.end()
+        # The node beside the controller expects no more beats. Once this came back, rosbridge has
+        # passed it on, and the connection may be closed.
+        self._bridge.send(op="publish", topic=self._topics.end, msg={})
+        end = time.monotonic() + _MOST_UNHEARD * _BEAT_SECONDS
+        while time.monotonic() < end:
+            message = self._bridge.receive(_LISTEN_SECONDS)
+            self._take(message)
+            if message is not None and message.get("topic") == self._topics.end:
+                break
+        return {"event": "reached"}
 
     def _judge(self, trajectory: Trajectory, sample: Sample, index: int,
                check: PullPlausibility | None) -> Decision:
@@ -349,18 +469,73 @@ class RosRobot:
         ahead = trajectory.joints[index:index + 50]
         return index + int(np.abs(ahead - joints).max(axis=1).argmin())
 
-    def _stop(self, goal: str, decision: Decision) -> dict[str, Any]:
+    def _stop(self, goal: str, decision: Decision, *, is_over: bool = False) -> dict[str, Any]:
         """Stop on both channels, and check that the arm is at rest."""
         self.guard.event(str(decision))
-        self._bridge.send(op="publish", topic=self._topics.stop, msg={"data": True})
-        self._bridge.send(op="cancel_action_goal", id=goal, action=self._topics.trajectory)
-        event = {"event": "stopped", "reason": str(decision)}
-        end = time.monotonic() + 1.0
-        while time.monotonic() < end:
-            sample = self._take(self._bridge.receive(_LISTEN_SECONDS))
-            if sample is not None and np.abs(sample.joint_speeds).max() < _STANDS_RAD_S:
-                return event | {"stands": True}
-        return event | {"stands": False}
+        stands, reason = self._cancelled(goal, is_over=is_over), str(decision)
+        # Of a protective stop the ended program may be heard first.
+        mode = SAFETY_MODES.get(int(self.reported.get("safety_mode", RUNNING["safety_mode"])))
+        if mode is not None and mode not in reason:
+            reason += f" ({mode})"
+        return {"event": "stopped", "reason": reason, "stands": stands}
+
+    def _cancelled(self, goal: str, *, is_over: bool = False) -> bool:
+        """Cancel a goal and publish a stop; returns whether the arm stands.
+
+        Both are said until the goal has ended: rosbridge drops the cancel of a goal that the
+        controller has not accepted yet, and what it has not processed when the connection closes.
+        """
+        end, said, stands = time.monotonic() + SECONDS, -np.inf, False
+        is_over = is_over or not self._is_sent
+        while True:
+            if time.monotonic() - said > _BEAT_SECONDS:
+                said = time.monotonic()
+                self._bridge.send(op="publish", topic=self._topics.stop, msg={"data": True})
+                self._bridge.send(op="cancel_action_goal", id=goal, action=self._topics.trajectory)
+            message = self._bridge.receive(_LISTEN_SECONDS)
+            is_over = is_over or _is_result(message, goal)
+            # A message that broke the motion off may come again; here it only does not show where
+            # the arm is.
+            with suppress(Exception):
+                if (sample := self._take(message)) is not None:
+                    stands = bool(np.abs(sample.joint_speeds).max() < _STANDS_RAD_S)
+            if is_over and stands:
+                return True
+            if time.monotonic() > end:
+                break
+        if not is_over:
+            self.warnings.append("the controller in ROS did not confirm within "
+                                 f"{SECONDS:g} s that its goal is cancelled: check the robot")
+        return stands
+
+    def _break_off(self, goal: str, error: BaseException) -> None:
+        """Cancel a goal because of an error, which is still to be raised."""
+        self.guard.event("the motion was broken off")
+        try:
+            stands = self._cancelled(goal)
+        except ConnectionError as lost:
+            if error is not lost and not isinstance(error, ConnectionError):
+                self.warnings.append(f"the motion was broken off, but {lost}: whether the arm "
+                                     "stands is not known. Check the robot; its stop node acts on "
+                                     "silence")
+            return
+        self.warnings.append("the motion was broken off: its goal was cancelled and a stop was "
+                             "published. The arm " + (
+                                 "stands" if stands else f"did not stand within {SECONDS:g} s"))
+
+
+def _rests(trajectory: Trajectory) -> np.ndarray:
+    """How long a trajectory stays near each of its rows, or the rows beside it [s], shape [n]."""
+    assert trajectory.joints is not None
+    ways = np.r_[0.0, np.abs(np.diff(trajectory.joints, axis=0)).max(axis=1).cumsum()]
+    ends = np.searchsorted(ways, ways + _STILL_RAD, side="right")
+    rests = trajectory.times[np.minimum(ends, len(ways) - 1)] - trajectory.times
+    return np.maximum(rests, np.maximum(np.r_[rests[0], rests[:-1]], np.r_[rests[1:], 0.0]))
+
+
+def _is_result(message: dict[str, Any] | None, goal: str) -> bool:
+    return message is not None and message.get("op") == "action_result" and (
+        message.get("id") == goal)
 
 
 def _moves_already() -> SafetyStop:

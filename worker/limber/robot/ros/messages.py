@@ -1,6 +1,7 @@
 """Messages of ROS 2 as the robot's own values: joint states, wrenches, trajectories."""
 
 import base64
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,14 +9,23 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.cell.cell import Cell
-from limber.robot.interface import Sample
+from limber.robot.interface import PLAYING, Sample
 from limber.robot.motion.trajectory import Trajectory
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 STOP = "std_msgs/msg/Bool"
+END = "std_msgs/msg/Empty"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 FOLLOW = "control_msgs/action/FollowJointTrajectory"
+STATUS_KINDS = {"safety_mode": "ur_dashboard_msgs/msg/SafetyMode",
+                "robot_mode": "ur_dashboard_msgs/msg/RobotMode",
+                "runtime_state": "std_msgs/msg/Bool", "slider": "std_msgs/msg/Float64"}
+"""What the UR driver publishes of its controller: the field of a sample, and the message."""
+RUNNING: dict[str, Any] = {"safety_mode": 1, "robot_mode": 7, "runtime_state": PLAYING,
+                           "slider": 1.0}
+"""A controller in order: of an arm whose driver publishes nothing of it."""
+_PROGRAM_STOPPED = 1
 _AXES = ("x", "y", "z")
 _SPLINE_RAD = 5e-5  # from a trajectory between two points of its goal; .05 mm at a reach of 1 m
 _FLOATS = {7: "f4", 8: "f8"}  # sensor_msgs/msg/PointField
@@ -28,55 +38,84 @@ def stamp_of(message: dict[str, Any]) -> float:
 
 
 class JointStates:
-    """Turns joint states into samples of a cell's arm.
+    """Turns joint states into samples of a cell's arm; those of other nodes are passed over.
 
     Args:
         cell: Its arm and tool.
-        names: Names in the first message.
-
-    Raises:
-        InputError: a joint of the arm is missing, or matches two names.
 
     Attributes:
-        ordered: The names in the arm's order.
+        ordered: The joints' names in ROS, in the arm's order; empty before its first message.
+        others: Names in the last message that was not of this arm.
     """
 
-    def __init__(self, cell: Cell, names: list[str]):
+    def __init__(self, cell: Cell):
         self._arm = cell.arm
         self._tool = matrices(np.array(cell.tool.grasp_pose))
-        self._chosen, self.ordered = [], []
-        for joint in cell.arm.ros_joints:
-            found = [k for k, name in enumerate(names) if joint in name]
-            if len(found) != 1:
-                raise InputError(f"{len(found)} joints of ROS are named like {joint}: "
-                                 f"{', '.join(names)}.", f"A {cell.arm.name} has one.",
-                                 "Check robot.model in the cell file and the topic of the joint "
-                                 "states.")
-            self._chosen.append(found[0])
-            self.ordered.append(names[found[0]])
+        self.ordered: list[str] = []
+        self.others: list[str] = []
 
-    def sample(self, message: dict[str, Any], arrived: float) -> Sample:
-        """Return the sample of a message that arrived at ``arrived`` [s, monotonic]. Values that
-        ROS does not report are those of a running robot.
+    def sample(self, message: dict[str, Any], arrived: float,
+               status: Mapping[str, Any] = RUNNING) -> Sample | None:
+        """Return the sample of a message that arrived at ``arrived`` [s, monotonic]; None if it
+        does not have all joints of the arm.
 
         Missing numbers are NaN, for which the guard stops.
-        """
-        joints = self._of(message, "position")
-        speeds = self._of(message, "velocity")
-        flange = self._arm.forward(joints)
-        speed = self._arm.jacobian(joints) @ speeds
-        lever = flange[:3, :3] @ self._tool[:3, 3]
-        speed[:3] += np.cross(speed[3:], lever)
-        return Sample(clock=stamp_of(message), arrived=arrived, joints=joints,
-                      joint_speeds=speeds, pose=pose_vectors(flange @ self._tool), speed=speed,
-                      wrench=np.zeros(6), robot_mode=7, safety_mode=1, runtime_state=2,
-                      slider=1.0)
 
-    def _of(self, message: dict[str, Any], name: str) -> np.ndarray:
-        values = message.get(name) or []
-        if len(values) <= max(self._chosen):
-            return np.full(len(self._chosen), np.nan)
-        return np.array([np.nan if values[k] is None else values[k] for k in self._chosen], float)
+        Args:
+            status: What the controller reports of itself, by the names of :class:`.Sample`.
+
+        Raises:
+            InputError: a joint of the arm matches two names, or another arm's joints come too.
+        """
+        if (chosen := self._chosen(message["name"])) is None:
+            self.others = list(message["name"])
+            return None
+        joints = _of(message, "position", chosen)
+        speeds = _of(message, "velocity", chosen)
+        pose, speed = np.full(6, np.nan), np.full(6, np.nan)
+        if np.isfinite(joints).all():
+            flange = self._arm.forward(joints)
+            pose = pose_vectors(flange @ self._tool)
+            speed = self._arm.jacobian(joints) @ speeds
+            speed[:3] += np.cross(speed[3:], flange[:3, :3] @ self._tool[:3, 3])
+        return Sample(clock=stamp_of(message), arrived=arrived, joints=joints,
+                      joint_speeds=speeds, pose=pose, speed=speed, wrench=np.zeros(6),
+                      **status)
+
+    def _chosen(self, names: list[str]) -> list[int] | None:
+        """Where the arm's joints are in a message's names, or None."""
+        if self.ordered and set(self.ordered) <= set(names):
+            return [names.index(name) for name in self.ordered]
+        found = [[k for k, name in enumerate(names) if name == joint]
+                 or [k for k, name in enumerate(names) if joint in name]
+                 for joint in self._arm.ros_joints]
+        if not all(found):
+            return None
+        for number, (joint, places) in enumerate(zip(self._arm.ros_joints, found, strict=True)):
+            alike = self.ordered[number:number + 1] + [names[k] for k in places]
+            if len(alike) != 1:
+                raise InputError(f"{len(alike)} joints of ROS are named like {joint}: "
+                                 f"{', '.join(alike)}.", f"A {self._arm.name} has one.",
+                                 "Check robot.model in the cell file, and that only one such arm "
+                                 "publishes on the topic of the joint states.")
+        self.ordered = [names[places[0]] for places in found]
+        return [places[0] for places in found]
+
+
+def _of(message: dict[str, Any], name: str, chosen: list[int]) -> np.ndarray:
+    values = message.get(name) or []
+    if len(values) <= max(chosen):
+        return np.full(len(chosen), np.nan)
+    return np.array([np.nan if values[k] is None else values[k] for k in chosen], float)
+
+
+def status_of(name: str, message: dict[str, Any]) -> float:
+    """Return what a message of :data:`STATUS_KINDS` reports, as :class:`.Sample` has it."""
+    if name == "slider":  # in per cent
+        return np.nan if message["data"] is None else 0.01 * float(message["data"])
+    if name == "runtime_state":
+        return PLAYING if message["data"] else _PROGRAM_STOPPED
+    return int(message["mode"])
 
 
 def wrench_of(message: dict[str, Any]) -> np.ndarray:

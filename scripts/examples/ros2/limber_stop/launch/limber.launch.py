@@ -18,7 +18,9 @@ def generate_launch_description():
     return LaunchDescription([
         DeclareLaunchArgument("urdf", default_value=""),
         Node(package="rosbridge_server", executable="rosbridge_websocket",
-             parameters=[{"address": "127.0.0.1", "port": 9090}]),
+             # Or a running goal blocks whatever comes after it, its own cancel too.
+             parameters=[{"address": "127.0.0.1", "port": 9090,
+                          "send_action_goals_in_new_thread": True}]),
         Node(package="limber_stop", executable="stop_node"),
         Node(package="robot_state_publisher", executable="robot_state_publisher",
              condition=IfCondition(PythonExpression(["'", urdf, "' != ''"])),

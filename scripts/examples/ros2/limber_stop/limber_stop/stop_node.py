@@ -3,7 +3,7 @@
 import rclpy
 from action_msgs.srv import CancelGoal
 from rclpy.node import Node
-from std_msgs.msg import Bool
+from std_msgs.msg import Bool, Empty
 
 from limber_stop.watch import Watch
 
@@ -17,9 +17,11 @@ class StopNode(Node):
         super().__init__("limber_stop")
         action = self.declare_parameter("action", ACTION).value
         topic = self.declare_parameter("topic", "/limber/stop").value
+        end = self.declare_parameter("end", "/limber/end").value
         self._watch = Watch()
         self._cancel = self.create_client(CancelGoal, f"{action}/_action/cancel_goal")
         self.create_subscription(Bool, topic, self._heard, 10)
+        self.create_subscription(Empty, end, lambda _: self._watch.ended(), 10)
         self.create_timer(0.02, self._look)
 
     def _now(self):

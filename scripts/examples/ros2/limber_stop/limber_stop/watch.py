@@ -17,6 +17,10 @@ class Watch:
         self._beat = None if stop else now
         return stop
 
+    def ended(self) -> None:
+        """The motion has come to its end: no more beats follow."""
+        self._beat = None
+
     def is_silent(self, now: float) -> bool:
         """Whether the beat has ended without a word; told once."""
         if self._beat is None or now - self._beat <= self._longest:
