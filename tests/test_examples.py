@@ -14,6 +14,8 @@ import pytest
 
 import limber
 from limber.batch.jobs.job_file import read_jobs
+from limber.batch.stage_task import run_task
+from limber.core.progress import SILENT
 from limber.recordings.recording import read_pull
 from limber.stages.pulls.export_pull import export_pull
 
@@ -155,14 +157,27 @@ def test_rendering(tmp_path):
     assert all(np.abs(sides[k] - sides[k - 1]).max() > 30 for k in range(3))
 
 
-def test_the_job_file(tmp_path):
-    """It is checked whole; each scan gets its stages, and a file of its name."""
+@pytest.mark.slow
+def test_the_job_file(tmp_path, monkeypatch):
+    """It is checked whole, and takes the tables that the guide offers: two make one pull."""
     shutil.copyfile(SCRIPTS / "night.toml", tmp_path / "night.toml")
-    for name in ("scans/apple.ply", "scans/pear.ply", "pulls/apple/one.csv", "pulls/apple/two.csv",
-                 "pulls/pear/one.csv"):
+    for name in ("scans/apple.ply", "scans/pear.ply"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("")
+    for folder in ("apple", "pear"):
+        for kind in ("markers", "robot"):
+            for name in ("one", "two")[:1 + (folder == "apple")]:
+                path = tmp_path / "pulls" / folder / kind / f"{name}.csv"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(SCRIPTS / "pull" / f"{kind}.csv", path)
     apple, _ = read_jobs(tmp_path / "night.toml").branches
     assert [task.label for task in apple.tasks] == [
         "reconstruct", "import-pull:one", "import-pull:two", "estimate", "report", "scene"]
     assert apple.tasks[-1].inputs.render == tmp_path / "results" / "apple.png"
+    shutil.copytree(ROOT / "blend_files" / "mature", apple.folder)
+    monkeypatch.chdir(tmp_path)
+    for task in apple.tasks[1:3]:
+        outcome = run_task(task, apple.folder, SILENT)
+        assert not outcome["error"] and outcome["result"]["frame_count"] == 24
+    pull = read_pull(apple.folder / "pulls" / "two")
+    assert np.isfinite(pull.wrenches[:, :3]).all() and pull.observations.point_count == 4
