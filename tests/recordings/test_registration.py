@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
-from limber.recordings.importing.import_request import require_on_branch
+from limber.recordings.importing.import_request import BranchFrame, require_on_branch
 from limber.recordings.recording import GraspEntry
 from limber.recordings.registration import register
 
@@ -48,6 +48,7 @@ def test_a_grasp_beside_the_branch_is_refused():
     nodes = np.array([[0.0, 0.0, z] for z in np.linspace(0, 0.5, 20)])
     beside = GraspEntry(point_m=(0.0, 0.2, 0.4), radius_m=0.01)
     with pytest.raises(InputError, match="from the branch"):
-        require_on_branch(beside, "pull", nodes)
-    require_on_branch(beside, "pull", None)
-    require_on_branch(GraspEntry(point_m=(0.0, 0.01, 0.4), radius_m=0.01), "pull", nodes)
+        require_on_branch(beside, "pull", BranchFrame(nodes=nodes))
+    require_on_branch(beside, "pull", BranchFrame())
+    require_on_branch(GraspEntry(point_m=(0.0, 0.01, 0.4), radius_m=0.01), "pull",
+                      BranchFrame(nodes=nodes))

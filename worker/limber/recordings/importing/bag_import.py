@@ -41,7 +41,7 @@ def read_bag_pull(path: Path, request: ImportRequest) -> Pull:
                           sigma=settings.position_sigma or 1e-3)
     if recorded is not None:
         entry = _with_recorded(entry, recorded, request)
-    require_on_branch(entry.grasp, request.name, request.branch.nodes)
+    require_on_branch(entry.grasp, request.name, request.branch)
     return of_known_robot(Pull(request.name, entry, found.robot.times, poses, wrenches, seen,
                                (*found.warnings, *warnings)), asked)
 
@@ -62,7 +62,7 @@ def _markers(seen: Observations, recorded: PullEntry | None, request: ImportRequ
     seen = replace(seen, positions=placed.apply(positions) if placed else positions)
     rest = np.array(at_rest) if known else seen.positions[0]
     if request.branch.nodes is not None:
-        require_near(rest, request.name, request.branch.nodes)
+        require_near(rest, request.name, request.branch)
     return seen, rest
 
 

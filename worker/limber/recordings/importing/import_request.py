@@ -12,10 +12,12 @@ from limber.core.alignment import Alignment
 from limber.core.constants import GRAVITY
 from limber.core.errors import InputError
 from limber.core.files.reading import read_toml
+from limber.core.not_none import present
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.recordings.bags.bag_pull import JointPoses
 from limber.recordings.cell_errors import CalibrationEntry
+from limber.recordings.importing.slips import likely_slip
 from limber.recordings.recording import GraspEntry, Pull, PullEntry, SensorEntry, entry_with
 from limber.recordings.registration import Registration, read_nominal, register
 from limber.recordings.settings import ImportSettings
@@ -181,38 +183,44 @@ class ImportRequest:
             rest_points_m=None if rest is None else tuple(map(tuple, rest.tolist())))
 
 
-def require_on_branch(grasp: GraspEntry, name: str, nodes: np.ndarray | None) -> None:
+def require_on_branch(grasp: GraspEntry, name: str, branch: BranchFrame) -> None:
     """Refuse a grasp beside the branch.
 
     Raises:
         InputError: no node is within two grasp radii (and 5 mm) of it.
     """
+    nodes = branch.nodes
     if nodes is None:
         return
     off = float(np.linalg.norm(nodes - np.array(grasp.point_m), axis=1).min())
-    if off > 2 * grasp.radius_m + 5e-3:
+    near = 2 * grasp.radius_m + 5e-3
+    if off > near:
+        slip = likely_slip(np.array([grasp.point_m]), nodes, branch.alignment, near)
         point = ", ".join(f"{value:.4g}" for value in grasp.point_m)
         raise InputError(
             f"{name}: the grasp point ({point}) m is {off * 1e3:.0f} mm away from the branch.",
             "The gripper would not hold the branch. The point, or the whole recording, has "
-            "another frame of reference or unit.",
+            f"another frame of reference or unit. {slip}".rstrip(),
             "Give a --grasp-point on the branch, in the frame set by --coordinates, and check "
             "--unit.")
 
 
-def require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:
+def require_near(rest: np.ndarray, name: str, branch: BranchFrame) -> None:
     """Refuse markers that are not at the branch, such as those in a capture system's own frame.
 
     Raises:
         InputError: one is farther from the mesh than a quarter of its extent.
     """
+    nodes = present(branch.nodes, "mesh of the branch")
     off = np.array([np.linalg.norm(nodes - point, axis=1).min() for point in rest])
     extent = float(np.linalg.norm(np.ptp(nodes, axis=0)))
     if off.max() > 0.25 * extent:
+        slip = likely_slip(rest[np.isfinite(rest).all(axis=1)], nodes, branch.alignment,
+                           0.25 * extent)
         raise InputError(
             f"{name}: at rest a marker is {off.max() * 1e3:.0f} mm away from the branch, which is "
             f"{extent * 1e3:.0f} mm long.",
-            "The recording has another frame of reference or another unit.",
+            f"The recording has another frame of reference or another unit. {slip}".rstrip(),
             "Give the markers' positions on the branch with --nominal, or the pose of their frame "
             "with --marker-frame, and check --unit.")
 

@@ -86,7 +86,7 @@ def _placed(rest: np.ndarray, positions: np.ndarray, labels: list[str], request:
         rest, positions = placed.apply(rest), placed.apply(positions)
     for message in (*warnings, *(placed.warnings if placed else ())):
         request.progress.warn(message)
-    require_near(rest, request.name, _nodes(request))
+    require_near(rest, request.name, request.branch)
     return _Placed(rest, positions, [labels[k] for k in used], placed.rms if placed else None)
 
 
@@ -141,7 +141,7 @@ def _write(request: ImportRequest, found: _Placed, times: np.ndarray, moved: np.
                           sigma=sigma)
     entry = request.as_stated(entry.model_copy(
         update={"calibration": WITHOUT_GRIPPER, **further}))
-    require_on_branch(entry.grasp, request.name, nodes)
+    require_on_branch(entry.grasp, request.name, request.branch)
     poses = np.zeros((2, 6))
     poses[:, :3] = entry.grasp.point_m
     wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))
@@ -178,7 +178,7 @@ def import_gauge(table: ForceTable, request: ImportRequest) -> dict[str, Any]:
             "point_sigma_m": CalibrationEntry().point_sigma_m, "camera_sigma_rad": 0.0}),
         "sensor": entry.sensor.model_copy(
             update={"measured_direction": tuple(direction.tolist())})}))
-    require_on_branch(entry.grasp, request.name, nodes)
+    require_on_branch(entry.grasp, request.name, request.branch)
     times = np.arange(len(table.force), dtype=float)
     seen = point + (table.displacement - zero)[:, None, None] * direction
     poses, wrenches = np.zeros((2, len(times), 6))

@@ -26,6 +26,7 @@ from limber.recordings.importing.recording_formats import (
     RecordingFormat,
     recording_format,
 )
+from limber.recordings.importing.slips import require_no_slip
 from limber.recordings.recording import (
     Observations,
     Pull,
@@ -154,6 +155,11 @@ def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEn
 
 def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
     """The pull of the branch's observations, or of the robot's log, and the robot's table."""
+    if chosen.holds == "robot" and request.settings.robot is not None:
+        raise InputError(
+            f"{request.source.name} holds a gripper's positions and forces, and --robot was given "
+            "as well.", "The two tables are likely exchanged.",
+            f"Give the markers as SOURCE, and --robot {request.source.name}.")
     found, settings = _read(chosen, request), request.settings
     observations: Observations | None = None
     rest: np.ndarray | None = None
@@ -170,9 +176,9 @@ def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
         "none" if chosen.holds == "robot" else chosen.holds, rest, drive=settings.drive,
         mode=settings.grasp_mode, sigma=settings.position_sigma or 1e-3,
         grasp=request.grasp_or(lambda: poses[np.isfinite(poses).all(axis=1)][0]))
-    require_on_branch(entry.grasp, request.name, request.branch.nodes)
-    pull = Pull(request.name, entry, robot.times, poses, wrenches, observations,
-                (*messages, *robot.warnings))
+    pull = require_no_slip(Pull(request.name, entry, robot.times, poses, wrenches, observations,
+                                (*messages, *robot.warnings)))
+    require_on_branch(entry.grasp, request.name, request.branch)
     return of_known_robot(pull, request) if chosen.holds == "robot" else pull
 
 
@@ -207,7 +213,7 @@ def _seen(read: tuple[Stream, list[str]], request: ImportRequest,
     placed = request.registered(seen.positions[0], labels)
     if placed is None:
         if request.branch.nodes is not None:
-            require_near(seen.positions[0], request.name, request.branch.nodes)
+            require_near(seen.positions[0], request.name, request.branch)
         if not request.own_markers(seen.positions):
             return seen, None, list(stream.warnings)
         return _at_rest_first(seen, labels, stream, request.name)
