@@ -166,9 +166,11 @@ def test_a_new_cell_shows_every_section_and_key(tmp_path, capfd):
             command.main(["new-cell", str(path), *options], standalone_mode=False)
         capfd.readouterr()
         return stop.value.code
-    assert run("--model", "ur10", "--mass-kg", "1.1", "--gripper", "digital_output") == 0
+    assert run("--model", "ur10", "--mass-kg", "1.1", "--gripper", "digital_output",
+               "--grasp-distance", "0.2") == 0
     cell = read_cell(path)
     assert (cell.arm.name, cell.tool.mass_kg, cell.sensor.kind) == ("ur10", 1.1, "ft300")
+    assert cell.tool.grasp_pose == (0, 0, 0.2, 0, 0, 0)
     assert cell.camera is cell.second_arm is cell.workspace is None and not cell.obstacles
     text = path.read_text(encoding="utf-8")
     assert run() == 2 and path.read_text(encoding="utf-8") == text
@@ -183,6 +185,42 @@ def test_a_new_cell_shows_every_section_and_key(tmp_path, capfd):
     schema = Cell.model_json_schema()
     wanted = {key for entry in schema["$defs"].values() for key in entry["properties"]}
     assert wanted <= keys
+
+
+@pytest.mark.parametrize("tool, told", [
+    ({"gripper": "robotiq"}, r"line \d+: tool.grasp_pose is at the flange"),
+    ({"gripper": "digital_output", "grasp_pose": [0, 0, 0, 0, 0, 1.5],
+      "parts": [{"start_m": [0, 0, 0], "end_m": [0, 0, 0.1], "radius_m": 0.04}]},
+     "tool.grasp_pose is at the flange"),
+    ({"gripper": "by_hand", "mass_kg": 0.9}, "tool.grasp_pose is at the flange"),
+    ({"gripper": "robotiq", "mass_kg": 0, "grasp_pose": [0, 0, 0.15, 0, 0, 0]},
+     "tool.mass_kg is 0, the mass of a bare flange")])
+def test_a_gripper_with_the_values_of_a_bare_flange_is_refused(tmp_path, tool, told):
+    content = {"robot": {"model": "ur5e", "address": "192.168.0.10"},
+               "base": {"pose": [0.6, 0.1, 0, 0, 0, 1.2]}, "tool": tool}
+    path = tmp_path / "cell.toml"
+    path.write_text(tomlkit.dumps(content))
+    with pytest.raises(InputError, match=told):
+        read_cell(path)
+    content["tool"] = {"gripper": "none", "mass_kg": 0}
+    path.write_text(tomlkit.dumps(content))
+    assert read_cell(path).tool.gripper == "none"
+
+
+def test_a_new_cell_says_what_is_to_be_filled_in_instead_of_zero(tmp_path, capfd):
+    path = tmp_path / "new.toml"
+    with pytest.raises(SystemExit) as stop:
+        command.main(["new-cell", str(path), "--gripper", "robotiq", "--json"],
+                     standalone_mode=False)
+    told = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert stop.value.code == 0 and told["to_fill_in"] == ["tool.grasp_pose", "tool.mass_kg"]
+    text = path.read_text(encoding="utf-8")
+    assert text.count("TO FILL IN") == 2 and "\ngrasp_pose" not in text
+    with pytest.raises(InputError, match="State where the branch lies between the fingers"):
+        read_cell(path)
+    path.write_text(text.replace("# grasp_pose =", "grasp_pose =", 1).replace(
+        "# mass_kg =", "mass_kg ="), encoding="utf-8")
+    assert read_cell(path).tool.mass_kg == 0.9
 
 
 def test_the_schema_of_a_cell_names_its_sections(capfd):

@@ -55,7 +55,8 @@ def served(own_address):
 
 def cell_at(address: str) -> Cell:
     return Cell(robot={"model": "ur5e", "address": address}, base={"pose": (0,) * 6},
-                tool={"gripper": "robotiq", "grip_seconds": 0.1, "grip_force": 0.4})
+                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "gripper": "robotiq",
+                      "grip_seconds": 0.1, "grip_force": 0.4})
 
 
 class Link:

@@ -21,8 +21,9 @@ from limber.stages.paths.arm_moves import to_joints
 from limber.stages.paths.arm_surroundings import ArmSurroundings
 from limber.store import Branch
 
+GRASP = (0, 0, 0.15, 0, 0, 0)
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
-            tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0),
+            tool={"grasp_pose": GRASP,
                   "parts": [{"start_m": (0, 0, 0), "end_m": (0, 0, 0.15), "radius_m": 0.04}]})
 HOME = np.array(CELL.arm.home)
 ASIDE = HOME + [1.6, 0, 0, 0, 0, 0]
@@ -110,7 +111,8 @@ def test_home_and_retreat_move_only_when_armed(e_series, tmp_path, capfd):
     """Back along the way of a killed program; then home from there, joints exact."""
     cell = cell_for(e_series.address)
     cell = cell.model_copy(update={"tool": cell.tool.model_copy(update={
-        "mass_kg": 0.0, "gripper": "digital_output", "grip_seconds": 0.1})})
+        "grasp_pose": GRASP, "mass_kg": 0.0, "gripper": "digital_output",
+        "grip_seconds": 0.1})})
     path = str(cell_file(cell, tmp_path))
     with RobotLink(cell) as link:
         begin = np.array(e_series.state["pose"])
@@ -137,8 +139,9 @@ def test_release_opens_the_gripper_and_goes_away_from_the_branch(e_series, tmp_p
     """Slow: the command starts a driver, and the arm goes back 20 mm in real time."""
     cell = cell_for(e_series.address)
     cell = cell.model_copy(update={
-        "tool": cell.tool.model_copy(update={"mass_kg": 0.0, "gripper": "digital_output",
-                                             "grip_seconds": 0.1}),
+        "tool": cell.tool.model_copy(update={
+            "grasp_pose": GRASP, "mass_kg": 0.0, "grip_seconds": 0.1,
+            "gripper": "digital_output"}),
         "approach": cell.approach.model_copy(update={"distance_m": 0.02})})
     path = str(cell_file(cell, tmp_path))
     e_series.ask("outputs", value=1)
@@ -173,7 +176,8 @@ def test_the_gripper_opens_while_the_robot_is_stopped(own_address, tmp_path, cap
 
     cell = cell_for(own_address)
     cell = cell.model_copy(update={"tool": cell.tool.model_copy(update={
-        "gripper": "digital_output", "grip_seconds": 0.1, "close_output": 3})})
+        "grasp_pose": GRASP, "gripper": "digital_output", "grip_seconds": 0.1,
+        "close_output": 3})})
     path = str(cell_file(cell, tmp_path))
     with new_robot(own_address, "ur5e", 1) as robot:
         robot.ask("outputs", value=0b1001)

@@ -40,7 +40,8 @@ class Link:
 
 def cell_with(gripper: str) -> Cell:
     return Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
-                tool={"gripper": gripper, "grip_seconds": 0.01})
+                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "gripper": gripper,
+                      "grip_seconds": 0.01})
 
 
 STOPPED = {"event": "stopped", "reason": "the force rises during the return [N] (41, allowed 38)"}

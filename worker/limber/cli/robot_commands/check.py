@@ -89,6 +89,11 @@ def _not_stated(cell: Cell) -> list[str]:
         found.append("The cell names no branch, so it is taken for each one.")
     if cell.tool.mass_kg is None:
         found.append("tool.mass_kg is not stated. No motion starts without it.")
+    if not any(cell.tool.grasp_pose[:3]) and cell.tool.gripper != "none":
+        found.append("tool.grasp_pose is not stated: the flange itself would go to the branch.")
+    if cell.tool.mass_kg and not any(cell.tool.centre_of_mass_m):
+        found.append("tool.centre_of_mass_m is not stated, so the gripper's weight counts as if it "
+                     "were in the flange; its torque is then taken for one of the branch.")
     if not cell.tool.parts:
         found.append("tool.parts is empty, so the gripper itself is not checked against obstacles.")
     if not cell.obstacles:

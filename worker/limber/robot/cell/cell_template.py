@@ -7,11 +7,12 @@ import tomlkit
 from pydantic import BaseModel
 
 from limber.core.json_values import plain
-from limber.robot.cell.cell import Cell
+from limber.robot.cell.cell import Cell, ToolEntry
 
 _WRITTEN = ("format_version", "branch", "calibrated")  # by `limber robot calibrate`
 _EXAMPLES: dict[str, Any] = {
-    "tool": {"parts": [{"start_m": [0.0, 0.0, 0.0], "end_m": [0.0, 0.0, 0.12],
+    "tool": {"grasp_pose": [0.0, 0.0, 0.15, 0.0, 0.0, 0.0], "mass_kg": 0.9,
+             "parts": [{"start_m": [0.0, 0.0, 0.0], "end_m": [0.0, 0.0, 0.12],
                         "radius_m": 0.04}]},
     "robot": {"version": "5.11.6", "joint_limits_rad": [[-3.1, 3.1]] * 6},
     "base": {"residual_m": 0.001},
@@ -25,6 +26,8 @@ _EXAMPLES: dict[str, Any] = {
                    "pose": [0.5, 0.0, -0.02, 0.0, 0.0, 0.0]},
                   {"kind": "mesh", "name": "pot", "file": "pot.stl", "unit": "mm"}]}
 """Values that a user has to replace; they are commented out."""
+TO_FILL_IN = ("grasp_pose", "mass_kg")
+"""Keys of [tool] for which no value is usual: without them nothing moves."""
 
 _HEAD = """\
 # The cell: which robot stands where beside the branch, what it holds, what it must not exceed.
@@ -49,10 +52,18 @@ def cell_template(cell: Cell) -> str:
             continue
         kind = _model_of(entry.annotation)
         stated = plain(value) if value is not None else {}
+        if name == "tool":
+            stated = {key: stated[key] for key in stated if key not in not_stated(cell)}
         lines = "\n".join(_lines(kind, stated, _EXAMPLES.get(name, {}), value is None))
         mark = "# " if value is None else ""
         parts.append(f"# {_first_line(kind)}\n{mark}[{name}]\n{lines}\n")
     return "\n".join(parts)
+
+
+def not_stated(cell: Cell) -> list[str]:
+    """Return the keys of [tool] that a cell with a gripper still has to state."""
+    return [] if cell.tool.gripper == "none" else [
+        name for name in TO_FILL_IN if getattr(cell.tool, name) == getattr(ToolEntry(), name)]
 
 
 def _lines(kind: type[BaseModel], stated: dict[str, Any], examples: dict[str, Any],
@@ -64,6 +75,8 @@ def _lines(kind: type[BaseModel], stated: dict[str, Any], examples: dict[str, An
             value, mark = examples.get(name, entry.default), "# "
         if entry.description:
             yield f"# {entry.description}"
+        if mark and kind is ToolEntry and name in TO_FILL_IN:
+            yield "# TO FILL IN, measured at your gripper; the next line is only an example."
         yield f"{mark}{name} = {_written(value)}"
 
 

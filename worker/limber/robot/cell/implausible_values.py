@@ -30,6 +30,7 @@ def slips(cell: "Cell") -> Iterator[str]:
     """
     yield from _joint_slips(cell)
     yield from _pose_slips(cell)
+    yield from _tool_slips(cell)
     yield from _limit_slips(cell)
     if cell.sensor.kind != "none":
         yield from _sensor_slips(cell.sensor, cell.limits.hard_force_n, cell.limits.hard_torque_nm)
@@ -76,6 +77,21 @@ def _pose_slips(cell: "Cell") -> Iterator[str]:
     for number, part in enumerate(cell.tool.parts):
         for end in ("start_m", "end_m"):
             yield from _far(f"tool.parts.{number}.{end}", getattr(part, end), _AT_FLANGE)
+
+
+def _tool_slips(cell: "Cell") -> Iterator[str]:
+    """Values of the gripper that are those of a bare flange."""
+    tool = cell.tool
+    is_driven = tool.gripper in ("digital_output", "robotiq")
+    if not any(tool.grasp_pose[:3]) and tool.gripper != "none" and (is_driven or tool.mass_kg):
+        yield (f"tool.grasp_pose is at the flange, where the gripper (tool.gripper = "
+               f'"{tool.gripper}") is screwed on; the flange would go where the fingers should be. '
+               "State where the branch lies between the fingers, in the flange's frame, such as "
+               "[0, 0, 0.15, 0, 0, 0] for fingers 0.15 m before it")
+    if is_driven and tool.mass_kg == 0 and not cell.robot.address.startswith("127."):
+        yield ("tool.mass_kg is 0, the mass of a bare flange, but tool.gripper is "
+               f'"{tool.gripper}"; its weight would be taken for a force on the '
+               "branch. State what the flange carries (`limber robot weigh` compares it)")
 
 
 def _far(name: str, position: Any, most: float) -> Iterator[str]:
