@@ -13,7 +13,8 @@ from limber.robot.motion.legs import described, legs_of
 from limber.stages.paths.plan_legs import legs_in_cell, legs_without_cell
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},
-            tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "grip_seconds": 0.5})
+            tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "grip_seconds": 0.5},
+            limits={"contact_n_per_m": 1000.0})
 ALONG = np.array([0.0, 0.0, 0.5]) + np.linspace(0, 1, 12)[:, None] * [0.08, 0.03, -0.02]
 
 

@@ -359,7 +359,7 @@ def test_way_points_out_of_reach_are_refused(tmp_path):
 
 def test_out_and_back_takes_as_long_each_way():
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},
-                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0)})
+                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0)}, limits={"contact_n_per_m": 1000.0})
     frames = np.tile(matrices(np.array([0.0, 0.0, 0.5, 0, 1.2, 0])), (3, 1, 1))
     frames[1, 0, 3], frames[2, 0, 3], frames[2, 1, 3] = 0.02, 0.02, 0.03
     made = there_and_back(cell, frames, speed=0.03, cycles=2, pause=0.5)

@@ -5,11 +5,13 @@ import pytest
 
 from benchmarks.robot_stepped import Run, Wall
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import matrices
 from limber.robot.cell.cell import Cell
 from limber.robot.motion.contact_speed import contact_speed, speed_within
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.robot.virtual.controller import Controller
+from limber.stages.pulls.record_path import there_and_back
 
 TOOL = np.array([0.0, 0.0, 0.15])
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
@@ -52,26 +54,47 @@ def test_a_wall_at_full_speed_stays_below_the_hard_limit(monkeypatch, predicted)
     assert np.abs(run.control.controller.speeds).max() < 1e-3
 
 
-@pytest.mark.parametrize("stiffness", [5e3, 1e5])
-def test_at_the_speed_that_is_chosen_a_contact_stays_below_the_hard_limit(monkeypatch, stiffness):
-    """A soft one needs no less than the cell's speed; a stiff one is met slowly."""
-    cell = CELL.model_copy(update={"limits": CELL.limits.model_copy(update={
+def stating(stiffness: float) -> Cell:
+    return CELL.model_copy(update={"limits": CELL.limits.model_copy(update={
         "contact_n_per_m": stiffness})})
-    speed = speed_within(cell, 0.05)
-    assert (speed == 0.05) == (stiffness == 5e3)
-    assert speed == min(0.05, contact_speed(cell, stiffness)) > 0.005
-    assert speed_within(CELL, 0.05) == 0.05
-    _, wall, event = against_a_wall(monkeypatch, speed, stiffness, predicted=False, cell=cell)
+
+
+@pytest.mark.parametrize("predicted", [True, False])
+@pytest.mark.parametrize("stiffness", [5e3, 1e5, None])
+def test_at_the_speed_that_is_chosen_a_contact_stays_below_the_hard_limit(
+        monkeypatch, stiffness, predicted):
+    """A soft one needs no less than the cell's speed; a rigid one, the default, is met slowly."""
+    cell, told = CELL if stiffness is None else stating(stiffness), []
+    speed = speed_within(cell, 0.05, told.append)
+    assert (speed == 0.05) == (stiffness == 5e3) == (not told)
+    assert speed == min(0.05, contact_speed(cell)) > 0.005
+    if told:
+        assert f"at {1e3 * speed:.1f} mm/s instead of 50.0 mm/s" in told[0]
+        assert "state limits.contact_n_per_m" in told[0]
+    _, wall, event = against_a_wall(monkeypatch, speed, stiffness or 2e5, predicted=predicted,
+                                    cell=cell)
     assert event["event"] in ("paused", "stopped")
-    assert 5.0 < wall.peak <= 1.1 * CELL.limits.hard_force_n
+    assert 3.0 < wall.peak <= 1.1 * CELL.limits.hard_force_n
+
+
+def test_a_motion_of_a_cell_that_states_no_stiffness_meets_rigid_things_slowly():
+    """Pulls, paths and motions of the arm alone keep to it, whatever speed is asked."""
+    frames = np.tile(CELL.arm.forward(np.array(CELL.arm.home)) @ matrices(
+        np.array(CELL.tool.grasp_pose)), (2, 1, 1))
+    frames[1, :3, 3] += [0, 0.03, 0]
+    most = contact_speed(CELL)
+    assert 0.005 < most < 0.01
+    for cell, speed in ((CELL, most), (stating(1e3), 0.05)):
+        pull = there_and_back(cell, frames, speed=0.05, cycles=1, pause=0.1)
+        assert pull.greatest_speeds[0] == pytest.approx(speed, rel=0.01)
 
 
 def test_a_contact_that_no_speed_is_slow_enough_for_is_refused():
     with pytest.raises(InputError, match="even at 1 mm/s"):
-        contact_speed(CELL, 1e7)
+        contact_speed(stating(1e7))
     slow = CELL.model_copy(update={"robot": CELL.robot.model_copy(update={"model": "ur5"}),
                                    "sensor": CELL.sensor.model_copy(update={"kind": "ft300"})})
-    assert contact_speed(slow, 2e4) < contact_speed(CELL, 2e4)
+    assert contact_speed(slow) < contact_speed(CELL)
 
 
 def test_after_a_pause_it_goes_on_from_where_it_braked(monkeypatch):

@@ -40,7 +40,9 @@ def standing_at(branch: Branch, address: str, *, model: str = "ur5e", fraction: 
         tool={"grasp_pose": GRASP_POSE, "gripper": "digital_output", "mass_kg": 0.0,
               "grip_seconds": grip_seconds},
         sensor={"kind": "controller" if arm.measures_force else "ft300"},
-        limits={"soft_force_n": 30.0, "hard_force_n": 40.0, "hard_torque_nm": 8.0, **limits})
+        # The virtual cell has nothing stiffer than the branch across its axis.
+        limits={"soft_force_n": 30.0, "hard_force_n": 40.0, "hard_torque_nm": 8.0,
+                "contact_n_per_m": 1000.0, **limits})
 
 
 def sideways(branch: Branch, fraction: float = 0.92) -> np.ndarray:

@@ -154,10 +154,10 @@ def _another_program(address: str) -> None:
 
 
 def cell_for(address: str, model: str = "ur5e") -> Cell:
-    """Return a cell of a virtual robot whose base is the branch's frame."""
+    """Return a cell of a virtual robot in free air, whose base is the branch's frame."""
     kind = "controller" if arm_named(model).measures_force else "ft300"
     return Cell(robot={"model": model, "address": address}, base={"pose": (0.0,) * 6},
-                sensor={"kind": kind})
+                sensor={"kind": kind}, limits={"contact_n_per_m": 1000.0})
 
 
 def straight(robot: VirtualRobot, way: tuple[float, float, float], speed: float = 0.05,

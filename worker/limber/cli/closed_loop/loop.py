@@ -51,6 +51,7 @@ PLANNED_TOLERANCE_M = 0.006
 
 _LENGTH_M = 0.4  # solved within some hundredths of a second
 _PEAK_N, _TRAVEL_M = 6.0, 0.04
+_SOFTER = 5.0  # a branch is this much stiffer nearer to its root, at most
 OPEN_FACTOR = 4.0
 """Ratio of the ends of a modulus's interval above which `limber suggest-pull` decides whether
 another pull is worthwhile for the plan.
@@ -174,7 +175,9 @@ class ClosedLoop:
             base={"pose": tuple(map(float, base))},
             tool={"grasp_pose": _GRASP_POSE, "gripper": "digital_output", "mass_kg": 0.0,
                   "grip_seconds": 4.0},
-            limits={"soft_force_n": 20.0, "hard_force_n": 30.0, "hard_torque_nm": 6.0})
+            # Nothing stiffer than the branch across its axis is in the virtual cell.
+            limits={"soft_force_n": 20.0, "hard_force_n": 30.0, "hard_torque_nm": 6.0,
+                    "contact_n_per_m": _SOFTER * _PEAK_N / _TRAVEL_M})
 
     def _reconstructed(self, truth: TrueBranch, cell: Cell) -> np.ndarray:
         """Scan, reconstruct, calibrate, name the flower; return the shift from the scan's frame to

@@ -23,6 +23,9 @@ from limber.robot.known_arms import arm_named
 from limber.robot.load_ratings import MOST_SPEED, MOST_TURN_SPEED
 from limber.robot.urdf.chain_arm import ENDING
 
+RIGID_N_PER_M = 2e5
+"""Stiffness with which a gripper meets a rigid thing: that of the arm and its joints [N/m]."""
+
 Vector = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float]
 
@@ -170,9 +173,10 @@ class LimitsEntry(_Entry):
                                "motion [N].")
     singularity: float = Field(0.05, gt=0, le=0.5)
     joint_margin_rad: float = Field(0.05, ge=0, le=1)
-    contact_n_per_m: float | None = Field(
-        None, gt=0, le=1e7, description="Stiffness of what the arm may run into, such as 20000 for "
-        "a wall [N/m]. Motions are so slow that such a contact stays below hard_force_n plus a "
+    contact_n_per_m: float = Field(
+        RIGID_N_PER_M, gt=0, le=1e7, description="Stiffness of the stiffest thing that the gripper "
+        "may run into [N/m]; by default a rigid one, 20000 for a thin panel, 1000 where there is "
+        "only the branch. Motions are so slow that such a contact stays below hard_force_n plus a "
         "tenth.")
 
     @model_validator(mode="after")

@@ -18,7 +18,6 @@ _EXAMPLES: dict[str, Any] = {
     "base": {"residual_m": 0.001},
     "sensor": {"file": "forces.csv", "device": "/dev/ttyUSB0",
                "topic": "/ft300/wrench"},
-    "limits": {"contact_n_per_m": 20000.0},
     "camera": {"pose": [0.0, -1.0, 0.5, -1.57, 0.0, 0.0]},
     "second_arm": {"model": "ur5e", "base_pose": [0.6, 0.6, 0.0, 0.0, 0.0, 0.0]},
     "workspace": {"low_m": [-0.4, -0.4, 0.0], "high_m": [0.4, 0.4, 1.2]},

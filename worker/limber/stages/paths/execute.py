@@ -209,6 +209,9 @@ def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSet
         progress.warn(warning)
     settings = _as_planned(stated, settings, cell)
     settings, cell = _as_slow_as_checked(stated.get("in_motion"), settings, cell, progress)
+    from limber.robot.motion.contact_speed import speed_within
+
+    speed_within(cell, present(settings.speed, "speed"), progress.warn)
     return branch, cell, settings, stated
 
 

@@ -135,7 +135,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         limits = asked if in_cell is None else in_cell.limits
         pace = Pace(settings.speed, settings.acceleration)
         if in_cell is not None:
-            pace = in_cell.slowed(pace)
+            pace = in_cell.slowed(pace, progress)
         found = plan_motion(
             field,
             grasp_model,
@@ -250,10 +250,13 @@ class _InCell:
                     surface_points(grasp_model.mesh, states.displacements), settings.hold,
                     progress)}
 
-    def slowed(self, pace: Pace) -> Pace:
+    def slowed(self, pace: Pace, progress: Progress) -> Pace:
         """Return the pace, no faster than the cell allows."""
+        from limber.robot.motion.contact_speed import speed_within
+
         most = self.cell.limits
-        return replace(pace, speed=min(pace.speed, most.speed_m_s),
+        return replace(pace, speed=speed_within(self.cell, min(pace.speed, most.speed_m_s),
+                                                progress.warn),
                        acceleration=min(pace.acceleration, most.acceleration_m_s2))
 
     def check_goal(self, settings: PlanSettings) -> None:

@@ -295,6 +295,7 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
           settings: RecordSettings, blocked: Blocked, progress: Progress) -> Trajectory:
     """The motion of the gripper from its position in a sample of the robot."""
     from limber.core.numerics.rigid import matrices
+    from limber.robot.motion.contact_speed import speed_within
     from limber.stages.pulls.record_path import (
         arc_path,
         suggested_pull,
@@ -312,6 +313,7 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
         raise InputError(f"--speed {settings.speed:g} exceeds the cell's "
                          f"{cell.limits.speed_m_s:g} m/s.", "The guard would slow it down.",
                          "Reduce --speed, or raise limits.speed_m_s in the cell file.")
+    speed = speed_within(cell, settings.speed, progress.warn)
     gripper, joints = sample[1:7], sample[19:25]
     here = matrices(gripper)
     if settings.waypoints is not None:
@@ -321,7 +323,7 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
     else:
         frames = np.array([here, here])
         frames[1, :3, 3] += distance * direction / length
-    return there_and_back(cell, frames, speed=settings.speed, cycles=settings.cycles,
+    return there_and_back(cell, frames, speed=speed, cycles=settings.cycles,
                           pause=settings.pause, start=joints, blocked=blocked)
 
 
