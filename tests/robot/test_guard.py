@@ -194,9 +194,7 @@ def test_a_force_unlike_the_predicted_one_stops_long_before_the_limit():
 
 
 @pytest.mark.parametrize("wanted, left, told", [
-    (5, 0.5, "never held"),
-    # Too much for a lost branch, too little for the prediction.
-    (8, 4.9, "dropped suddenly")])
+    (5, 0.5, "dropped suddenly"), (8, 4.9, "dropped suddenly")])
 def test_slip_is_told_from_the_predicted_force(wanted, left, told):
     bench = Bench()
     bench.guard.begin()

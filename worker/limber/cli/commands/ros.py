@@ -146,9 +146,11 @@ def scan(run: Run, cell_file: Path, topic: str, output: Path, views: int, url: s
 @click.option("--speed", default=0.03, show_default=True, help="Speed of the gripper [m/s].")
 @click.option("--arm", "armed", is_flag=True, help="Move the robot. Default: a dry run.")
 @click.option("--confirm", help="The plan's name, to confirm that the robot may move.")
+@click.option("--unwatched", is_flag=True, help="Follow the path also where its forces are too "
+              "small for the guard to see an empty gripper, a slip or a broken branch.")
 @_url
 def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, speed: float,
-           armed: bool, confirm: str | None, url: str) -> dict[str, Any]:
+           armed: bool, confirm: str | None, unwatched: bool, url: str) -> dict[str, Any]:
     """Follow one leg of a plan by the joint trajectory controller, under the guard.
 
     A stop, an error and Ctrl-C cancel the goal and publish True on /limber/stop. A websocket is no
@@ -167,7 +169,7 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
         require_weighed(read_cell(cell_file))
     planned = planned_motion(
         branch_folder, name, cell_file, ExecuteSettings(speed=speed), progress=run.progress,
-        is_to_move=armed)
+        is_to_move=armed, is_unwatched=unwatched)
     cell, motion, result = planned.cell, planned.motion, planned.result
     trajectory = {"approach": motion.approach, "path": motion.path, "return": motion.return_path,
                   "leaving": motion.leaving}[leg]

@@ -71,7 +71,7 @@ def _from_files(run: Run, cell: Cell, cell_file: Path, folder: Path | None, plan
         run.progress.warn(warning)
     if plan is not None and folder is not None:
         planned = planned_motion(folder, plan, cell_file, ExecuteSettings(),
-                                 progress=run.progress, is_to_move=True)
+                                 progress=run.progress, is_to_move=True, is_unwatched=True)
         result |= {"plan": plan, "motion": planned.result}
     run.close(f"{cell_file} describes a {cell.arm.name}; its base is known to "
               f"{1000 * cell.base.position_sigma_m:.1f} mm"

@@ -68,8 +68,7 @@ def goto_start(run: Run, cell_file: Path, confirm: str | None, armed: bool, bran
 
     cell = read_cell(cell_file)
     dry_run = execute(branch_folder, name, cell_file, ExecuteSettings(speed=speed),
-                      ExecuteOptions(),
-                      progress=run.progress)
+                      ExecuteOptions(unwatched=True), progress=run.progress)
     goal = np.array(dry_run["start_joints_rad"], float)
     return _to(run, cell_file, cell, branch_folder, goal, "goto-start", armed, confirm)
 

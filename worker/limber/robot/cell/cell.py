@@ -169,8 +169,9 @@ class LimitsEntry(_Entry):
     hard_force_n: float = Field(20.0, gt=0, description="Motion stops.")
     hard_torque_nm: float = Field(3.0, gt=0)
     unexpected_force_n: float = Field(
-        3.0, gt=0, description="Difference between measured and predicted force that stops the "
-                               "motion [N].")
+        3.0, gt=0, description="Largest difference between measured and predicted force [N]. With "
+        "the branch held the guard allows less: two fifths of the predicted force, and the "
+        "sensor's noise and drift.")
     singularity: float = Field(0.05, gt=0, le=0.5)
     joint_margin_rad: float = Field(0.05, ge=0, le=1)
     contact_n_per_m: float = Field(

@@ -301,8 +301,7 @@ def _ordered(order: dict[str, Any]) -> Trajectory:
 
 
 def _guard_of(cell: Cell, control: ArmControl) -> Guard:
-    return Guard(cell.arm, GuardSettings(cell.limits, cell.joint_limits, cell.workspace),
-                 control.rate)
+    return Guard(cell.arm, GuardSettings.of_cell(cell, control.rate), control.rate)
 
 
 def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> None:
@@ -312,7 +311,8 @@ def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> None
         samples += control.read(1.0)
     guard, chain = _guard_of(cell, control), WrenchChain(cell)
     base = frame_of(np.array(cell.base.pose))
-    guard.tared()
+    guard.tared(np.zeros((3, 3)))
+    guard.hold(np.zeros(3))
     guard.begin()
     for sample in samples:
         reading = sensor.read(sample)

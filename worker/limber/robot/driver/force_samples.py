@@ -20,6 +20,7 @@ from limber.robot.motion.trajectory import Trajectory
 
 _BATCH_SECONDS = 0.02
 _OLDEST_READING_SECONDS = 0.05
+_STANDING_SECONDS = 0.1  # over which the force of a resting branch is averaged
 _NOTHING = np.full(6, np.nan)
 _UPPER = np.triu_indices(3)
 
@@ -49,6 +50,8 @@ class Senses:
         self.smooth = _NOTHING
         self._held_for: np.ndarray | None = None
         self._held_at = np.zeros(6)
+        self._standing = np.zeros(3)
+        self._stood = float(np.exp(-1.0 / (_STANDING_SECONDS * control.rate)))
         self._tare_until: float | None = None
         self._batch: list[np.ndarray] = []
         self._batch_since = time.monotonic()
@@ -65,6 +68,14 @@ class Senses:
         if rest is None or self._held_for is None or np.abs(rest - self._held_for).max() > 0:
             # Here the gripper closed on the resting branch: displacements are measured from here.
             self._held_for, self._held_at = rest, sample.pose.copy()
+            self._hold(sample, trajectory)
+
+    def _hold(self, sample: Sample, trajectory: Trajectory) -> None:
+        expected = trajectory.expected
+        if expected is None or not expected.wrenches.any():
+            self._guard.hold(None)
+            return
+        self._guard.hold(self._standing - expected.wrenches[0, :3], sample.clock)
 
     def look(self, sample: Sample) -> None:
         """Judge a sample and keep it for the next batch."""
@@ -78,6 +89,8 @@ class Senses:
         self._under_way.judge(self._guard.feel(now), sample)
         following = self._under_way.following
         expected = uncertainty = sent = None
+        if following is None and np.isfinite(now).all():
+            self._standing = self._stood * self._standing + (1.0 - self._stood) * now[:3]
         if following is not None:
             self.retreat_path.note(sample)
             # The arm is at the target of one look-ahead ago.
@@ -156,11 +169,11 @@ class Senses:
         except WorkError as error:
             self._tell(event="refused", order="tare", reason=str(error))
             return
-        self._guard.tared()
-        self._is_tared = True
+        self._guard.tared(self._chain.at_rest)
+        self._is_tared, self._standing = True, np.zeros(3)
         self.followed_file.tared(self._chain.bias)
         self._tell(event="tared", bias=self._chain.bias.tolist(), sigma=sigma.tolist(),
-                   delay_s=self._chain.delay(self._rate))
+                   delay_s=self._chain.delay(self._rate), noise_n=self._guard.noise)
 
     def send_batch(self) -> None:
         """Send the samples of the last hundredths of a second."""

@@ -239,6 +239,7 @@ class WrenchChain:
     Attributes:
         cell: Gripper's mass, ranges, frames.
         bias, bias_sigma: Bias from the tare, flange frame, and its standard error, shape [6].
+        at_rest: Forces during the tare [N], shape [n, 3].
         count: Readings that the slower output averages; its delay is half of them.
     """
 
@@ -246,6 +247,7 @@ class WrenchChain:
     count: int = 5
     bias: np.ndarray = field(default_factory=lambda: np.zeros(6))
     bias_sigma: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    at_rest: np.ndarray | None = None
     _taring: list[np.ndarray] | None = None
     _recent: deque[np.ndarray] = field(default_factory=deque)
 
@@ -281,7 +283,7 @@ class WrenchChain:
             raise WorkError(f"The force spread by {spread[:3].max():.2g} N during the tare.",
                             "The gripper was touched or moved, or the sensor is faulty.",
                             "Let it hang free and at rest, and tare again.")
-        self.bias = readings.mean(axis=0)
+        self.bias, self.at_rest = readings.mean(axis=0), readings[:, :3]
         self.bias_sigma = spread / np.sqrt(len(readings))
         return self.bias_sigma
 

@@ -16,7 +16,15 @@ import numpy as np
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
 from limber.robot.cell.controller_settings import SteadySettings
-from limber.robot.driver.expected_force import DEVIATIONS, allowed_difference, difference_name
+from limber.robot.driver.expected_force import (
+    LOST_SHARE,
+    NOISES,
+    allowed_change,
+    allowed_difference,
+    difference_name,
+    kept_share,
+    noise_at_rest,
+)
 from limber.robot.driver.guard_states import (
     GO,
     SAFETY_MODES,
@@ -56,13 +64,42 @@ class Guard:
         self.reason = ""
         self._memory = GuardMemory()
         self._is_tared = False
+        self._kept = kept_share(self._step, settings.filter_time)
+        self._errors = settings.errors
+        self._held: np.ndarray | None = None
+        self._held_clock = 0.0
         self._set = SteadySettings(arm)
 
     # Actions of a person
 
-    def tared(self) -> None:
-        """The force sensor has been tared: from now on its limits apply."""
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the filtered force at rest, per axis [N]."""
+        return self._errors.noise
+
+    def tared(self, forces: np.ndarray | None = None) -> None:
+        """The force sensor has been tared: from now on its limits apply.
+
+        Args:
+            forces: Readings at rest, which tell its noise [N], shape [n, 3].
+        """
         self._is_tared = True
+        self._held = None
+        self._errors = self._settings.errors.measured(
+            None if forces is None else noise_at_rest(forces, self._kept))
+
+    def hold(self, off: np.ndarray | None, clock: float = 0.0) -> None:
+        """The gripper holds the resting branch; from here on its force follows the prediction.
+
+        What the fingers press aside when they close, and the sensor's drift so far, stay as they
+        are and tell nothing about the branch.
+
+        Args:
+            off: Measured force minus the predicted one there [N], shape [3]; None: it holds
+                nothing.
+            clock: Of the controller [s].
+        """
+        self._held, self._held_clock = off, clock
 
     def begin(self, *, by_joints: bool = False) -> None:
         """Allow a motion.
@@ -159,7 +196,7 @@ class Guard:
         for check in (self._check_clock(sample), self.modes(sample),
                       self._check_wrench(sample, wrench, raw), self._check_settings(sample),
                       self._check_position(sample, grasp, sent),
-                      self._check_expected(wrench, expected, uncertainty)):
+                      self._check_expected(sample, wrench, expected, uncertainty)):
             if check.verdict == Verdict.STOP:
                 return check
         if self._memory.relief is not None:
@@ -265,8 +302,12 @@ class Guard:
         return GO
 
     def _relieved_force(self, relief: Relief) -> float:
-        return relief.force + max(self._settings.limits.unexpected_force_n,
-                                  self._settings.least_force)
+        return relief.force + max(self._settings.limits.unexpected_force_n, self._least_change)
+
+    @property
+    def _least_change(self) -> float:
+        """Change of a force [N] that the noise of both its values does not explain."""
+        return float(np.sqrt(2.0)) * NOISES * self._errors.noise
 
     def _relieved_torque(self, relief: Relief) -> float:
         return relief.torque + self._settings.largest_torque_error
@@ -288,7 +329,7 @@ class Guard:
         has_gone = (mark is not None and grasp is not None
                     and length(grasp - mark) > settings.relief_distance)
         if mark is None or has_gone or sample.clock - relief.marked_clock > settings.relief_time:
-            if force > limits.soft_force_n and force > relief.marked_force - settings.least_force:
+            if force > limits.soft_force_n and force > relief.marked_force - self._least_change:
                 return self._stop("the force does not fall during the return [N]", force,
                                   limits.soft_force_n)
             relief.marked_force, relief.marked_clock, relief.marked_grasp = (
@@ -307,9 +348,8 @@ class Guard:
 
     def _filtered(self, wrench: np.ndarray) -> np.ndarray:
         """Return the force [6] to compare with the predicted one; ``wrench`` updates it."""
-        kept = np.exp(-self._step / self._settings.filter_time)
         before = wrench if self._memory.filtered is None else self._memory.filtered
-        self._memory.filtered = kept * before + (1 - kept) * wrench
+        self._memory.filtered = self._kept * before + (1 - self._kept) * wrench
         return self._memory.filtered
 
     def _check_position(self, sample: Sample, grasp: np.ndarray | None, sent: np.ndarray | None,
@@ -340,51 +380,65 @@ class Guard:
                 return self._stop("the robot left its path [m]", off, settings.off_path)
         return GO
 
-    def _check_expected(self, wrench: np.ndarray, expected: np.ndarray | None,
+    def _check_expected(self, sample: Sample, wrench: np.ndarray, expected: np.ndarray | None,
                         uncertainty: np.ndarray | None) -> Decision:
-        settings, memory = self._settings, self._memory
         if self.state not in (State.MOVING, State.PAUSED):
             return GO
-        if memory.relief is not None:
+        if self._memory.relief is not None:
             # A sudden fall of the force is the purpose of a retreat.
             return GO
         filtered = self._filtered(wrench)
-        force = length(filtered[:3])
         if expected is None:
-            # There is no prediction while E is being measured. A sudden loss still indicates a
-            # slip, but not while the branch is released and pulls in the gripper's direction of
-            # motion.
-            if memory.travel is not None and float(memory.travel @ filtered[:3]) < 0:
-                memory.peak = force
-            memory.peak = max(memory.peak * np.exp(-self._step / settings.loss_time), force)
-            lost = memory.peak - force
-            if lost > max(settings.lost_share * memory.peak, settings.least_force):
-                return self._stop("the force dropped suddenly: slip or break [N]", lost,
-                                  max(settings.lost_share * memory.peak, settings.least_force))
-            return GO
+            return self._check_drop(filtered)
         uncertainty = _CERTAIN if uncertainty is None else uncertainty
-        expected_size = length(expected[:3])
-        if expected_size > settings.least_force:
-            along = float(filtered[:3] @ expected[:3]) / expected_size
-            margin = DEVIATIONS * float(np.sqrt(max(
-                expected[:3] @ uncertainty[:3, :3] @ expected[:3], 0.0))) / expected_size
-            if along < (1 - settings.lost_share) * expected_size - settings.least_force - margin:
-                return self._stop("the branch slipped, broke or was never held: force in the "
-                                  "predicted direction [N]", along, expected_size)
-        limits = settings.limits
-        off = filtered - expected
-        before = self._usual_off(off[:3])
+        limits, off = self._settings.limits, filtered - expected
+        change = off[:3] if self._held is None else off[:3] - self._held
+        before = self._usual_off(change)
+        if self._held is not None:
+            decision = self._check_held(sample, change, before, expected, uncertainty)
+            if decision.verdict == Verdict.STOP:
+                return decision
         for name, part, allowed, most in (
                 (None, slice(0, 3), limits.unexpected_force_n, limits.soft_force_n),
                 ("the torque differs from the predicted one [N m]", slice(3, 6),
-                 settings.largest_torque_error, limits.hard_torque_nm)):
+                 self._settings.largest_torque_error, limits.hard_torque_nm)):
             error = length(off[part])
             if error > allowed:
                 within = allowed_difference(off[part], uncertainty[part, part], allowed, most)
                 if error > within:
                     return self._stop(name or difference_name(
-                        off[:3], expected[:3], before, settings.least_force),
-                                      error, within)
+                        change, expected[:3], before, allowed), error, within)
+        return GO
+
+    def _check_drop(self, filtered: np.ndarray) -> Decision:
+        """Judge a force [6] without a prediction, as while E is being measured.
+
+        A sudden loss still indicates a slip, but not while the branch is released and pulls in the
+        gripper's direction of motion.
+        """
+        memory, force = self._memory, length(filtered[:3])
+        if memory.travel is not None and float(memory.travel @ filtered[:3]) < 0:
+            memory.peak = force
+        memory.peak = max(memory.peak * np.exp(-self._step / self._settings.loss_time), force)
+        allowed = float(np.hypot(LOST_SHARE * memory.peak, self._least_change))
+        if memory.peak - force > allowed:
+            return self._stop("the force dropped suddenly: slip or break [N]", memory.peak - force,
+                              allowed)
+        return GO
+
+    def _check_held(self, sample: Sample, change: np.ndarray, before: np.ndarray,
+                    expected: np.ndarray, uncertainty: np.ndarray) -> Decision:
+        """Judge by how much the force on the held branch has changed otherwise than predicted."""
+        memory = self._memory
+        memory.largest_expected = max(memory.largest_expected, length(expected[:3]))
+        errors = float(self._errors.within(sample.clock - self._held_clock))
+        error, least = length(change), float(np.hypot(LOST_SHARE * memory.largest_expected, errors))
+        if error > least:
+            within = allowed_change(change, uncertainty[:3, :3], memory.largest_expected, errors,
+                                    self._settings.limits.soft_force_n)
+            if error > within:
+                return self._stop(difference_name(change, expected[:3], before, errors), error,
+                                  within)
         return GO
 
     def _usual_off(self, off: np.ndarray) -> np.ndarray:

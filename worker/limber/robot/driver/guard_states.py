@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
-from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
+from limber.robot.cell.cell import Cell, LimitsEntry, WorkspaceEntry
+from limber.robot.driver.expected_force import ForceErrors, kept_share
 
 
 class State(Enum):
@@ -56,28 +58,34 @@ class GuardSettings:
         filter_time: Time constant of the force that is compared with the predicted one [s]. The
             hard limits apply to every single reading.
         off_path: Largest distance from the target [m].
-        lost_share: Fraction of its force that a held branch loses when it slips or breaks.
+        errors: Errors of the measured force; its noise until that is measured at rest.
         loss_time: Time in which such a loss counts as sudden [s].
-        least_force: Force below which a loss cannot be distinguished from noise [N].
         largest_torque_error: Largest difference between the torque and the predicted one [N m].
-        relief_distance: Path of a retreat over which a force above the soft limit falls by at least
-            ``least_force`` [m].
+        relief_distance: Path of a retreat over which a force above the soft limit falls by more
+            than its noise [m].
         relief_time: The same for a slow retreat [s].
     """
 
     limits: LimitsEntry
     joint_limits: np.ndarray
     workspace: WorkspaceEntry | None = None
+    errors: ForceErrors = field(
+        default_factory=lambda: ForceErrors(noise=0.05, drift=0.8 / 60.0, inertia=0.0))
     longest_silence: float = 0.05
     frozen_time: float = 0.05
     filter_time: float = 0.01
     off_path: float = 0.01
-    lost_share: float = 0.4
     loss_time: float = 0.5
-    least_force: float = 1.0
     largest_torque_error: float = 1.0
     relief_distance: float = 0.02
     relief_time: float = 10.0
+
+    @classmethod
+    def of_cell(cls, cell: Cell, rate: float, **others: Any) -> "GuardSettings":
+        """Return the settings for a cell whose arm sends ``rate`` samples a second."""
+        kept = kept_share(1.0 / rate, cls.filter_time)
+        return cls(cell.limits, cell.joint_limits, cell.workspace, ForceErrors.of_cell(cell, kept),
+                   **others)
 
 
 @dataclass
@@ -107,6 +115,7 @@ class GuardMemory:
     frozen_since: float = 0.0
     filtered: np.ndarray | None = None
     peak: float = 0.0
+    largest_expected: float = 0.0
     usual_off: np.ndarray | None = None
     grasp: np.ndarray | None = None
     travel: np.ndarray | None = None

@@ -86,8 +86,8 @@ class RosRobot:
                  on_sample: Callable[[float, np.ndarray, np.ndarray], None] | None = None):
         self._cell, self._bridge, self._topics = cell, bridge, topics
         self._on_sample = on_sample
-        self.guard = Guard(cell.arm, GuardSettings(cell.limits, cell.joint_limits, cell.workspace,
-                                                   off_path=_OFF_PATH_M), cell.arm.rate)
+        self.guard = Guard(cell.arm, GuardSettings.of_cell(cell, cell.arm.rate,
+                                                           off_path=_OFF_PATH_M), cell.arm.rate)
         self._chain = WrenchChain(cell)
         self._sensor = frame_of(np.array(cell.sensor.pose))
         self._base = frame_of(np.array(cell.base.pose))
@@ -212,7 +212,7 @@ class RosRobot:
                 self._chain.wrench(sample, self._reading)
         sigma = self._chain.end_tare()
         self._warm_up()
-        self.guard.tared()
+        self.guard.tared(self._chain.at_rest)
         self._kept.begin()
         self._kept.tared(self._chain.bias)
         return sigma
@@ -220,9 +220,10 @@ class RosRobot:
     def _warm_up(self) -> None:
         """Judge the present samples once: compiling or loading must not delay a motion."""
         assert self.last is not None and self._reading is not None
-        guard = Guard(self._cell.arm, GuardSettings(self._cell.limits, self._cell.joint_limits),
+        guard = Guard(self._cell.arm, GuardSettings.of_cell(self._cell, self._cell.arm.rate),
                       self._cell.arm.rate)
-        guard.tared()
+        guard.tared(np.zeros((3, 3)))
+        guard.hold(np.zeros(3))
         guard.begin()
         now, _ = self._chain.wrench(self.last, self._reading)
         guard.look(self.last, wrench=now, raw=np.stack([self._reading.raw] * 2), expected=now,
@@ -251,6 +252,10 @@ class RosRobot:
                       self._cell.arm.joint_names)
         if np.abs(sample.joint_speeds).max() > _STANDS_RAD_S:
             raise _moves_already()
+        expected = trajectory.expected
+        if expected is not None and expected.wrenches.any() and not goes_on:
+            clock = self._settled().clock
+            self.guard.hold(self.smooth[:3] - expected.wrenches[0, :3], clock)
         self.guard.begin()
         self._way.begin(sample, trajectory, goes_on=goes_on)
         return self._watched_goal(trajectory, goal, check)

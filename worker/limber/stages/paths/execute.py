@@ -72,7 +72,7 @@ class ExecuteSettings(Settings):
 class ExecuteOptions(Settings):
     """Dry run, or motion."""
 
-    groups: ClassVar[Groups] = {"running": ("arm", "confirm", "after_stop")}
+    groups: ClassVar[Groups] = {"running": ("arm", "confirm", "after_stop", "unwatched")}
     common = ("arm", "confirm")
 
     arm: bool = Field(False, description="Move the robot. Default: a dry run.",
@@ -84,6 +84,10 @@ class ExecuteOptions(Settings):
         "ask", description="What to do after a stop. ask: ask at the terminal, or hold without "
                            "one.",
         json_schema_extra=NOT_KEPT)
+    unwatched: bool = Field(
+        False, description="Follow the path also where its forces are too small for the guard to "
+        "see an empty gripper, a slip, a broken branch or a wrong sensor.",
+        json_schema_extra={"switch": True} | NOT_KEPT)
 
 
 def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
@@ -103,6 +107,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
 
     Raises:
         InputError: plan, cell and branch do not belong together, or the user did not confirm.
+            Or the guard could not see a lost branch on the path, and ``unwatched`` is not set.
         NoPathError: the arm cannot follow the path; the message states where and why.
         SafetyStop: the motion was stopped; the log is nevertheless in the folder.
     """
@@ -112,7 +117,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
 
         require_weighed(read_cell(cell_file))
     planned = planned_motion(folder, name, cell_file, settings, progress=progress,
-                             is_to_move=options.arm)
+                             is_to_move=options.arm, is_unwatched=options.unwatched)
     if not options.arm:
         write_preview(planned.branch, name, planned.settings, planned.cell, planned.motion)
         return planned.result | {"armed": False, "reached": None, "stop_reason": None,
@@ -140,9 +145,12 @@ class PlannedMotion:
 
 
 def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings, *,
-                   progress: Progress, is_to_move: bool,
+                   progress: Progress, is_to_move: bool, is_unwatched: bool,
                    ) -> PlannedMotion:
     """Return the checked motion of a plan.
+
+    Args:
+        is_unwatched: A path on which the guard cannot see a lost branch is only a warning.
 
     Raises:
         InputError, NoPathError: as :func:`execute`.
@@ -160,6 +168,7 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
         path_nudge,
         planned_poses,
         predicted_along,
+        require_watched,
         require_within_limits,
     )
     from limber.stages.paths.plan_cell import KeptClear, blocked_by
@@ -190,6 +199,7 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
         cell, clear.obstacles, motion, predicted.poses[:, :3], np.array(clear.surfaces),
         present(settings.hold, "time at the path's end"), progress)}
     require_within_limits(cell, predicted.poses, predicted.wrenches[:, :3])
+    require_watched(cell, motion.path, is_unwatched, progress.warn)
     return PlannedMotion(branch, cell, settings, motion, across, result)
 
 
@@ -327,11 +337,13 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
            ) -> tuple[dict[str, Any], tuple[int, int] | None]:
     """Execute the legs in order, the nudge before the path; end at the first that is stopped."""
     from limber.robot.motion.legs import legs_of
+    from limber.stages.paths.execute_path import require_watched
 
     _open_at_start(cell, link, motion)
     progress(0.5, "taring: keep the gripper free")
     live.at("taring")
-    link.tare(_TARE_SECONDS)
+    tared = link.tare(_TARE_SECONDS)
+    require_watched(cell, motion.path, options.unwatched, progress.warn, tared["noise_n"])
     on_path: tuple[int, int] | None = None
     event: dict[str, Any] = {}
     for number, leg in enumerate(legs_of(cell, motion, present(settings.hold, "hold"))):

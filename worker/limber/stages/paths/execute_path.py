@@ -1,5 +1,6 @@
 """The path that a plan is executed along: its poses, and the branch's forces solved again there."""
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -17,9 +18,12 @@ from limber.planning.cost import arc_lengths
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.recordings.recording import POSE_COLUMNS
 from limber.robot.cell.cell import Cell
+from limber.robot.driver.expected_force import not_seen
 from limber.robot.driver.force_sensors import INDEPENDENT_READINGS
+from limber.robot.driver.guard_states import GuardSettings
 from limber.robot.motion.execution import Blocked, RobotMotion
 from limber.robot.motion.expected_wrench import Predicted
+from limber.robot.motion.trajectory import Trajectory
 from limber.stages.paths.plan_cell import KeptClear
 from limber.stages.paths.plan_uncertainty import estimated_uncertainty
 from limber.stages.pulls.record_nudge import Nudge, checked_nudge
@@ -153,6 +157,44 @@ def require_within_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> 
             raise InputError(f"The path leaves the workspace at ({position}) m.",
                              "The guard would stop there.", "Plan inside it, or correct the cell "
                                                             "file.")
+
+
+def require_watched(cell: Cell, path: Trajectory, is_unwatched: bool, warn: Callable[[str], None],
+                    noise: float | None = None) -> None:
+    """Refuse a path with forces so small that the guard cannot see that the branch is lost.
+
+    Args:
+        is_unwatched: The user accepts that: it is only told.
+        noise: Of the filtered force at rest, per axis [N], if it was measured.
+
+    Raises:
+        InputError: states the peak force, what is explained otherwise, and what would be seen.
+    """
+    expected = path.expected
+    assert expected is not None
+    settings = GuardSettings.of_cell(cell, cell.arm.rate)
+    errors = settings.errors.measured(noise)
+    forces = expected.wrenches[:, :3]
+    unseen = not_seen(path.times, forces, expected.covariance[:, :3, :3], errors,
+                      cell.limits.soft_force_n)
+    if not unseen:
+        return
+    from_force = max(unseen.values())
+    told = (f"The guard could not see {' or '.join(unseen)}: the force along the path is at most "
+            f"{np.linalg.norm(forces, axis=1).max():.2g} N, and "
+            f"{float(errors.within(path.duration)):.2g} N of it are explained by the sensor's "
+            f"noise ({'stated' if noise is None else 'measured'}: {errors.noise:.2g} N, filtered), "
+            "its drift and the gripper's inertia. "
+            + (f"From about {from_force:.2g} N on they would be seen" if np.isfinite(from_force)
+               else "No force is predicted at all"))
+    if is_unwatched:
+        warn(f"{told}. `limber execute` follows it only with --unwatched.")
+        return
+    raise InputError(
+        f"{told}.", "The arm would go on with nothing in the gripper, or with a broken branch.",
+        "Plan a path that bends the branch further or hold it nearer to its root; state the sensor "
+        "as it is (sensor.force_sigma_n, sensor.drift_n_per_minute); or give --unwatched, and "
+        "watch the branch yourself.")
 
 
 def force_sigma(cell: Cell, samples: np.ndarray) -> float:
