@@ -297,11 +297,14 @@ def arguments_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> list[str]
     Raises:
         SettingError: a required value is missing, or a text is not a list as required.
     """
-    values = values_of(group_of(scene, stage), stage)
+    group = group_of(scene, stage)
+    values = values_of(group, stage)
     for field in stage.fields.values():
         if not field.is_kept:
             values.pop(field.name)
-    return stage.arguments({**values, "branch_folder": folder})
+    # The worker asks for a unit that nobody stated, even if it would be the default.
+    stated = {name for name in ("unit",) if name in stage.fields and group.is_property_set(name)}
+    return stage.arguments({**values, "branch_folder": folder}, stated)
 
 
 def outcome_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> dict[str, Any]:

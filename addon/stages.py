@@ -8,7 +8,7 @@ packages. No bpy here.
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -163,10 +163,11 @@ class Stage:
             found.setdefault(field.group, []).append(field)
         return found
 
-    def arguments(self, values: Mapping[str, Any]) -> list[str]:
-        """Return the command line that gives the stage these values; defaults are omitted.
+    def arguments(self, values: Mapping[str, Any], stated: Collection[str] = ()) -> list[str]:
+        """Return the command line that gives the stage these values.
 
-        Fields missing in ``values`` keep the worker's default.
+        Defaults are omitted, except of the fields in ``stated``. Fields missing in ``values`` keep
+        the worker's default.
 
         Raises:
             SettingError: a required value is missing, or a text is not a list as required.
@@ -181,7 +182,7 @@ class Stage:
                 raise SettingError(f"{field.title} is missing: {field.description}")
             if field.is_argument:
                 arguments.append(str(value))
-            elif value is not None and not field.is_default(value):
+            elif value is not None and (field.name in stated or not field.is_default(value)):
                 options += field.typed(value)
         return [self.name, *options, "--", *arguments]
 
@@ -207,6 +208,11 @@ def sensors(stage: str) -> dict[str, Any]:
     """Return the sensor presets of a stage by name: ``title``, ``source`` and ``settings``."""
     return {name: known for name, known in _content()["sensors"].items()
             if known["stage"] == stage}
+
+
+def longest_m() -> float:
+    """Return the largest size of a plant [m] of which the unit is not asked."""
+    return _content()["longest_m"]
 
 
 @cache

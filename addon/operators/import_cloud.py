@@ -9,12 +9,11 @@ from .. import branch_folder, branches, deleted_points, scans
 from ..branches import FOLDER_KEY, OFFSET_KEY, SCAN_KEY, add_object
 from ..bridge import meshes
 from ..overlays.cloud import COLOUR
+from ..stages import longest_m
 from .viewing import clear_view, look_at, push_undo
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "um": 1e-6}
 _INTERVAL_SECONDS = 0.05
-_LONGEST_PLANT_M = 300.0
-"""No plant is so large: a file with larger numbers is not in metres."""
 _KINDS = (".ply", ".xyz", ".txt", ".csv", ".tsv", ".asc", ".pts", ".xyzrgb")
 
 
@@ -82,7 +81,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         deleted_points.number_points(cloud)
         if scan.offset.any():
             cloud[OFFSET_KEY] = [float(value) for value in scan.offset]
-        guessed = scan.extent > _LONGEST_PLANT_M and scan.unit is None and (
+        guessed = scan.extent > longest_m() and scan.unit is None and (
             not settings.reconstruct.is_property_set("unit"))
         if scan.unit in _METRES:
             settings.reconstruct.unit = scan.unit
@@ -101,8 +100,8 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         unit = settings.reconstruct.unit
         size = f"{scan.extent:.4g} {unit} across"
         if guessed:
-            self.report({"WARNING"}, f"{size}. The unit was assumed to be millimetres. If it is "
-                                     "another, set Unit and import the scan again.")
+            self.report({"WARNING"}, f"{size}, if its unit is millimetres, as was assumed. Is it? "
+                                     "If not, set Unit and import the scan again.")
         told = [f"{len(scan.points)} points, {size}", *([hidden] if hidden else [])]
         self.report({"INFO"}, "; ".join(told))
         return {"FINISHED"}

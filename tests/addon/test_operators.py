@@ -11,6 +11,7 @@ import pytest
 
 from limber.core.files.atomic import file_digest
 from limber.geometry.io.clouds import read_cloud
+from limber.geometry.plausible_size import LONGEST
 from limber.store import Branch
 
 POINTS = np.random.default_rng(7).random((40, 3)) * 300
@@ -314,16 +315,25 @@ def test_import_stands_in_the_file_menu(bpy, registered):
     assert bpy.types.LIMBER_FH_cloud.bl_import_operator == "limber.import_cloud"
 
 
-def test_a_scan_of_thousands_of_units_is_in_millimetres(bpy, registered, tmp_path):
-    """Nobody scans a plant of 400 m: guessed and said, unless the user has set the unit."""
-    np.savetxt(tmp_path / "a.xyz", POINTS * 1.5)
+def test_a_scan_of_more_units_than_a_plant_has_metres_is_in_millimetres(
+        bpy, registered, tmp_path):
+    """From the worker's limit on: guessed and asked, unless the user has set the unit."""
+    limit = importlib.import_module("limber_addon.stages").longest_m()
+    assert limit == LONGEST
+    np.savetxt(tmp_path / "a.xyz", POINTS * 1.1 * limit / np.ptp(POINTS, axis=0).max())
     settings = bpy.context.scene.limber.reconstruct
     bpy.ops.limber.import_cloud(filepath=str(tmp_path / "a.xyz"))
     assert settings.unit == "mm"
     assert list(bpy.data.objects["a scan"].scale) == pytest.approx([0.001] * 3)
-    settings.unit = "cm"
-    bpy.ops.limber.import_cloud(filepath=str(tmp_path / "a.xyz"))
-    assert settings.unit == "cm"
+    for unit in ("cm", "m"):
+        settings.unit = unit
+        bpy.ops.limber.import_cloud(filepath=str(tmp_path / "a.xyz"))
+        assert settings.unit == unit
+    # The worker would ask for it again.
+    stages, properties = (importlib.import_module(f"limber_addon.{name}") for name in (
+        "stages", "properties"))
+    typed = properties.arguments_of(bpy.context.scene, stages.stages()["reconstruct"], "a.branch")
+    assert typed[typed.index("--unit") + 1] == "m"
 
 
 def test_map_coordinates_keep_their_digits(bpy, registered, tmp_path):

@@ -59,6 +59,25 @@ def test_result_files_and_keys(generated):
     assert mesh.is_quadratic and set(mesh.cell_data) >= {"young", "poisson", "density"}
 
 
+def test_the_unit_of_a_scan_is_asked_for(tmp_path, capsys):
+    """Millimetres without --unit, before any work; what is stated is taken up to 100 m."""
+    z = np.linspace(0, 40.0, 400)
+    scan = tmp_path / "twig.xyz"
+    np.savetxt(scan, np.column_stack([np.cos(9 * z), np.sin(9 * z), z]))
+    given = ["reconstruct", str(scan), "-o", str(tmp_path / "twig.branch"), "--json"]
+    assert call(given) == 2
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert "40 m long" in told["error"]
+    assert {"option": "unit", "value": "mm"} in told["choices"]
+    assert {"option": "unit", "value": "m"} in told["choices"]
+    assert not (tmp_path / "twig.branch").exists()
+    for scale, text in ((3.0, "No plant"), (1.0, "unit")):
+        cloud = Cloud(np.loadtxt(scan) * scale)
+        with pytest.raises(InputError, match=text):
+            reconstruct_cloud(cloud, ReconstructSettings(
+                **{"unit": "m"} if scale > 1 else {}))
+
+
 def test_truth_is_carried_in_the_branch_frame(generated):
     """The true skeleton lies on the reconstructed one after alignment, and Young's modulus too."""
     folder, branch, _ = generated

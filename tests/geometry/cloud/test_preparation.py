@@ -87,13 +87,6 @@ def test_refused(points, complaint):
         prepare(Cloud(points), 1.0)
 
 
-def test_millimetres_taken_for_metres_are_noticed():
-    """A kilometre-long branch is a branch in millimetres; the warning has the extent."""
-    rod = _rod()
-    rod[:2, 2] = 0, 1
-    assert "1000 m long" in prepare(Cloud(rod * 1000), 1.0).warnings[0]
-
-
 def _plane(count: int, side: float, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return np.column_stack([rng.uniform(-side / 2, side / 2, (count, 2)),

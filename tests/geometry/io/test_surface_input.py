@@ -110,21 +110,28 @@ def test_faces_without_area_are_left_out():
     assert len(surface.faces) == len(whole.faces) and "without area" in warnings[0]
 
 
-@pytest.mark.parametrize(("scale", "text"), [(1000.0, "200 m long. Is its unit millimetres"),
-                                             (0.001, "0.2 mm long. Is its unit")])
-def test_a_wrong_unit_is_suspected(scale, text):
-    """Millimetres read as metres, and the other way round."""
-    whole = bar()
-    _, warnings = usable_surface(Surface(whole.vertices * scale, whole.faces), FILE)
-    assert text in warnings[0]
+@pytest.mark.parametrize(("scale", "unit", "text"), [
+    (200.0, "m", "40 m long, read in m.*--unit mm .0.04 m., --unit m[.]"),
+    (0.025, "m", "0.005 m long.*--unit m[.]"),
+    (1000.0, "m", "200 m long.*No plant.*--unit mm .0.2 m."),
+    (0.001, "mm", "0.0002 m long.*No plant.*--unit m .0.2 m."),
+    (1e18, "m", "No plant"), (1e-7, "m", "No plant")])
+def test_a_wrong_unit_is_asked_for(scale, unit, text):
+    """Millimetres read as metres, and the other way round; impossible sizes even if stated."""
+    places = bar().vertices * scale
+    with pytest.raises(InputError, match=text):
+        size_doubts(places, "surface", unit, is_stated=False)
+    if "No plant" in text:
+        with pytest.raises(InputError, match=text):
+            size_doubts(places, "surface", unit, is_stated=True)
+    else:
+        assert size_doubts(places, "surface", unit, is_stated=True) == []
 
 
-def test_what_no_branch_can_be_is_refused():
-    """A mile of wood, or none: no mesh is begun."""
-    whole = bar()
-    for scale in (1e18, 1e-7):
-        with pytest.raises(InputError, match="No branch has this size"):
-            size_doubts(whole.vertices * scale, "surface")
+def test_a_large_plant_without_a_unit_is_a_warning():
+    assert size_doubts(bar().vertices, "surface", "m", is_stated=False) == []
+    told, = size_doubts(bar().vertices * 125, "surface", "m", is_stated=False)
+    assert "25 m long" in told and "--unit mm (0.025 m)" in told
 
 
 def test_refused_surfaces_leave_no_folder(tmp_path, capsys):

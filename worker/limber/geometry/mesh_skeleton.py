@@ -54,7 +54,8 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
         raise InputError(f"{int((read.radius <= 0).sum())} of {read.node_count} nodes of {path} "
                          "have radius 0.", "A branch has a thickness.",
                          "Give each node its radius.")
-    for text in size_doubts(read.nodes, "cylinder model"):
+    for text in size_doubts(read.nodes, "cylinder model", settings.unit,
+                            is_stated="unit" in settings.model_fields_set):
         progress.warn(text)
     alignment, skeleton = _aligned(read, scale, settings)
     meshed = mesh_skeleton(skeleton, ReconstructSettings(

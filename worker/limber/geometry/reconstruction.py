@@ -29,6 +29,7 @@ from limber.geometry.leaf_removal import (
     show_leaves,
     without_leaves,
 )
+from limber.geometry.plausible_size import size_doubts
 from limber.geometry.point_classes import Show, classified, shown_if_refused
 from limber.geometry.pruned_twigs import (
     leave_out_twigs,
@@ -138,6 +139,9 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
     raw = raw.with_valid_columns(_OWN_COLUMNS)
     prepared = prepare(raw, UNIT_METRES[settings.unit], settings, eye=eye,
                        up=np.array(settings.up, float))
+    prepared.warnings[:0] = size_doubts(
+        prepared.cloud.points, "scan", settings.unit,
+        is_stated=raw.unit is not None or "unit" in settings.model_fields_set)
     for text in prepared.warnings:
         progress.warn(text)
     supports = [] if own is not None else find_supports(prepared.cloud.points,

@@ -166,7 +166,9 @@ def command_line(*models: Settings) -> list[str]:
     for model in models:
         for name, field in type(model).model_fields.items():
             value = getattr(model, name)
-            if not field.is_required() and value == field.get_default(call_default_factory=True):
+            # A stated value counts even if it is the default: the unit would be asked for.
+            if not field.is_required() and name not in model.model_fields_set and (
+                    value == field.get_default(call_default_factory=True)):
                 continue
             if (field.json_schema_extra or {}).get("argument"):
                 arguments.append(str(value))

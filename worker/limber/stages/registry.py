@@ -191,15 +191,17 @@ def stage_schema(name: str) -> dict[str, Any]:
 
 
 def all_schemas() -> dict[str, Any]:
-    """Return the schemas of all stages by name, the format's version, and the presets of species
-    and sensors.
+    """Return the schemas of all stages by name, the format's version, the presets of species and
+    sensors, and the largest size [m] without a question about the unit.
     """
+    from limber.geometry.plausible_size import LONGEST
     from limber.mechanics.materials.species import SOURCE, SPECIES
     from limber.recordings.sensor_presets import SENSORS
 
     return {"format": FORMAT,
             "species": {"source": SOURCE,
                         "presets": {name: asdict(known) for name, known in SPECIES.items()}},
+            "longest_m": LONGEST,
             "sensors": {name: asdict(known) for name, known in SENSORS.items()},
             "stages": {name: stage_schema(name) for name in stage_summaries()}}
 

@@ -16,8 +16,6 @@ from limber.geometry.cloud.single_view import Sight, View, find_sight, flying_pi
 from limber.geometry.settings import PreparationSettings
 
 POINT_MINIMUM = 50
-_LARGEST_EXTENT = 40.0  # [m] tallest plant that is scanned as a branch
-_SMALLEST_EXTENT = 0.02
 _SHEET_LEAST = 0.08  # smallest fraction of the points that makes a wall or the ground
 _SHEETS_MOST = 6  # a box has six
 _AT_ONCE = 200_000  # points whose neighbours are held in memory at a time
@@ -296,12 +294,6 @@ def _rounding(points: np.ndarray) -> float:
 
 def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
     texts = []
-    extent = float(np.ptp(points, axis=0).max())
-    if extent > _LARGEST_EXTENT:
-        unit = "millimetres (--unit mm)" if extent > 100 else "centimetres (--unit cm)"
-        texts.append(f"The cloud is {extent:.0f} m long. Is its unit {unit}?")
-    if extent < _SMALLEST_EXTENT:
-        texts.append(f"The cloud is {1000 * extent:.1f} mm long. Is its unit (--unit) correct?")
     if counts.get("not_finite"):
         texts.append("Points with coordinates that are not finite (NaN or infinity) were "
                      f"discarded: {counts['not_finite']}.")

@@ -30,7 +30,7 @@ def read_depth(depth_path: Path, camera_path: Path, mask_path: Path | None = Non
         raise InputError(f"{depth_path} has no reading within the mask.",
                          "A cloud needs depths greater than 0.",
                          "Check the mask and the depth image.")
-    return Cloud(seen.points, {"sigma": seen.sigma})
+    return Cloud(seen.points, {"sigma": seen.sigma}, unit="m")
 
 
 def _image(path: Path) -> np.ndarray:

@@ -7,7 +7,6 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.geometry.io.formats import Format, Registry
-from limber.geometry.plausible_size import size_doubts
 from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.surface_checks import crossings, pieces
 
@@ -49,7 +48,7 @@ def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
                          "The surface of a solid must not intersect itself.",
                          "Unite its parts (in Blender: a Boolean modifier with Self), then mesh "
                          "the surface again.")
-    return surface, warnings + size_doubts(surface.vertices, "surface")
+    return surface, warnings
 
 
 def _welded(surface: Surface) -> tuple[Surface, list[str]]:

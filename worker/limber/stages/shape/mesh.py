@@ -58,16 +58,18 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     settings = settings or MeshSurfaceSettings()
     path, drawn = require_file(path, "A surface"), None
     warnings: list[str] = []
-    chosen = body_format(path)
+    chosen, is_stated = body_format(path), "unit" in settings.model_fields_set
     has_cylinders = chosen in SKELETONS.readers()
     if has_cylinders:
         progress = progress.keeping(warnings)
     elif chosen is SECTIONS:
         drawn = read_sections(path, settings.unit)
-        warnings += size_doubts(drawn.axis, "axis of the sections")
+        warnings += size_doubts(drawn.axis, "axis of the sections", settings.unit,
+                                is_stated=is_stated)
     else:
         surface, warnings = usable_surface(
             SURFACES.read_as(chosen, path, scale=UNIT_METRES[settings.unit]), path)
+        warnings += size_doubts(surface.vertices, "surface", settings.unit, is_stated=is_stated)
     branch = Branch.create(folder)
     digests = {"surface": file_digest(path)}
     if not force and branch.is_current("mesh", settings, digests=digests):

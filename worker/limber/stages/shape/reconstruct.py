@@ -121,7 +121,8 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
     raw = read_points(cloud_path) if camera_path is None else read_depth(
         cloud_path, camera_path, mask_path)
     unit, unit_notes = unit_of(raw, settings.unit)
-    settings = settings.model_copy(update={"unit": unit})
+    if unit != settings.unit:
+        settings = settings.model_copy(update={"unit": unit})
     digests = {"cloud": file_digest(cloud_path)}
     for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path),
                        ("without", without_path)):
