@@ -55,7 +55,8 @@ def choice_title(stage: Stage, option: str, value: object) -> str:
         return ""
     if field.kind == "boolean":
         return f"{field.title}: {'on' if value else 'off'}"
-    shown = f"{value:g}" if isinstance(value, float) else str(value).replace("_", " ")
+    shown = (f"{value:g}" if isinstance(value, float) else str(value).replace("_", " ")
+             if not isinstance(value, list) else " ".join(f"{number:g}" for number in value))
     return f"{field.title}: {shown}{f' {field.unit}' if field.unit else ''}"
 
 
@@ -79,8 +80,10 @@ def _setting(match: re.Match, stage: Stage | None) -> str:
 
 def _is_value(field: Field | None, word: str | None) -> bool:
     """Whether the word after an option is its value; it may as well be the next of the sentence."""
-    return field is not None and bool(word) and field.kind in ("choice", "number", "integer") and (
-        word.rstrip(".") in field.choices or word[0].isdigit())
+    if field is None or not word:
+        return False
+    return word.rstrip(".") in (*field.choices, field.word) or (
+        field.kind in ("choice", "number", "integer") and word[0].isdigit())
 
 
 def _field(name: str, stage: Stage | None) -> Field | None:

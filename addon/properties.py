@@ -147,6 +147,9 @@ def values_of(group: Any, stage: Stage, only: set[str] | None = None) -> dict[st
     for name, field in stage.fields.items():
         if only is not None and name not in only:
             continue
+        if field.word and getattr(group, word_property(field)):
+            found[name] = field.word
+            continue
         if field.is_optional and has_switch(field) and not getattr(group, OPEN + name):
             found[name] = None
             continue
@@ -157,17 +160,29 @@ def values_of(group: Any, stage: Stage, only: set[str] | None = None) -> dict[st
     return found
 
 
+def word_property(field: Field) -> str:
+    """Return the name of the property that states whether a vector is its word instead."""
+    return f"{field.word}_{field.name}"
+
+
+def put(group: bpy.types.PropertyGroup, field: Field, value: Any) -> None:
+    """Set a setting to ``value``, as in JSON; TypeError or ValueError if it has no such value."""
+    is_word = bool(field.word) and value == field.word
+    if field.word:
+        setattr(group, word_property(field), is_word)
+    if field.is_optional and has_switch(field):
+        setattr(group, OPEN + field.name, value is not None and not is_word)
+    if value is None or is_word:
+        group.property_unset(field.name)
+    else:
+        setattr(group, field.name, field.shown(value))
+
+
 def take_over(group: bpy.types.PropertyGroup, stage: Stage, settings: dict[str, Any]) -> None:
     """Set the settings of a stage to those that made a branch."""
     for name in stage.settings & settings.keys():
-        field, value = stage.fields[name], settings[name]
-        if field.is_optional and has_switch(field):
-            setattr(group, OPEN + name, value is not None)
-        if value is None:
-            group.property_unset(name)
-            continue
         try:
-            setattr(group, name, field.shown(value))
+            put(group, stage.fields[name], settings[name])
         except (TypeError, ValueError):
             # The branch is from a version with other choices: the default stays.
             group.property_unset(name)
@@ -178,7 +193,7 @@ def differs(group: Any, stage: Stage, settings: dict[str, Any]) -> bool:
     now = values_of(group, stage)
     for name in stage.settings & settings.keys():
         value, before = now[name], settings[name]
-        if value is None or before is None:
+        if value is None or before is None or stage.fields[name].word in (value, before):
             if value != before and (value or before):
                 return True
         elif stage.fields[name].kind in ("number", "vector"):
@@ -213,6 +228,10 @@ def stage_properties(stage: Stage, options: set[str] = frozenset()) -> dict[str,
         if field.is_optional and has_switch(field):
             found[OPEN + name] = bpy.props.BoolProperty(
                 name=field.title, description=f"{field.description} Off: the worker decides",
+                options=set(options))
+        if field.word:
+            found[word_property(field)] = bpy.props.BoolProperty(
+                name=f"{field.title}: {field.word}", description=field.about(field.word),
                 options=set(options))
     return found
 

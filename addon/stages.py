@@ -47,6 +47,7 @@ class Field:
         least, most: Bounds of a number, or None; ``is_open`` states that ``least`` itself is
         excluded.
         length: Length of a vector.
+        word: What a vector may be instead of its numbers, or empty.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Field:
     most: float | None = None
     is_open: bool = False
     length: int = 0
+    word: str = ""
 
     @property
     def label(self) -> str:
@@ -76,7 +78,8 @@ class Field:
         """Return what the description says of a choice, where it has the form "choice: text"; else
         all of it.
         """
-        names = "|".join(re.escape(name) for name in self.choices)
+        names = "|".join(re.escape(name) for name in (*self.choices, *([self.word] * bool(
+            self.word))))
         parts = re.split(rf"(?:^|(?<=[.;:,] ))({names}): ", self.description)
         told = dict(zip(parts[1::2], parts[2::2], strict=True))
         return told.get(choice, self.description).rstrip(" ;,")
@@ -86,6 +89,8 @@ class Field:
         flag = "--" + self.name.replace("_", "-")
         if self.kind == "boolean":
             return [flag if value else f"--no-{flag[2:]}"]
+        if self.word and value == self.word:
+            return [flag, value]
         if self.kind == "vector":
             return [flag, *map(number_text, value)]
         if self.kind == "rows":
@@ -259,7 +264,8 @@ def _field(name: str, about: dict[str, Any], *, is_required: bool) -> Field:
         most=kind.get("maximum", kind.get("exclusiveMaximum")),
         is_open="exclusiveMinimum" in kind,
         length=len((kind.get("items", kind) if kind["type"] == "array" else {}).get(
-            "prefixItems", ())))
+            "prefixItems", ())),
+        word=next((other["const"] for other in kinds[1:] if "const" in other), ""))
 
 
 def _kind(about: dict[str, Any]) -> str:

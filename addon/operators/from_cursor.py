@@ -32,7 +32,15 @@ class LIMBER_OT_from_cursor(bpy.types.Operator):
             self.report({"ERROR"}, f"{self.stage} has no position {self.field!r}.")
             return {"CANCELLED"}
         group = properties.group_of(context.scene, stage)
-        place = tuple(branches.in_branch(context.scene, context.scene.cursor.location))
+        cursor = context.scene.cursor.location
+        if stage.name == "reconstruct":
+            scan = _scan_of(context)
+            if scan is None:
+                self.report({"ERROR"}, "The scan is not shown. Import it, then place the cursor.")
+                return {"CANCELLED"}
+            properties.put(group, field, _in_file(scan, [scan.matrix_world.inverted() @ cursor])[0])
+            return {"FINISHED"}
+        place = tuple(branches.in_branch(context.scene, cursor))
         if is_list:
             # One more of them.
             given = getattr(group, field.name)
@@ -125,12 +133,10 @@ class LIMBER_OT_crop_scan(bpy.types.Operator):
             self.report({"ERROR"}, "No points are selected. Select the points to keep in Edit "
                                    "Mode, or an object around them.")
             return {"CANCELLED"}
-        # The file's own numbers: in double precision, since map coordinates are large.
-        offset = scan.get(branches.OFFSET_KEY, (0.0,) * 3)
         settings = context.scene.limber.reconstruct
+        places = _in_file(scan, places)
         for name, bound in (("crop_low", min), ("crop_high", max)):
-            setattr(settings, name, [bound(place[axis] for place in places) + offset[axis]
-                                     for axis in range(3)])
+            setattr(settings, name, [bound(place[axis] for place in places) for axis in range(3)])
             setattr(settings, properties.OPEN + name, True)
         self.report({"INFO"}, "The scan is cropped when it is reconstructed")
         return {"FINISHED"}
@@ -144,6 +150,13 @@ def _scan_of(context: bpy.types.Context) -> bpy.types.Object | None:
     path = context.scene.limber.reconstruct.cloud
     return next((thing for thing in context.scene.objects if branches.SCAN_KEY in thing
                  and path and thing.name.startswith(f"{Path(path).stem} scan")), None)
+
+
+def _in_file(scan: bpy.types.Object, places: list[Vector]) -> list[list[float]]:
+    """Return positions of a scan's object in the coordinates of its file."""
+    # In double precision, since map coordinates are large.
+    offset = scan.get(branches.OFFSET_KEY, (0.0,) * 3)
+    return [[place[axis] + offset[axis] for axis in range(3)] for place in places]
 
 
 def _selected(scan: bpy.types.Object) -> list[Vector]:

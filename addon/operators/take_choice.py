@@ -37,9 +37,7 @@ class LIMBER_OT_take_choice(bpy.types.Operator):
     def _run(self, context, how: str):
         stage, value = stages()[self.stage], json.loads(self.value)
         field, group = stage.fields[self.option], properties.group_of(context.scene, stage)
-        if field.is_optional and properties.has_switch(field):
-            setattr(group, properties.OPEN + field.name, True)
-        setattr(group, field.name, field.shown(value))
+        properties.put(group, field, value)
         self.report({"INFO"}, plain_words.choice_title(stage, self.option, value))
         try:
             return getattr(bpy.ops.limber, properties.attribute_name(stage.name))(

@@ -11,7 +11,17 @@ from ..lines import draw_text, has_room_beside
 from ..operators.presets import sensor_menu
 from ..plain_words import choice_title, first_sentence, plain, settings_in, stages_in
 from ..stages import Field, Stage, stages
-from ..steps import FIRST, PLACES, REGIONS, STEPS, WAYS, StageView, Step, StepState
+from ..steps import (
+    FIRST,
+    PLACES,
+    REGIONS,
+    SCAN_PLACES,
+    STEPS,
+    WAYS,
+    StageView,
+    Step,
+    StepState,
+)
 from ..steps import next_step as step_after
 from .comparing import draw_moduli, draw_paths
 from .pulls import draw_pulls
@@ -249,9 +259,10 @@ def _draw_fields(layout: bpy.types.UILayout, context: bpy.types.Context, view: S
 def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: Stage,
                 field: Field) -> None:
     group = properties.group_of(context.scene, stage)
-    has_place = "branch_folder" in stage.fields and (field.name in PLACES or (
-        field.kind == "vector" and field.length == 3 and field.unit == "m"
-        and field.name not in WAYS))
+    has_place = (field.name in SCAN_PLACES if stage.name == "reconstruct" else
+                 "branch_folder" in stage.fields and (field.name in PLACES or (
+                     field.kind == "vector" and field.length == 3 and field.unit == "m"
+                     and field.name not in WAYS)))
     has_region = stage.name == "plan" and field.name in REGIONS
     heading = field.label
     value = getattr(group, field.name) if field.kind in ("list", "rows") else ""
@@ -270,6 +281,8 @@ def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: S
         inner = row.row()
         inner.active = getattr(group, properties.OPEN + field.name)
     inner.prop(group, field.name, text="")
+    if field.word:
+        row.prop(group, properties.word_property(field), text=field.word.capitalize(), toggle=True)
     if has_place:
         operator = row.operator("limber.from_cursor", text="", icon="CURSOR")
         operator.stage, operator.field = stage.name, field.name

@@ -122,3 +122,32 @@ def test_every_error_of_a_stage_is_told_without_the_command_line(addon):
                 for hit in re.findall(r"--[a-z][a-z-]+|`limber [^`]*`", plain(text)):
                     left.setdefault(hit, path.name)
     assert not {hit: name for hit, name in left.items() if hit not in known}
+
+
+def test_the_root_that_an_error_asks_for_is_set_by_a_button_or_the_cursor(bpy, failing):
+    """The button sets the place, or the word; the cursor gives the file's coordinates."""
+    stages, properties = part("stages").stages(), part("properties")
+    stage = stages["reconstruct"]
+    group = properties.group_of(bpy.context.scene, stage)
+
+    def root():
+        return properties.values_of(group, stage, {"root"})["root"]
+    assert root() is None
+    for value in ([1.0, -2.0, 300.0], "auto"):
+        with pytest.raises(RuntimeError, match="two plants"):
+            bpy.ops.limber.take_choice(stage="reconstruct", option="root", value=json.dumps(value))
+        assert root() == (value if value == "auto" else tuple(value))
+        typed = json.loads(failing.read_text().splitlines()[-1])
+        given = typed[typed.index("--root") + 1:]
+        assert given[0] == "auto" if value == "auto" else [*map(float, given[:3])] == value
+    assert part("plain_words").choice_title(stage, "root", [1.0, -2.0, 0.5]) == "Root: 1 -2 0.5"
+    bpy.context.view_layer.update()
+    bpy.context.scene.cursor.location = (1.0, 2.0, 0.5)
+    cloud = next(thing for thing in bpy.context.scene.objects if "limber_scan_sha256" in thing)
+    offset = cloud.get("limber_map_offset", (0.0, 0.0, 0.0))
+    assert bpy.ops.limber.from_cursor(stage="reconstruct", field="root") == {"FINISHED"}
+    assert root() == pytest.approx(
+        [1000 * place + off for place, off in zip((1, 2, 0.5), offset, strict=True)], rel=1e-5)
+    properties.take_over(group, stage, {"root": "auto"})
+    assert root() == "auto" and not properties.differs(group, stage, {"root": "auto"})
+    assert properties.differs(group, stage, {"root": None})

@@ -14,7 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from limber.cli import main
 from limber.core.errors import Cancelled, ConvergenceError, InputError, SafetyStop
-from limber.stages.command_line import settings_options
+from limber.geometry.settings import ReconstructSettings
+from limber.stages.command_line import command_line, settings_options
 from limber.stages.registry import stage_description, stage_summaries
 
 
@@ -90,6 +91,27 @@ def test_settings_become_options(arguments, wanted, capfd):
     code, _ = invoke(function, arguments, capfd)
     assert code == 0
     assert seen == [wanted]
+
+
+@pytest.mark.parametrize(("arguments", "wanted"), [
+    (["--root", "auto"], "auto"), (["--root=auto"], "auto"),
+    (["--root", "-900", "793", "2060.5"], (-900.0, 793.0, 2060.5)), ([], None)])
+def test_a_word_may_stand_for_the_numbers_of_an_option(arguments, wanted, capfd):
+    """As it is typed; a command line made of it is read the same."""
+    seen = []
+
+    def code_of(given):
+        @settings_options(ReconstructSettings)
+        def function(run, settings, **_options):
+            """Probe."""
+            seen.append(settings)
+            return {}
+        return invoke(function, given, capfd)[0]
+    assert code_of(arguments) == 0 and code_of(command_line(seen[0])) == 0
+    assert [settings.root for settings in seen] == [wanted, wanted]
+    with pytest.raises(click.UsageError, match="extra arguments"):
+        code_of(["--root", "auto", "1", "2"])
+    assert code_of(["--root", "1", "auto", "2"]) == 2
 
 
 @pytest.mark.parametrize("arguments", [["--size=-1"], ["--size=nan"], ["--fractions", "0.1,x"]])

@@ -20,6 +20,8 @@ from limber.stages.registry import stage_schema
     ("reconstruct", "--plants everything, --no-such thing, `limber cache --clear`", []),
     ("energy", "Switch weight off (--no-gravity) or sample more: --samples 200.",
      [{"option": "gravity", "value": False}, {"option": "samples", "value": 200}]),
+    ("reconstruct", "State it: --root 1.5 -2 3e-1 (probability 0.6), or --root 1 2. Or --root "
+     "auto.", [{"option": "root", "value": [1.5, -2.0, 0.3]}, {"option": "root", "value": "auto"}]),
     ("plan", "Choose a goal (--goal).", [])])
 def test_options_with_a_value_are_offered(stage, text, wanted):
     """In the text's order, each once; not what the stage does not know, nor what has no value."""

@@ -210,7 +210,8 @@ def test_a_search_comes_back_to_its_last_bit(tmp_path) -> None:
     place, points = rng.normal(size=3), rng.normal(size=(40, 3))
     found = replace(
         result_of_skeleton(skeleton, points), noise=0.1 / 3, loops=[1 / 7], pruned=4, leafy=True,
-        second_base=place, root_probability=2 / 3, bridges=[
+        second_base=place, root_ends=[
+            {"at": place, "probability": 2 / 3}], bridges=[
             {"from": place, "to": -place, "length": 1 / 3, "price": 2.0},
             {"from": place, "to": -place, "length": 1 / 3, "price": 2.0, "thickness": 1 / 7,
              "probability": 1 / 3, "rival_from": place, "rival_to": None, "rival_price": None}],

@@ -248,7 +248,7 @@ def _run(run: SameTreeRun) -> SameTreeRun:
     rng = np.random.default_rng([run.seed, *run.change.encode()])
     cloud, settings, back = _CHANGED[run.change](cloud, {"leave_out": True} | settings, rng)
     try:
-        made = reconstruct_cloud(cloud, ReconstructSettings(**settings))
+        made = reconstruct_cloud(cloud, ReconstructSettings(**{"root": "auto"} | settings))
     except Exception as error:  # a crash is what the row asks for
         seen = error.seen if isinstance(error, LimberError) else f"{type(error).__name__}: {error}"
         return replace(run, failure=seen, seconds=time.perf_counter() - began)

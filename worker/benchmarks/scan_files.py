@@ -84,7 +84,8 @@ def _run(name: str, source: str, out: Path | None) -> ScanRun:
 def real_scan(name: str) -> tuple[Cloud, ReconstructSettings]:
     """A real scan by the stem of its file, and its settings."""
     file = next(file for file in SCANS if Path(file).stem == name)
-    return read_points(DATA / file), ReconstructSettings(**(_LEAFY | SCANS[file]))
+    return read_points(DATA / file), ReconstructSettings(
+        **({"root": "auto"} | _LEAFY | SCANS[file]))
 
 
 def off_any_point(made: Reconstruction) -> float:

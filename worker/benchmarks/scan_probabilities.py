@@ -34,7 +34,6 @@ from limber.geometry.leaf_removal import without_leaves
 from limber.geometry.reconstruction import seen_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.confidence import PLACED, evidence
-from limber.geometry.skeleton.contraction.root_end import ROOT_ODDS
 from limber.geometry.skeleton.joining.rivals import bridge_evidence
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -138,8 +137,8 @@ def outcomes(done: list[Skeletonised], out: Path) -> dict[str, Outcomes]:
         told["bridges"].add(np.array([bridge_evidence(*(bridge[name] for name in (
             "price", "length", "thickness", "rival_price"))) for bridge in one.bridges]).reshape(
                 -1, 3), bridges_right(one.bridges, truth), source)
-        odds = np.log(max(one.root_probability, 1e-12) / max(1 - one.root_probability, 1e-12)
-                      ) - ROOT_ODDS[0]
+        # Right if the fit returns a constant of 0 and a slope of 1.
+        odds = np.log(max(one.root_probability, 1e-12) / max(1 - one.root_probability, 1e-12))
         off = np.linalg.norm(found.nodes[0] - truth.nodes[0])
         told["roots"].add(np.array([[odds]]), np.array([off <= 2 * truth.radius[0]]), source)
     return told

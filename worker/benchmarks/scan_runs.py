@@ -156,7 +156,7 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
         LimberError: it could not be reconstructed.
     """
     path, branch = case.write(folder), folder / f"{case.name}.branch"
-    result = reconstruct(path, branch, ReconstructSettings(**case.settings))
+    result = reconstruct(path, branch, ReconstructSettings(**{"root": "auto"} | case.settings))
     manifest = json.loads((branch / "branch.json").read_text())
     aligned = read_cylinders(branch / "skeleton.csv")
     alignment = Alignment.model_validate(manifest["alignment"])

@@ -230,7 +230,7 @@ def _looped(folder: Path, case: ScanCase, rng: np.random.Generator) -> _Loop:
     drawn = np.exp(rng.uniform(*np.log(YOUNG_PA)) + np.linspace(0.4, -0.4, len(FRACTIONS))
                    + rng.uniform(-0.5, 0.5, len(FRACTIONS)))
     folder_of_branch = folder / "drawn.branch"
-    reconstructing = ReconstructSettings(**case.settings)
+    reconstructing = ReconstructSettings(**{"root": "auto"} | case.settings)
     reconstruct(case.write(folder), folder_of_branch, reconstructing)
     branch = Branch.open(folder_of_branch)
     axes = case.truth.moved(branch.manifest.alignment.apply(case.truth.nodes))

@@ -90,7 +90,8 @@ def test_warnings_have_places_in_the_coordinates_of_the_file():
             if "gap" in text]
     place = [float(part) for part in re.search(r"\(([^)]*)\)", told[0])[1].split(",")]
     assert place == pytest.approx([5000, 0, 300], abs=60)
-    odd = replace(result, other_root=result.skeleton.nodes[-1])
+    odd = replace(result, root_ends=[{"at": result.skeleton.nodes[end], "probability": 0.5}
+                                     for end in (0, -1)])
     text = next(text for text in odd.warnings_at(lambda place: place + [5, 0, 0])
                 if "--root" in text)
     assert "origin" not in text and text.count("(5.0") + text.count("(4.9") == 2

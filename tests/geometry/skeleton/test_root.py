@@ -1,9 +1,14 @@
 """Which end of a curve graph is the root."""
 
-import numpy as np
+from types import SimpleNamespace
 
+import numpy as np
+import pytest
+
+from limber.core.errors import InputError
 from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
 from limber.geometry.skeleton.contraction.root_end import root_node
+from limber.geometry.skeleton.plausibility import OPEN, check_root
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -51,3 +56,48 @@ def test_a_foot_with_few_points_is_judged_by_what_follows_it():
     graph, points = _graph([foot, stem])
     start, *_ = root_node(graph, points, None, _UP)
     assert graph.nodes[start, 2] == 0.0
+
+
+def _rod(thick, up):
+    """The choice on 41 nodes along x from 0 to 1 m, with the thickness ``thick(x)`` [m]."""
+    places = [(x, 0.0, 0.0) for x in np.linspace(0.0, 1.0, 41)]
+    graph, _ = _graph([(places, -1, 0.0, 12)])
+    graph.thickness[:] = [thick(x) for x, *_ in places]
+    points = graph.nodes[graph.owner] + graph.thickness[graph.owner, None] * np.tile(
+        _ring(np.zeros(3), 1.0, 12)[:, [2, 0, 1]], (41, 1))
+    return root_node(graph, points, None, np.array(up, float))
+
+
+def test_the_thick_end_of_a_hanging_branch_is_the_root():
+    """Side branches point down and away from it, and thin ends hang lower."""
+    main = ([(0.02 * k, 0.0, -0.05 * k) for k in range(41)], -1, 0.006, 12)
+    sides = [([(0.02 * k + side * 0.03 * n, 0.0, -0.05 * k - 0.04 * n) for n in range(1, 15)], k,
+              0.003, 12) for k, side in ((8, 1), (16, -1), (24, 1))]
+    graph, points = _graph([main, *sides])
+    choice = root_node(graph, points, None, _UP)
+    assert graph.nodes[choice.node].tolist() == [0.0, 0.0, 0.0]
+    assert choice.ends[0]["probability"] > OPEN
+
+
+def test_a_tapering_rod_stands_on_its_thick_end_and_an_even_one_on_its_lower():
+    for up, node in (((1, 0, 0), 0), ((-1, 0, 0), 40)):
+        choice = _rod(lambda x: 0.01, up)
+        assert choice.node == node and choice.ends[0]["probability"] > OPEN
+    for up in ((1, 0, 0), (0, 0, 1)):
+        choice = _rod(lambda x: 0.012 - 0.009 * x, up)
+        assert choice.node == 0 and choice.ends[0]["probability"] > OPEN
+    # Upside down, thickness outweighs height.
+    assert _rod(lambda x: 0.012 - 0.009 * x, (-1, 0, 0)).node == 0
+
+
+def test_the_root_is_asked_for_where_two_ends_are_near_even():
+    choice = _rod(lambda x: 0.01, (0, 0, 1))
+    assert {tuple(end["at"]) for end in choice.ends} == {(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)}
+    result = SimpleNamespace(root_ends=choice.ends,
+                             root_probability=choice.ends[0]["probability"])
+    with pytest.raises(InputError, match=r"which of 2 ends.*--root auto") as asked:
+        check_root(result, lambda place: 1000 * place + [5, 0, 0])
+    for option in ("--root 5.000 0.000 0.000 (", "--root 1005.000 0.000 0.000 ("):
+        assert option in str(asked.value)
+    result.root_probability = OPEN
+    check_root(result, lambda place: place)

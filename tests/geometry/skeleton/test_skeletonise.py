@@ -236,7 +236,7 @@ def _root_of_stem(foot: np.ndarray, thick: list[float], support: list[int]) -> i
     z, x = np.arange(0, 0.6, 0.005), 0.005 * np.arange(1, 41)
     count = len(foot)
     nodes = np.vstack([foot, np.stack([0 * z, 0 * z, z], axis=1),
-                       np.stack([x, 0 * x, 0.3 - x], axis=1)])
+                       np.stack([x, 0 * x, 0.3 + x], axis=1)])
     edges = np.stack([np.arange(len(nodes) - 1), np.arange(1, len(nodes))], axis=1)
     edges[count + 119] = [count + 60, count + 120]
     thickness = np.concatenate([thick, np.full(120, 0.009), np.full(40, 0.004)])

@@ -156,7 +156,7 @@ def _run(task: tuple[str, str], seed: int, source: str) -> RealRun:
         np.linalg.norm(other[:, 1] - other[:, 0], axis=1).sum())
     try:
         made = reconstruct_cloud(cloud, ReconstructSettings(
-            **({"leave_out": True} | scan.settings)))
+            **({"leave_out": True, "root": "auto"} | scan.settings)))
     except Exception as error:  # a crash is counted as a refusal is
         text = error.seen if isinstance(error, LimberError) else f"{type(error).__name__}: {error}"
         return replace(run, failure=text, reference_m=reference,

@@ -43,9 +43,10 @@ from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.alternatives import alternatives, entries
 from limber.geometry.skeleton.checkpoint import FoundSkeleton
 from limber.geometry.skeleton.control_points import FRACTIONS
-from limber.geometry.skeleton.edits import Edit, edited
+from limber.geometry.skeleton.edits import Edit, SetRoot, edited
 from limber.geometry.skeleton.plausibility import (
     check_explained,
+    check_root,
     off_axes,
     unexplained_share,
 )
@@ -177,6 +178,8 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
                             lambda place: (place + wood.origin) / scale,
                             lambda off: bool(supports) or (
                                 settings.leaves != "keep" and show_leaves(wood, off)))
+        if settings.root is None and not any(isinstance(edit, SetRoot) for edit in edits):
+            check_root(found, alignment.undo)
     # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.
     warnings = list(prepared.warnings)
     if named:
@@ -390,7 +393,8 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
                              "(--unit applies to both).")
         return result_of_skeleton(own.moved(own.nodes - prepared.origin), prepared.cloud.points)
     scale = UNIT_METRES[settings.unit]
-    root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin
+    root = None if settings.root in (None, "auto") else (
+        np.array(settings.root) * scale - prepared.origin)
     return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),
                        view=prepared.view, progress=progress, show_apart=show_apart,
                        where=lambda place: (place + prepared.origin) / scale)

@@ -126,9 +126,10 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
         "m", description="Unit of the file, if it does not state one.")
     up: Direction = Field(
         (0.0, 0.0, 1.0), description="The up direction in the file's axes.")
-    root: tuple[float, float, float] | None = Field(
-        None, description="A point near the root, in the file's coordinates. Default: the thick "
-            "end.")
+    root: tuple[float, float, float] | Literal["auto"] | None = Field(
+        None, description="A point near the root, in the file's coordinates. auto: the likeliest "
+        "end, however unlikely. Default: the likeliest end, but stop if its probability is below "
+        "0.8.")
     upright: bool = Field(
         False, description="Turn the branch, and gravity with it, so that it grows along z, as "
         "in the paper. Default: keep the scan's up direction.")

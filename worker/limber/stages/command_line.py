@@ -47,6 +47,13 @@ class GroupedCommand(click.Command):
             ["--help-all"], is_flag=True, is_eager=True, expose_value=False,
             callback=_show_all, help="Show this message with all options, and exit."))
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the arguments; a word may stand for all numbers of an option."""
+        for param in self.get_params(ctx):
+            if isinstance(param.type, _NumberOrWord):
+                args = param.type.repeated(args, param)
+        return super().parse_args(ctx, args)
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options title by title."""
         sections: dict[str, list[tuple[str, str]]] = {}
@@ -71,6 +78,35 @@ class GroupedCommand(click.Command):
         if hidden:
             formatter.write_paragraph()
             formatter.write_text(f"{hidden} more options: --help-all")
+
+
+class _NumberOrWord(click.ParamType):
+    """A number, or one of the words that stand for all numbers of an option."""
+
+    name = "number"
+
+    def __init__(self, words: Collection[str]):
+        self.words = words
+
+    def repeated(self, args: list[str], param: click.Parameter) -> list[str]:
+        """Return arguments in which a word is given as often as numbers would be."""
+        found: list[str] = []
+        for text in args:
+            flag, is_joined, word = text.partition("=")
+            if found[-1:] and found[-1] in param.opts and text in self.words:
+                found += param.nargs * [text]
+            elif is_joined and flag in param.opts and word in self.words:
+                found += [flag, *param.nargs * [word]]
+            else:
+                found.append(text)
+        return found
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return value if value in self.words else click.FLOAT.convert(value, param, ctx)
+
+    def joined(self, _ctx: click.Context, _param: click.Parameter, values: Any) -> Any:
+        """A word that was given for all numbers, or the numbers; a callback of click."""
+        return values[0] if values and len({*values}) == 1 and values[0] in self.words else values
 
 
 _ALL = "limber.help_all"
@@ -217,7 +253,8 @@ def _parameter(model: type[BaseModel], name: str, field: Any, destination: str) 
     if kind is bool:
         return click.option(f"{flag}/--no-{flag[2:]}", destination, **common)
     if typing.get_origin(kind) is tuple:
-        return _tuple_option([*flags, destination], typing.get_args(kind), common)
+        return _tuple_option([*flags, destination], typing.get_args(kind), common,
+                             _words(field.annotation))
     for part in field.metadata:
         if isinstance(part, OneOf):
             return click.option(*flags, destination, type=click.Choice(part.names()), **common)
@@ -229,7 +266,14 @@ def _parameter(model: type[BaseModel], name: str, field: Any, destination: str) 
     return click.option(*flags, destination, type=_click_type(kind), **common)
 
 
-def _tuple_option(names: list[str], items: tuple, common: dict[str, Any]) -> Callable:
+def _words(annotation: Any) -> list[str]:
+    """The words that a field takes besides its numbers."""
+    return [word for kind in typing.get_args(annotation) if typing.get_origin(kind) is Literal
+            for word in typing.get_args(kind)]
+
+
+def _tuple_option(names: list[str], items: tuple, common: dict[str, Any], words: list[str],
+                  ) -> Callable:
     if items[-1] is Ellipsis and typing.get_origin(items[0]) is tuple:
         parts = typing.get_args(items[0])
         return click.option(*names, nargs=len(parts), type=parts[0], multiple=True, **common)
@@ -238,7 +282,11 @@ def _tuple_option(names: list[str], items: tuple, common: dict[str, Any]) -> Cal
         return click.option(*names, callback=_listed, multiple=True,
                             **{"metavar": "A,B,...", **common})
     if len(items) == 3:
-        common = {"metavar": "X Y Z", **common}
+        common = {"metavar": "|".join(["X Y Z", *words]), **common}
+    if words:
+        kind = _NumberOrWord(words)
+        common = {"callback": kind.joined, **common}
+        return click.option(*names, nargs=len(items), type=kind, **common)
     return click.option(*names, nargs=len(items), type=items[0], **common)
 
 

@@ -42,7 +42,7 @@ def offers(schema: dict[str, Any], text: str) -> list[dict[str, Any]]:
         name, value = match["name"].replace("-", "_"), (match["value"] or "").rstrip(".")
         one = _switch(fields, name)
         if one is None and value and name in fields:
-            one = _valued(name, fields[name], value)
+            one = _valued(name, fields[name], value, text[match.start("value"):])
         if one is not None and one not in found:
             found.append(one)
     return found
@@ -55,10 +55,14 @@ def _switch(fields: dict[str, Any], name: str) -> dict[str, Any] | None:
     return None
 
 
-def _valued(name: str, about: dict[str, Any], value: str) -> dict[str, Any] | None:
+def _valued(name: str, about: dict[str, Any], value: str, rest: str) -> dict[str, Any] | None:
     for kind in about.get("anyOf", [about]):
-        if value in kind.get("enum", ()):
+        if value in kind.get("enum", [kind.get("const")]):
             return {"option": name, "value": value}
+        if kind.get("maxItems"):
+            numbers = re.match(" ".join(kind["maxItems"] * [f"({_NUMBER})"]), rest)
+            if numbers:
+                return {"option": name, "value": [float(each) for each in numbers.groups()]}
         if kind.get("type") in ("number", "integer"):
             try:
                 number = float(value)

@@ -25,11 +25,11 @@ from limber.geometry.skeleton.edits import (
     SplitBranch,
     edited,
 )
+from limber.geometry.skeleton.plausibility import OPEN
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.uncertain_parts import DoubtfulKind, DoubtfulPart
 
 _DETOUR = 1.5  # longest path over a bridge that is still its own, in its lengths
-_OPEN = 0.8  # probability below which a decision is listed among the uncertain parts
 _Combination = tuple[float, tuple[Edit, ...]]
 """Logarithm of its probability, and its edits."""
 
@@ -233,9 +233,9 @@ def open_questions(skeleton: Skeleton, doubts: SearchDoubts) -> list[DoubtfulPar
     """Return attachments and the root, where they are uncertain, for the list of such parts."""
     found = []
     for one in attachments(skeleton, doubts.bridges):
-        if one.probability < _OPEN:
+        if one.probability < OPEN:
             found.append(_part(skeleton, DoubtfulKind.attachment, one.node, one.probability))
-    if doubts.root_probability < _OPEN and _root_edit(skeleton, doubts):
+    if doubts.root_probability < OPEN and _root_edit(skeleton, doubts):
         found.append(_part(skeleton, DoubtfulKind.root, 0, doubts.root_probability))
     return found
 

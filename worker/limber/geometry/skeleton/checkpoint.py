@@ -61,8 +61,8 @@ class FoundSkeleton:
         """Write an NPZ file."""
         result = self.result
         values = {name: getattr(result, name) for name in (
-            "noise", "bridges", "split_off", "loops", "pruned", "second_base", "other_root",
-            "leafy", "unlikely", "root_probability")} | {
+            "noise", "bridges", "split_off", "loops", "pruned", "second_base", "root_ends",
+            "leafy", "unlikely")} | {
             "iterations": result.contraction.iterations, "status": result.contraction.status,
             "leaves": [{"count": len(leaf.points), "area": leaf.area} for leaf in self.leaves]}
         np.savez(path, told=np.array(json.dumps(plain(values))), **asdict(result.skeleton),
@@ -95,8 +95,8 @@ class FoundSkeleton:
             skeleton, contraction, arrays["node_of_point"], arrays["residual"], stored.noise,
             [bridge.found() for bridge in stored.bridges],
             [piece.found() for piece in stored.split_off], stored.loops, stored.pruned,
-            _position_array(stored.second_base), _position_array(stored.other_root), stored.leafy,
-            [twig.found() for twig in stored.unlikely], stored.root_probability),
+            _position_array(stored.second_base), [end.found() for end in stored.root_ends],
+            stored.leafy, [twig.found() for twig in stored.unlikely]),
             _leaves(path, arrays, stored))
 
 
@@ -136,6 +136,11 @@ class _Twig(_Part):
     probability: float
 
 
+class _End(_Part):
+    at: _Place
+    probability: float = Field(ge=0, le=1)
+
+
 class _Leaf(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -152,10 +157,9 @@ class _Stored(BaseModel):
     loops: list[float]
     pruned: int
     second_base: _Place | None
-    other_root: _Place | None
+    root_ends: list[_End]
     leafy: bool
     unlikely: list[_Twig]
-    root_probability: float = Field(1.0, ge=0, le=1)
     iterations: int
     status: ContractionStatus
     leaves: list[_Leaf]

@@ -17,6 +17,8 @@ Where = Callable[[np.ndarray], np.ndarray]
 _STOUT = 0.13  # median distance from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
 _ROUND = 0.3  # fraction of the radius by which points of a round branch may scatter
 _MOST_OFF = 0.5  # fraction of points off all axes above which these do not describe the scan
+OPEN = 0.8
+"""Probability below which a decision is an open question."""
 _NAMED = 3  # gaps and loops named one by one
 _FIX = ("Crop the scan to one branch (--crop-low, --crop-high), or provide a skeleton "
         "(--skeleton).")
@@ -167,12 +169,34 @@ def _doubt_texts(result: Any, where: Where) -> list[str]:
         texts.append(f"The plant has a second base at {_position_text(where(result.second_base))}. "
                      "Do two "
                      "plants touch? Then crop the scan to one of them (--crop-low, --crop-high).")
-    if result.other_root is not None:
-        texts.append(f"The end at {_position_text(where(result.other_root))} is about as likely to "
-                     "be the "
-                     f"root as the end at {_position_text(where(result.skeleton.nodes[0]))}. If it "
-                     "is the root, state it with --root.")
+    if len(result.root_ends) > 1:
+        texts.append(f"Which end is the root is uncertain: {_ends_text(result.root_ends, where)}. "
+                     "The first was taken. If it is another, state it with --root.")
     return texts
+
+
+def check_root(result: Any, where: Where) -> None:
+    """Ask for the root where the scan leaves it open.
+
+    Raises:
+        InputError: the likeliest end has a probability below that of a decided question.
+    """
+    if result.root_probability >= OPEN:
+        return
+    ends = result.root_ends
+    ways = ", ".join("--root " + " ".join(f"{v:.3f}" for v in where(end["at"]))
+                     + f" (probability {end['probability']:.2f})" for end in ends)
+    raise InputError(
+        f"The scan does not show which of {len(ends)} ends is the root.",
+        "Their thickness and height, the taper of the axes and the directions of side branches do "
+        "not decide between them. The fixed end and the radii depend on it.",
+        f"State a place near the root, in the scan's coordinates: {ways}. Or take the likeliest "
+        "end (--root auto).").at(where(ends[0]["at"]))
+
+
+def _ends_text(ends: list[dict], where: Where) -> str:
+    return ", ".join(f"the end at {_position_text(where(end['at']))} with a probability of "
+                     f"{end['probability']:.2f}" for end in ends)
 
 
 def shows_round(result: Any) -> bool:

@@ -37,11 +37,11 @@ class SkeletonResult:
         pruned: Number of spurs pruned.
         second_base: Position where the plant seems to reach the ground a second time [m], shape
         [3].
-        other_root: Another end that is about as likely to be the root [m], shape [3].
+        root_ends: The likeliest ends, as in
+            :class:`~limber.geometry.skeleton.contraction.root_end.RootChoice`.
         unlikely: Dropped twigs, more likely absent than not, as
             :func:`~limber.geometry.skeleton.confidence.likely` returns them.
         leafy: Most points were on no cylinder, and axes were placed in the middle of leaves.
-        root_probability: That the root is the chosen end, and not the next likely one.
     """
 
     skeleton: Skeleton
@@ -54,10 +54,19 @@ class SkeletonResult:
     loops: list[float] = field(default_factory=list)
     pruned: int = 0
     second_base: np.ndarray | None = None
-    other_root: np.ndarray | None = None
+    root_ends: list[dict] = field(default_factory=list)
     leafy: bool = False
     unlikely: list[dict] = field(default_factory=list)
-    root_probability: float = 1.0
+
+    @property
+    def root_probability(self) -> float:
+        """That the chosen end is the root, among all ends; 1 if the user stated it."""
+        return self.root_ends[0]["probability"] if self.root_ends else 1.0
+
+    @property
+    def other_root(self) -> np.ndarray | None:
+        """The next likely end [m], shape [3]; None where the root is sure."""
+        return self.root_ends[1]["at"] if len(self.root_ends) > 1 else None
 
     @property
     def warnings(self) -> list[str]:
@@ -75,15 +84,14 @@ class SkeletonResult:
 
     def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> "SkeletonResult":
         """Return the result in another frame; ``move`` transforms points [n, 3] to it."""
-        bridges, split_off, unlikely = (
+        bridges, split_off, unlikely, ends = (
             [part | {name: move(part[name][None])[0] for name in _PLACES
                      if part.get(name) is not None} for part in parts]
-            for parts in (self.bridges, self.split_off, self.unlikely))
-        base, other = (None if position is None else move(position[None])[0]
-                       for position in (self.second_base, self.other_root))
+            for parts in (self.bridges, self.split_off, self.unlikely, self.root_ends))
+        base = None if self.second_base is None else move(self.second_base[None])[0]
         return replace(self, skeleton=self.skeleton.moved(move(self.skeleton.nodes)),
                        bridges=bridges, split_off=split_off, unlikely=unlikely, second_base=base,
-                       other_root=other)
+                       root_ends=ends)
 
     def report(self) -> dict[str, Any]:
         """Numbers for the stage's result."""
@@ -93,7 +101,8 @@ class SkeletonResult:
                 "bridges": self.bridges, "length_shares": shares(self.skeleton),
                 "doubtful_run_count": len({int(run) for run in self.skeleton.branch[
                     self.skeleton.probability < 0.5]}), "split_off": self.split_off,
-                "unlikely_twigs": self.unlikely, "other_root": self.other_root,
+                "unlikely_twigs": self.unlikely, "root_ends": self.root_ends,
+                "other_root": self.other_root,
                 "root_probability": self.root_probability,
                 "loop_lengths_m": self.loops, "pruned_spur_count": self.pruned}
 

@@ -54,7 +54,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     Args:
         points: Scanned points [m], shape [n, 3].
         settings: Settings to use.
-        root: A point [m] near the root, shape [3]; None: the thick end of the plant.
+        root: A point [m] near the root, shape [3]; None: the end with the best odds.
         up: The up direction, shape [3]; None: z.
         view: The depth camera's view of the points, if they are one's: they scatter only along its
             sight.
@@ -105,7 +105,7 @@ class _Search:
 
     def root(self, graph: CurveGraph, points: np.ndarray, near: np.ndarray | None,
              ) -> RootChoice:
-        """The root's node, and another end that is about as likely to be the root."""
+        """The root's node, and the likeliest ends."""
         return root_node(graph, points, near, self.up)
 
     def in_levels(self, points: np.ndarray, base: np.ndarray, width: float | None = None,
@@ -157,7 +157,7 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
         if show_apart is not None and (graph.plants or graph.split_off):
             show_apart(graph.owner[cKDTree(thin).query(points)[1]] < 0)
         raise
-    start, other_root, certainty = search.root(graph, thin, root)
+    start, ends = search.root(graph, thin, root)
     if len(points) > _FEW and is_sparse(thin, contraction.points):
         thin, loops = points[thinned(points, POINT_LIMIT)], graph.loops
         graph, start = search.in_levels(thin, graph.nodes[start])
@@ -182,4 +182,4 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     progress(1.0, "skeleton", nodes=skeleton.node_count)
     return SkeletonResult(skeleton, contraction, segment, residual, fitted.noise, graph.bridges,
                           graph.split_off, graph.loops, pruned + more, second_base(skeleton, up),
-                          other_root, leafy, unlikely, certainty)
+                          ends, leafy, unlikely)
