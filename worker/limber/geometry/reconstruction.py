@@ -47,7 +47,9 @@ from limber.geometry.skeleton.edits import Edit, SetRoot, edited
 from limber.geometry.skeleton.plausibility import (
     check_explained,
     check_root,
+    check_surface,
     off_axes,
+    surface_text,
     unexplained_share,
 )
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
@@ -55,6 +57,7 @@ from limber.geometry.skeleton.radii.silhouette import without_hidden_twigs
 from limber.geometry.skeleton.search_result import SkeletonResult, result_of_skeleton
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import Apart, skeletonise
+from limber.geometry.skeleton.surface_evidence import RESOLVED, surface_share, without_volumes
 from limber.geometry.skeleton.upright import upright_rotation
 from limber.geometry.surface.forks import smooth_forks
 from limber.geometry.surface.surface import Surface
@@ -170,6 +173,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         cloud = labelled(cloud, found.skeleton)
     if keep is not None and known is None:
         keep(alignment, found.skeleton, FoundSkeleton(whole, leaves))
+    share = 1.0  # who gives a skeleton states its radii
     if own is None:
         scale = UNIT_METRES[settings.unit]
         with named_if_refused(named), shown_if_refused(show, prepared, leaves, supports,
@@ -178,6 +182,9 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
                             lambda place: (place + wood.origin) / scale,
                             lambda off: bool(supports) or (
                                 settings.leaves != "keep" and show_leaves(wood, off)))
+            share = surface_share(found.skeleton, found.node_of_point, found.residual)
+            if not found.leafy:
+                check_surface(share, len(wood.cloud), found.skeleton.length)
         if settings.root is None and not any(isinstance(edit, SetRoot) for edit in edits):
             check_root(found, alignment.undo)
     # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.
@@ -185,7 +192,10 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
     if named:
         warnings.append(named)
         progress.warn(named)
-    for text in found.warnings_at(alignment.undo):
+    texts = found.warnings_at(alignment.undo)
+    if share < RESOLVED:
+        texts.append(surface_text(share))
+    for text in texts:
         warnings.append(text)
         progress.warn(text)
     if edits:
@@ -206,7 +216,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         "leaf_count": len(hung), "leaf_mass_kg": sum(leaf["mass_kg"] for leaf in hung),
         "leaf_area_m2": sum(leaf["area_m2"] for leaf in hung),
         "point_count": len(cloud), "dropped_points": prepared.counts, "gravity_m_s2": gravity,
-        "skeleton_warnings": warnings}
+        "skeleton_warnings": warnings} | without_volumes(share)
     return Reconstruction(alignment, cloud, meshed, gravity, numbers)
 
 

@@ -175,6 +175,32 @@ def _doubt_texts(result: Any, where: Where) -> list[str]:
     return texts
 
 
+def check_surface(share: float, count: int, length: float) -> None:
+    """Refuse points of which none show a surface.
+
+    Args:
+        share: Fraction of the volume that they show.
+        count: Number of points.
+        length: Length of all axes [m].
+
+    Raises:
+        InputError: they show none.
+    """
+    if share == 0:
+        raise InputError(
+            f"The {count} points show no surface along {length:.3g} m of axes.",
+            "Around every axis they scatter as points all through its section would, so they show "
+            "neither a radius nor a volume.",
+            "Scan more densely or with less noise, or give a skeleton with radii (--skeleton).")
+
+
+def surface_text(share: float) -> str:
+    """Warning that the volume is unresolved."""
+    return (f"The points show a surface for {100 * share:.0f} % of the volume only. Elsewhere they "
+            "scatter as points all through the sections would. The volume is unresolved and not "
+            "stated, and masses and stiffnesses that follow from it are guesses.")
+
+
 def check_root(result: Any, where: Where) -> None:
     """Ask for the root where the scan leaves it open.
 

@@ -230,6 +230,7 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     from limber.geometry.skeleton.alternatives import SearchDoubts, alternatives, entries
     from limber.geometry.skeleton.confidence import shares
     from limber.geometry.skeleton.edits import edited, edits_text
+    from limber.geometry.skeleton.surface_evidence import without_volumes
     from limber.geometry.skeleton.totals import totals
     from limber.store.loading import load_found_skeleton, load_masses
 
@@ -260,7 +261,9 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
         stage.result.update(made.result | meshed.numbers | totals(skeleton, doubts) | {
             "alternatives": entries(alternatives(skeleton, doubts),
                                     lambda edit: edit.in_file(alignment)),
-            "length_shares": shares(skeleton), "warnings": warnings})
+            "length_shares": shares(skeleton), "warnings": warnings} | (
+                {} if "surface_share" not in made.result else without_volumes(
+                    made.result["surface_share"])))
 
 
 def _write(skeleton: Skeleton, path: Path, unit: str) -> None:

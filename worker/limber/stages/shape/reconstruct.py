@@ -431,6 +431,6 @@ STAGE = StageDescription(
             "truth/"),
     found=("{length_m:m} of centreline in {branch_count:#branch/branches}, radius "
            "{radius_min_m:m} to {radius_max_m:m}.",
-           "{tet_count:count} tetrahedra, {mesh_volume_m3:cm3}.",
+           "{tet_count:count} tetrahedra.", "Volume {mesh_volume_m3:cm3}.",
            "{done_count:#scan/scans} reconstructed."),
     then="{tet_count:if}limber skeleton {output}", step="skeleton", label="Reconstruct")
