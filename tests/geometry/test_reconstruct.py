@@ -78,6 +78,25 @@ def test_the_unit_of_a_scan_is_asked_for(tmp_path, capsys):
                 **{"unit": "m"} if scale > 1 else {}))
 
 
+@pytest.mark.slow
+def test_an_open_root_is_asked_for_and_leaves_an_earlier_result_whole(tmp_path, capsys):
+    """An even rod that lies flat: two ends, each offered in the unit of the file."""
+    rng = np.random.default_rng(4)
+    along, turn = 400 * rng.random(800), 2 * np.pi * rng.random(800)
+    scan, folder = tmp_path / "rod.xyz", tmp_path / "rod.branch"
+    np.savetxt(scan, np.column_stack([along, 10 * np.cos(turn), 10 * np.sin(turn)]))
+    given = ["reconstruct", str(scan), "-o", str(folder), "--unit", "mm", "--json"]
+    assert call([*given, "--root", "auto"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["root_probability"] < 0.8 and "uncertain" in " ".join(told["warnings"])
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert call(given) == 2
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    ends = sorted(one["value"][0] for one in told["choices"] if one["value"] != "auto")
+    assert ends == pytest.approx([0, 400], abs=40)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
 def test_truth_is_carried_in_the_branch_frame(generated):
     """The true skeleton lies on the reconstructed one after alignment, and Young's modulus too."""
     folder, branch, _ = generated

@@ -1,14 +1,10 @@
 """Which end of a curve graph is the root."""
 
-from types import SimpleNamespace
-
 import numpy as np
-import pytest
 
-from limber.core.errors import InputError
 from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
 from limber.geometry.skeleton.contraction.root_end import root_node
-from limber.geometry.skeleton.plausibility import OPEN, check_root
+from limber.geometry.skeleton.plausibility import OPEN, root_question
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -93,11 +89,8 @@ def test_a_tapering_rod_stands_on_its_thick_end_and_an_even_one_on_its_lower():
 def test_the_root_is_asked_for_where_two_ends_are_near_even():
     choice = _rod(lambda x: 0.01, (0, 0, 1))
     assert {tuple(end["at"]) for end in choice.ends} == {(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)}
-    result = SimpleNamespace(root_ends=choice.ends,
-                             root_probability=choice.ends[0]["probability"])
-    with pytest.raises(InputError, match=r"which of 2 ends.*--root auto") as asked:
-        check_root(result, lambda place: 1000 * place + [5, 0, 0])
-    for option in ("--root 5.000 0.000 0.000 (", "--root 1005.000 0.000 0.000 ("):
-        assert option in str(asked.value)
-    result.root_probability = OPEN
-    check_root(result, lambda place: place)
+    assert choice.ends[0]["probability"] < OPEN
+    asked = str(root_question(choice.ends, lambda place: 1000 * place + [5, 0, 0]))
+    for text in ("which of 2 ends", "--root auto", "--root 5.000 0.000 0.000 (",
+                 "--root 1005.000 0.000 0.000 ("):
+        assert text in asked

@@ -45,10 +45,11 @@ from limber.geometry.skeleton.checkpoint import FoundSkeleton
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.edits import Edit, SetRoot, edited
 from limber.geometry.skeleton.plausibility import (
+    OPEN,
     check_explained,
-    check_root,
     check_surface,
     off_axes,
+    root_question,
     surface_text,
     unexplained_share,
 )
@@ -171,7 +172,10 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         estimate = loaded(ESTIMATORS[settings.radii])
         found = replace(found, skeleton=estimate(found.skeleton, cloud.points, settings))
         cloud = labelled(cloud, found.skeleton)
-    if keep is not None and known is None:
+    # Nothing is written before the user has answered: an earlier result stays whole.
+    is_open = found.root_probability < OPEN and settings.root is None and not any(
+        isinstance(edit, SetRoot) for edit in edits)
+    if keep is not None and known is None and not is_open:
         keep(alignment, found.skeleton, FoundSkeleton(whole, leaves))
     share = 1.0  # who gives a skeleton states its radii
     if own is None:
@@ -182,11 +186,11 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
                             lambda place: (place + wood.origin) / scale,
                             lambda off: bool(supports) or (
                                 settings.leaves != "keep" and show_leaves(wood, off)))
-            share = surface_share(found.skeleton, found.node_of_point, found.residual)
+            share = surface_share(whole.skeleton, whole.node_of_point, whole.residual)
             if not found.leafy:
-                check_surface(share, len(wood.cloud), found.skeleton.length)
-        if settings.root is None and not any(isinstance(edit, SetRoot) for edit in edits):
-            check_root(found, alignment.undo)
+                check_surface(share, len(wood.cloud), whole.skeleton.length)
+        if is_open:
+            raise root_question(found.root_ends, alignment.undo)
     # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.
     warnings = list(prepared.warnings)
     if named:

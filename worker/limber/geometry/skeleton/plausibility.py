@@ -201,18 +201,11 @@ def surface_text(share: float) -> str:
             "stated, and masses and stiffnesses that follow from it are guesses.")
 
 
-def check_root(result: Any, where: Where) -> None:
-    """Ask for the root where the scan leaves it open.
-
-    Raises:
-        InputError: the likeliest end has a probability below that of a decided question.
-    """
-    if result.root_probability >= OPEN:
-        return
-    ends = result.root_ends
+def root_question(ends: list[dict], where: Where) -> InputError:
+    """Return the error that asks which of the likeliest ends is the root."""
     ways = ", ".join("--root " + " ".join(f"{v:.3f}" for v in where(end["at"]))
                      + f" (probability {end['probability']:.2f})" for end in ends)
-    raise InputError(
+    return InputError(
         f"The scan does not show which of {len(ends)} ends is the root.",
         "Their thickness and height, the taper of the axes and the directions of side branches do "
         "not decide between them. The fixed end and the radii depend on it.",
