@@ -332,6 +332,7 @@ def test_a_scan_of_more_units_than_a_plant_has_metres_is_in_millimetres(
     # The worker would ask for it again.
     stages, properties = (importlib.import_module(f"limber_addon.{name}") for name in (
         "stages", "properties"))
+    settings.output = "a.branch"
     typed = properties.arguments_of(bpy.context.scene, stages.stages()["reconstruct"], "a.branch")
     assert typed[typed.index("--unit") + 1] == "m"
 

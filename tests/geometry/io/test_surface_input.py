@@ -111,7 +111,7 @@ def test_faces_without_area_are_left_out():
 
 
 @pytest.mark.parametrize(("scale", "unit", "text"), [
-    (200.0, "m", "40 m long, read in m.*--unit mm .0.04 m., --unit m[.]"),
+    (200.0, "m", "40 m long, read in m.*--unit mm .0.04 m.,.* --unit m[.]"),
     (0.025, "m", "0.005 m long.*--unit m[.]"),
     (1000.0, "m", "200 m long.*No plant.*--unit mm .0.2 m."),
     (0.001, "mm", "0.0002 m long.*No plant.*--unit m .0.2 m."),
