@@ -51,11 +51,31 @@ def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up
     odds = evidence @ np.array(ROOT_ODDS)
     share = np.exp(odds - odds.max())
     share /= share.sum()
-    likeliest = np.argsort(-share, kind="stable")
-    count = min(int(np.searchsorted(np.cumsum(share[likeliest]), _SURE)) + 1, _NAMED)
-    return RootChoice(int(tips[likeliest[0]]), [
-        {"at": graph.nodes[tips[end]], "probability": float(share[end])}
-        for end in likeliest[:count]])
+    nodes, chances = _apart(graph, tips, share)
+    count = min(int(np.searchsorted(np.cumsum(chances), _SURE)) + 1, _NAMED)
+    return RootChoice(nodes[0], [
+        {"at": graph.nodes[node], "probability": chance}
+        for node, chance in list(zip(nodes, chances, strict=True))[:count]])
+
+
+def _apart(graph: CurveGraph, tips: np.ndarray, share: np.ndarray) -> tuple[list[int], list[float]]:
+    """Ends at different places, the likeliest first, and their probabilities.
+
+    Strands of one foot are one place: the likeliest of them stands for all.
+    """
+    nodes: list[int] = []
+    chances: list[float] = []
+    for end in np.argsort(-share, kind="stable"):
+        node = int(tips[end])
+        same = [k for k, other in enumerate(nodes) if np.linalg.norm(
+            graph.nodes[node] - graph.nodes[other]) < _STRAND * graph.thickness[other]]
+        if same:
+            chances[same[0]] += float(share[end])
+        else:
+            nodes.append(node)
+            chances.append(float(share[end]))
+    order = np.argsort(-np.array(chances), kind="stable")
+    return [nodes[k] for k in order], [chances[k] for k in order]
 
 
 def root_evidence(graph: CurveGraph, points: np.ndarray, up: np.ndarray,
