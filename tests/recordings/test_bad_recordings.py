@@ -200,7 +200,8 @@ def test_rgbd_faults(bare_folder, tables, capsys):
     """A missing image, no intrinsics, a camera that moves, no list: each its own sentence."""
     folder = tables / "rgbd"
     (folder / "depth").mkdir(parents=True)
-    camera = D455.model_copy(update={"width": 8, "height": 6, "depth_scale": 5000.0})
+    camera = D455.model_copy(update={
+        "width": 8, "height": 6, "cx": 3.5, "cy": 2.5, "depth_scale": 5000.0})
     rows = []
     for k in range(4):
         write_depth(folder / "depth" / f"f{k}.png", np.full((6, 8), 1.2), camera)
@@ -221,7 +222,7 @@ def test_rgbd_faults(bare_folder, tables, capsys):
     (folder / "intrinsic.json").write_text(json.dumps(open3d))
     assert run(0)["warnings"] == []
     (folder / "intrinsic.json").unlink()
-    (folder / "calibration.txt").write_text("525.0 525.0 319.5 239.5\n")
+    (folder / "calibration.txt").write_text("525.0 525.0 3.5 2.5\n")
     assert run(0)["warnings"] == []
     (folder / "groundtruth.txt").write_text("0.0 0 0 0 0 0 0 1\n1.0 0.1 0 0 0 0 0 1\n")
     assert "camera moves" in run(2)["error"]
@@ -232,6 +233,8 @@ def test_rgbd_faults(bare_folder, tables, capsys):
     (folder / "mask").mkdir()
     Image.fromarray(np.full((6, 8), 255, np.uint8)).save(folder / "mask" / "f0.png")
     assert warned(run(0), "2 of 3 frames have no mask")
+    Image.fromarray(np.full((6, 8), 120, np.uint8)).save(folder / "depth" / "f0.png")
+    assert "f0.png has 8 bits a pixel" in run(2)["error"]
 
 
 def test_markers_in_another_unit_are_refused(branch_folder, capsys):

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from limber.core.errors import InputError
 from limber.core.progress import SILENT
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
-from limber.perception.observe import read_depth, write_depth
+from limber.geometry.io.depth_images import depth_metres
+from limber.perception.observe import write_depth
 from limber.recordings.bags.bag_reader import read_bag
 from limber.recordings.bags.bag_writer import _Messages, write_mcap
 from limber.recordings.recording import read_pull, write_pull
@@ -145,7 +146,7 @@ def test_depth_images_come_with_their_camera(tmp_path, bare_folder, plain_pull):
     files = sorted((target / "depth").glob("*.png"))
     assert [float(file.stem) for file in files] == pytest.approx([0.5, 1.5, 2.5], abs=1e-6)
     first = files[0]
-    assert np.allclose(read_depth(first, found), depths[0], atol=1e-3)
+    assert np.allclose(depth_metres(first, found), depths[0], atol=1e-3)
 
 
 def test_a_sensors_own_frame_is_turned_by_tf(tmp_path, bare_folder):

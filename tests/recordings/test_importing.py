@@ -11,10 +11,11 @@ from PIL import Image
 from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.geometry.cloud.camera import D455, read_camera, write_camera
-from limber.perception.observe import list_frames, read_depth, write_depth
+from limber.geometry.cloud.pixels import read_mask
+from limber.geometry.io.depth_images import depth_metres
+from limber.perception.observe import list_frames, write_depth
 from limber.recordings.importing.import_request import ImportRequest
 from limber.recordings.importing.recording_formats import RECORDINGS
-from limber.recordings.masks import read_mask
 from limber.recordings.recording import (
     POSE_COLUMNS,
     WRENCH_COLUMNS,
@@ -119,7 +120,8 @@ def test_rgbd_folder_in_the_layout_of_tum(bare_folder, source):
     folder = source / "rgbd"
     (folder / "depth").mkdir(parents=True)
     (folder / "mask").mkdir()
-    camera = D455.model_copy(update={"width": 8, "height": 6, "depth_scale": 5000.0})
+    camera = D455.model_copy(update={
+        "width": 8, "height": 6, "cx": 3.5, "cy": 2.5, "depth_scale": 5000.0})
     write_camera(folder / "camera.toml", camera)
     depth = np.full((6, 8), 1.25)
     lines = ["# depth maps"]
@@ -135,7 +137,7 @@ def test_rgbd_folder_in_the_layout_of_tum(bare_folder, source):
     assert [time for time, _ in frames] == [10.0, 10.5, 11.0]
     moved = read_camera(target / "camera.toml")
     assert np.allclose(moved.pose, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-6)
-    assert np.allclose(read_depth(frames[1][1], moved), 1.26, atol=1e-4)
+    assert np.allclose(depth_metres(frames[1][1], moved), 1.26, atol=1e-4)
     assert len(list((target / "mask").iterdir())) == 3
 
 
@@ -201,7 +203,8 @@ def test_masks_of_a_yolo_model_of_ones_own(bare_folder, source, monkeypatch, cap
     folder = source / "rgbd"
     for sub in ("depth", "rgb"):
         (folder / sub).mkdir(parents=True)
-    camera = D455.model_copy(update={"width": 8, "height": 6, "depth_scale": 5000.0})
+    camera = D455.model_copy(update={
+        "width": 8, "height": 6, "cx": 3.5, "cy": 2.5, "depth_scale": 5000.0})
     write_camera(folder / "camera.toml", camera)
     lists = {"depth": [], "rgb": []}
     for k in range(3):

@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from limber.core.errors import InputError, MissingDependencyError
-from limber.recordings.masks import YoloSegmenter, read_mask, segment_by_depth
+from limber.geometry.cloud.pixels import read_mask
+from limber.recordings.masks import YoloSegmenter, segment_by_depth
 
 
 def test_depth_range_and_small_pieces():

@@ -118,7 +118,7 @@ def _depth(_template: Path, path: Path) -> Any:
 
 
 def _mask(_template: Path, path: Path) -> Any:
-    from limber.recordings.masks import read_mask
+    from limber.geometry.cloud.pixels import read_mask
 
     return read_mask(path)
 

@@ -203,7 +203,7 @@ def test_depth_image_with_mask(tmp_path):
     """A flat depth image at 0.5 m becomes points at 0.5 m, only where the mask is."""
     from PIL import Image
 
-    depth = np.full((48, 64), 500, np.uint16)
+    depth = np.full((48, 64), 500, np.uint16)  # too few of them in the mask to judge
     mask = np.zeros((48, 64), np.uint8)
     mask[10:20, 30:40] = 255
     Image.fromarray(depth).save(tmp_path / "depth.png")

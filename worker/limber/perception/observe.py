@@ -10,10 +10,11 @@ from limber.core.errors import InputError
 from limber.core.numerics.rigid import poses_at, rotation_angle, rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, SeenCloud, depth_to_cloud, read_camera
-from limber.geometry.cloud.pixels import read_pixels
+from limber.geometry.cloud.pixels import read_mask
+from limber.geometry.io.depth_images import depth_metres
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.perception.tracking import Anchor, CurveTracker, rest_offset
-from limber.recordings.masks import read_mask, segment_by_depth
+from limber.recordings.masks import segment_by_depth
 from limber.recordings.recording import Observations, Pull
 
 CAMERA_OFFSET_M = 4e-3
@@ -101,12 +102,6 @@ def list_frames(folder: Path, kind: str) -> list[tuple[float, Path]]:
     return frames
 
 
-def read_depth(path: Path, camera: Camera) -> np.ndarray:
-    """Read a 16-bit depth image into metres, shape [height, width]; 0 means no reading."""
-    pixels = read_pixels(path, "a 16-bit depth image (PNG)")
-    return (pixels if pixels.ndim == 2 else pixels[..., 0]) / camera.depth_scale
-
-
 def write_depth(path: Path, depth: np.ndarray, camera: Camera) -> None:
     """Write depth [m] as a 16-bit PNG."""
     from PIL import Image
@@ -122,14 +117,14 @@ def _loader(folder: Path, kind: str) -> Callable[[Path], SeenCloud]:
         return lambda path: _read_cloud(path, camera)
     camera = read_camera(camera_path)
     empty_scene = folder / "background.png"
-    background = read_depth(empty_scene, camera) if empty_scene.exists() else None
+    background = depth_metres(empty_scene, camera) if empty_scene.exists() else None
 
     def load(path: Path) -> SeenCloud:
-        depth = read_depth(path, camera)
         mask_path = folder / "mask" / path.name
-        mask = read_mask(mask_path) if mask_path.exists() else segment_by_depth(
-            depth, background=background)
-        return depth_to_cloud(camera, depth, mask)
+        mask = read_mask(mask_path) if mask_path.exists() else None
+        depth = depth_metres(path, camera, mask)
+        return depth_to_cloud(camera, depth, segment_by_depth(
+            depth, background=background) if mask is None else mask)
     return load
 
 

@@ -17,6 +17,7 @@ from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.geometry.cloud.pixels import read_pixels
 from limber.geometry.io.clouds import read_points, unit_of
+from limber.geometry.io.depth_images import depth_metres
 
 TUM_DEPTH_SCALE = 5000.0
 CAMERA_MOVES_M, CAMERA_TURNS_RAD = 3e-3, 0.005
@@ -107,6 +108,7 @@ def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SI
     warnings += messages
     write_camera(folder / "camera.toml", camera)
     masks = _masks(source, [stamp for stamp, _ in present], settings)
+    depth_metres(present[0][1], camera)  # all frames are of one kind; each is checked when used
     (folder / "depth").mkdir(parents=True, exist_ok=True)
     for index, (stamp, file) in enumerate(present):
         progress(index / len(present), "copying frames")

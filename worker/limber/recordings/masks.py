@@ -9,13 +9,6 @@ import scipy
 
 from limber.core.errors import InputError, MissingDependencyError, WorkError
 from limber.core.optional import pip_install
-from limber.geometry.cloud.pixels import read_pixels
-
-
-def read_mask(path: Path) -> np.ndarray:
-    """Read a mask image; nonzero is branch. Returns shape [height, width] of bool."""
-    pixels = read_pixels(path, "a mask")
-    return (pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)) > 0
 
 
 def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,

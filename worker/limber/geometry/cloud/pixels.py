@@ -38,6 +38,15 @@ def read_pixels(path: Path, what: str) -> np.ndarray:
                          ) from error
 
 
+def read_mask(path: Path) -> np.ndarray:
+    """Read a mask image; nonzero is branch. Returns shape [height, width] of bool."""
+    pixels = read_pixels(path, "a mask")
+    if pixels.ndim == 2:
+        return pixels > 0
+    colours = pixels.shape[2] - (pixels.shape[2] in (2, 4))  # opacity says nothing
+    return pixels[..., :colours].max(axis=2) > 0
+
+
 def _check_chunks(path: Path) -> None:
     """Refuse a PNG file that announces longer chunks than it has, before allocating memory."""
     size = path.stat().st_size

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from limber.core.optional import require_extra
 from limber.geometry.cloud.camera import Camera, read_camera
-from limber.geometry.cloud.pixels import read_pixels
 from limber.geometry.io.clouds import read_points
+from limber.geometry.io.depth_images import depth_metres
 from limber.recordings.bags.bag_pull import BRANCH_FRAME
 from limber.recordings.bags.bag_reader import LIMBER, PULL_TOML
 from limber.recordings.recording import Pull, entry_text
@@ -163,7 +163,7 @@ def _of_frames(messages: _Messages, folder: Path, pull: Pull) -> Iterator[_Messa
 
 def _image(messages: _Messages, seconds: float, file: Path, camera: Camera) -> Any:
     """Depths in metres as floats, whatever the file's scale."""
-    depth = (read_pixels(file, "a depth image") / camera.depth_scale).astype("<f4")
+    depth = depth_metres(file, camera).astype("<f4")
     return messages.make(
         "sensor_msgs/msg/Image", header=messages.header(seconds, _CAMERA),
         height=depth.shape[0], width=depth.shape[1], encoding="32FC1", is_bigendian=0,
