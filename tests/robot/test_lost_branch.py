@@ -86,7 +86,7 @@ def test_a_lost_branch_stops_a_path_of_small_forces(monkeypatch, fault, peak):
 
 
 @pytest.mark.parametrize("peak", [0.5, 1.5, 4.0])
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, 3, 10])
 def test_a_branch_that_is_held_raises_no_alarm(monkeypatch, peak, seed):
     event = followed_with(monkeypatch, "none", peak, seed)
     assert event["event"] == "reached", event

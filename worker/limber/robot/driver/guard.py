@@ -387,6 +387,9 @@ class Guard:
         if self._memory.relief is not None:
             # A sudden fall of the force is the purpose of a retreat.
             return GO
+        if expected is not None and self._held is not None and self._memory.filtered is None:
+            # Begun with a single reading, the filtered force would have that reading's noise.
+            self._memory.filtered = expected + np.r_[self._held, np.zeros(3)]
         filtered = self._filtered(wrench)
         if expected is None:
             return self._check_drop(filtered)
