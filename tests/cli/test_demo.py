@@ -34,7 +34,7 @@ def stages(monkeypatch):
                               "Raise --max-force or --max-strain. Or move the goal (--goal).")
         return results.get(arguments[0], {})
     monkeypatch.setattr(demo, "run_stage", run)
-    monkeypatch.setattr(demo, "_second_arm", lambda _branch: ["--tip-goal", 1.0, 0.0, 0.5])
+    monkeypatch.setattr(demo, "_tip_goal", lambda _branch: ["--tip-goal", 1.0, 0.0, 0.5])
     return seen
 
 
@@ -51,7 +51,7 @@ def test_what_is_known_of_a_scan_reaches_the_stages(stages, tmp_path) -> None:
         assert part in told
     assert " ".join(stages["plan"]).endswith("--goal 0.1 0.2 0.3")
     assert main.call(["demo", str(scan), "-o", str(tmp_path / "other")]) == 0
-    assert " ".join(stages["plan"]).endswith("--tip-goal 1.0 0.0 0.5"), "a second arm's reach"
+    assert " ".join(stages["plan"]).endswith("--tip-goal 1.0 0.0 0.5"), "a place for the tip"
 
 
 @pytest.mark.parametrize("own", [False, True])

@@ -14,7 +14,12 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.settings import PlanSettings
 from limber.results.report.damage_figure import damage_along_branch
 from limber.results.report.report_tables import comparison_rows
-from limber.stages.paths.plan_strength import strength_for, strength_of_plan, with_damage
+from limber.stages.paths.plan_strength import (
+    default_limit,
+    strength_for,
+    strength_of_plan,
+    with_damage,
+)
 
 SHAPE, SCALE = 6.0, 0.05
 
@@ -100,6 +105,24 @@ def test_a_probability_of_damage_limits_the_strain(tmp_path):
     with pytest.raises(InputError, match="--break-tests"):
         strength_for(BARE, PlanSettings(max_damage=0.01), None)
     assert strength_for(BARE, PlanSettings(), None) is None
+
+
+def test_a_plan_keeps_under_a_strength_that_is_known_or_assumed():
+    """By half, unless the user limits the strain. Of stems softer than wood nothing is assumed."""
+    settings, tests = PlanSettings(), Strength.of_tests(np.linspace(0.04, 0.06, 9), "tests")
+    assert with_damage(Limits(), settings, tests, 1e8).strain == pytest.approx(
+        0.5 * tests.median)
+    assert with_damage(Limits(), settings, None, 8e9).strain == pytest.approx(0.003)
+    assert with_damage(Limits(), settings, None, 1e8).strain == np.inf
+    own = PlanSettings(max_strain=0.02)
+    assert with_damage(Limits.of(own), own, tests, 8e9).strain == 0.02
+    ash = PlanSettings(wood="ash")
+    of_ash = with_damage(Limits.of(ash), ash, Strength.of_species("ash"), 8e9)
+    assert of_ash.strain == Limits.of(ash).strain
+    assert "0.3 %, half of that at which" in default_limit(
+        Limits(strain=0.003), settings, None)
+    assert not default_limit(Limits(strain=0.02), own, None)
+    assert not default_limit(Limits.of(ash), ash, None)
 
 
 def test_a_plan_over_its_strength_is_said_to_be():

@@ -294,14 +294,13 @@ def test_a_field_too_coarse_for_the_asked_bound_is_told():
     assert doubts_of(summary, 6.0) == []
 
 
-def test_a_shortest_path_that_is_longer_is_named():
-    """Its percentages would praise the gentle path for what RRT* did not find."""
+def test_a_wide_bound_is_named():
+    """With the planner that comes closest, unless it is that one."""
     summary = {"baseline": {"field_energy_error": 0.0, "length_m": 0.028},
                "plan": {"field_energy_error": 0.0, "length_m": 0.0024},
                "certificate": {"gap_percent": 411.0}, "planner": "eikonal"}
-    wide, longer = doubts_of(summary, 6.0)
+    wide, = doubts_of(summary, 6.0)
     assert "411.0 % more" in wide and "eikonal" not in wide
-    assert "longer than the gentle one" in longer
     assert "eikonal" in doubts_of(summary | {"planner": "d-rrt-star"}, 6.0)[0]
 
 

@@ -11,7 +11,7 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import fit_field
 from limber.planning.goals.allowed_poses import goal_points
 from limber.planning.goals.camera_view import View
-from limber.planning.goals.chosen_pose import default_goal, second_arm_goal
+from limber.planning.goals.chosen_pose import default_goal, second_arm_goal, tip_goal
 from limber.planning.goals.goal import GoalRequest
 from limber.planning.goals.goal_kinds import goal_of
 from limber.planning.goals.regions import Ball, BoxRegion
@@ -121,6 +121,15 @@ def test_a_second_arm_reaches_a_part_of_the_poses_and_not_rest(ridge_field):
     assert goal.distance(ridge_field, ridge_field.rest[None])[0] > goal.tolerance + 0.01
     far = default_goal(ridge_field, 0.01).centre(ridge_field)
     assert goal.distance(ridge_field, far[None])[0] < goal.tolerance
+
+
+def test_the_goal_of_a_demo_is_a_small_ball_that_the_tip_reaches(ridge_field):
+    """Outside of rest, and smaller than the branch."""
+    goal = tip_goal(ridge_field)
+    points = ridge_field.region.draw(20_000, np.random.default_rng(0))
+    assert goal.tolerance <= 0.02
+    assert (goal.distance(ridge_field, points) <= goal.tolerance).any()
+    assert goal.distance(ridge_field, ridge_field.rest[None])[0] > goal.tolerance
 
 
 @pytest.mark.parametrize(("settings", "words"), [

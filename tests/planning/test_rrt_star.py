@@ -8,15 +8,18 @@ import pytest
 
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import Progress
-from limber.planning.cost import CostWeights, measure_path
+from limber.planning.baseline_and_plan import _shortest_known
+from limber.planning.constraints.limits import Limits
+from limber.planning.cost import STEP, CostWeights, EdgeWeights, arc_lengths, measure_path
 from limber.planning.goals.allowed_poses import goal_points
 from limber.planning.goals.chosen_pose import default_goal
 from limber.planning.goals.grasp_goal import GraspGoal
 from limber.planning.goals.regions import Ball
 from limber.planning.goals.target_goal import TargetGoal
+from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.ompl_engine import OmplRrtStar
 from limber.planning.planners.tree_search import PathProblem, Search
-from limber.planning.planners.trees import plan_path
+from limber.planning.planners.trees import FoundPath, plan_path
 
 START = np.array([-0.13, 0.0, 0.0])
 GOAL = GraspGoal((0.13, 0.0, 0.0), 0.01)
@@ -63,6 +66,19 @@ def test_baseline_is_the_straight_line(well_field, engine):
                       Search(iterations=800, seed=2), engine=engine)
     straight = np.linalg.norm(found.points[-1] - found.points[0])
     assert measured(well_field, found.points).length_m < 1.02 * straight
+
+
+def test_no_plan_is_shorter_than_the_shortest_path(well_field):
+    """RRT*'s path has the error of its samples; the two paths, shortened, do not."""
+    problem = GentleProblem(well_field, Limits().on(well_field), EdgeWeights(0.0, 1.0, STEP),
+                            START, GOAL)
+    end = np.array([0.122, 0.0, 0.0])
+    tree, plan = (FoundPath(np.array([START, [0.0, aside, 0.0], end]), 1.0, 1.0, [{"cost": aside}])
+                  for aside in (0.03, 0.02))
+    for one, other in ((tree, plan), (plan, tree), (None, plan)):
+        found = _shortest_known(problem, one, other)
+        assert arc_lengths(found.points)[-1] < 1.01 * (0.26 - GOAL.tolerance)
+        assert found.history == (one or other).history
 
 
 @pytest.mark.slow

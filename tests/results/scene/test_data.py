@@ -99,15 +99,15 @@ def test_scale(tmp_path, mesh, low, high, log, ticks):
     assert ((colours >= 0) & (colours <= 1)).all()
 
 
-def test_a_goal_larger_than_the_branch_is_shown_where_the_path_ends(tmp_path, mesh):
-    """A second arm's reach would hide the branch: the target's end stands for it."""
+def test_a_goal_larger_than_the_branch_is_shown_as_it_is(tmp_path, mesh):
+    """As a second arm's reach: a small ball where the path ends would be another goal."""
     goal = {"kind": "tip", "position_m": [0.6, 0.0, 0.5], "tolerance_m": 0.3}
     end = {"target_end_m": [0.36, 0.01, 0.41]}
     plan = {"plans/p.json": json.dumps({"goal": goal} | end),
             "plans/p.csv": "x_m,y_m,z_m\n0,0,0.3\n0.1,0,0.3\n"}
     data = scene_data(_branch(tmp_path / "a.branch", mesh, plan__p=plan))
-    assert data.info["goal"] == {"kind": "tip", "centre_m": end["target_end_m"],
-                                 "radius_m": None}
+    assert data.info["goal"] == {"kind": "tip", "centre_m": goal["position_m"],
+                                 "radius_m": 0.3}
 
 
 def test_goal_path_and_motion(tmp_path, mesh):

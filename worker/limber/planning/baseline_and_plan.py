@@ -27,7 +27,7 @@ from limber.planning.path_problem import UNPROVEN, BlockedError, GentleProblem, 
 from limber.planning.path_start import check_start
 from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.eikonal import GentlePath, plan_gentle, separated
-from limber.planning.planners.refine import is_along, refine
+from limber.planning.planners.refine import distinct, is_along, refine
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, chosen_engine, found_again, plan_path
 from limber.planning.settings import PlanSettings
@@ -42,7 +42,7 @@ _ANY = 1e6  # gap: any path suffices
 
 @dataclass(frozen=True)
 class PathPair:
-    """RRT* (length alone) and the gentle plan between the same start and goal region.
+    """The shortest path known and the gentle plan between the same start and goal region.
 
     ``approach`` [k, 3] is a gentle path from the rest pose to the start: a branch that is pushed
     there straight may buckle on the path and arrive in another state. ``certificate`` gives the
@@ -239,7 +239,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         weighed = replace(weighed, distance=detour.weight * weighed.distance)
         problem = replace(problem, weights=weighed.weights)
     plan, certificate = _chosen(problem, gentle, trees, settings)
-    baseline = trees.get("RRT*") or _shortest(problem, gentle.points)
+    baseline = _shortest_known(problem, trees.get("RRT*"), plan)
     compared = {"straight line": np.stack([start, goal.centre(field)]),
                 "eikonal": gentle.points}
     for name, path in trees.items():
@@ -345,8 +345,20 @@ def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,
     return found
 
 
+def _shortest_known(problem: GentleProblem, tree: FoundPath | None, plan: FoundPath) -> FoundPath:
+    """Return the shortest of RRT*'s path, the plan, and these two shortened as far as possible.
+
+    RRT*'s alone has the error of its samples: it was longer than some plans.
+    """
+    rough = [plan] if tree is None else [tree, plan]
+    shortened = [_shortest(problem, points) for points in distinct([one.points for one in rough])]
+    shortest = min((*rough, *(one for one in shortened if np.isfinite(one.cost))),
+                   key=lambda one: float(arc_lengths(one.points)[-1]))
+    return replace(shortest, history=rough[0].history)
+
+
 def _shortest(problem: GentleProblem, path: np.ndarray) -> FoundPath:
-    """Return the path shortened as far as possible, if RRT* found none."""
+    """Return the path shortened as far as possible."""
     weights = problem.weights._replace(energy=0.0)
     points, cost = refine(path, replace(problem, weights=weights))
     return FoundPath(points, cost, cost, engine="refined")

@@ -19,7 +19,6 @@ from limber.planning.settings import PlanSettings
 _CHANGES = ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent")
 _STILL = 1e-9  # [m] a path that is not longer has no length
 _WIDE_GAP = 5.0  # percent above which there is a warning
-_LONGER = 1.05  # a smoothed gentle path may be a little shorter than an unsmoothed RRT* path
 
 
 def summary_of(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
@@ -114,10 +113,6 @@ def doubts_of(summary: dict[str, Any], field_error: float, *paths: ResolvedPath)
         doubts.append(f"The path may {takes} up to {gap:.1f} % more {energy}than the best "
                       "possible one" + ("." if summary["planner"] == "eikonal" else
                                         "; `--planner eikonal` comes closest."))
-    shortest, gentle = (summary[key]["length_m"] for key in ("baseline", "plan"))
-    if shortest > _LONGER * gentle:
-        doubts.append("The path called shortest is longer than the gentle one: RRT* found no "
-                      "shorter one. The saving against it means little. Allow more --iterations.")
     unsolved = sum(path.unsolved_count for path in paths)
     if unsolved:
         doubts.append(f"{unsolved} poses along the shortest path had no acceptable solution. Its "

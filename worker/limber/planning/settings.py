@@ -94,7 +94,9 @@ class PlanSettings(Settings):
         "Largest torque of the gripper at any pose [Nm]. A gripper that turns with the branch "
         "needs almost none."))
     max_strain: float | None = Field(None, gt=0, lt=1, description=(
-        "Largest principal strain anywhere in the branch at any pose (0.01 is 1 %)."))
+        "Largest principal strain anywhere in the branch at any pose (0.01 is 1 %). Default: half "
+        "of the breaking strain by --break-tests or --wood, or of green wood where the modulus is "
+        "that of wood; else none."))
     wood: Literal["ash", "cherry", "maple", "oak", "walnut"] | None = Field(None, description=(
         "Limit the strain to half of the breaking strain of green wood of this species (0.3 %; "
         "Wood Handbook FPL-GTR-190). Young shoots withstand more; give --max-strain for them."))

@@ -6,7 +6,7 @@ from typing import Any
 
 from limber.core.constants import STANDARD_GRAVITY
 from limber.core.errors import InputError
-from limber.planning.constraints.damage import assumed
+from limber.planning.constraints.damage import assumed, assumed_strain
 from limber.robot.known_arms import arm_named
 from limber.robot.ur.arms import ARMS
 from limber.store import Branch
@@ -167,11 +167,14 @@ def peaks_line(peaks: Mapping[str, Any], model: str | None = None) -> str:
     """Return the largest strain and force of a motion, each with the limit that it exceeds.
 
     Args:
-        peaks: ``peak_strain``, and ``peak_force_n`` [N], 0 if no gripper holds the branch.
+        peaks: ``peak_strain``, and ``peak_force_n`` [N], 0 if no gripper holds the branch; the
+            branch's ``young_median_pa``, by which a strength is assumed or not.
         model: Name or file of the arm that applies the force, if known.
     """
     strain, force = peaks["peak_strain"], peaks.get("peak_force_n")
-    parts = [("Largest strain", f"{100 * strain:.2g} %", strain_remark(strain, assumed(strain)))]
+    of_wood = assumed_strain(peaks.get("young_median_pa") or 0.0) is not None
+    parts = [("Largest strain", f"{100 * strain:.2g} %",
+              strain_remark(strain, assumed(strain)) if of_wood else "")]
     if force:
         parts.append(("peak force", f"{force:.3g} N", force_remark(force, model)))
     return "; ".join(f"{name} {value}" + (f", {remark}" if remark else "")

@@ -160,8 +160,8 @@ _option = functools.partial(click.option, cls=GroupedOption, group="demo")
 @_option("--edits", type=click.Path(path_type=Path),
          help="Edits of the skeleton, as of `limber skeleton`.")
 @_option("--goal", type=float, nargs=3, metavar="X Y Z",
-         help="Goal position of the grasp, in the branch's frame [m]. Default: the branch's tip, "
-              "with its flower, within reach of a second arm.")
+         help="Goal position of the grasp, in the branch's frame [m]. Default: a place "
+              "for the branch's tip, some centimetres away.")
 @_option("--young", default=",".join(f"{value:g}" for value in DEMO_YOUNG),
          show_default=True, metavar="A,B,C,D",
          help="Assumed Young's modulus [Pa] at the control points of your CLOUD's pull.")
@@ -260,7 +260,7 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
         demo.stage("Young's modulus from the pull", "estimate", branch)
         demo.stage("a pull with the estimated modulus", "simulate", branch)
         demo.stage("energy over grasp poses", "energy", branch, "--seed", seed)
-        goal = ["--goal", *options["goal"]] if options.get("goal") else _second_arm(branch)
+        goal = ["--goal", *options["goal"]] if options.get("goal") else _tip_goal(branch)
         demo.stage("the gentlest path and the shortest", "plan", branch, "--name", "to-goal",
                    "--seed", seed, *goal)
     except Cancelled:
@@ -271,12 +271,12 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
     return failure
 
 
-def _second_arm(branch: Path) -> list[object]:
-    """The paper's task, as options of `limber plan`: the tip into a second arm's reach."""
+def _tip_goal(branch: Path) -> list[object]:
+    """A place some centimetres from the branch's tip, as options of `limber plan`."""
     from limber.planning.field.energy_field import EnergyField
-    from limber.planning.goals.chosen_pose import second_arm_goal
+    from limber.planning.goals.chosen_pose import tip_goal
 
-    goal = second_arm_goal(EnergyField.read(branch / "energy.npz"))
+    goal = tip_goal(EnergyField.read(branch / "energy.npz"))
     return ["--tip-goal", *goal.region.middle.tolist(), "--goal-tolerance", goal.tolerance]
 
 

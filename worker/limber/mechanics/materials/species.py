@@ -16,6 +16,11 @@ STRENGTH_OVER_YOUNG = 0.006
 0.0049 (Douglas fir) to 0.0067 (white ash), 0.006 in the middle.
 """
 
+LEAST_YOUNG = 4.4e9
+"""Least Young's modulus [Pa] of green wood in table 5-3a (northern white cedar). Nothing is assumed
+of the strength of softer stems: that ratio has no source for them.
+"""
+
 SAFETY = 2.0
 """Rupture strain over allowable strain of a species: a branch has knots, forks and younger wood."""
 

@@ -21,8 +21,9 @@ import scipy
 
 from limber.core.errors import InputError
 from limber.core.numerics.compiled import compiled
-from limber.mechanics.materials.species import SPECIES, STRENGTH_OVER_YOUNG
+from limber.mechanics.materials.species import LEAST_YOUNG, SPECIES, STRENGTH_OVER_YOUNG
 
+ASSUMED_SOURCE = "green wood, assumed"
 _FEWEST = 5  # break tests
 _DRAWS = 500
 _COLUMN = "strain_at_break"
@@ -108,9 +109,16 @@ class Strength:
                 "peak_strain": strain, "damage_probability": self.damage(strain)}
 
 
+def assumed_strain(young: float) -> float | None:
+    """Return the strain at break assumed for a branch with this median modulus [Pa]; None for one
+    that is softer than wood.
+    """
+    return STRENGTH_OVER_YOUNG if young >= LEAST_YOUNG else None
+
+
 def assumed(strain: float) -> dict[str, Any]:
-    """Return the assessment of a largest ``strain`` without a known strength, as plain data."""
-    return {"source": "green wood, assumed", "tests": 0, "median_strain": STRENGTH_OVER_YOUNG,
+    """Return the assessment of a largest ``strain`` in wood of unknown strength, as plain data."""
+    return {"source": ASSUMED_SOURCE, "tests": 0, "median_strain": STRENGTH_OVER_YOUNG,
             "peak_strain": strain, "damage_probability": None}
 
 

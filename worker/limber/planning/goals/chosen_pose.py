@@ -13,6 +13,8 @@ from limber.planning.goals.regions import Ball, ball
 from limber.planning.goals.target_goal import TargetGoal
 
 _REACH = 0.85  # [m] of a UR5, which stands for the second arm
+_HALF = 0.5  # of the grasp's way to the default goal
+_TIP_TOLERANCE = 0.02  # [m] about a flower's radius
 _BEGINS = 0.6  # fraction of the tip's way to the default goal at which that reach begins
 
 
@@ -57,6 +59,20 @@ def second_arm_goal(field: EnergyField) -> TargetGoal:
     way = there - rest
     x, y, z = map(float, rest + (_BEGINS + _REACH / np.linalg.norm(way)) * way)
     return TargetGoal(Ball((x, y, z), _REACH))
+
+
+def tip_goal(field: EnergyField) -> TargetGoal:
+    """Return a goal as a person states one: a small ball some centimetres from the tip.
+
+    The tip is there while the grasp is half-way to the default goal: the branch reaches it.
+
+    Raises:
+        NoPathError: there is no far pose.
+    """
+    chart = field.region.chart.plain
+    rest, far = chart.map(np.stack([field.rest, default_goal(field, 0.01).centre(field)]))
+    x, y, z = map(float, field.tip(chart.curved((rest + _HALF * (far - rest))[None]))[0])
+    return TargetGoal(Ball((x, y, z), _TIP_TOLERANCE))
 
 
 def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits: FieldArrays,

@@ -247,7 +247,8 @@ def _simulation(branch: Branch, name: str) -> Section:
         f"{min(frames['min_det_f']):.3f}.")
     if frames["largest_principal_strains"]:
         forces = np.linalg.norm(frames["grasp_forces_n"] or [[0.0]], axis=1)
-        section.text.append(peaks_line({"peak_strain": max(frames["largest_principal_strains"]),
+        section.text.append(peaks_line({"young_median_pa": entry.result.get("young_median_pa"),
+                                        "peak_strain": max(frames["largest_principal_strains"]),
                                         "peak_force_n": float(forces.max())}))
     return section
 

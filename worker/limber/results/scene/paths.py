@@ -46,8 +46,7 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
     _add_trees(data, branch, plan)
     _add_energy_scale(data)
     data.info["plan"] = plan
-    data.info["goal"] = _goal(summary, data.arrays.get("path:plan"),
-                              float(np.ptp(data.arrays["vertices"], axis=0).max()))
+    data.info["goal"] = _goal(summary, data.arrays.get("path:plan"))
     saved, added = summary.get("energy_saved_percent"), summary.get("length_added_percent")
     if saved is not None and added is not None:
         data.info["notes"].append(
@@ -114,14 +113,10 @@ def _path_note(summary: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _goal(summary: dict[str, Any], path: np.ndarray | None, size: float) -> dict[str, Any] | None:
-    """Return what must reach the goal region, its centre [m], and its radius [m] or None; of a
-    region larger than the branch's ``size`` [m], where the path ends in it.
-    """
+def _goal(summary: dict[str, Any], path: np.ndarray | None) -> dict[str, Any] | None:
+    """Return what must reach the goal region, its centre [m], and its radius [m] or None."""
     goal = summary.get("goal") or {}
     centre, radius = goal.get("position_m"), goal.get("tolerance_m")
-    if summary.get("target_end_m") is not None and 2.0 * (radius or 0.0) > size:
-        centre, radius = summary["target_end_m"], None
     if centre is None:
         if path is None:
             return None

@@ -160,6 +160,7 @@ def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
         "grasp_force_n": motion.grasp_force[-1].tolist(),
         "tip_displacement_m": (displacement[-1, tip] - displacement[0, tip]).tolist(),
         "min_det_f": float(motion.min_det_f.min()), "peak_strain": max(strains),
+        "young_median_pa": float(np.median(model.young)),
         "peak_force_n": float(np.linalg.norm(motion.grasp_force, axis=-1).max(initial=0.0))}
 
 

@@ -71,6 +71,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         Cancelled: the best result so far was kept, if there was one and no finished plan of that
         name.
     """
+    from limber.planning.constraints.damage import assumed_strain
     from limber.planning.constraints.damage_along import DamageAlong
     from limber.planning.constraints.limits import Limits
     from limber.planning.field.energy_field import EnergyField
@@ -79,7 +80,12 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     from limber.planning.plan_file import whole_motion
     from limber.planning.timing import Pace
     from limber.stages.paths.plan_legs import legs_without_cell
-    from limber.stages.paths.plan_strength import strength_for, strength_of_plan, with_damage
+    from limber.stages.paths.plan_strength import (
+        default_limit,
+        strength_for,
+        strength_of_plan,
+        with_damage,
+    )
     from limber.stages.paths.plan_tables import SETPOINT_RATE, setpoints
     from limber.stages.paths.plan_uncertainty import young_uncertainty
     from limber.store.loading import known_damping, load_grasp_model, load_skeleton
@@ -110,7 +116,10 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     strength = strength_for(branch, settings, break_tests)
     if break_tests is not None:
         digests = digests | {"break tests": file_digest(break_tests)}
-    asked = with_damage(Limits.of(settings, stiffer), settings, strength)
+    young = float(np.median(grasp_model.model.young))
+    asked = with_damage(Limits.of(settings, stiffer), settings, strength, young)
+    if np.isfinite(asked.strain):
+        digests = digests | {"strain": f"{asked.strain:.6g}"}
     uncertainty = (
         None if settings.confidence is None else young_uncertainty(branch, grasp_model, asked)
     )
@@ -136,24 +145,30 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         pace = Pace(settings.speed, settings.acceleration)
         if in_cell is not None:
             pace = in_cell.slowed(pace, progress)
-        found = plan_motion(
-            field,
-            grasp_model,
-            settings,
-            limits=limits,
-            cell=None if in_cell is None else in_cell.positions,
-            uncertainty=uncertainty,
-            pace=pace,
-            workers=workers,
-            progress=progress,
-        )
+        try:
+            found = plan_motion(
+                field,
+                grasp_model,
+                settings,
+                limits=limits,
+                cell=None if in_cell is None else in_cell.positions,
+                uncertainty=uncertainty,
+                pace=pace,
+                workers=workers,
+                progress=progress,
+            )
+        except NoPathError as error:
+            limited = default_limit(limits, settings, strength)
+            raise type(error)(error.seen, error.why, f"{error.fix} {limited}".strip()) from error
+        if limited := default_limit(limits, settings, strength):
+            progress.warn(limited)
         if found.summary["stopped"]:
             progress = progress.to_the_end()
         if found.summary["stopped"] and finished:
             raise Cancelled("The search was stopped.", f"The finished plan {name} is kept.",
                             "Run it again when there is time for it.")
         # A user who limits the strain knows the wood: no strength is assumed.
-        if strength is not None or settings.max_strain is None:
+        if strength is not None or (settings.max_strain is None and assumed_strain(young)):
             found.summary["strength"] = strength_of_plan(
                 strength, found.plan, found.summary.get("in_motion"), progress)
         pace = found.pace

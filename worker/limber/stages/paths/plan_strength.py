@@ -4,9 +4,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from limber.core.errors import InputError
 from limber.core.progress import Progress
-from limber.planning.constraints.damage import Strength, assumed, read_break_tests
+from limber.mechanics.materials.species import SAFETY
+from limber.planning.constraints.damage import (
+    ASSUMED_SOURCE,
+    Strength,
+    assumed,
+    assumed_strain,
+    read_break_tests,
+)
 from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import ResolvedPath
 from limber.planning.settings import PlanSettings
@@ -32,16 +41,37 @@ def strength_for(branch: Branch, settings: PlanSettings, break_tests: Path | Non
     return None
 
 
-def with_damage(limits: Limits, settings: PlanSettings, strength: Strength | None) -> Limits:
-    """Return the limits, with the strain's reduced to the allowed probability of damage."""
-    if strength is None or settings.max_damage is None:
+def with_damage(limits: Limits, settings: PlanSettings, strength: Strength | None,
+                young: float = 0.0) -> Limits:
+    """Return the limits, with the strain's reduced to the allowed probability of damage.
+
+    Where the settings limit neither, it is half of the strain at which half of such branches
+    break, if that is known or, by the branch's median modulus ``young`` [Pa], assumed.
+    """
+    if settings.max_damage is not None and strength is not None:
+        most = strength.strain_limit(settings.max_damage)
+    elif np.isfinite(limits.strain):
         return limits
-    return replace(limits, strain=min(limits.strain, strength.strain_limit(settings.max_damage)))
+    else:
+        most = (strength.median if strength else assumed_strain(young) or np.inf) / SAFETY
+    return replace(limits, strain=min(limits.strain, most))
+
+
+def default_limit(limits: Limits, settings: PlanSettings, strength: Strength | None) -> str:
+    """Return what limits the strain where the user gave no limit; empty if nothing does."""
+    if not np.isfinite(limits.strain) or settings.max_strain or settings.max_damage or (
+            settings.wood):
+        return ""
+    source = ASSUMED_SOURCE if strength is None else strength.source
+    return (f"The strain is limited to {100 * limits.strain:.2g} %, half of that at which half of "
+            f"such branches break ({source}). --max-strain sets another limit.")
 
 
 def strength_of_plan(strength: Strength | None, plan: ResolvedPath,
                      in_motion: dict[str, Any] | None, progress: Progress) -> dict[str, Any]:
-    """Return the assessment of a plan's largest strain; warn if it exceeds a known strength."""
+    """Return the assessment of a plan's largest strain by a known strength, or that of green wood;
+    warn if it exceeds a known one.
+    """
     states = plan.ahead
     at = int(states.strains.argmax())
     peak = float(states.strains[at])
