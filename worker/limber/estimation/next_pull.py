@@ -217,14 +217,32 @@ def suggest(subject: Subject, values: Values, known: Known, cell: Cell,
     fit = [one.peak_strain <= max_strain and one.peak_force <= max_force for one in made]
     kept = [one for one, keeps in zip(made, fit, strict=True) if keeps]
     if not kept:
-        least = min((one.peak_strain for one in made), default=np.inf)
-        raise WorkError(
-            f"No pull keeps the limits: {len(found) - len(made)} of {len(found)} are impossible, "
-            f"and the gentlest one strains the branch by {100 * least:.2g} %.",
-            "Even short pulls load the branch too much, or it has no room to move.",
-            "Increase --max-strain or --max-force, or grasp the branch farther out (--fractions).")
+        raise _none_kept(made, len(found), max_strain, max_force)
     return Suggested(kept, [one for one, keeps in zip(made, fit, strict=True) if not keeps],
                      len(found) - len(made))
+
+
+def _none_kept(made: list[ExpectedPull], count: int, max_strain: float, max_force: float,
+               ) -> WorkError:
+    """Why no pull is left, with the limits that would leave the gentlest one."""
+    if not made:
+        return WorkError(f"None of {count} pulls can be simulated.",
+                         "Each of their simulations on this branch ended without a result.",
+                         "Check the moduli and the mesh, or hold it elsewhere (--fractions).")
+    least = min(made, key=lambda one: one.peak_strain)
+    limits, enough = [f"a strain of {100 * max_strain:.3g} %"], []
+    if least.peak_strain > max_strain:
+        enough.append(f"--max-strain {1.05 * least.peak_strain:.3g}")
+    if np.isfinite(max_force):
+        limits.append(f"a force of {max_force:.3g} N")
+    if least.peak_force > max_force:
+        enough.append(f"--max-force {1.05 * least.peak_force:.3g}")
+    return WorkError(
+        f"No pull keeps the limits: {count - len(made)} of {count} are impossible, and the "
+        f"gentlest one strains the branch by {100 * least.peak_strain:.2g} % and takes "
+        f"{least.peak_force:.2g} N.", f"Allowed: {' and '.join(limits)}.",
+        f"For that pull, {' and '.join(enough)} would do if the branch bears it. Or hold the "
+        "branch elsewhere (--fractions).")
 
 
 def _all(choices: list[PullChoice], subject: Subject, values: Values, known: Known, cell: Cell,
