@@ -8,7 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.paper_branches import measured
 from limber.core.errors import InputError, WorkError
-from limber.estimation.fit_assessment import Estimate, require_result
+from limber.core.progress import Progress
+from limber.estimation.estimated_branch import Subject
+from limber.estimation.fit_assessment import Estimate, judge_fit, require_result
+from limber.estimation.fit_preparation import tell_doubts
 from limber.estimation.fitting.optimise import Fit, FitStatus
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
@@ -90,6 +93,10 @@ def test_a_failed_fit_names_what_is_wrong_with_the_branch(small, small_bench, ob
     found = Estimate(fit, objective, uncertainty(evaluation, objective),
                      identifiability(evaluation, objective.space))
     assert "E2 would be 6.6e+10 Pa" in found.is_bad
+    heard = []
+    judge_fit(found, Progress(on_warning=heard.append))
+    # No file was written, and no interval includes the errors of such a fit.
+    assert not any("corrected for them" in each for each in heard)
     skeleton = small.skeleton
     with pytest.raises(WorkError, match="Check units") as error:
         require_result(found, skeleton)
@@ -98,3 +105,34 @@ def test_a_failed_fit_names_what_is_wrong_with_the_branch(small, small_bench, ob
     radius[len(radius) // 2] *= 0.2
     with pytest.raises(WorkError, match="fourth power of the radius"):
         require_result(found, replace(skeleton, radius=radius))
+
+
+def test_a_failed_fit_tells_which_force_the_path_takes(small, small_bench, pull):
+    """Where a path is prescribed, a reading of another size is shown beside it."""
+    for factor, is_told in ((0.1, True), (1.0, False)):
+        read = with_force(pull, lambda force, factor=factor: factor * force)
+        objective = small_bench.objective([read], SETTINGS.model_copy(update={"drive": "pose"}))
+        evaluation = objective.evaluate(np.log(TRUTH), jacobian=True)
+        found = Estimate(Fit(evaluation, FitStatus.misfit, ""), objective,
+                         uncertainty(evaluation, objective),
+                         identifiability(evaluation, objective.space))
+        with pytest.raises(WorkError) as error:
+            require_result(found, small.skeleton)
+        assert ("N were recorded" in error.value.why) == is_told
+
+
+def test_doubts_are_told_before_the_fit(small, small_bench, pull):
+    """A neck, and points far off at rest, are known without a simulation; each is told once."""
+    subject = Subject(small_bench.mesh, small.skeleton, small_bench.points, small_bench.weights,
+                      small_bench.model, Values(TRUTH, 0.36, 900.0))
+    heard = []
+    tell_doubts([pull], subject, Progress(on_warning=heard.append))
+    assert heard == []
+    radius = subject.skeleton.radius.copy()
+    radius[len(radius) // 2] *= 0.2
+    rest = np.array(pull.entry.rest_points_m) + [0.0, 0.0, 0.03]
+    far = replace(pull, entry=pull.entry.model_copy(update={
+        "rest_points_m": tuple(map(tuple, rest.tolist()))}))
+    tell_doubts([far], replace(subject, skeleton=replace(subject.skeleton, radius=radius)),
+                Progress(on_warning=heard.append))
+    assert len(heard) == 2 and "up to 3" in heard[0] and "fourth power" in heard[1]

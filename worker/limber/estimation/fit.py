@@ -62,6 +62,7 @@ from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.creep import with_creep
 from limber.estimation.uncertainty.force_checks import require_own_frame
 from limber.estimation.uncertainty.identifiability import (
+    SCALE_DEVIATION,
     force_is_measured,
     identifiability,
     link_unresolved,
@@ -116,7 +117,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
         shifts: dict[str, np.ndarray] = {}
         begin, earlier = near, None
         for rounds_left in reversed(range(ROUNDS)):
-            forwards = forwards_of(pulls, branch, chosen, progress, shifts)
+            forwards = forwards_of(pulls, branch, chosen, shifts)
             if earlier is not None:
                 earlier.begin(forwards)
             try:
@@ -192,9 +193,11 @@ def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
             raise failure
         return present(heavy, "estimate with the weight")
     found.is_weightless = True
-    progress.warn(
-        "The branch is too soft to carry its own weight in the scanned shape. The estimate "
-        "ignores its weight. Check the density, gravity and the unit of the force.")
+    if found.scale_deviation <= SCALE_DEVIATION:
+        # Otherwise nothing is known of how soft it is, and the estimate is refused.
+        progress.warn(
+            "The branch is too soft to carry its own weight in the scanned shape. The estimate "
+            "ignores its weight. Check the density, gravity and the unit of the force.")
     return found
 
 

@@ -11,7 +11,7 @@ from limber.core.errors import WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
-from limber.estimation.fit_preparation import forwards_of
+from limber.estimation.fit_preparation import forwards_of, neck
 from limber.estimation.fitting.left_out import held_out, without
 from limber.estimation.fitting.nuisances import CREEP, in_words, nuisance_records, unlikely
 from limber.estimation.fitting.objective import Objective
@@ -66,9 +66,8 @@ times as likely as the other, about as much as priors that are stated roughly ma
 """
 FAR_OFF = 2.0
 """Assumed errors of a point's place on the branch beyond which it is named where a fit fails."""
-NECK = 0.5
-"""Radius over a larger one farther out that is named where a fit fails: a sixteenth of the
-stiffness."""
+FORCE_OFF = 0.5
+"""Difference of simulated and recorded force over the recorded one that is named likewise."""
 WIDE = 0.15
 """Standard deviation of a log E above which advice on narrowing it is given."""
 
@@ -233,10 +232,12 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
             f"The residuals are {found.uncertainty.variance_factor**0.5:.1f} times the stated "
             "noise. Either the model lacks an effect, or the sensors are noisier than stated. The "
             "intervals are widened by this factor.")
-    if (corrected := in_words(found.cell_errors)) is not None:
-        progress.warn(corrected)
-    if (creep := found.creep) is not None:
-        progress.warn(creep_sentence(creep))
+    if found.stopped or found.is_bad is None:
+        # Of a refused fit neither is known, and no interval includes them.
+        if (corrected := in_words(found.cell_errors)) is not None:
+            progress.warn(corrected)
+        if (creep := found.creep) is not None:
+            progress.warn(creep_sentence(creep))
     named = outliers(found.fit.evaluation, found.objective)
     if named:
         worst = "; ".join(f"{entry['pull']} {entry['what']} at {entry['time_s']:.2f} s "
@@ -300,14 +301,34 @@ def require_result(found: Estimate, skeleton: Skeleton) -> None:
         raise too_little_said(found.objective, found.fit.evaluation, SCALE_DEVIATION)
     young = ", ".join(f"{value / 1e6:.4g}" for value in found.values.young)
     ended = f"The fit ended at {young} MPa. Nothing was written."
-    seen = [*_points_off(found.objective.forwards), *_neck(skeleton)]
+    reason = " ".join([reason, *_force_off(found)])
+    seen = [*_points_off(found.objective.forwards), *neck(skeleton)]
     if seen:
         raise WorkError("The pulls give no estimate.", " ".join([reason, *seen]),
                         f"{ended} Correct the reconstruction (`limber skeleton`, or a scan from "
                         "more sides), and check that the points are where they should be on it.")
     raise WorkError("The pulls give no estimate.", reason,
-                    f"{ended} Check units, grasp point, frame of reference and the markers' order, "
-                    "and the warnings about the recording. Or use more pulls.")
+                    f"{ended} Check units, grasp point and mode, frame of reference, the order of "
+                    "the markers, and the warnings about the recording. Or use more pulls.")
+
+
+def _force_off(found: Estimate) -> list[str]:
+    """A sentence if a prescribed path takes another force than the recorded one."""
+    for forward in found.objective.forwards:
+        if forward.drive != "pose" or not forward.uses_force:
+            continue
+        # Without the fitted errors of the sensor, which would hide it.
+        simulated = forward.simulate(found.values, (), False)
+        read = forward.frames.wrenches[:, :3]
+        peak = int(np.nanargmax(np.linalg.norm(read, axis=1)))
+        if simulated is None or not (np.linalg.norm(simulated.forces[peak] - read[peak])
+                                     > FORCE_OFF * np.linalg.norm(read[peak])):
+            continue
+        takes, recorded = (", ".join(f"{value:.3g}" for value in force)
+                           for force in (simulated.forces[peak], read[peak]))
+        return [f"At the largest force in {forward.name}, the gripper's recorded path and rotation "
+                f"take ({takes}) N in the simulation; ({recorded}) N were recorded."]
+    return []
 
 
 def _points_off(forwards: Sequence[Forward]) -> list[str]:
@@ -324,19 +345,6 @@ def _points_off(forwards: Sequence[Forward]) -> list[str]:
             worst, name = float(np.nanmax(off)), forward.name
     return [f"In {name}, the points at rest are up to {1e3 * worst:.0f} mm away from their places "
             "on the reconstructed branch."] if name else []
-
-
-def _neck(skeleton: Skeleton) -> list[str]:
-    """A sentence if the main path is much thinner somewhere than farther out."""
-    path = skeleton.main_path()
-    radius, along = skeleton.radius[path], skeleton.arc_length[path]
-    beyond = np.maximum.accumulate(radius[::-1])[::-1]
-    thin = int(np.argmin(radius / beyond))
-    if radius[thin] > NECK * beyond[thin]:
-        return []
-    return [f"The reconstructed branch has a radius of {1e3 * radius[thin]:.1f} mm at "
-            f"{1e3 * along[thin]:.0f} mm from its base, but {1e3 * beyond[thin]:.1f} mm farther "
-            "out. Its stiffness goes with the fourth power of the radius."]
 
 
 def require_one_explanation(free: Estimate, as_stated: Estimate) -> None:

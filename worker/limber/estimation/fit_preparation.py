@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.progress import SILENT, Progress
+from limber.core.progress import Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.forward.forward_model import Forward, under_its_weight
 from limber.estimation.forward.gripper_torque import uses_torque
@@ -14,17 +14,50 @@ from limber.estimation.forward.point_directions import PointDirections
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace
 from limber.estimation.settings import EstimateSettings
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.recordings.cell_errors import CalibrationEntry, calibration_of
 from limber.recordings.recording import Pull, PullEntry
 from limber.recordings.synchronisation import Frames, frames_of
 
 FREE_FRAME_M, FREE_FRAME_RAD = 0.1, 0.3
 """Standard deviations of the observer's frame if it is fitted freely (--free-frame)."""
+NECK = 0.5
+"""Radius over a larger one farther out that is named: a sixteenth of the stiffness."""
+
+
+def tell_doubts(pulls: list[Pull], subject: Subject, progress: Progress) -> None:
+    """Warn before a fit of what already speaks against the recordings or the reconstruction."""
+    for pull in pulls:
+        frames = frames_of(pull)
+        for message in frames.warnings:
+            progress.warn(message)
+        off = _off_at_rest(pull, frames, _rest_points(pull.entry, subject))
+        if off is not None and np.nanmax(off) > 5e-3 + 5 * pull.entry.sensor.position_sigma_m:
+            progress.warn(
+                f"{pull.name}: at rest, the observed points are up to {np.nanmax(off) * 1e3:.0f} "
+                "mm away from their positions on this branch. Possible causes are a scan whose tip "
+                "is short, another branch, another frame of reference, or another order of the "
+                "markers.")
+    for sentence in neck(subject.skeleton):
+        progress.warn(f"{sentence} If the branch is not so thin there, the moduli come out wrong. "
+                      "Correct the skeleton (`limber skeleton`), or scan from more sides.")
+
+
+def neck(skeleton: Skeleton) -> list[str]:
+    """A sentence if the main path is much thinner somewhere than farther out."""
+    path = skeleton.main_path()
+    radius, along = skeleton.radius[path], skeleton.arc_length[path]
+    beyond = np.maximum.accumulate(radius[::-1])[::-1]
+    thin = int(np.argmin(radius / beyond))
+    if radius[thin] > NECK * beyond[thin]:
+        return []
+    return [f"The reconstructed branch has a radius of {1e3 * radius[thin]:.1f} mm at "
+            f"{1e3 * along[thin]:.0f} mm from its base, but {1e3 * beyond[thin]:.1f} mm farther "
+            "out. Its stiffness goes with the fourth power of the radius."]
 
 
 def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
-                progress: Progress = SILENT, shifts: Mapping[str, np.ndarray] | None = None,
-                ) -> list[Forward]:
+                shifts: Mapping[str, np.ndarray] | None = None) -> list[Forward]:
     """Make the forward simulation of each pull.
 
     Args:
@@ -38,10 +71,7 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
     for pull in pulls:
         frames = frames_of(pull)
         entry = _with_overrides(pull.entry, frames, settings)
-        for message in frames.warnings:
-            progress.warn(message)
-        rest = subject.control_points if entry.rest_points_m is None else np.array(
-            entry.rest_points_m)
+        rest = _rest_points(entry, subject)
         if frames.positions.shape[1] not in (0, len(rest)):
             raise InputError(
                 f"{pull.name} observes {frames.positions.shape[1]} points, but {len(rest)} rest "
@@ -54,7 +84,7 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
                 "An estimate compares how points of the branch moved.",
                 "Import it with the markers, depth images or clouds of the same time, or name "
                 "other pulls with --pull.")
-        _check_rest(pull, frames, rest, progress)
+        _off_at_rest(pull, frames, rest)
         moved = (shifts or {}).get(pull.name)
         if moved is not None:
             rest = rest + moved[:, None] * PointDirections.at(subject.mesh, rest).rest
@@ -163,19 +193,22 @@ def _with_free_errors(entry: PullEntry, frames: Frames, settings: EstimateSettin
     return known.model_copy(update=free) if free else None
 
 
-def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, progress: Progress) -> None:
-    """Warn if the points in the first frame, at rest, are not at their positions on the branch.
+def _rest_points(entry: PullEntry, subject: Subject) -> np.ndarray:
+    return subject.control_points if entry.rest_points_m is None else np.array(entry.rest_points_m)
+
+
+def _off_at_rest(pull: Pull, frames: Frames, rest: np.ndarray) -> np.ndarray | None:
+    """Distance of each observed point at rest from its position on the branch [m]; None: unknown.
 
     Raises:
         InputError: all of them are farther away than the branch is long.
     """
     at_rest = np.linalg.norm(frames.poses[:, :3] - pull.entry.grasp.point_m, axis=1) < 2e-3
-    if not len(rest) or not at_rest.any() or pull.entry.gravity_m_s2 is not None:
-        return
-    at_rest_positions = frames.positions[at_rest]
-    if not np.isfinite(at_rest_positions).any():
-        return
-    off = np.linalg.norm(np.nanmedian(at_rest_positions, axis=0) - rest, axis=1)
+    seen = frames.positions[at_rest]
+    if seen.shape[1:2] != (len(rest),) or pull.entry.gravity_m_s2 is not None or (
+            not np.isfinite(seen).any()):
+        return None
+    off = np.linalg.norm(np.nanmedian(seen, axis=0) - rest, axis=1)
     size = float(np.linalg.norm(np.ptp(np.vstack([rest, pull.entry.grasp.point_m]), axis=0)))
     if np.nanmin(off) > max(2 * size, 0.1):
         raise InputError(
@@ -185,9 +218,4 @@ def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, progress: Progress
             "The recording uses another unit or another frame of reference.",
             "Import it with --unit, or with --nominal (the positions of the markers on the "
             "branch).")
-    limit = 5e-3 + 5 * pull.entry.sensor.position_sigma_m
-    if np.nanmax(off) > limit:
-        progress.warn(
-            f"{pull.name}: at rest, the observed points are up to {np.nanmax(off) * 1e3:.0f} mm "
-            "away from their positions on this branch. Possible causes are a scan whose tip is "
-            "short, another branch, another frame of reference, or another order of the markers.")
+    return off

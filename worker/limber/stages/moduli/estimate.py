@@ -91,6 +91,7 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
     from limber.estimation.estimate_summary import details, summary
     from limber.estimation.fit import fit_branch
     from limber.estimation.fit_assessment import judge_model, require_result
+    from limber.estimation.fit_preparation import tell_doubts
     from limber.estimation.fitting.evaluations import EvaluationLog
     from limber.stages.moduli.other_skeletons import add_other_skeletons
     from limber.store.loading import load_pulls, load_subject, pull_names, pulls_digest
@@ -106,6 +107,7 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
     warnings: list[str] = []
     heard = progress.keeping(warnings)
     pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
+    tell_doubts(pulls, subject, heard)
     log_path = branch.folder / EVALUATIONS
     if force or not resume:
         log_path.unlink(missing_ok=True)
