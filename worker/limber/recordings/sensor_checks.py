@@ -186,7 +186,9 @@ def _with_right_sign(pull: Pull) -> Pull:
     if not np.isfinite(pull.wrenches).any() or not pull.entry.sensor.tared:
         # Without a zero, the work is unknown.
         return pull
-    work = work_done(pull)
+    # By the change of the force: its zero may not be that of a recording that begins bent.
+    first = pull.wrenches[np.isfinite(pull.wrenches).all(axis=1)][:1]
+    work = work_done(replace(pull, wrenches=pull.wrenches - first))
     most, least = work.max(), work.min()
     noise = pull.entry.sensor.force_sigma_n * np.sqrt(
         np.sum(np.diff(pull.poses[:, :3], axis=0)**2))
