@@ -158,7 +158,7 @@ def test_rendering(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_job_file(tmp_path, monkeypatch):
+def test_the_job_file(tmp_path):
     """It is checked whole, and takes the tables that the guide offers: two make one pull."""
     shutil.copyfile(SCRIPTS / "night.toml", tmp_path / "night.toml")
     for name in ("scans/apple.ply", "scans/pear.ply"):
@@ -175,7 +175,6 @@ def test_the_job_file(tmp_path, monkeypatch):
         "reconstruct", "import-pull:one", "import-pull:two", "estimate", "report", "scene"]
     assert apple.tasks[-1].inputs.render == tmp_path / "results" / "apple.png"
     shutil.copytree(ROOT / "blend_files" / "mature", apple.folder)
-    monkeypatch.chdir(tmp_path)
     for task in apple.tasks[1:3]:
         outcome = run_task(task, apple.folder, SILENT)
         assert not outcome["error"] and outcome["result"]["frame_count"] == 24

@@ -75,6 +75,23 @@ fractions = [0.3, 0.7]
     assert apple.tasks[-1].settings.fractions == (0.3, 0.7)
 
 
+def test_files_named_in_settings_lie_beside_the_job_file(write, tmp_path):
+    """They were looked for in the folder in which limber batch was started."""
+    files = {"robot": "one.csv", "nominal": "rest.csv", "cell": "cell.toml",
+             "pull_toml": "mine.toml", "yolo_weights": "own.pt"}
+    stated = "\n".join(f'{key} = "{{scan}}/{name}"' for key, name in files.items())
+    jobs = read_jobs(write(f"""{SCANS}
+[[job.stage]]
+run = "import-pull"
+source = "pulls/{{scan}}/one.csv"
+name = "one"
+{stated}
+"""))
+    settings = jobs.branches[0].tasks[1].settings
+    assert {key: getattr(settings, key) for key in files} == {
+        key: tmp_path / "apple" / name for key, name in files.items()}
+
+
 def test_a_sweep_is_every_combination(write):
     """Each has a branch of its own, named after its values."""
     jobs = read_jobs(write(SCANS + """

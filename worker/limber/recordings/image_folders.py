@@ -298,7 +298,7 @@ def _yolo_masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
         raise InputError(f"{source} has no colour images.", "YOLO segments the branch in colour "
                                                             "images.",
                          "Record rgb/ (and rgb.txt), or omit --yolo-weights.")
-    segment = YoloSegmenter(Path(settings.yolo_weights), prompt=settings.yolo_prompt,
+    segment = YoloSegmenter(settings.yolo_weights, prompt=settings.yolo_prompt,
                             class_name=settings.yolo_class)
     masks: list[np.ndarray | None] = []
     for stamp in stamps:

@@ -1,5 +1,6 @@
 """Settings of an import; this module imports no heavy package."""
 
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
@@ -33,7 +34,7 @@ class ImportSettings(Settings):
 
     kind: Annotated[str, OneOf(kind_names)] = Field(
         "auto", description="Kind of SOURCE. auto: determined from its name and content.")
-    robot: str | None = Field(None, description="CSV of the gripper with time, pose and wrench.")
+    robot: Path | None = Field(None, description="CSV of the gripper with time, pose and wrench.")
     unit: Literal["m", "cm", "mm"] | None = Field(
         None, description="Unit of positions in SOURCE. Default: the unit in the columns' names, "
         "else metres.")
@@ -41,10 +42,10 @@ class ImportSettings(Settings):
         None, description="Unit of forces. Default: the unit in the columns' names, else newtons.")
     rate_hz: float | None = Field(
         None, gt=0, description="Frames per second, if SOURCE has no time stamps.")
-    nominal: str | None = Field(
+    nominal: Path | None = Field(
         None, description="CSV with label,x_m,y_m,z_m: positions of the markers on the branch at "
         "rest. A rigid transform fits the recording's first frames to them.")
-    pull_toml: str | None = Field(
+    pull_toml: Path | None = Field(
         None, description="TOML file whose entries replace those that the import writes to the "
         "pull's pull.toml, such as the table calibration, or tared in the table sensor.")
     marker_frame: tuple[float, float, float, float, float, float] | None = Field(
@@ -99,7 +100,7 @@ class ImportSettings(Settings):
     torque_sigma: float | None = Field(
         None, gt=0, description="Noise of torques about the pose's position [N m]. A clamped "
         "gripper's torque is used only if this is given.")
-    cell: str | None = Field(
+    cell: Path | None = Field(
         None, description="The robot's cell file: its base in the branch's frame, and its "
         "kinematics.")
     frame_pose: tuple[float, float, float, float, float, float] | None = Field(
@@ -114,7 +115,7 @@ class ImportSettings(Settings):
     bag_clock: Literal["header", "log"] = Field(
         "header", description="Time stamps of a bag: those in the messages' headers, or the "
             "times of logging.")
-    yolo_weights: str | None = Field(
+    yolo_weights: Path | None = Field(
         None, description="Weights file of your own YOLO segmentation model, for masks of an "
         "RGB-D folder's colour images (needs ultralytics).")
     yolo_prompt: str | None = Field(

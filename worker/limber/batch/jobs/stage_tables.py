@@ -169,27 +169,35 @@ class _StageValues:
 
     def _runs(self, values: dict[str, Any]) -> list[dict[str, Any]]:
         """Return the values of each run: one run per file that matches a pattern in the inputs."""
-        choices = [self._files(key, value) for key, value in values.items()
-                   if "path" in _said_of(self._fields[key], "format") and isinstance(value, str)]
+        named = [key for key, value in values.items()
+                 if "path" in _said_of(self._fields[key], "format") and isinstance(value, str)]
+        several = [key for key in named if self._is_pattern(key, values[key])]
         found = []
-        for files in itertools.product(*choices):
-            stem = next((path.stem for _, path, is_found in reversed(files) if is_found), "")
+        for files in itertools.product(*(self._files(key, values[key]) for key in several)):
+            stem = files[-1].stem if files else ""
             run = {key: value.replace("{file}", stem) if isinstance(value, str) else value
-                   for key, value in values.items()}
-            found.append(run | {key: path for key, path, _ in files})
+                   for key, value in values.items()} | dict(zip(several, files, strict=True))
+            found.append(run | {key: self._file(key, run[key]) for key in named
+                                if key not in several})
         return found
 
-    def _files(self, key: str, name: str) -> list[tuple[str, Path, bool]]:
-        """Return the choices for a file: its field, its path, whether a pattern found it."""
+    def _is_pattern(self, key: str, name: str) -> bool:
+        return self._fields[key]["group"] != "output" and glob.has_magic(name)
+
+    def _file(self, key: str, name: str) -> Path:
+        """Return the file that a field names, one to write or one to read."""
         key_path = (*self._key_path, key)
-        if self._fields[key]["group"] == "output":
-            return [(key, self._of.paths.written(name, key_path), False)]
-        if not glob.has_magic(name):
-            return [(key, self._of.paths.file(name, key_path), False)]
-        matches = self._of.paths.files(name, key_path)
+        paths = self._of.paths
+        return (paths.written if self._fields[key]["group"] == "output" else paths.file)(
+            name, key_path)
+
+    def _files(self, key: str, pattern: str) -> list[Path]:
+        """Return the files that match a pattern in an input."""
+        key_path = (*self._key_path, key)
+        matches = self._of.paths.files(pattern, key_path)
         if matches == []:
-            self._problems.add(key_path, f"{key}: no file matches {name!r}.")
-        return [(key, path, True) for path in matches or ()]
+            self._problems.add(key_path, f"{key}: no file matches {pattern!r}.")
+        return list(matches or ())
 
     def _checked(self, values: dict[str, Any]) -> StageTask | None:
         made = []

@@ -145,7 +145,7 @@ class ImportRequest:
         """
         if self.settings.nominal is None:
             return None
-        known, nominal = read_nominal(Path(self.settings.nominal))
+        known, nominal = read_nominal(self.settings.nominal)
         return register(rest, labels, known, self.in_branch(nominal), self.name)
 
     @cached_property
@@ -156,7 +156,7 @@ class ImportRequest:
             InputError: the file is missing or not TOML.
         """
         path = self.settings.pull_toml
-        return {} if path is None else read_toml(Path(path), "entries of a pull.toml")
+        return {} if path is None else read_toml(path, "entries of a pull.toml")
 
     def as_stated(self, entry: PullEntry) -> PullEntry:
         """Return the entry with the user's entries in place of its own.

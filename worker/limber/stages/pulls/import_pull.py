@@ -65,8 +65,8 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
     for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
                           ("yolo", settings.yolo_weights), ("cell", settings.cell),
                           ("pull_toml", settings.pull_toml)):
-        if named and Path(named).is_file():
-            digests[key_of] = _digest(Path(named))
+        if named and named.is_file():
+            digests[key_of] = _digest(named)
     if not force and branch.is_current(key, settings, digests=digests):
         return branch.manifest.stages[key].result
     with branch.stage(key, settings, digests=digests) as stage:
@@ -106,7 +106,7 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
     from limber.robot.cell.cell import read_cell
     from limber.robot.recorder import known_errors, known_noise
 
-    cell = read_cell(Path(settings.cell))
+    cell = read_cell(settings.cell)
     joint_names = cell.arm.ros_joints
     tool = matrices(np.array(cell.tool.grasp_pose))
 
