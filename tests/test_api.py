@@ -415,7 +415,7 @@ def test_verbs_are_the_commands(own, tmp_path):
         assert Folder.read(own.folder).manifest.stages == entries, command
     assert done["report"].path.stat().st_size > 10_000
     cell = standing_at(Folder.read(own.folder), "127.0.0.1", fraction=0.667)
-    dry = own.execute(cell_file(cell, tmp_path), name="p")
+    dry = own.execute(cell_file(cell, tmp_path), name="p", unwatched=True)
     assert not dry.armed and dry.peak_force is None and "armed no" in repr(dry)
 
 

@@ -85,23 +85,23 @@ def test_gradient_of_the_subsolution_stays_below_the_cost_by_brute_force(across,
     seen = []
     original = lower_bound.subsolution
 
-    def kept(ground, known, shape, inside, **options):
-        result = original(ground, known, shape, inside, **options)
-        seen.append((ground, result[0], inside))
+    def kept(rates, known, shape, inside, **options):
+        result = original(rates, known, shape, inside, **options)
+        seen.append((rates, result[0], inside))
         return result
 
     monkeypatch.setattr(lower_bound, "subsolution", kept)
     grids = []
     bound = lower_bound._bound
-    monkeypatch.setattr(lower_bound, "_bound", lambda problem, land, grid, cell: (
-        grids.append(grid), bound(problem, land, grid, cell))[1])
+    monkeypatch.setattr(lower_bound, "_bound", lambda problem, on_grid, grid, cell: (
+        grids.append(grid), bound(problem, on_grid, grid, cell))[1])
     certify(problem, lambda _path: found.cost)
     generator = np.random.default_rng(2)
     checked = 0
     for grid in grids:
-        ground, u, inside = next(item for item in seen
+        rates, u, inside = next(item for item in seen
                                  if item[1].shape == grid.open_cells.shape)
-        cells = np.argwhere(ground.open_cells & ~inside)
+        cells = np.argwhere(rates.open_cells & ~inside)
         cells = cells[generator.integers(len(cells), size=3000)]
         place = generator.uniform(size=(len(cells), 3))
         slope = np.linalg.norm(_spline_slope(u, cells, place) / grid.edges, axis=1)
@@ -227,11 +227,11 @@ def test_a_grid_too_coarse_for_a_valley_proves_nothing(well_field, monkeypatch, 
     """The next grid is asked; and a path that keeps the limits is a better proof than any."""
     problem, spacings, bound = problem_on(well_field), [], lower_bound._bound
 
-    def blind(problem, land, grid, cell):
+    def blind(problem, on_grid, grid, cell):
         spacings.append(grid.spacing)
         if len(spacings) <= wrong_grids:
             raise NoPathError("No path exists", "Proven on a grid")
-        return bound(problem, land, grid, cell)
+        return bound(problem, on_grid, grid, cell)
 
     monkeypatch.setattr(lower_bound, "_bound", blind)
     found = plan_gentle(problem)
@@ -367,11 +367,11 @@ def test_no_point_of_a_targets_goal_costs_more_than_the_slack(well_field):
     assert len(points) > 100
     grid, cell = first_grid(problem)
     for _ in range(3):
-        ground = lower_bound._terrain(problem, lower_bound._land(problem, grid, cell), grid)
-        goal_cells = about_goal(problem, grid, ground)
+        rates = lower_bound._terrain(problem, lower_bound._field_on_grid(problem, grid, cell), grid)
+        goal_cells = about_goal(problem, grid, rates)
         spot = (points - grid.origin) @ grid.axes.T / grid.edges
         number = np.floor(spot).astype(int)
-        is_open = ground.open_cells[tuple(number.T)]
+        is_open = rates.open_cells[tuple(number.T)]
         assert is_open.mean() > 0.5
         number, t = number[is_open], (spot - number)[is_open]
         weights = np.stack([0.5 * (1 - t)**2, 0.5 + t - t**2, 0.5 * t**2])
@@ -382,7 +382,7 @@ def test_no_point_of_a_targets_goal_costs_more_than_the_slack(well_field):
             value += goal_cells.cost[where] * np.prod([
                 weights[step, :, axis] for axis, step in enumerate(offset)], axis=0)
         assert value.max() <= goal_cells.slack
-        grid, cell = refined(grid, ground.open_cells, goal_cells.near, cell, 0.6)
+        grid, cell = refined(grid, rates.open_cells, goal_cells.near, cell, 0.6)
 
 
 class Jump(GraspGoal):
@@ -398,8 +398,8 @@ def test_where_the_target_moves_fast_far_from_the_goal_nothing_counts_as_near_it
     problem = problem_on(well_field, goal=Jump((0.1, 0.06, 0.02), 0.01))
     grid, cell = first_grid(problem)
     grid, cell = refined(grid, grid.open_cells, grid.about_goal, cell, 0.5)
-    ground = lower_bound._terrain(problem, lower_bound._land(problem, grid, cell), grid)
-    known = grid.points(np.argwhere(about_goal(problem, grid, ground).known) + 0.5)
+    rates = lower_bound._terrain(problem, lower_bound._field_on_grid(problem, grid, cell), grid)
+    known = grid.points(np.argwhere(about_goal(problem, grid, rates).known) + 0.5)
     away = np.linalg.norm(known - problem.goal.position, axis=1)
     assert 0.01 < away.max() < 0.05
 
@@ -455,17 +455,17 @@ def test_bounds_together_are_those_of_each_alone_and_ask_the_field_once(
     and no corner is evaluated twice on a grid."""
     one = problem_on(ridge_field)
     two = replace(one, weights=one.weights._replace(length=4.0 * one.weights.length))
-    asked, grids, land = [], [], lower_bound._land
+    asked, grids, on_grid = [], [], lower_bound._field_on_grid
     energy = type(ridge_field).energy
     monkeypatch.setattr(type(ridge_field), "energy", lambda self, points: (
         asked.append(len(points)), energy(self, points))[1])
 
     def counted(problem, grid, cell):
         asked.clear()
-        found = land(problem, grid, cell)
+        found = on_grid(problem, grid, cell)
         grids.append((asked[:], len(found.corners)))
         return found
-    monkeypatch.setattr(lower_bound, "_land", counted)
+    monkeypatch.setattr(lower_bound, "_field_on_grid", counted)
     together = plan_gentle_all([one, two], enough=[0.05, 0.05])
     count = len(grids)
     assert count >= 2 and all(numbers == [corners] for numbers, corners in grids)
@@ -480,13 +480,13 @@ def test_cells_are_flat_where_energy_bends_off_a_shell(well_field):
     """Ten times the bends along the last axis: it is cut more, up to the largest ratio of edges,
     and bends shrink as a common ratio would make them."""
     grid, cell = first_grid(problem_on(well_field))
-    ground = lower_bound._terrain(problem_on(well_field), lower_bound._land(
+    rates = lower_bound._terrain(problem_on(well_field), lower_bound._field_on_grid(
         problem_on(well_field), grid, cell), grid)
-    bends = np.ones_like(ground.bends) * np.array([1.0, 1.0, 10.0]).reshape(3, 1, 1, 1)
-    ratios = lower_bound._ratios(ground._replace(bends=bends), ground.open_cells, 0.7)
+    bends = np.ones_like(rates.bends) * np.array([1.0, 1.0, 10.0]).reshape(3, 1, 1, 1)
+    ratios = lower_bound._ratios(rates._replace(bends=bends), rates.open_cells, 0.7)
     assert ratios[0] == ratios[1] > 2.0 * ratios[2]
     assert (ratios**2 * [1.0, 1.0, 10.0]).sum() <= 0.7**2 * 12.0 * (1 + 1e-9)
-    flat = lower_bound._ratios(ground._replace(bends=bends**4), ground.open_cells, 0.34)
+    flat = lower_bound._ratios(rates._replace(bends=bends**4), rates.open_cells, 0.34)
     edges = flat * grid.edges
     assert edges.max() / edges.min() <= 4.0 + 1e-9
 

@@ -88,15 +88,15 @@ def test_no_allowed_pose_lies_in_a_closed_cell_nor_costs_less_than_is_claimed(
     rate = problem.weights.length + problem.weights.energy * bowing_field.energy(poses)
     original, asked = lower_bound._bound, []
 
-    def bound(problem, land, grid, cell):
-        found = original(problem, land, grid, cell)
+    def bound(problem, on_grid, grid, cell):
+        found = original(problem, on_grid, grid, cell)
         place = (poses - grid.origin) @ grid.axes.T / grid.edges
         number = np.floor(place).astype(int)
         within = ((number >= 0) & (number < grid.open_cells.shape)).all(axis=1)
         within[within] = grid.open_cells[tuple(number[within].T)]
         number, part = number[within], place[within] - number[within]
-        lost = ~found.ground.open_cells[tuple(number.T)]
-        least = claimed_rate(found.ground, number, part)
+        lost = ~found.rates.open_cells[tuple(number.T)]
+        least = claimed_rate(found.rates, number, part)
         asked.append((within.sum(), lost.sum(), (least > rate[within] * (1 + 1e-9)).sum()))
         return found
 

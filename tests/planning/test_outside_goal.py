@@ -97,7 +97,7 @@ def test_a_goal_from_outside_is_planned_to(planned_branch, tmp_path):
     assert 0.0 < bound["lower_bound"] <= bound["upper_bound"]
     assert bound["full_model"]["lower_bound"] <= bound["full_model"]["cost"]
     assert read_plan(folder / "plans/side.json").summary["goal"]["kind"] == "side"
-    assert drawn(told, None, size=0.4)["kind"] == "side"
+    assert drawn(told, None)["kind"] == "side"
     assert plan_paths(folder, settings, name="side") == done
 
 

@@ -106,7 +106,7 @@ def test_what_is_read_writes_nothing_and_what_is_set_is_put_back(resting_robot):
     resting_robot.ask("payload", value=before["payload"])
     resting_robot.ask("tool", offset=before["tool"])
     cell = Cell(robot={"model": "ur5e", "address": resting_robot.address},
-                base={"pose": (0,) * 6}, tool={"mass_kg": 0.5})
+                base={"pose": (0,) * 6}, tool={"mass_kg": 0.5, "grasp_pose": (0, 0, 0.15, 0, 0, 0)})
     try:
         seen = observe(cell, 0.1)
         told = "; ".join(map(str, seen.differences))
@@ -118,7 +118,7 @@ def test_what_is_read_writes_nothing_and_what_is_set_is_put_back(resting_robot):
         assert {name: state[name] for name in before} == before
         with RobotLink(cell):
             state = resting_robot.state
-            assert state["payload"] == 0.5 and state["tool"] == [0.0] * 6
+            assert state["payload"] == 0.5 and state["tool"] == [0.0, 0.0, 0.15, 0.0, 0.0, 0.0]
             with pytest.raises(SafetyStop, match="A program is running on the controller"):
                 show_before_motion(cell, lambda text: None)
         state = resting_robot.state

@@ -120,7 +120,7 @@ def test_a_gripper_is_weighed_before_the_branch_is_held(monkeypatch, tmp_path):
     """Refused until it was weighed without a fault, and for another mass with both values."""
     monkeypatch.setenv("LIMBER_STATE", str(tmp_path))
     cell = Cell(robot={"model": "ur5e", "address": "192.0.2.5"}, base={"pose": (0,) * 6},
-                tool={"mass_kg": MASS})
+                tool={"mass_kg": MASS, "grasp_pose": (0, 0, 0.15, 0, 0, 0)})
     path, weighed_mass = tmp_path / "cell.toml", {"mass_kg": MASS + 0.01, "mass_sigma_kg": 0.01}
     with pytest.raises(InputError, match="was never weighed"):
         require_weighed(cell)
