@@ -130,7 +130,7 @@ def test_pause_at_the_soft_limit_then_resume(e_series):
         assert "soft force" in link.wait("paused", "stopped", "reached", seconds=5)["reason"]
         stands_soon(e_series)
         # By 5 % each 30 ms: a force that falls faster is a slip.
-        for force in [*np.geomspace(12, 0.7, 54), 0.0]:
+        for force in [*np.geomspace(12, 0.3, 72), 0.0]:
             e_series.ask("added_wrench", wrench=[0, 0, float(force), 0, 0, 0])
             time.sleep(0.03)
         assert np.linalg.norm(e_series.state["tool_speed"]) < 1e-3
@@ -156,7 +156,8 @@ def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(e_serie
     """It pauses, goes back some centimetres under the same force, stops and lets go."""
     cell = cell_for(e_series.address)
     cell = cell.model_copy(update={"tool": cell.tool.model_copy(update={
-        "gripper": "digital_output", "grip_seconds": 0.2})})
+        "gripper": "digital_output", "grip_seconds": 0.2,
+        "grasp_pose": (0, 0, 0.15, 0, 0, 0)})})
     with RobotLink(cell) as link:
         tared(link)
         link.gripper(close=True)
