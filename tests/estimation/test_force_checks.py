@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force, without_cell
 
-from benchmarks.paper_branches import measured
 from limber.core.errors import InputError, WorkError
 from limber.core.progress import Progress
 from limber.estimation.estimated_branch import Subject
@@ -14,32 +14,19 @@ from limber.estimation.fit_assessment import Estimate, judge_fit, require_result
 from limber.estimation.fit_preparation import tell_doubts
 from limber.estimation.fitting.optimise import Fit, FitStatus
 from limber.estimation.parameters import Values
-from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.force_checks import other_frame, require_own_frame
 from limber.estimation.uncertainty.identifiability import identifiability, require_scale
 
-SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=4)
-TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
-
 
 @pytest.fixture(scope="module")
 def pull(small_pull):
-    """A recorded pull that does not state its cell."""
-    entry = small_pull.entry.model_copy(update={"calibration": None})
-    return replace(measured(small_pull, 3), entry=entry)
+    return without_cell(small_pull)
 
 
 @pytest.fixture(scope="module")
 def objective(small_bench, pull):
     return small_bench.objective([pull], SETTINGS)
-
-
-def with_force(pull, change):
-    """The same pull with other readings of the force; ``change`` maps [n, 3]."""
-    wrenches = pull.wrenches.copy()
-    wrenches[:, :3] = change(wrenches[:, :3])
-    return replace(pull, wrenches=wrenches)
 
 
 def test_a_small_force_is_named_with_its_assumed_errors(small_bench, pull):

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force, without_cell
 
-from benchmarks.paper_branches import measured
 from limber.core.errors import WorkError
 from limber.core.progress import Progress
 from limber.estimation.fitting.evaluations import EvaluationLog
@@ -15,30 +15,17 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.fitting.optimise import LONGEST_STEP, gauss_newton
 from limber.estimation.forward.gripper_path import force_for_travel
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
-from limber.estimation.settings import EstimateSettings
 from limber.mechanics.grasp import Grasp
-
-SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=4)
-TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 
 
 @pytest.fixture(scope="module")
 def pull(small_pull):
-    """A recorded pull that does not state its cell: the path is observed."""
-    entry = small_pull.entry.model_copy(update={"calibration": None})
-    return replace(measured(small_pull, 3), entry=entry)
+    return without_cell(small_pull)
 
 
 @pytest.fixture(scope="module")
 def objective(small_bench, pull):
     return small_bench.objective([pull], SETTINGS)
-
-
-def with_force(pull, change):
-    """The same pull with other readings of the force; ``change`` maps [n, 3]."""
-    wrenches = pull.wrenches.copy()
-    wrenches[:, :3] = change(wrenches[:, :3])
-    return replace(pull, wrenches=wrenches)
 
 
 @pytest.mark.parametrize("young", [1e3, 6e5, 1e8, 1e11])
