@@ -24,11 +24,14 @@ class BuildWithAddon(build_py):
         sources = sorted(p for p in (ROOT / "addon").rglob("*") if p.suffix in kinds)
         if not sources:
             raise FileNotFoundError("The folder addon/ is not beside setup.py; the wheel needs it.")
+        addon = Path(self.build_lib, "limber", "results", "scene", "addon")
         for source in sources:
-            target = Path(self.build_lib, "limber", "results", "scene", "addon",
-                          source.relative_to(ROOT / "addon"))
+            target = addon / source.relative_to(ROOT / "addon")
             self.mkpath(str(target.parent))
             self.copy_file(str(source), str(target))
+        # It reads tables of points as the worker does.
+        self.copy_file(str(ROOT / "worker" / "limber" / "core" / "files" / "text_columns.py"),
+                       str(addon))
         self._write_sbom()
 
     def _write_sbom(self):

@@ -5,6 +5,10 @@ each file of ``operators`` one action, each file of ``panels`` one step of the w
 """
 
 import importlib
+from pathlib import Path
+
+# The build puts the reader of tables beside these files; in a checkout the worker has it.
+__path__.append(str(Path(__file__).resolve().parents[1] / "worker" / "limber" / "core" / "files"))
 
 # In the order of registration: a class comes after those that it refers to.
 MODULES = (

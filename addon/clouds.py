@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from . import column_titles, text_columns
+from . import text_columns
 
 _PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4",
               "uint": "u4", "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1",
@@ -54,7 +54,7 @@ def read_colours(path: Path) -> np.ndarray | None:
 
 def _read_text(path: Path) -> tuple[np.ndarray, str | None]:
     read = text_columns.read_columns(path)
-    axes = column_titles.three_of("position", read.names)
+    axes = text_columns.three_of("position", read.names)
     if axes is None:
         raise ValueError("x, y and z are missing")
     return read.values[:, list(axes)], read.unit
@@ -76,9 +76,9 @@ def _read_ply(path: Path) -> tuple[np.ndarray, str | None]:
         _, count, columns = _read_ply_header(stream)
         end = stream.tell()
         stream.seek(0)
-        unit = column_titles.stated_unit(stream.read(end).decode("utf-8", "replace"))
+        unit = text_columns.stated_unit(stream.read(end).decode("utf-8", "replace"))
         names = [name for name, _ in columns]
-        axes = column_titles.three_of("position", names)
+        axes = text_columns.three_of("position", names)
         if axes is None:
             raise ValueError("x, y and z are missing")
         if rows is not None:

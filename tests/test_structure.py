@@ -90,11 +90,10 @@ def test_addon_computes_nothing():
     assert not {str(path) for path, names in modules.items() if names & numerical}
 
 
-@pytest.mark.parametrize("name", ["column_titles.py", "text_columns.py"])
-def test_addon_reads_tables_as_the_worker_does(name):
-    """Its copies of the files that read them are the worker's (scripts/make_addon_schema)."""
-    assert (ROOT / "addon" / name).read_bytes() == (
-        CORE / "core" / "files" / name).read_bytes()
+def test_what_the_addon_takes_of_the_worker_imports_no_limber():
+    """The build puts this file beside the add-on's own."""
+    path = CORE / "core" / "files" / "text_columns.py"
+    assert "limber" not in imported_modules(path.parent)[path]
 
 
 def test_benches_need_no_tests():

@@ -216,8 +216,9 @@ def _build(root, out):
 
 
 def _copy_scripts(root):
-    (root / "scripts").mkdir()
-    for name in ("scripts/build_extension", "scripts/check_dependencies", "requirements.lock"):
+    for name in ("scripts/build_extension", "scripts/check_dependencies", "requirements.lock",
+                 "worker/limber/core/files/text_columns.py"):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, root / name)
     for name in ("worker/docs", "blend_files/manual"):
         shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -230,7 +231,7 @@ def _check(path):
     assert path.name == f"limber-{manifest['version']}.zip"
     sources = {file.relative_to(ROOT / "addon").as_posix()
                for file in (ROOT / "addon").rglob("*.py")}
-    assert sources | {"sbom.cdx.json", "guide/howto/scan.html"} <= names
+    assert sources | {"sbom.cdx.json", "guide/howto/scan.html", "text_columns.py"} <= names
     assert not [name for name in names if "__pycache__" in name or name.endswith(".pyc")]
 
 

@@ -366,7 +366,8 @@ def addon_module(name: str) -> Any:
 
     # Its package file does.
     package = sys.modules.setdefault("addon_files", types.ModuleType("addon_files"))
-    package.__path__ = [str(Path(__file__).parents[2] / "addon")]
+    root = Path(__file__).parents[2]
+    package.__path__ = [str(root / "addon"), str(root / "worker" / "limber" / "core" / "files")]
     return importlib.import_module(f"addon_files.{name}")
 
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from limber.core.constants import FORCE_UNITS_N, UNIT_METRES
 from limber.core.errors import InputError
-from limber.core.files import column_titles
-from limber.core.files.column_titles import LENGTHS, plain
+from limber.core.files import text_columns
+from limber.core.files.text_columns import LENGTHS, plain
 from limber.recordings.table_parts.capture_titles import capture_preamble
 from limber.recordings.table_parts.clocks import (
     TIME_UNITS_S,
@@ -111,7 +111,7 @@ def read_table(path: str | Path) -> Table:
                          "The columns cannot be identified without names.",
                          "Add a first line such as t_s,x_m,y_m,z_m.")
     table = Table(path, titles, np.empty((0, width)), rate_hz=capture.rate_hz,
-                  unit=capture.unit or column_titles.stated_unit("\n".join(comments)))
+                  unit=capture.unit or text_columns.stated_unit("\n".join(comments)))
     words = words_in(rows[first])
     table.clocks = tuple(k for k, part in enumerate(rows[first]) if is_clock(part))
     table.values = _numbers(table, bare[first:], rows[first:], text.endswith(("\n", "\r")), words)
@@ -130,8 +130,8 @@ def _without_words(table: Table, words: list[int]) -> Table:
 
 
 def split_title(title: str) -> Title:
-    """Split the unit from a column's name: :func:`limber.core.files.column_titles.split_title`."""
-    return Title(*column_titles.split_title(title, _UNITS))
+    """Split the unit from a column's name: :func:`limber.core.files.text_columns.split_title`."""
+    return Title(*text_columns.split_title(title, _UNITS))
 
 
 def scale_of(title: Title, units: dict[str, float], default: str, where: Path) -> float:

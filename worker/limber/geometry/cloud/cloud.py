@@ -8,7 +8,7 @@ from typing import IO
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.files.column_titles import three_of
+from limber.core.files.text_columns import three_of
 from limber.geometry.cloud.columns import PARTS, ply_columns, valid_columns
 
 POINTS = "\0points"

@@ -11,10 +11,9 @@ import numpy as np
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
-from limber.core.files.column_titles import stated_unit, three_of
 from limber.core.files.declared_sizes import check_las, check_pcd, check_ply
 from limber.core.files.reading import read_arrays
-from limber.core.files.text_columns import ColumnsError, Table
+from limber.core.files.text_columns import ColumnsError, Table, stated_unit, three_of
 from limber.geometry.cloud.cloud import LEFT_OUT, POINTS, Cloud
 from limber.geometry.cloud.columns import property_names
 from limber.geometry.cloud.piecewise_reading import gathered

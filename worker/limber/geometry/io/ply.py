@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.files.column_titles import stated_unit
 from limber.core.files.declared_sizes import header_bytes
+from limber.core.files.text_columns import stated_unit
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.columns import property_names
 from limber.geometry.cloud.piecewise_reading import PIECE_POINTS, gathered

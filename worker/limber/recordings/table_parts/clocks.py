@@ -6,7 +6,7 @@ import re
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.files.column_titles import plain
+from limber.core.files.text_columns import plain
 
 TIME_UNITS_S = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), 1.0),
