@@ -14,6 +14,7 @@ import pytest
 from benchmarks.machine_stalls import HELD_UP_SECONDS, Witness
 from benchmarks.robot_cells import sideways
 from benchmarks.robot_faults import new_robot, restored
+from limber.core.numerics.rigid_kernels import pose_between
 from limber.mechanics.solve_status import Status
 from limber.robot.driver.real_time import claim_real_time, may_use_two_processors
 from limber.robot.virtual.controller import Controller
@@ -26,20 +27,19 @@ FRACTION = 0.92  # of the main path, where the small branch is planned to be hel
 class Registers:
     """Writes commands into a controller's registers as ur-rtde does, and steps it."""
 
-    def __init__(self, controller: Controller, script: str = "def rtde_control():\nend\n"):
+    def __init__(self, controller: Controller):
         self.controller = controller
-        controller.load_script(script)
+        controller.load_script("def rtde_control():\nend\n")
         controller.step()
 
-    def write(self, command: int, *numbers: float, background: bool = False) -> None:
+    def write(self, command: int, *numbers: float) -> None:
         values = {f"input_double_register_{k}": float(x) for k, x in enumerate(numbers)}
-        self.controller.write_inputs({**values, "input_int_register_1": int(background)})
+        self.controller.write_inputs(values)
         self.controller.write_inputs({"input_int_register_0": command})
 
-    def run(self, command: int, *numbers: float, background: bool = False,
-            most_seconds: float = 20.0) -> list[np.ndarray]:
+    def run(self, command: int, *numbers: float, most_seconds: float = 20.0) -> list[np.ndarray]:
         """Do a command; returns the tool's poses at every step until the script says done."""
-        self.write(command, *numbers, background=background)
+        self.write(command, *numbers)
         poses = [self.controller.pose]
         for _ in range(int(most_seconds / self.controller.seconds)):
             self.controller.step()
@@ -51,6 +51,22 @@ class Registers:
         self.controller.write_inputs({"input_int_register_0": 0})
         self.controller.step()
         return poses
+
+    def servo(self, command: int, target: np.ndarray, lookahead: float = 0.1,
+              gain: float = 300.0) -> None:
+        """Send one target of a stream, as ur-rtde does, and step on."""
+        self.write(command, *target, 0, 0, 0.002, lookahead, gain)
+        self.controller.write_inputs({"input_int_register_0": 0})
+        self.controller.step()
+
+    def line(self, target: np.ndarray, speed: float = 0.1, settle: float = 1.5) -> np.ndarray:
+        """Stream the tool's poses on a line to ``target`` [6]; returns those it took, [n, 6]."""
+        start, poses = self.controller.pose, []
+        count = int(np.linalg.norm(target[:3] - start[:3]) / speed / self.controller.seconds)
+        for part in np.r_[np.linspace(0, 1, count), np.ones(int(settle / self.controller.seconds))]:
+            self.servo(24, pose_between(start, target, part))
+            poses.append(self.controller.pose)
+        return np.array(poses)
 
     def wait(self, seconds: float) -> np.ndarray:
         """Step on; returns the tool's poses, shape [n, 6]."""

@@ -229,8 +229,8 @@ def test_the_virtual_controller_moves_it_on_a_line():
     registers = Registers(Controller("pieper-6", seed=3))
     start = registers.controller.pose.copy()
     target = start + [0.05, 0.03, -0.02, 0, 0, 0.1]
-    poses = np.array(registers.run(3, *target, 0.1, 0.5))
-    assert poses[-1] == pytest.approx(target, abs=1e-9)
+    poses = registers.line(target)
+    assert poses[-1] == pytest.approx(target, abs=1e-6)
     way = target[:3] - start[:3]
     off = np.cross(poses[:, :3] - start[:3], way) / np.linalg.norm(way)
     assert np.linalg.norm(off, axis=1).max() < 1e-4

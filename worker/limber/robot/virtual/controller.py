@@ -16,7 +16,7 @@ from limber.robot.interface import Arm
 from limber.robot.known_arms import arm_named
 from limber.robot.ur.arms import UrArm
 from limber.robot.ur.factory_calibration import FactoryCalibration, one_arm
-from limber.robot.virtual.arm_motions import STOP_DECELERATION, Braking, Motion, Unreachable
+from limber.robot.virtual.arm_motions import STOP_DECELERATION, Braking, Motion
 from limber.robot.virtual.controller_modes import RobotMode, RuntimeState, SafetyMode, SensorFault
 from limber.robot.virtual.force_sensor import CB3_ESTIMATE, E_SERIES, FT300, ForceSensor
 from limber.robot.virtual.payload import Load, Nothing, RobotiqRegisters
@@ -82,11 +82,8 @@ class Controller:
         self.outputs_int = [0] * 48
         self.outputs_double = [0.0] * 48
         self.digital_outputs, self.gripper_output = 0, 0
-        self.analog_outputs = [0.0, 0.0]
-        self.history: deque[np.ndarray] = deque(maxlen=100)
         self.log: deque[str] = deque(maxlen=200)
         self._reading = np.zeros(6)
-        self._target = np.zeros(6)
         self._update_tool()
 
     # Time
@@ -106,18 +103,14 @@ class Controller:
             self.program.step(self)
         self._move()
         self._feel()
-        self.history.append(self.joints.copy())
 
     def _move(self) -> None:
         before = self.speeds
         if self.motion is None or self.motion.finished:
             self.speeds = np.zeros(6)
         else:
-            try:
-                self.joints, self.speeds = self.motion.step(
-                    self.joints, self.speeds, self.seconds, self.slider)
-            except Unreachable as reason:
-                self.protective_stop(str(reason))
+            self.joints, self.speeds = self.motion.step(
+                self.joints, self.speeds, self.seconds, self.slider)
             if np.any(np.abs(self.speeds) > 1.05 * np.asarray(self.arm.joint_speed)):
                 self.protective_stop("a joint exceeds its speed limit")
         self.accelerations = (self.speeds - before) / self.seconds
@@ -282,7 +275,7 @@ class Controller:
     def write_inputs(self, values: dict[str, Any]) -> None:
         """Accept values that a client sent."""
         self.inputs.update(values)
-        if {"input_int_register_0", "input_int_register_24"} & set(values) and self.watchdog:
+        if "input_int_register_0" in values and self.watchdog:
             self.watchdog = (self.watchdog[0], self.step_count)
         if self.program is not None and not self.paused and self.program.is_control_script:
             self.program.written(self)
@@ -291,9 +284,6 @@ class Controller:
         self._write_digital(values, "standard_digital_output", 0)
         self._write_digital(values, "configurable_digital_output", 8)
         self._write_digital(values, "tool_digital_output", 16)
-        for k in range(2):
-            if values.get("standard_analog_output_mask", 0) >> k & 1:
-                self.analog_outputs[k] = float(values.get(f"standard_analog_output_{k}", 0.0))
 
     def _write_digital(self, values: dict[str, Any], name: str, first: int) -> None:
         mask = int(values.get(f"{name}_mask", 0)) << first
@@ -347,8 +337,6 @@ class Controller:
             safety_status_bits=int(normal) | reduced << 1 | protective << 2 | safeguard << 4
             | emergency << 6 | emergency << 7 | (not normal and not reduced) << 10,
             actual_digital_output_bits=self.digital_outputs,
-            standard_analog_output0=self.analog_outputs[0],
-            standard_analog_output1=self.analog_outputs[1],
             payload=self.payload, payload_cog=self.payload_centre, tcp_offset=self.tool_offset)
         values.update(zip(_INT_NAMES, self.outputs_int, strict=True))
         values.update(zip(_DOUBLE_NAMES, self.outputs_double, strict=True))

@@ -1,4 +1,4 @@
-"""The force-torque sensor of the virtual robot: noise, drift, weight, zeroing, saturation."""
+"""The force-torque sensor of the virtual robot: noise, drift, saturation."""
 
 from dataclasses import dataclass
 
@@ -14,10 +14,10 @@ class SensorTraits:
 
     Attributes:
         force_sigma, torque_sigma: White noise of a sample [N], [N m].
-        force_bias, torque_bias: Reading without load before zeroing, each axis at random [N], [N
+        force_bias, torque_bias: Reading without load, each axis at random [N], [N
             m].
         gain_sigma: Relative standard deviation of the sensor's gain, one for all readings.
-        drift_n_per_minute: Drift of the force along z after zeroing.
+        drift_n_per_minute: Drift of the force along z.
         force_range, torque_range: Saturation of a reading [N], [N m].
         estimated: Whether it is computed from motor currents (CB3): slow errors of newtons.
     """
@@ -52,31 +52,21 @@ class ForceSensor:
         self._rng = rng
         self._bias = np.r_[traits.force_bias * rng.standard_normal(3),
                            traits.torque_bias * rng.standard_normal(3)]
-        self._offset = np.zeros(6)
         self._drift = 0.0
         self._slow = np.zeros(6)
         self._range = np.r_[np.full(3, traits.force_range), np.full(3, traits.torque_range)]
         self._sigma = np.r_[np.full(3, traits.force_sigma), np.full(3, traits.torque_sigma)]
-        self._load = np.zeros(6)
         self.gain = 1.0 + traits.gain_sigma * float(rng.standard_normal())
 
     def read(self, wrench: np.ndarray, seconds: float) -> np.ndarray:
         """Return a reading, ``seconds`` after the last one, shape [6] in N and N m."""
-        self._load = wrench
         self._drift += self.traits.drift_n_per_minute / 60.0 * seconds
-        return np.clip(self._true_reading(seconds) - self._offset
-                       + self._sigma * self._rng.standard_normal(6), -self._range, self._range)
-
-    def zero(self) -> None:
-        """Tare the present load (zero_ftsensor)."""
-        self._offset = self._true_reading(0.0)
-
-    def _true_reading(self, seconds: float) -> np.ndarray:
-        if self.traits.estimated and seconds > 0:
+        if self.traits.estimated:
             # Friction in the joints: an error that drifts with about a second's memory.
             kept = np.exp(-seconds)
             spread = np.r_[np.full(3, 2.0), np.full(3, 0.3)] * np.sqrt(1 - kept**2)
             self._slow = kept * self._slow + spread * self._rng.standard_normal(6)
-        reading = self.gain * self._load + self._bias + self._slow
+        reading = self.gain * wrench + self._bias + self._slow
         reading[2] += self._drift
-        return reading
+        return np.clip(reading + self._sigma * self._rng.standard_normal(6),
+                       -self._range, self._range)

@@ -19,7 +19,7 @@ from limber.core.errors import LimberError, WorkError
 from limber.core.json_lines import json_objects
 from limber.core.processes.end_with_parent import end_by_closing
 from limber.robot.driver.real_time import spare_what_is_loaded
-from limber.robot.virtual.arm_motions import Servo, SpeedMotion, Waypoint, line_move
+from limber.robot.virtual.arm_motions import Servo, nearest_joints
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.server import Server, new_loop
 
@@ -138,11 +138,8 @@ def serve(controller: Controller, address: str, *, control: bool = False,
 
 def _warm_up(controller: Controller) -> None:
     """Do beforehand what would stop the clock: compiling, for seconds, and full collections."""
-    slow = Waypoint("line", controller.pose, True, 0.1, 0.1)
-    line_move(controller.arm, controller.joints, controller.pose, [slow], controller.tool)
+    nearest_joints(controller.arm, controller.pose, controller.tool, controller.joints)
     Servo().step(controller.joints, controller.speeds, controller.seconds, 1.0)
-    SpeedMotion(controller.arm, controller.tool).step(controller.joints, controller.speeds,
-                                                      controller.seconds, 1.0)
     spare_what_is_loaded()
 
 
