@@ -45,8 +45,7 @@ class BranchRecord:
         key = stage.key.format_map({"name": values.get("name", "")}) if stage.key else ""
         record = self.stages.get(key)
         # Two stages may make the same file (a pull): the settings show which one did.
-        return record if record and (
-            set(record.settings) <= stage.fields.keys() | stage.retired) else None
+        return record if record and set(record.settings) <= stage.fields.keys() else None
 
     def has(self, patterns: Iterable[str]) -> bool:
         """Whether the folder has a file for each of these: its name, or the start of one."""

@@ -165,7 +165,7 @@ class Session:
         Returns:
             The number that the reply carries.
         """
-        return self._send(command="grasp", point=list(point), radius_m=radius, mode="pinned")
+        return self._send(command="grasp", point=list(point), radius_m=radius, mode="point")
 
     def move(self, grasp: int, position: tuple[float, float, float]) -> int:
         """Move a grasp to ``position`` [m]."""

@@ -128,8 +128,7 @@ class Stage:
     """A stage of the worker: its fields by name, and the files it reads and writes.
 
     ``step`` names its panel (empty: it has none), ``label`` is the text of its button,
-    ``retired`` are the settings of older folders that are constants now, ``moves_robot`` is whether
-    it moves the robot: ``always``, ``when armed`` or empty.
+    ``moves_robot`` is whether it moves the robot: ``always``, ``when armed`` or empty.
     """
 
     name: str
@@ -139,7 +138,6 @@ class Stage:
     writes: tuple[str, ...]
     fields: dict[str, Field]
     settings: frozenset[str]
-    retired: frozenset[str]
     step: str
     label: str
     moves_robot: str
@@ -246,7 +244,6 @@ def _stage(name: str, told: dict[str, Any]) -> Stage:
             fields[field] = _field(field, about, is_required=field in required)
     return Stage(name, told["summary"], told["key"], tuple(told["reads"]), tuple(told["writes"]),
                  fields, frozenset(told["settings"].get("properties", {})),
-                 frozenset(told["settings"].get("retired", ())),
                  told["step"], told["label"], told["moves_robot"])
 
 

@@ -231,7 +231,7 @@ def test_a_branch_tells_what_it_holds(example):
     (lambda branch: branch.plan(max_force=-1), "max_force -1: Input should be greater than 0"),
     (lambda branch: branch.simulate(move=(1, 2)), "move [1, 2]"),
     (lambda branch: branch.load(), "Give wind, snow, fruit or cut"),
-    (lambda branch: branch.session(modes="pinned"), "Did you mean mode?"),
+    (lambda branch: branch.session(modes="point"), "Did you mean mode?"),
     (lambda branch: branch.session(mode="held"), "mode 'held'"),
     (lambda branch: branch.estimate(follow=True), 'branch.run("estimate", follow=True)'),
     (lambda branch: branch.run("plann"), "There is no stage 'plann'. Did you mean plan"),
@@ -357,7 +357,7 @@ def test_a_stage_without_a_verb_runs(branch_folder):
 @pytest.mark.slow
 def test_a_session_follows(branch_folder):
     """The session is that of the command."""
-    with limber.open(branch_folder).session(mode="pinned", reduced=False) as session:
+    with limber.open(branch_folder).session(mode="point", reduced=False) as session:
         assert session.hello["event"] == "hello" and session.alive
     assert not session.alive
 

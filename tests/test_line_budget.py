@@ -1,10 +1,14 @@
-"""The budget of lines of code, which only falls: a new feature pays with what it replaces."""
+"""The budgets of lines of code and of settings, which only fall: a new feature pays with what it
+replaces.
+"""
 
 import ast
 import tomllib
 from pathlib import Path
 
 import pytest
+
+from limber.stages.registry import stage_schema, stage_summaries
 
 ROOT = Path(__file__).parents[1]
 BUDGET = tomllib.loads((ROOT / "tests" / "line_budget.toml").read_text(encoding="utf-8"))
@@ -47,6 +51,16 @@ def test_lines_of_code_only_fall(name: str):
 
 def test_the_budget_names_no_part_that_is_gone():
     assert set(BUDGET["lines"]) == set(parts())
+
+
+def test_settings_only_fall():
+    """What all stages take, inputs and options of a run included; and of it what is for experts."""
+    fields = [about for schema in map(stage_schema, stage_summaries())
+              for part in ("inputs", "settings", "options")
+              for about in schema[part].get("properties", {}).values()]
+    counts = {"fields": len(fields), "expert": sum(about["expert"] for about in fields)}
+    assert counts == BUDGET["settings"], (
+        "More than the budget: replace a setting by a rule. Fewer: lower it in line_budget.toml.")
 
 
 def test_what_counts_as_code():

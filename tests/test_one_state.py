@@ -50,7 +50,7 @@ def expected(folder):
     """The loaded branch itself: pose, energy, force and where the flower is."""
     branch = Branch.open(folder)
     loaded = load_branch(branch, gravity=True, progress=REFUSING)
-    grasp = loaded.marked_grasp("pinned")
+    grasp = loaded.marked_grasp("point")
     pose = grasp.rest_pose + np.r_[MOVE, np.zeros(3)]
     state = loaded.equilibrium(grasp, pose).require()
     return grasp, pose, state, loaded.target_positions(state.displacement)
@@ -76,7 +76,7 @@ def test_simulate(folder, expected):
     """Along its whole way, at the end of it."""
     grasp, _, state, _ = expected
     settings = SimulateSettings(kind="static", move=tuple(MOVE), frame_rate=3,
-                                grasp_mode="pinned")
+                                grasp_mode="point")
     loaded = load_branch(Branch.open(folder), gravity=True, progress=REFUSING)
     motion = motion_of(load_case_of(loaded.model, settings, None, grasp.centre), settings)
     assert motion.energy[0] == 0.0
@@ -97,7 +97,7 @@ def test_estimate_and_predict(folder, expected):
     grasp, pose, state, _ = expected
     subject = load_subject(Branch.open(folder), EstimateSettings())
     entry = PullEntry(grasp=GraspEntry(point_m=tuple(grasp.centre), radius_m=0.012,
-                                       mode="pinned"))
+                                       mode="point"))
     pull = _recorded(pose, state.reaction_force, entry)
     patch = replace(grasp)
     forward = QuasiStaticForward("one", subject.model, subject.weights, entry, frames_of(pull),
@@ -144,7 +144,7 @@ def test_session(folder, expected):
     from limber.session.client import InteractiveSession
 
     _, pose, state, flower = expected
-    with InteractiveSession(folder, mode="pinned", reduced=False) as session:
+    with InteractiveSession(folder, mode="point", reduced=False) as session:
         number = session.move(pose)
         frame = session.wait(number, 60.0)
         while frame is not None and not frame.is_reached:

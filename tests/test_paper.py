@@ -72,7 +72,6 @@ def test_it_has_an_option_and_a_row_in_the_guide(what, stage, values):
         kind = next(kind for kind in kinds if name in kind.model_fields)
         assert name in stage_schema(stage)[
             ("inputs", "settings", "options")[kinds.index(kind)]]["properties"]
-        assert name not in kind.former()
         flag = f"--{name.replace('_', '-')}"
         assert flag in options_of(command), what
         row = next((line for line in page.splitlines() if f"`{stage}`" in line and flag in line),

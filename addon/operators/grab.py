@@ -290,7 +290,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             moved = tuple(a - b for a, b in zip(target, hold.rest, strict=True))
             self._give(context, "simulate", grasp_point=tuple(hold.rest), move=moved)
             group = properties.group_of(context.scene, stages()["simulate"])
-            group.grasp_radius, group.grasp_mode = self.radius, "pinned"
+            group.grasp_radius, group.grasp_mode = self.radius, "point"
             self.report({"INFO"}, "Kept for Simulate a Motion in Material.")
         elif kept is Kept.START:
             self._give(context, "plan", start=target)

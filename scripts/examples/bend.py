@@ -9,7 +9,7 @@ from limber.store import Branch
 from limber.store.loading import load_branch
 
 branch = load_branch(Branch.read(sys.argv[1]))
-grasp = branch.marked_grasp("pinned")
+grasp = branch.marked_grasp("point")
 for way in (0.005, 0.010, 0.015):  # along x [m]
     pose = grasp.rest_pose + [way, 0, 0, 0, 0, 0]
     result = branch.equilibrium(grasp, pose).require()

@@ -212,7 +212,7 @@ def test_grab(run, blender, environment, beam, tmp_path):
     seen = driven("drive_grab.py", blender, environment, tmp_path)
     assert seen["began"] == ["RUNNING_MODAL"]
     is_given, move, place, mode = seen["kept"]
-    assert is_given and mode == "pinned"
+    assert is_given and mode == "point"
     assert abs(move[0]) > 0.02 and abs(move[1]) < 0.005
     assert abs(place[2] - 0.57) < 0.06, "where it was pressed"
     assert seen["restored"] < 1e-6 and seen["motion_shown"]

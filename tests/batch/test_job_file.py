@@ -10,7 +10,6 @@ from limber.batch.jobs.stage_tables import why_not_in_batches
 from limber.batch.jobs.toml_positions import toml_lines
 from limber.core.errors import InputError
 from limber.core.units import in_unit
-from limber.geometry.settings import ReconstructSettings
 from limber.stages.registry import stage_description, stage_summaries
 from limber.store import Branch
 
@@ -118,7 +117,6 @@ def test_a_sweep_is_every_combination(write):
     ("[[job]]\nscans = ['none*.ply']\n[[job.stage]]\nrun = 'reconstruct'", 2, "No file matches"),
     ("[[job]]\nscans = ['scans/*.ply']", 1, "no [[job.stage]]"),
     (SCANS + "\n# a comment\nbridge_limt = 2", 8, "Did you mean bridge_limit?"),
-    (SCANS + "prune = 3", 6, "prune: it cannot be set any more and is always 2.5"),
     (SCANS + "bridge_limit = -1", 6, "greater than or equal to 0"),
     (SCANS + "bridge_limit = [1, 2]", 6, "should be a valid number"),
     (SCANS + 'density = "8 mm"', 6, "It must be in kg/m^3"),
@@ -146,11 +144,6 @@ def test_what_is_wrong_is_told_with_its_line(write, text, line, said):
     told = refusal(path)
     assert f"line {line}:" in told and said in told, told
     assert not (path.parent / "jobs").exists()
-
-
-def test_a_constant_of_an_older_job_file_is_no_problem(write):
-    jobs = read_jobs(write(SCANS + "prune = 2.5\n"))
-    assert jobs.branches[0].tasks[0].settings == ReconstructSettings()
 
 
 def test_every_problem_is_told_at_once(write):

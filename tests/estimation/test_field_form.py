@@ -132,7 +132,6 @@ def test_other_forms_lie_within_what_is_expected_of_them(field, small_bench):
         return float(np.abs(form).max())
 
     assert farthest(field) < 2.0
-    assert farthest(field.same_at_any_step()) > 3.0
 
 
 def test_bumps_are_small_where_the_modulus_does_not_change(field):
@@ -143,4 +142,3 @@ def test_bumps_are_small_where_the_modulus_does_not_change(field):
     # At the base and halfway to the second control point; elsewhere nothing steps.
     assert growth[:2] == pytest.approx(np.hypot(1, np.log(8) * np.array([1.0, 1.5])))
     assert growth[2:] == pytest.approx(1.0)
-    assert field.same_at_any_step().deviations(steep) == pytest.approx(field.widths)

@@ -26,7 +26,7 @@ def clamped(small):
                        control_points(small.skeleton, FRACTIONS), FRACTIONS,
                        np.array(small.young), is_weightless=True)
     return simulate_pull(truth, "pull-1", VirtualPullSettings(
-        young=small.young, poisson=0.36, frames=8, mode="clamped", grasp_fraction=0.85, phase=0.5,
+        young=small.young, poisson=0.36, frames=8, mode="rigid", grasp_fraction=0.85, phase=0.5,
         seed=2, reach=0.2, position_noise=0.0, force_noise=0.0, torque_noise=0.0))[0]
 
 
@@ -57,5 +57,5 @@ def test_the_length_in_the_gripper_enters_the_interval(clamped, small, small_ben
 
 
 def test_a_pinned_grasp_has_no_length(clamped, small, small_bench):
-    objective, evaluation = evaluated(clamped, small, small_bench, mode="pinned")
+    objective, evaluation = evaluated(clamped, small, small_bench, mode="point")
     assert grip_error(evaluation, objective) is None

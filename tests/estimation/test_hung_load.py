@@ -37,7 +37,7 @@ class Rig:
         """True static displacement of the markers under own weight and ``weight`` [m]."""
         model = BranchModel(self.mesh, young=YOUNG, poisson=0.36, density=900.0,
                             gravity=(0.0, 0.0, -9.80665))
-        grasp = grasp_on(self.mesh, GraspEntry(point_m=self.grasp, radius_m=0.01, mode="pinned"))
+        grasp = grasp_on(self.mesh, GraspEntry(point_m=self.grasp, radius_m=0.01, mode="point"))
         state = solve_static(model, grasp=grasp, grasp_force=(0.0, 0.0, -weight)).require()
         operator = point_operator(self.mesh, self.nominal)
         return (operator @ state.displacement.ravel()).reshape(-1, 3)

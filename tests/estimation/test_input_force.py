@@ -103,7 +103,7 @@ def test_a_clamped_gripper_needs_its_torque(small, small_bench):
     (As long as the pull does not press the branch together: held it stays, pushed it buckles.)
     """
     pull = simulate_pull(small.truth(), "pull-1", VirtualPullSettings(
-        young=small.young, poisson=0.36, frames=8, mode="clamped", phase=0.5, seed=2,
+        young=small.young, poisson=0.36, frames=8, mode="rigid", phase=0.5, seed=2,
         gravity=False, reach=0.1, position_noise=0.0, force_noise=0.0, torque_noise=0.0))[0]
     sensor = pull.entry.sensor
     pull = driven(pull)
@@ -116,7 +116,7 @@ def test_a_clamped_gripper_needs_its_torque(small, small_bench):
     deaf = driven(pull, sensor=sensor.model_copy(update={"torque_sigma_nm": None}))
     with pytest.raises(InputError, match="torque is not known"):
         small_bench.objective([deaf], SETTINGS)
-    with pytest.raises(InputError, match="clamped"):
+    with pytest.raises(InputError, match="clamped gripper"):
         DynamicForward("p", small_bench.model, small_bench.weights, pull.entry, frames_of(pull),
                        small_bench.points)
 
@@ -126,7 +126,7 @@ def test_nodal_loads_have_the_wrench(small_bench, small):
     the torque.
     """
     point = small.skeleton.point_at(0.9) + [1e-3, 0.0, 0.0]
-    entry = GraspEntry(point_m=tuple(map(float, point)), radius_m=0.012, mode="clamped")
+    entry = GraspEntry(point_m=tuple(map(float, point)), radius_m=0.012, mode="rigid")
     mesh = small_bench.mesh
     grasp = grasp_on(mesh, entry)
     pose = np.array([0.1, 0.0, 0.3, 0.3, -0.2, 0.5])
@@ -142,7 +142,7 @@ def test_response_of_a_small_motion(small_bench):
     """Modes give what the force's noise does to the points, as the simulation does."""
     bench = small_bench
     entry = GraspEntry(point_m=tuple(map(float, bench.branch.skeleton.point_at(0.92))),
-                       radius_m=0.012, mode="pinned")
+                       radius_m=0.012, mode="point")
     grasp, times = grasp_on(bench.mesh, entry), np.linspace(0.0, 0.6, 13)
     model = bench.model.with_parameters(young=bench.weights @ TRUTH)
     forces = 1e-5 * np.random.default_rng(1).standard_normal((13, 3))
@@ -172,7 +172,7 @@ def test_a_gripper_that_compresses_the_branch_is_not_replaced_by_its_force(small
     modulus 11 times too large, outside its interval, without a word.
     """
     settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=6, phase=0.5, seed=4,
-                                   mode="clamped", pose_sigma=1e-5, position_noise=0.0,
+                                   mode="rigid", pose_sigma=1e-5, position_noise=0.0,
                                    force_noise=0.0, torque_noise=0.0, gravity=False)
     pull = simulate_pull(small.truth(), "pull-1", settings)[0]
     values = Values(np.array(small.young), 0.36, 900.0)
@@ -182,6 +182,6 @@ def test_a_gripper_that_compresses_the_branch_is_not_replaced_by_its_force(small
                                    frames_of(pull), np.array(pull.entry.rest_points_m))
 
     assert forward(pull).is_held_against_its_force(values)
-    loose = pull.entry.grasp.model_copy(update={"mode": "pinned"})
+    loose = pull.entry.grasp.model_copy(update={"mode": "point"})
     pull = replace(pull, entry=pull.entry.model_copy(update={"grasp": loose}))
     assert not forward(pull).is_held_against_its_force(values)

@@ -63,7 +63,7 @@ def test_the_mesh_error_foretells_how_a_much_finer_mesh_differs(small):
     """A mesh of few long elements is too stiff; by how much is told, to be corrected."""
     bench = Bench(small, slice_length=4.0, sides=6)
     grasp = grasp_on(bench.mesh, GraspEntry(
-        point_m=tuple(small.skeleton.point_at(0.9)), radius_m=0.012, mode="pinned"))
+        point_m=tuple(small.skeleton.point_at(0.9)), radius_m=0.012, mode="point"))
     operator = point_operator(bench.mesh, bench.points)
     found = mesh_error(bench.model, grasp, operator, bench.weights, YOUNG)
     model = bench.model.with_parameters(young=bench.weights @ YOUNG)
@@ -114,7 +114,7 @@ def test_one_recording_gives_one_modulus_on_any_mesh(gravity):
         mesh = box_mesh(cells)
         model = BranchModel(mesh, young=3e5, poisson=POISSON, density=DENSITY, gravity=None)
         grasp = grasp_on(mesh, GraspEntry(point_m=tuple(LOAD_POINT_M), radius_m=0.012,
-                                          mode="pinned"))
+                                          mode="point"))
         tips = point_operator(mesh, NOMINAL_M[TIPS])
         stiff = mesh_error(model, grasp, tips, np.ones((mesh.tet_count, 1)), np.array([3e5]),
                            [load])

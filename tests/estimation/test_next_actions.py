@@ -78,7 +78,7 @@ def test_a_calibration_gives_what_was_promised(today, small_bench, noisy, action
 @pytest.mark.parametrize("pose_sigma", [0.0, 1e-3])
 def test_a_recorded_torque_gives_what_was_promised(small, small_bench, pose_sigma):
     """A clamping gripper whose torque was not recorded leaves the outer moduli undetermined."""
-    settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=10, mode="clamped",
+    settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=10, mode="rigid",
                                    grasp_fraction=0.85, phase=0.5, torque_noise=0.0)
     pull = simulate_pull(small.truth(), "pull-1", settings)[0]
     calibration = CELL.model_copy(update={

@@ -66,7 +66,7 @@ def test_a_branch_that_cannot_stand_is_refused_not_divided_by(small_bench):
     """No force is asked to move what falls by itself; before, its travel of zero was a divisor."""
     model = small_bench.model.with_parameters(young=1e4, gravity=(0.0, 0.0, -9.81)).as_scanned()
     tip = model.mesh.nodes[np.argmax(model.mesh.nodes[:, 2])]
-    grasp = Grasp.at(model.mesh, tip, 0.012, "pinned")
+    grasp = Grasp.at(model.mesh, tip, 0.012, "point")
     with pytest.raises(WorkError, match="equilibrium"):
         force_for_travel(model, grasp, np.array([1.0, 0.0, 0.0]), 0.02)
     sound = model.with_parameters(young=5e8)
@@ -81,7 +81,7 @@ def test_a_travel_beyond_reach_is_refused(small_bench):
     model = small_bench.model
     tip = model.mesh.nodes[np.argmax(model.mesh.nodes[:, 2])]
     with pytest.raises(WorkError, match="No sideways force"):
-        force_for_travel(model, Grasp.at(model.mesh, tip, 0.012, "pinned"),
+        force_for_travel(model, Grasp.at(model.mesh, tip, 0.012, "point"),
                          np.array([1.0, 0.0, 0.0]), 1.0)
 
 

@@ -61,7 +61,7 @@ def estimated(folder, branch, pull, capsys, *options, tables=""):
     assert call(["import-pull", str(branch), str(folder / "markers.csv"), "--name", "pull-2",
                  "--robot", str(folder / "robot.csv"), "--time-offset", "0",
                  "--grasp-point", *map(str, entry.grasp.point_m),
-                 "--grasp-radius", str(entry.grasp.radius_m), "--grasp-mode", "pinned",
+                 "--grasp-radius", str(entry.grasp.radius_m), "--grasp-mode", "point",
                  "--position-sigma", str(entry.sensor.position_sigma_m),
                  "--force-sigma", str(entry.sensor.force_sigma_n),
                  "--pull-toml", str(stated), "--progress", "none"]) == 0

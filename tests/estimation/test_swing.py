@@ -29,7 +29,7 @@ LOAD = 0.15
 
 def beam(cells):
     mesh = box_mesh(SIZE, cells)
-    end = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.2 - 1e-9), "pinned")
+    end = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.2 - 1e-9), "point")
     return mesh, end
 
 

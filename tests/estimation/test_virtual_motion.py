@@ -77,7 +77,7 @@ def test_a_hung_weight_is_driven_by_its_force(truth, bench):
 
 def test_a_clamped_grasp_twists_and_its_torque_tells_the_outer_moduli(truth, bench):
     """The torque's derivatives equal central differences; with it E4 is known far better."""
-    pull = simulated(truth, mode="clamped", frames=8, grasp_fraction=0.85)
+    pull = simulated(truth, mode="rigid", frames=8, grasp_fraction=0.85)
     assert np.linalg.norm(pull.wrenches[-1, 3:]) > 1e-3
     settings = EstimateSettings(poisson=0.36, hold_out=False, key_frames=4)
     sensor = pull.entry.sensor.model_copy(update={

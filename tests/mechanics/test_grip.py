@@ -102,4 +102,4 @@ def test_only_what_is_in_the_gripper_is_stiffer():
     assert np.array_equal(held.young, model.young)
     assert held.with_young(2 * YOUNG).lame_mu == pytest.approx(2 * held.lame_mu)
     assert held.gripped().lame_mu == pytest.approx(model.lame_mu)
-    assert model.gripped(Grasp.at(model.mesh, [0, 0, PLACE], HALF, "pinned")) is model
+    assert model.gripped(Grasp.at(model.mesh, [0, 0, PLACE], HALF, "point")) is model

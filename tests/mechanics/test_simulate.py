@@ -42,7 +42,7 @@ def folder(tmp_path):
 def test_motion_writes_what_the_design_says(folder):
     """A pull in time: keys, PC2 of the surface, first frame the scan, skipped when current."""
     settings = SimulateSettings(move=(0.02, 0, -0.001), duration=0.2, hold=0.1,
-                                grasp_mode="pinned")
+                                grasp_mode="point")
     result = simulate(folder, settings)
     assert result.keys() >= KEYS
     assert result["converged"]
@@ -223,7 +223,7 @@ def _frames(folder, name="simulate"):
 def test_a_second_gripper_props_the_branch(folder):
     """A load at half the length, the tip held: the prop carries 5/16 of it (beam theory)."""
     simulate(folder, SimulateSettings(
-        kind="static", gravity=False, frame_rate=1, grasp_mode="pinned", grasp_radius=0.008,
+        kind="static", gravity=False, frame_rate=1, grasp_mode="point", grasp_radius=0.008,
         load_at=((0, 0, 0.15, 0.1, 0, 0),), hold_at=((0, 0, 0.3),)))
     held = np.array(_frames(folder)["hold_forces_n"])
     assert held.shape == (2, 1, 3)
@@ -235,7 +235,7 @@ def test_pose_and_hold_together_in_motion(folder):
     """One gripper moves, another holds: forces of both are given, the held place stays."""
     simulate(folder, SimulateSettings(
         move=(0.003, 0, 0), hold_at=((0, 0, 0.3),), grasp_point=(0, 0, 0.15), duration=0.1,
-        hold=0.05, grasp_mode="pinned", gravity=False))
+        hold=0.05, grasp_mode="point", gravity=False))
     frames = _frames(folder)
     assert np.shape(frames["hold_forces_n"]) == (frames["frame_count"], 1, 3)
     assert frames["grasp_forces_n"][-1][0] > 0 > frames["hold_forces_n"][-1][0][0]
@@ -249,7 +249,7 @@ def test_pose_and_hold_together_in_motion(folder):
 def test_a_load_grows_as_a_grasp_force_does(folder):
     """The same force by --load-at and by --grasp-force: the same motion."""
     place = {"grasp_point": (0, 0, 0.2), "duration": 0.1, "hold": 0.1, "gravity": False,
-             "grasp_mode": "pinned"}
+             "grasp_mode": "point"}
     simulate(folder, SimulateSettings(grasp_force=(0.5, 0, 0), name="force", **place))
     simulate(folder, SimulateSettings(load_at=((0, 0, 0.2, 0.5, 0, 0),), name="load", **place))
     assert _frames(folder, "load")["energies_j"] == pytest.approx(
@@ -284,7 +284,7 @@ def test_a_way_from_a_table_is_followed(folder, tmp_path):
     part = np.linspace(0, 1, 7)
     rows = [f"{5 + p:.9f},{1 + 20 * p:.9f},{2:.1f},{3 - p:.9f}" for p in part]
     way.write_text("\n".join(["t_s,x_mm,y_mm,z_mm", *rows]) + "\n")
-    common = ["--kind", "static", "--grasp-mode", "pinned", "--no-gravity", "--frame-rate", "6",
+    common = ["--kind", "static", "--grasp-mode", "point", "--no-gravity", "--frame-rate", "6",
               "--progress", "none"]
     assert call(["simulate", str(folder), "--along", str(way), "--name", "way", *common]) == 0
     assert call(["simulate", str(folder), "--move", "0.02", "0", "-0.001", *common]) == 0
@@ -303,7 +303,7 @@ def test_a_pull_is_replayed(folder, tmp_path):
     with branch.stage("pull:a") as stage:
         stage.path("pulls/a/pull.toml").write_text(
             "observation = 'none'\n[grasp]\npoint_m = [0.0, 0.0, 0.2]\nradius_m = 0.02\n"
-            "mode = 'pinned'\n")
+            "mode = 'point'\n")
         stage.path("pulls/a/robot.csv").write_text(
             "t_s,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad\n7,0,0,0.2,0,0,0\n9,0.02,0,0.2,0,0,0\n"
             "127,0,0,0.2,0,0,0\n")

@@ -24,7 +24,7 @@ quadratic = straight_beam(0.2, 0.004, slice_count=4)
 for material in ("st_venant_kirchhoff", "stable_neo_hookean", "linear"):
     for mesh in (quadratic, quadratic.linear()):
         model = BranchModel(mesh, young=5e7, poisson=0.35, density=900, material=material)
-        for mode in ("pinned", "clamped"):
+        for mode in ("point", "rigid"):
             grasp = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.199), mode)
             pose = grasp.rest_pose + np.array([0.002, 0, -0.0001, 0, 0, 0])
             found = solve_static(model, grasp=grasp, pose=pose).require()

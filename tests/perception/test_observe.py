@@ -22,7 +22,7 @@ def pull(scene) -> Pull:
     poses[:, :3] = [scene.control_points(bend)[3] for bend in BENDS]
     held = tuple(float(x) for x in poses[0, :3])
     entry = PullEntry(observation="depth", grasp=GraspEntry(
-        point_m=held, radius_m=0.008, mode="pinned"))
+        point_m=held, radius_m=0.008, mode="point"))
     return Pull("seen", entry, np.arange(len(BENDS)) * 0.5, poses, np.full((len(BENDS), 6), np.nan))
 
 

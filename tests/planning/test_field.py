@@ -13,7 +13,7 @@ from limber.planning.field.fit_choice import error_measures
 from limber.planning.field.interpolation.chart import Chart
 from limber.planning.field.interpolation.radial import RadialInterpolant
 from limber.planning.field.interpolation.valid_region import TrustRegion
-from limber.planning.field.sampling import energy_inputs, is_sampled_on
+from limber.planning.field.sampling import energy_inputs
 
 ELSEWHERE = np.random.default_rng(9).uniform(-0.1, 0.1, (80, 3))
 
@@ -239,15 +239,8 @@ def test_a_sample_at_a_snap_costs_the_others_no_slopes(well):
 
 
 def test_a_field_knows_its_branch_on_any_machine(small_mesh, small_skeleton):
-    """Last digits of a grasp's weights differ between machines; fields of earlier versions digested
-    them, so that a folder that was moved asked for its field again."""
+    """Last digits of a grasp's weights differ between machines, to which a folder may be moved."""
     model = small_grasp_model(small_mesh, small_skeleton, None)
-    inputs, centre = energy_inputs(model), model.grasp.centre
+    inputs = energy_inputs(model)
     elsewhere = replace(model.grasp, weights=np.nextafter(model.grasp.weights, 1.0))
     assert energy_inputs(replace(model, grasp=elsewhere)) == inputs
-    assert is_sampled_on(inputs, centre, model)
-    assert not is_sampled_on(inputs | {"material": "another"}, centre, model)
-    earlier = {name: value for name, value in inputs.items() if name != "grasp nodes"}
-    earlier["grasp"] = "a digest of another machine's weights"
-    assert is_sampled_on(earlier, np.nextafter(centre, 1.0), model)
-    assert not is_sampled_on(earlier, centre + [1e-6, 0.0, 0.0], model)

@@ -1,8 +1,7 @@
-"""Plan files: the whole motion of format 2, format 1 as it was, and what is refused."""
+"""Plan files: the whole motion, and what is refused."""
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +18,6 @@ from limber.planning.plan_file import (
 )
 from limber.planning.settings import PlanSettings
 from limber.planning.timing import Pace
-
-OLD = Path(__file__).parent / "plan_format_1.json"  # written by the last version before format 2
 
 
 def solved(xs):
@@ -88,7 +85,7 @@ def written(path, folder):
 def test_what_is_written_is_read(path, tmp_path):
     """All columns, vectors as vectors; summary, limits and timing with them."""
     plan = read_plan(written(path, tmp_path))
-    assert plan.version == 2 and plan.summary["seed"] == 3
+    assert plan.summary["seed"] == 3
     assert plan.summary["timing"]["acceleration_m_s2"] == 0.1
     assert plan.summary["limits"]["energy_j"]["limit"] == 0.1 and plan.summary["robot"] is None
     motion = whole_motion(path, ("flower", "leaf"))
@@ -109,18 +106,9 @@ def test_an_arm_that_is_no_object_is_refused(path, tmp_path, robot):
         read_plan(file)
 
 
-def test_format_1_is_read():
-    """A plan of the first format: sizes of forces, no vectors, no motion."""
-    plan = read_plan(OLD)
-    stored = json.loads(OLD.read_text())
-    assert "format_version" not in stored and plan.version == 1
-    assert plan.motion is None and plan.plan.forces is None and plan.plan.times is None
-    np.testing.assert_array_equal(plan.plan.force_sizes, stored["plan"]["forces_n"])
-    assert plan.baseline.poses.shape == (len(stored["baseline"]["energies_j"]), 6)
-
-
 @pytest.mark.parametrize(("spoil", "words"), [
     (lambda content: content.update(format_version=3), "format 3"),
+    (lambda content: content["plan"].update(forces_n=content["plan"]["energies_j"]), "no vectors"),
     (lambda content: content["plan"]["energies_j"].pop(), "unequal"),
     (lambda content: content.pop("motion"), "motion"),
     (lambda content: content["plan"]["poses"].__setitem__(0, [0.0] * 5), "not a plan"),

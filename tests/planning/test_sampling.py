@@ -97,7 +97,7 @@ def test_force_is_the_gradient_of_the_energy(small_model, some, small_mesh, smal
 
 def test_firm_grasp_at_the_natural_rotation_costs_no_more(small_model, some):
     """A clamped gripper that turns as the sample says needs the pinned one's energy (2 %)."""
-    firm = Grasp.from_mesh(small_model.mesh, mode="clamped")
+    firm = Grasp.from_mesh(small_model.mesh, mode="rigid")
     for target in some[0][:3]:
         loose = small_model.follow(target[None], small_model.rest.displacement)[0]
         held = solve_static(small_model.model, grasp=firm,

@@ -36,11 +36,3 @@ def test_the_largest_bound_of_all_grids_counts_where_it_is_known(tmp_path):
     places = np.array([[0.15, 0.225, 0.225], [0.15, 0.375, 0.225], [0.15, 0.1, 0.1]])
     found = CostToGo.read(tmp_path / "bound.npz").at(places)
     np.testing.assert_allclose(found, [0.7, 0.2, 0.2], rtol=1e-6)
-
-
-def test_a_bound_of_an_older_version_is_read(tmp_path):
-    """It has one grid of cubes."""
-    np.savez(tmp_path / "bound.npz", origin_m=np.zeros(3), axes=np.eye(3), spacing_m=0.1,
-             costs=np.full((3, 3, 3), 0.4))
-    found = CostToGo.read(tmp_path / "bound.npz")
-    np.testing.assert_allclose(found.at(np.full((1, 3), 0.12)), 0.4)

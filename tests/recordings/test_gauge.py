@@ -31,7 +31,7 @@ def table(branch_folder, tmp_path):
     """Gauge to 0.01 N, ruler to 1 mm; the ruler's zero is at 12 mm."""
     mesh, point = load_mesh(Branch.read(branch_folder)), grasp_of(branch_folder)
     model = BranchModel(mesh, young=YOUNG, poisson=0.36, density=900.0, gravity=None)
-    grasp = grasp_on(mesh, GraspEntry(point_m=tuple(point), radius_m=0.01, mode="pinned"))
+    grasp = grasp_on(mesh, GraspEntry(point_m=tuple(point), radius_m=0.01, mode="point"))
     rows = ["distance from base (cm);force (N);deflection (mm)"]
     for force in FORCES:
         state = solve_static(model, grasp=grasp, grasp_force=force * SIDEWAYS).require()

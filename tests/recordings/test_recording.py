@@ -27,7 +27,7 @@ def test_entries_are_checked_by_name(tmp_path, plain_pull):
     write_pull(tmp_path / "p", plain_pull)
     path = tmp_path / "p" / "pull.toml"
     text = path.read_text()
-    path.write_text(text.replace('mode = "clamped"', 'mode = "glued"'))
+    path.write_text(text.replace('mode = "rigid"', 'mode = "glued"'))
     with pytest.raises(InputError, match=r"grasp\.mode"):
         read_entry(path)
     path.write_text(text + "\nunknown = 3\n")

@@ -27,7 +27,7 @@ def branch():
     mesh = straight_beam(0.2, 0.004, slice_count=6, young=1e8, grasp_fraction=0.7)
     model = BranchModel(mesh, young=1e8, poisson=0.35, density=900.0)
     weights = young_weights(mesh, np.array([[0.0, 0.0, 0.1]]))
-    return model, Grasp.from_mesh(mesh, "pinned"), weights, np.array([1e8])
+    return model, Grasp.from_mesh(mesh, "point"), weights, np.array([1e8])
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +59,8 @@ def test_all_that_a_model_depends_on_is_in_its_key(branch):
         (model.with_parameters(poisson=0.3), grasp, weights, young, SETTINGS),
         (model.with_point_masses([PointMass((0, 0, 0.2), 0.01)]), grasp, weights, young, SETTINGS),
         (model.with_rest_nodes(1.001 * mesh.nodes), grasp, weights, young, SETTINGS),
-        (model, Grasp.from_mesh(mesh, "clamped"), weights, young, SETTINGS),
-        (model, Grasp.of_nodes(mesh, grasp.nodes[1:], "pinned"), weights, young, SETTINGS),
+        (model, Grasp.from_mesh(mesh, "rigid"), weights, young, SETTINGS),
+        (model, Grasp.of_nodes(mesh, grasp.nodes[1:], "point"), weights, young, SETTINGS),
         (model, grasp, weights, 2 * young, SETTINGS),
         (model, grasp, 0.5 * weights, young, SETTINGS),
         (model, grasp, weights, young, ReducedSettings(size=21))]

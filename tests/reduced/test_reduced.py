@@ -37,7 +37,7 @@ def weights(model) -> np.ndarray:
 @pytest.fixture(scope="module")
 def grasp(model) -> Grasp:
     """The patch, pinned."""
-    return Grasp.from_mesh(model.mesh, "pinned")
+    return Grasp.from_mesh(model.mesh, "point")
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_the_grasp_follows_the_pose_exactly(model):
     from limber.reduced.training import Trainer, sample_poses, sample_young
 
     weights, young = as_control_points(model)
-    for mode in ("clamped", "pinned"):
+    for mode in ("rigid", "point"):
         grasp = Grasp.from_mesh(model.mesh, mode)
         rng = np.random.default_rng(5)
         poses = sample_poses(model, grasp, 6, rng, TRAINING)
@@ -119,7 +119,7 @@ def test_the_grasp_follows_the_pose_exactly(model):
         pose = grasp.rest_pose + [0.01, -0.02, -0.004, 0.1, 0.2, -0.1]
         q = np.concatenate([held.at(pose), rng.normal(size=26 - held.count)])
         moved = np.tensordot(q, basis.columns, 1)[grasp.nodes]
-        if mode == "clamped":
+        if mode == "rigid":
             np.testing.assert_allclose(moved, grasp.displacement(model.mesh.nodes, pose),
                                        atol=1e-9)
         else:

@@ -30,7 +30,7 @@ def model() -> BranchModel:
 @pytest.fixture(scope="module")
 def grasp(model) -> Grasp:
     """The patch, pinned."""
-    return Grasp.from_mesh(model.mesh, "pinned")
+    return Grasp.from_mesh(model.mesh, "point")
 
 
 @pytest.fixture(scope="module")

@@ -63,9 +63,9 @@ def test_each_leg_is_checked_for_collisions(motion):
 def test_a_plan_without_a_robot_has_the_legs_of_the_branch():
     count = np.arange(5.0)
     motion = PlanPath(np.column_stack([0.01 * np.array([0, 1, 2, 1, 0]), *np.zeros((5, 5))]), count,
-                 np.array([0.0, 1, 3, 1, 0]), count, torques=np.zeros((5, 3)),
-                 times=np.array([0.0, 1, 3, 5, 6]),
-                 phases=("approach", "path", "path", "return", "return"))
+                      count, np.outer([0.0, 1, 3, 1, 0], [0.0, 0, 1]), torques=np.zeros((5, 3)),
+                      times=np.array([0.0, 1, 3, 5, 6]),
+                      phases=("approach", "path", "path", "return", "return"))
     path, hold, back = legs_without_cell(motion, 2.5)
     assert (path["duration_s"], hold["start_s"], back["start_s"]) == (3.0, 3.0, 5.5)
     assert path["length_m"] == back["length_m"] == pytest.approx(0.02)

@@ -20,7 +20,7 @@ def cache(tmp_path_factory):
 @pytest.fixture(scope="module")
 def session(branch_folder, cache):
     """A session that was seen to learn, and is ready."""
-    with InteractiveSession(branch_folder, mode="pinned", cache_folder=cache, **SMALL) as running:
+    with InteractiveSession(branch_folder, mode="point", cache_folder=cache, **SMALL) as running:
         pose = np.array(running.hello["rest_pose"]) + [0.01, 0, 0, 0, 0, 0]
         running.early = running.wait(running.move(pose))
         event = running.wait_for("model", 90)
@@ -87,7 +87,7 @@ def test_loads_are_not_answered_by_a_model_that_does_not_know_them(session):
 def test_a_second_session_does_not_learn_again(session, branch_folder, cache):
     """It finds the model, and answers the same."""
     first = at(session, 0.015, 0.004)
-    with InteractiveSession(branch_folder, mode="pinned", cache_folder=cache, **SMALL) as second:
+    with InteractiveSession(branch_folder, mode="point", cache_folder=cache, **SMALL) as second:
         event = second.wait_for("model", 60)
         assert event is not None and event["from_cache"]
         frame = at(second, 0.015, 0.004)
@@ -101,7 +101,7 @@ def test_a_damaged_cache_is_said_and_learnt_again(branch_folder, cache, tmp_path
     """A broken file costs a warning and the time to learn, not the session."""
     (path,) = cache.glob("*.npz")
     (tmp_path / path.name).write_bytes(path.read_bytes()[:1000])
-    options = {"mode": "pinned", "cache_folder": tmp_path, **SMALL}
+    options = {"mode": "point", "cache_folder": tmp_path, **SMALL}
     with InteractiveSession(branch_folder, **options) as second:
         event = second.wait_for("model", 90)
         assert event is not None and not event["from_cache"]

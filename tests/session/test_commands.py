@@ -56,7 +56,7 @@ def test_two_grasps_and_a_release(session, model):
     """Both grasps' forces and the surface are those of the full model; let go, it springs back."""
     assert not session.hello["grasps"]
     rest = session.latest().positions
-    one = session.grab(point=[0.0, 0.0, 0.1], mode="clamped", radius=0.011)
+    one = session.grab(point=[0.0, 0.0, 0.1], mode="rigid", radius=0.011)
     two = session.grab(vertex=tip_vertex(session), radius=0.011)
     numbers = [one["grasp"], two["grasp"]]
     assert numbers[1] == numbers[0] + 1
@@ -65,8 +65,8 @@ def test_two_grasps_and_a_release(session, model):
     second = np.array(two["pose"]) + [0.02, 0.01, -0.0005, 0, 0, 0]
     session.move(first, grasp=numbers[0])
     frame = settled(session, session.move(second, grasp=numbers[1]))
-    grasps = [Grasp.at(model.mesh, [0, 0, 0.1], 0.011, "clamped"),
-              Grasp.at(model.mesh, rest[rest[:, 2].argmax()], 0.011, "pinned")]
+    grasps = [Grasp.at(model.mesh, [0, 0, 0.1], 0.011, "rigid"),
+              Grasp.at(model.mesh, rest[rest[:, 2].argmax()], 0.011, "point")]
     full = solve_static(model, grasp=grasps, pose=np.array([first, second])).require()
     assert frame.status == Status.full and frame.is_trusted
     assert [held.number for held in frame.grasps] == numbers
@@ -314,7 +314,7 @@ def test_named_targets_are_followed(branch_folder, tmp_path):
     with Branch.open(folder).stage("target") as stage:
         stage.path("targets.json").write_text(json.dumps(
             {"format_version": 1, "targets": targets}))
-    with InteractiveSession(folder, reduced=False, mode="pinned") as session:
+    with InteractiveSession(folder, reduced=False, mode="point") as session:
         assert session.hello["targets"] == ["flower"]
         rest = session.latest()
         np.testing.assert_allclose(rest.targets, [[0, 0, 0.18]], atol=1e-6)

@@ -18,7 +18,7 @@ from limber.session.protocol import (
 
 GOOD = [
     {"command": "hello", "protocol": PROTOCOL},
-    {"command": "grasp", "vertex": 3, "mode": "clamped", "radius_m": 0.02},
+    {"command": "grasp", "vertex": 3, "mode": "rigid", "radius_m": 0.02},
     {"command": "grasp", "point": [0.0, 0.1, 0.2]},
     {"command": "release"}, {"command": "release", "grasp": 2},
     {"command": "move", "id": 5, "pose": [0, 0, 0.2, 0.0, 0.1, 0]},

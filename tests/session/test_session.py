@@ -26,7 +26,7 @@ SMALL = {"grasps": 24, "size": 36, "fields": 70, "cache": False}
 @pytest.fixture(scope="module")
 def session(branch_folder):
     """A session whose reduced model is ready."""
-    with InteractiveSession(branch_folder, mode="pinned", **SMALL) as running:
+    with InteractiveSession(branch_folder, mode="point", **SMALL) as running:
         assert running.wait_for("model", 90) is not None, running.events
         yield running
 
@@ -75,7 +75,7 @@ def test_answers_agree_with_the_full_model(session, branch_folder):
     pose = moved(session, x=0.03, y=0.01, z=-0.006)
     frame = session.wait(session.move(pose))
     model = load_model(Branch.open(branch_folder)).as_scanned()
-    full = solve_static(model, grasp=Grasp.from_mesh(model.mesh, "pinned"), pose=pose).require()
+    full = solve_static(model, grasp=Grasp.from_mesh(model.mesh, "point"), pose=pose).require()
     assert frame.is_converged and frame.is_reduced
     assert frame.energy == pytest.approx(full.energy, rel=0.02)
     np.testing.assert_allclose(frame.reaction_force, full.reaction_force,

@@ -133,27 +133,6 @@ def test_every_branch_has_a_uuid_of_its_own(branch: Branch, tmp_path: Path):
     assert Branch.create(tmp_path / "pear.branch").uuid not in (uuid, None)
 
 
-def test_a_folder_of_format_1_is_read_and_gets_its_uuid_when_written(branch: Branch):
-    """Reading leaves an older folder's bytes alone; the first stage writes it in this format."""
-    path = branch.folder / "branch.json"
-    content = json.loads(path.read_text())
-    del content["uuid"]
-    path.write_text(json.dumps(content | {"format_version": 1}))
-    old = path.read_bytes()
-    again = Branch.open(branch.folder, verify=True)
-    assert again.uuid is None
-    assert path.read_bytes() == old
-    with again.stage("second"):
-        pass
-    uuid = again.uuid
-    assert uuid is not None
-    with again.stage("third"):
-        pass
-    written = json.loads(path.read_text())
-    assert (written["format_version"], written["uuid"]) == (FORMAT_VERSION, uuid)
-    assert set(written["stages"]) == {"first", "second", "third"}
-
-
 def test_newer_format_is_refused(branch: Branch):
     """A folder of a newer format is refused with both versions and what to do."""
     path = branch.folder / "branch.json"

@@ -4,8 +4,8 @@ from typing import ClassVar
 
 import pytest
 
-from limber.core.errors import InputError, WorkError
-from limber.core.settings import Settings, checked_settings
+from limber.core.errors import WorkError
+from limber.core.settings import Settings
 from limber.store import Branch
 from limber.store import branch as module
 
@@ -14,12 +14,6 @@ class First(Settings):
     """Settings of a stage."""
 
     size: int = 3
-
-
-class Shorter(First):
-    """The same of a program in which ``steps`` cannot be set any more."""
-
-    retired: ClassVar[dict[str, int]] = {"steps": 8}
 
 
 class Mended(First):
@@ -40,19 +34,6 @@ def test_a_program_whose_results_changed_runs_its_stage_again(tmp_path):
     again = Branch.open(tmp_path / "a.branch")
     assert again.is_current("reconstruct", Mended())
     assert not again.is_current("reconstruct", First()), "an older program makes its own"
-
-
-def test_a_setting_that_became_a_constant_leaves_old_folders_as_they_are(tmp_path):
-    """The folder states it: with the constant's value it is up to date, with another it is not."""
-    branch = Branch.create(tmp_path / "a.branch")
-    for steps, is_current in ((8, True), (9, False)):
-        with branch.stage("reconstruct", {"size": 3, "steps": steps}) as stage:
-            stage.path("x.txt").write_text("1")
-        assert branch.is_current("reconstruct", Shorter()) == is_current
-        assert not branch.is_current("reconstruct", Shorter(size=4))
-    assert checked_settings(Shorter, {"size": 3, "steps": 8}) == Shorter()
-    with pytest.raises(InputError, match="steps"):
-        checked_settings(Shorter, {"size": 3, "steps": 9})
 
 
 def test_no_stage_begins_on_a_full_disk(tmp_path, monkeypatch):

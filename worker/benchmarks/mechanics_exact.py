@@ -67,7 +67,7 @@ class Cantilever:
     @classmethod
     def make(cls, ratio: float = 1.0, slices: int = 83) -> "Cantilever":
         mesh = straight_beam(LENGTH, RADIUS, RADIUS * ratio, slice_count=slices)
-        end = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > LENGTH - 1e-9), "pinned")
+        end = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > LENGTH - 1e-9), "point")
         area, inertia = section(mesh)
         return cls(mesh, end, inertia, area)
 
@@ -148,7 +148,7 @@ def _under_end_moment(beam: Cantilever, moment: float) -> np.ndarray:
     Dead forces on the face would be another load, and an unstable one. The face is held, and its
     position and rotation are sought at which it takes the moment and no force.
     """
-    model, face = beam.model(), replace(beam.end, mode="clamped")
+    model, face = beam.model(), replace(beam.end, mode="rigid")
     angle = moment * LENGTH / (YOUNG * beam.inertia)
     parts = np.linspace(0, 1, int(np.ceil(angle / 0.3)) + 1)[1:]
     result = follow_poses(model, face, np.array([_arc_pose(part * angle) for part in parts])
@@ -258,7 +258,7 @@ def _cube(cells: int) -> TetMesh:
 
 def short_beam(slices: int = 16) -> tuple[TetMesh, Grasp]:
     mesh = straight_beam(0.2, 0.005, slice_count=slices)
-    return mesh, Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.2 - 1e-9), "pinned")
+    return mesh, Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.2 - 1e-9), "point")
 
 
 def time_rate_row(_setting: Setting) -> list[Row]:

@@ -31,7 +31,7 @@ YOUNG = 5e7
 KNOWN = ReducedSettings(size=62, vibration_count=1, field_count=100)
 CHANGED = ReducedSettings(size=66, vibration_count=0, field_count=110)
 CLAMPED = ReducedSettings(size=90, vibration_count=0, field_count=140)
-SESSION = {"mode": "pinned", "gravity": False, "grasps": 2, "size": 62, "fields": 100}
+SESSION = {"mode": "point", "gravity": False, "grasps": 2, "size": 62, "fields": 100}
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Branching:
     grasp_point: np.ndarray
 
     def grasp(self, mode: str) -> Grasp:
-        radius = 0.006 if mode == "clamped" else 0.0
+        radius = 0.006 if mode == "rigid" else 0.0
         return Grasp.at(self.model.mesh, self.grasp_point, radius, mode)
 
 
@@ -113,7 +113,7 @@ def pinned_rows(setting: Setting) -> list[Row]:
     """Measure pinned grasps and a session; the raw numbers go to the folder ``out`` as JSON."""
     quick, progress = setting.quick, setting.progress
     branch = bench_branch()
-    bench = GraspBench(branch, "pinned", setting.seed)
+    bench = GraspBench(branch, "point", setting.seed)
     count, varied = (50, 100) if quick else (120, 160)
     known = bench.train(count, 1.0, None, progress.part(0.0, 0.25))
     held_out = bench.test(10 if quick else 40, False, known, progress.part(0.25, 0.32))
@@ -147,7 +147,7 @@ def pinned_rows(setting: Setting) -> list[Row]:
 
 def clamped_rows(setting: Setting) -> list[Row]:
     """Measure clamped grasps: the position and the rotation are given."""
-    bench = GraspBench(bench_branch(), "clamped", setting.seed)
+    bench = GraspBench(bench_branch(), "rigid", setting.seed)
     known = bench.train(setting.at_most(200, 100), 1.0, None, setting.progress.part(0.0, 0.7))
     errors = measure(bench.reduce(_with_known_young(known), CLAMPED), bench.test(
         setting.at_most(30, 10), False, known, setting.progress.part(0.8, 0.95)))
@@ -292,7 +292,7 @@ def _put_in_cache(path: Path, cache: Path, reduced: ReducedModel, snapshots: Sna
     """Let the session find the existing model instead of making one."""
     settings = SessionSettings(**SESSION)
     held = load_held(path, settings)
-    grasp = held.loaded.marked_grasp("pinned")
+    grasp = held.loaded.marked_grasp("point")
     key = model_key(held.model, grasp, held.weights, held.young, reduced_settings(settings))
     ReducedCache(cache).store(key, reduced, snapshots)
 

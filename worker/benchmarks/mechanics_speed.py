@@ -185,7 +185,7 @@ def grasp_row(setting: Setting) -> list[Row]:
     count = setting.at_most(300, 40)
     model = _branch_model(_sized_mesh(2800))
     reach = 2 / 3 * LENGTH
-    grasp = Grasp.at(model.mesh, model.mesh.nodes[_node_at(model.mesh, reach)], 0.0, "pinned")
+    grasp = Grasp.at(model.mesh, model.mesh.nodes[_node_at(model.mesh, reach)], 0.0, "point")
     poses = np.array([np.concatenate([grasp.centre + move, np.zeros(3)])
                       for move in _tour(grasp.centre, count, setting.generator(52))])
     start = time.process_time()

@@ -160,7 +160,7 @@ def edge_load(mesh: TetMesh) -> Grasp:
     for start in range(0, len(on_edge) - 2, 2):
         weights[along[start:start + 3]] += np.array([1, 4, 1]) / 6
     weights /= weights.sum()
-    return Grasp(on_edge, weights, weights @ mesh.nodes[on_edge], "pinned")
+    return Grasp(on_edge, weights, weights @ mesh.nodes[on_edge], "point")
 
 
 def drop(young: float, load: float, *, poisson: float = POISSON,

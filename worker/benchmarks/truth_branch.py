@@ -113,7 +113,7 @@ def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0,
     points = control_points(skeleton, FRACTIONS)
     entry = PullEntry(
         gravity_m_s2=GRAVITY, source="truth", rest_points_m=tuple(map(tuple, points.tolist())),
-        grasp=GraspEntry(point_m=tuple(point.tolist()), radius_m=1.3 * radius, mode="pinned"))
+        grasp=GraspEntry(point_m=tuple(point.tolist()), radius_m=1.3 * radius, mode="point"))
     grasp = grasp_on(mesh, entry.grasp)
     states = np.linspace(0.0, 6.0, STATES)
     made = moved(truth.model, grasp, MotionWanted(

@@ -90,7 +90,7 @@ def made_rig(folder: Path, rng: np.random.Generator) -> Rig:
     grasp = skeleton.nodes[78]
     model = BranchModel(mesh, young=YOUNG, poisson=0.36, density=900.0, gravity=GRAVITY)
     state = solve_static(
-        model, grasp=grasp_on(mesh, GraspEntry(point_m=tuple(grasp), radius_m=0.01, mode="pinned")),
+        model, grasp=grasp_on(mesh, GraspEntry(point_m=tuple(grasp), radius_m=0.01, mode="point")),
         grasp_force=(0.0, 0.0, -WEIGHT)).require()
     moved = (point_operator(mesh, nominal) @ state.displacement.ravel()).reshape(-1, 3)
     times = np.arange(450) / 100.0

@@ -29,7 +29,7 @@ _TESTED, _TESTS = 300, 10  # test grasps, and those of one trial
 def doubt_rows(setting: Setting) -> list[Row]:
     """Grasps of a reduced model after E changed by up to 3 at each control point, checked."""
     source = source_digest(("mechanics", "reduced"), __file__, mechanics_reduced.__file__)
-    bench = GraspBench(bench_branch(), "pinned", setting.seed)
+    bench = GraspBench(bench_branch(), "point", setting.seed)
     known = _trained(bench, setting, source)
     if known is None:
         return [Row(*asked, "the training goes on with the same --seed and --out", None, 0)

@@ -261,7 +261,7 @@ def _imported(folder: Path, pull: Pull, branch: Path) -> None:
         for name in ("force_bias_sigma_n", "force_drift_sigma_n")), encoding="utf-8")
     import_pull(branch, folder / "markers.csv", "pull-1", ImportSettings(
         robot=str(folder / "robot.csv"), time_offset=0.0, grasp_point=entry.grasp.point_m,
-        grasp_radius=entry.grasp.radius_m, grasp_mode="pinned",
+        grasp_radius=entry.grasp.radius_m, grasp_mode="point",
         position_sigma=entry.sensor.position_sigma_m, force_sigma=entry.sensor.force_sigma_n,
         pull_toml=str(sensor)))
 

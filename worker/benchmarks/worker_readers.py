@@ -320,7 +320,7 @@ def _commands(_template: Path, folder: Path) -> list[Path]:
     path = folder / "commands.jsonl"
     path.write_text("\n".join(json.dumps(one) for one in (
         {"command": "hello", "protocol": 2, "id": 1},
-        {"command": "grasp", "vertex": 4, "mode": "pinned", "radius_m": 0.01},
+        {"command": "grasp", "vertex": 4, "mode": "point", "radius_m": 0.01},
         {"command": "move", "pose": [0.1, 0, 0.4, 0, 0, 0], "grasp": 1},
         {"command": "young", "young_pa": [1e8, 1e8]},
         {"command": "loads", "loads": [{"point": [0, 0, 0.3], "force_n": [0, 0, -1]}]},

@@ -34,7 +34,7 @@ def make_model(mesh, **options):
 
 
 def tip_of(mesh):
-    return Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > LENGTH - 1e-9), "pinned")
+    return Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > LENGTH - 1e-9), "point")
 
 
 @pytest.mark.slow

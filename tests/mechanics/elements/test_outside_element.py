@@ -58,7 +58,7 @@ def beam(counts: tuple[int, int, int] = (1, 1, 6)) -> TetMesh:
 def bent(mesh: TetMesh) -> tuple[BranchModel, np.ndarray, float]:
     """The beam with its end moved aside: model, displacement [m], energy [J]."""
     model = BranchModel(mesh, young=1e8, poisson=0.3, density=900.0, gravity=None)
-    grasp = Grasp.from_mesh(mesh, mode="pinned")
+    grasp = Grasp.from_mesh(mesh, mode="point")
     result = solve_static(model, grasp=grasp,
                           pose=grasp.rest_pose + [0.004, 0, 0, 0, 0, 0]).require()
     return model, result.displacement, result.strain_energy

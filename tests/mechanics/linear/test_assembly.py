@@ -124,7 +124,7 @@ def test_force_is_linear_in_young_and_superposes(short_box):
 
 def test_pinned_solution_keeps_the_mean_and_balances(short_box):
     """A pinned patch moves in the mean as told, and the factored equations are satisfied."""
-    grasp = Grasp.of_nodes(short_box, np.flatnonzero(short_box.nodes[:, 2] > 0.0299), "pinned")
+    grasp = Grasp.of_nodes(short_box, np.flatnonzero(short_box.nodes[:, 2] > 0.0299), "point")
     model = make_model(short_box)
     equations = model.equations([grasp])
     zero = np.zeros_like(short_box.nodes)
@@ -177,7 +177,7 @@ def test_a_tangent_stays_what_it_is(name, short_box, monkeypatch):
     """Another tangent of the same equations changes nothing in one that is still held; the memory
     of one that is not serves the next, and one that cannot be factorised takes none along."""
     monkeypatch.setattr(equations_module, "make_factor", lambda pattern: factor_of(name, pattern))
-    grasp = Grasp.of_nodes(short_box, np.flatnonzero(short_box.nodes[:, 2] > 0.0299), "pinned")
+    grasp = Grasp.of_nodes(short_box, np.flatnonzero(short_box.nodes[:, 2] > 0.0299), "point")
     model = make_model(short_box)
     equations = model.equations([grasp])
     zero = np.zeros_like(short_box.nodes)

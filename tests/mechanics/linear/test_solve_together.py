@@ -21,7 +21,7 @@ def test_several_forces_are_solved_as_each_alone(beam, count):
     """Of any number; with a pinned grasp each with its own move of the pin."""
     rng = np.random.default_rng(count)
     rights = rng.standard_normal((count, *beam.mesh.nodes.shape))
-    for grasps in ((), (Grasp.from_mesh(beam.mesh, "pinned"),)):
+    for grasps in ((), (Grasp.from_mesh(beam.mesh, "point"),)):
         tangent = beam.equations(grasps).tangent(beam, np.zeros_like(beam.mesh.nodes))
         moves = rng.standard_normal((3 * len(grasps), count))
         alone = [tangent.solve(right, move.reshape(-1, 3))
@@ -43,7 +43,7 @@ def test_forces_in_a_few_places_are_solved_as_any(beam):
 
 def test_a_pin_is_solved_for_only_when_it_is_asked_for(beam, monkeypatch):
     """Whether a state is stable is known without; what it takes is known half-way."""
-    equations, solved = beam.equations((Grasp.from_mesh(beam.mesh, "pinned"),)), []
+    equations, solved = beam.equations((Grasp.from_mesh(beam.mesh, "point"),)), []
     for name in ("down", "up"):
         half = getattr(SupernodalFactor, name)
         monkeypatch.setattr(SupernodalFactor, name, lambda factor, right, name=name, half=half:
@@ -58,7 +58,7 @@ def test_a_pin_is_solved_for_only_when_it_is_asked_for(beam, monkeypatch):
 
 def test_a_pin_is_solved_for_as_with_a_general_library(beam, monkeypatch):
     """By halves and whole: the same, with forces, with moves of the pin alone, and with both."""
-    equations = beam.equations((Grasp.from_mesh(beam.mesh, "pinned"),))
+    equations = beam.equations((Grasp.from_mesh(beam.mesh, "point"),))
     rng = np.random.default_rng(3)
     rights, moves = rng.standard_normal((2, *beam.mesh.nodes.shape)), rng.standard_normal((3, 2))
     cases = [(rights, moves), (rights, None), (np.zeros_like(rights), moves)]

@@ -216,7 +216,7 @@ def test_one_energy_gives_the_built_in_law(mesh):
 def test_a_bent_branch_is_in_equilibrium(mesh, material):
     """Far aside: the gripper's force is the energy's derivative to its position."""
     model = make_model(mesh, material)
-    grasp = Grasp.at(mesh, [0, 0, 0.15], 0.015, "pinned")
+    grasp = Grasp.at(mesh, [0, 0, 0.15], 0.015, "point")
     pose = grasp.rest_pose + [0.06, 0.01, -0.012, 0, 0, 0]
     result = solve_static(model, grasp=grasp, pose=pose, settings=PRECISE).require()
     built_in = solve_static(model.with_material("st_venant_kirchhoff"), grasp=grasp, pose=pose,
@@ -234,7 +234,7 @@ def test_a_bent_branch_is_in_equilibrium(mesh, material):
 def test_a_far_swing_keeps_its_energy(mesh, material):
     """Let go from far aside in long steps: the energy stays; damping only takes of it."""
     model = make_model(mesh, material, damping=UNDAMPED)
-    grasp = Grasp.at(mesh, [0, 0, 0.2], 0.01, "pinned")
+    grasp = Grasp.at(mesh, [0, 0, 0.2], 0.01, "point")
     bent = solve_static(model, grasp=grasp, grasp_force=[3.0, 0, 0]).require()
     assert bent.displacement[grasp.nodes, 0].mean() > 0.02
     times = np.linspace(0.0, 0.15, 16)

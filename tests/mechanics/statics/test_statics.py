@@ -38,7 +38,7 @@ def beam(slender_beam):
 @pytest.fixture(scope="module")
 def tip(slender_beam):
     return Grasp.of_nodes(slender_beam, np.flatnonzero(slender_beam.nodes[:, 2] > LENGTH - 1e-9),
-                          "pinned")
+                          "point")
 
 
 @pytest.mark.parametrize("alpha", [1.0, 2.0, 5.0, 10.0])
@@ -76,7 +76,7 @@ def test_tapered_beam(short_box):
             continue
         mesh = round_mesh(0.006, 0.006 * ratio, 0.5, 2, 60)
         model = BranchModel(mesh, young=YOUNG, poisson=0.3, density=900, gravity=None)
-        tip = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.5 - 1e-9), "pinned")
+        tip = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.5 - 1e-9), "point")
         force = 1e-4
         result = solve_static(model, grasp=tip, grasp_force=[force, 0, 0]).require()
         moved = (tip.weights @ result.displacement[tip.nodes])[0]
@@ -101,7 +101,7 @@ def polygon_inertia(mesh):
 @pytest.mark.slow
 def test_work_of_the_gripper_is_the_energy(beam, slender_beam):
     """The clamped gripper's force and torque, summed along its path, give the strain energy."""
-    grasp = Grasp.at(slender_beam, [0, 0, 0.5], 0.01, "clamped")
+    grasp = Grasp.at(slender_beam, [0, 0, 0.5], 0.01, "rigid")
     parts = np.linspace(0, 1, 41)
     rate = np.array([0.15, 0.04, 0.0, 0.0, 0.4, 0.3])
     # Along the axis as much as sideways motion takes: neither stretched nor buckled.
@@ -122,7 +122,7 @@ def test_force_and_pose_are_dual(column):
     """The reaction at a pinned pose, applied as a force, gives the same shape."""
     mesh, _ = column
     beam = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
-    grasp = Grasp.at(mesh, [0, 0, 0.45], 0.012, "pinned")
+    grasp = Grasp.at(mesh, [0, 0, 0.45], 0.012, "point")
     pose = grasp.rest_pose + np.array([0.15, 0.05, -0.033, 0, 0, 0])
     held = solve_static(beam, grasp=grasp, pose=pose).require()
     pulled = solve_static(beam, grasp=grasp, grasp_force=held.reaction_force).require()
@@ -135,7 +135,7 @@ def test_result_does_not_depend_on_the_path():
     """A far pose reached at once, in small steps, or with plain Newton has one energy."""
     mesh = box_mesh((0.012, 0.012, 0.6), (1, 1, 40))
     beam = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
-    grasp = Grasp.at(mesh, [0, 0, 0.4], 0.01, "pinned")
+    grasp = Grasp.at(mesh, [0, 0, 0.4], 0.01, "point")
     # Farther than the axis falls when bent so far: no straight column has to buckle first.
     pose = grasp.rest_pose + np.array([0.15, 0.05, -0.035, 0, 0, 0])
     once = solve_static(beam, grasp=grasp, pose=pose,
@@ -150,7 +150,7 @@ def test_result_does_not_depend_on_the_path():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["pinned", "clamped"])
+@pytest.mark.parametrize("mode", ["point", "rigid"])
 def test_a_guess_of_the_end_saves_the_way(column, mode):
     """Near the end, or far off it: the state is the one that the way leads to, its pose the asked
     one to the last digit; from the end itself there is nothing to do."""
@@ -177,7 +177,7 @@ def test_a_guess_of_the_end_saves_the_way(column, mode):
 def test_two_grasps_balance(beam, slender_beam):
     """Two grasps held at poses: each has its reaction; with the base they balance."""
     grasps = [Grasp.at(slender_beam, [0, 0, z], 0.01, mode)
-              for z, mode in ((0.3, "pinned"), (0.55, "clamped"))]
+              for z, mode in ((0.3, "point"), (0.55, "rigid"))]
     poses = np.array([g.rest_pose for g in grasps])
     poses[0, 0] += 0.05
     poses[1, 1] += 0.05
@@ -201,7 +201,7 @@ def test_neo_hooke_and_stvk_agree_at_small_strain(slender_beam, tip):
     moved = []
     for material in ("st_venant_kirchhoff", "stable_neo_hookean"):
         mesh = box_mesh((0.02, 0.02, 0.2), (1, 1, 8))
-        patch = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.2 - 1e-9), "pinned")
+        patch = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.2 - 1e-9), "point")
         model = BranchModel(mesh, young=1e8, poisson=0.3, density=900, gravity=None,
                             material=material)
         result = solve_static(model, grasp=patch, grasp_force=[1.0, 0, 0]).require()
@@ -314,7 +314,7 @@ def test_a_column_that_must_buckle_first():
     """A straight bar pressed and drawn aside: no small step leads on, it snaps, and stays."""
     mesh = box_mesh((0.008, 0.008, 0.6), (1, 1, 60))
     model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
-    grasp = Grasp.at(mesh, [0, 0, 0.4], 0.008, "pinned")
+    grasp = Grasp.at(mesh, [0, 0, 0.4], 0.008, "point")
     pose = grasp.rest_pose + np.array([0.15, 0.05, -0.05, 0, 0, 0])
     result = solve_static(model, grasp=grasp, pose=pose).require()
     assert result.min_det_f > 0.9
@@ -331,7 +331,7 @@ def column():
     return mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.6 - 1e-9)
 
 
-@pytest.mark.parametrize(("mode", "factor"), [("pinned", 20.19), ("clamped", 4 * np.pi**2)])
+@pytest.mark.parametrize(("mode", "factor"), [("point", 20.19), ("rigid", 4 * np.pi**2)])
 def test_pressed_column_buckles(column, mode, factor):
     """A straight bar pressed on its axis buckles at Euler's load, within 4 %, and bends on."""
     mesh, top = column
@@ -348,7 +348,7 @@ def test_symmetric_column_says_that_its_side_is_chance(column):
     """Clamped at both ends nothing tells the sides apart: it warns and says where it snapped."""
     mesh, top = column
     model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
-    grasp = Grasp.of_nodes(mesh, top, "clamped")
+    grasp = Grasp.of_nodes(mesh, top, "rigid")
     result = solve_static(model, grasp=grasp, pose=grasp.rest_pose - [0, 0, 0.01, 0, 0, 0])
     assert result.converged
     assert result.snapped_at and any("buckled" in warning for warning in result.warnings)
@@ -360,7 +360,7 @@ def test_a_saddle_is_not_passed_off_as_an_equilibrium(column):
     model = BranchModel(mesh, young=YOUNG, poisson=0.0, density=900, gravity=None)
     euler = np.pi**2 * YOUNG * 0.012**4 / 12 / 4 / 0.6**2
     load = np.zeros_like(mesh.nodes)
-    grasp = Grasp.of_nodes(mesh, top, "pinned")
+    grasp = Grasp.of_nodes(mesh, top, "point")
     load[top, 2] = -1.3 * euler * grasp.weights
     straight = np.zeros_like(mesh.nodes)
     straight[:, 2] = -1.3 * euler / (YOUNG * 0.012**2) * mesh.nodes[:, 2]
@@ -373,7 +373,7 @@ def test_a_bow_that_turned_over_is_said_to_have_another_state(column):
     """A bow pushed through by a force stays so when let go; a column that buckled comes back."""
     mesh, top = column
     model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
-    end = Grasp.of_nodes(mesh, top, "clamped")
+    end = Grasp.of_nodes(mesh, top, "rigid")
     pressed = end.rest_pose - [0, 0, 0.012, 0, 0, 0]
     middle = np.abs(mesh.nodes[:, 2] - 0.3) < 0.02
     push = np.where(middle[:, None], [1.0 / middle.sum(), 0.0, 0.0], 0.0)
@@ -397,7 +397,7 @@ def test_dead_load_beyond_buckling(column):
     """1.1 times Euler's load bends a cantilever sideways as the elastica of that load does."""
     mesh, top = column
     model = BranchModel(mesh, young=YOUNG, poisson=0.0, density=900, gravity=None)
-    grasp = Grasp.of_nodes(mesh, top, "pinned")
+    grasp = Grasp.of_nodes(mesh, top, "point")
     euler = np.pi**2 * YOUNG * 0.012**4 / 12 / 4 / 0.6**2
     result = solve_static(model, grasp=grasp, grasp_force=[0, 0, -1.1 * euler])
     assert result.converged, result.message
@@ -416,7 +416,7 @@ def test_neo_hookean_bears_strong_compression(move):
     mesh = box_mesh((0.01, 0.01, 0.03), (2, 2, 6))
     model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None,
                         material="stable_neo_hookean")
-    grasp = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.03 - 1e-9), "clamped")
+    grasp = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.03 - 1e-9), "rigid")
     result = solve_static(model, grasp=grasp, pose=grasp.rest_pose + [*move, 0, 0, 0])
     assert result.converged, result.message
     assert result.min_det_f > 0
@@ -428,7 +428,7 @@ def test_soft_stvk_points_to_the_other_material():
     """Where St. Venant-Kirchhoff gives way the message says so, and what bears it."""
     mesh = box_mesh((0.01, 0.01, 0.03), (2, 2, 6))
     model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
-    grasp = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.03 - 1e-9), "clamped")
+    grasp = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.03 - 1e-9), "rigid")
     result = solve_static(model, grasp=grasp, pose=grasp.rest_pose - [0, 0, 0.015, 0, 0, 0])
     assert not result.converged
     assert "stable_neo_hookean" in result.message

@@ -20,7 +20,7 @@ from limber.store.loading import load_branch
 folder = "../../../blend_files/mature"
 field = limber.open(folder).results["energy"]
 loaded = load_branch(Branch.open(folder))
-grasp = loaded.marked_grasp("pinned")
+grasp = loaded.marked_grasp("point")
 mesh, faces = loaded.mesh, outer_faces(loaded.mesh)
 
 base = mesh.nodes[mesh.point_data["fixed"] > 0].mean(0)

@@ -16,7 +16,7 @@ from limber.store.loading import load_branch
 folder = "../../../blend_files/mature"
 field = limber.open(folder).results["energy"]
 loaded = load_branch(Branch.open(folder))
-grasp = loaded.marked_grasp("pinned")
+grasp = loaded.marked_grasp("point")
 rest = grasp.rest_pose
 base = loaded.mesh.nodes[loaded.mesh.point_data["fixed"] > 0].mean(0)
 arm = rest[:3] - base

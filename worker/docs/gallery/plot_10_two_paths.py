@@ -19,7 +19,7 @@ from limber.store.loading import load_branch
 folder = "../../../blend_files/bending_branch"
 plan = limber.open(folder).results["plan:to-goal"]
 loaded = load_branch(Branch.open(folder))
-grasp, state = loaded.marked_grasp("pinned"), None
+grasp, state = loaded.marked_grasp("point"), None
 for pose in plan.path:
     state = loaded.equilibrium(grasp, pose, start=state).require()
 mesh, faces, camera = loaded.mesh, outer_faces(loaded.mesh), Camera(azimuth=60)

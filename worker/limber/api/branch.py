@@ -362,7 +362,7 @@ class Branch:
         _, values = self._values(stage, quiet, settings)
         return Result(MappingProxyType(values))
 
-    def session(self, *, mode: str = "clamped", **settings: Any) -> "InteractiveSession":
+    def session(self, *, mode: str = "rigid", **settings: Any) -> "InteractiveSession":
         """Start a process in which the branch follows its grasps, many times a second.
 
         Args:
@@ -376,7 +376,7 @@ class Branch:
         Raises:
             InputError: a setting is refused. WorkError: the session did not start.
 
-        >>> with limber.open("a.branch").session(mode="pinned") as session:  # doctest: +SKIP
+        >>> with limber.open("a.branch").session(mode="point") as session:  # doctest: +SKIP
         ...     session.wait(session.move([0.02, 0, 0.25, 0, 0, 0])).energy
         """
         from limber.session.client import InteractiveSession

@@ -9,12 +9,12 @@ import difflib
 import math
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import core_schema
 
 from limber.core.errors import InputError
@@ -106,21 +106,7 @@ class OneOf:
         return name
 
 
-class Renamed:
-    """Annotates a choice with new names, beside the old ones in files and results."""
-
-    def __init__(self, kept: Mapping[str, str]):
-        self.kept = kept
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
-        return core_schema.no_info_before_validator_function(self._as_kept, handler(source))
-
-    def _as_kept(self, value: Any) -> Any:
-        return self.kept.get(value, value) if isinstance(value, str) else value
-
-
-GraspMode = Annotated[Literal["clamped", "pinned"],
-                      Renamed({"rigid": "clamped", "point": "pinned"})]
+GraspMode = Literal["rigid", "point"]
 """Rigid: position and rotation of a piece are held; point: only its mean position."""
 
 Groups = dict[str, tuple[str, ...]]
@@ -137,8 +123,6 @@ class Settings(BaseModel):
             its bases.
         common: Fields that ``--help`` shows besides required ones: those that most users choose.
             ``--help-all`` shows the others too.
-        retired: Former fields that are constants now, each with its value. A folder, a preset or a
-            job file that states this value is as before; another value is refused.
         results_version: Increased when the same settings on the same input give other results than
             before. Branches then count as out of date, and a batch runs the stage again.
     """
@@ -147,31 +131,7 @@ class Settings(BaseModel):
 
     groups: ClassVar[Groups] = {}
     common: ClassVar[tuple[str, ...]] = ()
-    retired: ClassVar[Mapping[str, Any]] = {}
     results_version: ClassVar[int] = 1
-
-    @classmethod
-    def without_retired(cls, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return values by name, without former fields that have the constant's value."""
-        former = cls.former()
-        return {name: value for name, value in values.items()
-                if name not in former or value != former[name]}
-
-    @classmethod
-    def former(cls) -> dict[str, Any]:
-        """Return the retired fields of the model and its bases, each with its value."""
-        return {name: value for base in cls.__mro__
-                for name, value in vars(base).get("retired", {}).items()}
-
-    @model_validator(mode="before")
-    @classmethod
-    def _drop_retired(cls, values: Any) -> Any:
-        if not isinstance(values, Mapping):
-            return values
-        remaining, former = cls.without_retired(values), cls.former()
-        for name in remaining.keys() & former:
-            raise ValueError(f"{_flag(name)} {remaining[name]!r}: {why_constant(former[name])}")
-        return remaining
 
     @classmethod
     def group_of(cls, name: str) -> str:
@@ -197,13 +157,7 @@ class Settings(BaseModel):
             content["expert"] = cls.is_expert(name)
             if unit := _UNIT.search(content.get("description", "")):
                 content["unit"] = unit.group(1)
-        return schema | ({"retired": sorted(former)} if (former := cls.former()) else {})
-
-
-def why_constant(value: Any) -> str:
-    """Return why a retired setting cannot have another value than its constant."""
-    now = "is not used" if value is None else f"is always {value!r}"
-    return f"it cannot be set any more and {now}"
+        return schema
 
 
 def nearest(name: str, known: Sequence[str]) -> str:

@@ -143,7 +143,7 @@ def is_path_observed(entry: PullEntry, frames: Frames, settings: EstimateSetting
     return (entry.drive == "pose" and settings.drive is None and settings.forward == "full"
             and bool(measured.mean() > 0.8)
             and (known.pose_sigma_m > 0 or known.pose_sigma_rad > 0)
-            and (entry.grasp.mode == "pinned" or uses_torque(entry, frames)))
+            and (entry.grasp.mode == "point" or uses_torque(entry, frames)))
 
 
 def parameter_space(subject: Subject, forwards: list[Forward], settings: EstimateSettings,

@@ -10,7 +10,7 @@ neighbouring moduli differ.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -105,10 +105,6 @@ class YoungField:
         # For a uniform branch both fields of the mixture are the same.
         return np.vstack([deviation @ by_young / max(float(deviation @ deviation), 1e-12),
                           sizes_by_young / sizes[:, None]])
-
-    def same_at_any_step(self) -> "YoungField":
-        """Return the field with the bumps of a uniform branch, as in older estimates."""
-        return self if self.straight is None else replace(self, steps=np.zeros_like(self.steps))
 
     def order_moduli(self, values: Values, deviation: Mapping[str, float],
                      ) -> list[dict[str, Any]]:

@@ -326,7 +326,7 @@ def _without_noise(choice: PullChoice, subject: Subject, values: Values, cell: C
     times = np.linspace(0.0, _SECONDS, _FRAMES)
     entry = PullEntry(
         calibration=cell.calibration, sensor=cell.sensor, weightless=not model.gravity.any(),
-        grasp=GraspEntry(point_m=tuple(map(float, point)), mode="pinned",
+        grasp=GraspEntry(point_m=tuple(map(float, point)), mode="point",
                          radius_m=float(1.3 * skeleton.radius_at(choice.fraction))),
         rest_points_m=tuple(tuple(map(float, p)) for p in subject.control_points),
         source="limber suggest-pull")

@@ -83,10 +83,10 @@ def _forward(known: dict[str, Any], subject: Subject, entry: PullEntry, load: np
                     np.broadcast_to(points, (2, *points.shape)),
                     np.broadcast_to(np.eye(3), (2, len(points), 3, 3)))
     driven = entry.model_copy(update={"drive": "force", "motion": "quasi_static"})
-    if entry.grasp.mode == "clamped":
+    if entry.grasp.mode == "rigid":
         # A force alone does not determine a hand's rotation.
         driven = driven.model_copy(update={
-            "grasp": entry.grasp.model_copy(update={"mode": "pinned"})})
+            "grasp": entry.grasp.model_copy(update={"mode": "point"})})
     return QuasiStaticForward("prediction", subject.model, subject.weights, driven, frames,
                               points, key_count=1, field=subject.field), values
 

@@ -1,6 +1,6 @@
 """Settings of estimates, virtual pulls and predictions, without heavy imports."""
 
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -31,8 +31,6 @@ class EstimateSettings(Settings):
                         "mesh_check", "shapes"),
     }
     common = ("pull", "fractions")
-    retired: ClassVar[dict[str, Any]] = {
-        "evaluations": 400, "robust": True, "control_points": "evidence"}
 
     pull: tuple[str, ...] = Field((), description="Names of the pulls to use. Default: all.")
     method: Literal["gauss-newton", "nelder-mead"] = Field(
@@ -139,7 +137,6 @@ class SwingSettings(Settings):
         "uncertainty": ("density_sigma",),
     }
     common = ("pull",)
-    retired: ClassVar[dict[str, Any]] = {"periods": 6.0, "gravity": True}
 
     pull: str | None = Field(None, description="Name of the swing. Default: the only one.")
     poisson: float | None = Field(None, ge=0, lt=0.495, description="Poisson's ratio.")
@@ -164,7 +161,6 @@ class VirtualPullSettings(Settings):
             "camera_turn_sigma", "point_sigma", "clock_sigma"),
     }
     common = ("cell_errors", "seed")
-    retired: ClassVar[dict[str, Any]] = {"turn": 2.0}
 
     young: tuple[float, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]. Default: that of a "
@@ -197,8 +193,8 @@ class VirtualPullSettings(Settings):
         "must be beyond the last control point: the branch does not bend beyond the grasp, so its "
         "modulus there cannot be estimated.")
     mode: GraspMode = Field(
-        "pinned", description="point (pinned): a loop holds the branch and lets it turn. rigid "
-        "(clamped): the gripper turns the branch less than it would turn freely, so that a torque "
+        "point", description="point: a loop holds the branch and lets it turn. rigid: "
+        "the gripper turns the branch less than it would turn freely, so that a torque "
         "acts.")
     reach: float = Field(
         0.35, gt=0, le=0.8, description="Sideways travel of the grasp as a fraction of its arc "
@@ -209,7 +205,7 @@ class VirtualPullSettings(Settings):
     force_noise: float = Field(
         0.02, ge=0, description="Noise of the force as a fraction of its largest value.")
     torque_noise: float = Field(
-        0.02, ge=0, description="Noise of the torque as a fraction of its largest value (clamped).")
+        0.02, ge=0, description="Noise of the torque as a fraction of its largest value (rigid).")
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
     own_weight: bool = Field(
@@ -291,7 +287,6 @@ class PredictSettings(Settings):
         "grasp and loads": ("weight", "load"),
     }
     common = ("weight", "load")
-    retired: ClassVar[dict[str, Any]] = {"gravity": True}
 
     pull: str | None = Field(
         None, description="Name of the pull whose points, grasp and gravity are used. Default: "

@@ -174,7 +174,7 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     entry = entry.model_copy(update={"sensor": SensorEntry(
         position_sigma_m=max(settings.position_noise, 1e-4),
         force_sigma_n=max(settings.force_noise, 2e-3) * sizes[0],
-        torque_sigma_nm=torque_sigma if settings.mode == "clamped" and torque_sigma > 0 else None)})
+        torque_sigma_nm=torque_sigma if settings.mode == "rigid" and torque_sigma > 0 else None)})
     observations = None if settings.camera else Observations(settings.times, positions)
     pull = Pull(name, entry, settings.times, poses, wrenches, observations)
     return pull, displacements
@@ -256,7 +256,7 @@ def _kind(settings: VirtualPullSettings,
         return "weight"
     if settings.motion == "dynamic":
         return "release" if settings.drive == "force" else "shake"
-    return "turned" if settings.mode == "clamped" and settings.drive == "pose" else "pull"
+    return "turned" if settings.mode == "rigid" and settings.drive == "pose" else "pull"
 
 
 def _entry(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool) -> PullEntry:

@@ -1,6 +1,6 @@
 """Settings of reconstruction from scans and surfaces; this module imports nothing heavy."""
 
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -25,9 +25,6 @@ class PreparationSettings(Settings):
         "input": ("crop_low", "crop_high", "camera_at"),
         "shape": ("keep_sheets", "keep_flying"),
     }
-    retired: ClassVar[dict[str, Any]] = {
-        "flying_speck": 20, "silhouette_reach": 1.5, "flying_angle": 78.0, "outlier_neighbours": 8,
-        "outlier_ratio": 5.0, "outlier_radius": 0.0, "voxel": 0.0}
 
     crop_low: tuple[float, float, float] | None = Field(
         None, description="Lower corner of the box to keep, in the file's coordinates.")
@@ -51,8 +48,6 @@ class SkeletonSettings(Settings):
         "the paper's equations": ("contraction_weight", "gap_factor", "radii",
                                   "radius_neighbours", "radius_low", "radius_high"),
     }
-    retired: ClassVar[dict[str, Any]] = {
-        "contraction_points": 12_000, "attraction": "constant", "prune": 2.5}
 
     bridge_limit: float = Field(
         0.15, ge=0, le=1, description="Bridge gaps up to this fraction of the cloud's diagonal.")
@@ -98,7 +93,6 @@ class MeshSettings(Settings):
     groups: ClassVar[Groups] = {
         "mesh": ("mesher", "mesh_spacing", "mesh_time_limit", "mesh_memory_limit_mb"),
     }
-    retired: ClassVar[dict[str, Any]] = {"mesh_sides": 8}
 
     mesher: Literal["auto", "ftetwild", "sweep"] = Field(
         "auto", description="auto: a sweep along the axes, or fTetWild if the sweep cannot join "
@@ -120,7 +114,6 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
         "mesh": ("grasp_fraction",),
     }
     common = ("unit", "up", "root", "leaves")
-    retired: ClassVar[dict[str, Any]] = {"twig_order": 9}
 
     unit: Literal["m", "cm", "mm", "in", "um"] = Field(
         "m", description="Unit of the file, if it does not state one.")
@@ -200,7 +193,6 @@ class BranchSpec(Settings):
         "scan": ("noise", "point_spacing", "unevenness", "occlusion", "view", "gap_count"),
         "material": ("young_mean",),
     }
-    retired: ClassVar[dict[str, Any]] = {"gap_length": 0.02, "outlier_share": 0.0}
 
     length: float = Field(0.9, gt=0.05, description="Length of the main axis [m].")
     radius_root: float = Field(0.009, gt=0, description="Radius at the root [m].")

@@ -47,7 +47,7 @@ class Grasp:
             work-conjugate.
         centre: Position of the pose at rest [m], shape [3]: the patch's weighted centre, or the
             middle of a gripper that holds a piece of the branch, which may lie beside it.
-        mode: ``clamped``: the patch moves as a rigid body with the pose. ``pinned``: its mean
+        mode: ``rigid``: the patch moves as a rigid body with the pose. ``point``: its mean
             position follows the pose, its rotation is free.
         held: Fraction of each tetrahedron inside a clamping gripper, shape [tet_count], if known;
             the model must then be :meth:`limber.mechanics.model.BranchModel.gripped`.
@@ -56,7 +56,7 @@ class Grasp:
     nodes: np.ndarray
     weights: np.ndarray
     centre: np.ndarray
-    mode: Literal["clamped", "pinned"] = "clamped"
+    mode: Literal["rigid", "point"] = "rigid"
     held: np.ndarray | None = None
 
     @property
@@ -66,7 +66,7 @@ class Grasp:
 
     @classmethod
     def at(cls, mesh: TetMesh, point: np.ndarray, radius: float,
-           mode: Literal["clamped", "pinned"] = "clamped") -> "Grasp":
+           mode: Literal["rigid", "point"] = "rigid") -> "Grasp":
         """Return the grasp of all nodes within ``radius`` [m] of ``point`` [m], centred on it.
 
         A radius of 0 takes the nearest node. A pinned patch is widened if the mesh is so coarse
@@ -86,7 +86,7 @@ class Grasp:
                 "Move the point onto the branch or widen the radius; check the units (metres).")
         grasp = cls.of_nodes(mesh, nodes, mode, point if radius > 0 else None)
         wider = radius
-        while mode == "pinned" and wider < _WIDEST * radius and (
+        while mode == "point" and wider < _WIDEST * radius and (
                 np.linalg.norm(grasp.centre - point) > 1e-6 * radius):
             # A coarse mesh may have nodes on one side of the position only.
             wider *= _WIDER
@@ -129,7 +129,7 @@ class Grasp:
         return replace(grasp.holding(mesh, point, half_length), centre=point.copy())
 
     @classmethod
-    def from_mesh(cls, mesh: TetMesh, mode: Literal["clamped", "pinned"] = "clamped",
+    def from_mesh(cls, mesh: TetMesh, mode: Literal["rigid", "point"] = "rigid",
                   point: np.ndarray | Sequence[float] | None = None) -> "Grasp":
         """Return the grasp marked in the mesh's point data ``grasp``.
 
@@ -148,7 +148,7 @@ class Grasp:
 
     @classmethod
     def of_nodes(cls, mesh: TetMesh, nodes: np.ndarray,
-                 mode: Literal["clamped", "pinned"] = "clamped",
+                 mode: Literal["rigid", "point"] = "rigid",
                  point: np.ndarray | Sequence[float] | None = None) -> "Grasp":
         """Return the grasp of the given nodes.
 
@@ -158,10 +158,10 @@ class Grasp:
         Raises:
             InputError: the mode is unknown, or a node is fixed.
         """
-        if mode not in ("clamped", "pinned"):
+        if mode not in ("rigid", "point"):
             raise InputError(f"Grasp mode {mode!r} is unknown.",
                              "A grasp holds position and rotation, or position only.",
-                             "Use 'clamped' or 'pinned'.")
+                             "Use 'rigid' or 'point'.")
         nodes = np.unique(np.asarray(nodes, np.int64))
         fixed = mesh.point_data.get("fixed")
         if fixed is not None and np.any(fixed[nodes]):

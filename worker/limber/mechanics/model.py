@@ -140,7 +140,7 @@ class BranchModel:
         which only the nodes are known, change nothing.
         """
         held = [grasp.held for grasp in grasps
-                if grasp.mode == "clamped" and grasp.held is not None]
+                if grasp.mode == "rigid" and grasp.held is not None]
         if not held and np.ndim(self.stiffening) == 0:
             return self
         other = self._copy(stiffening=stiffening(np.max(held, axis=0)) if held else 1.0)

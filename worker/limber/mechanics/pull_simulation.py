@@ -58,8 +58,8 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
     Raises:
         InputError: options do not fit. ConvergenceError: no equilibrium of the branch was found.
     """
-    def patch(point: Point, mode: Literal["clamped", "pinned"]) -> Grasp:
-        if mode == "clamped" and settings.grasp_radius > 0:
+    def patch(point: Point, mode: Literal["rigid", "point"]) -> Grasp:
+        if mode == "rigid" and settings.grasp_radius > 0:
             return Grasp.gripping(model.mesh, np.array(point), settings.grasp_radius)
         return Grasp.at(model.mesh, np.array(point), settings.grasp_radius, mode)
 
@@ -69,7 +69,7 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
     model = model.gripped(grasp, *holds)
     loads = np.zeros_like(model.mesh.nodes)
     for point in settings.load_at:
-        loaded = patch(point[:3], "pinned")
+        loaded = patch(point[:3], "point")
         loads[loaded.nodes] += loaded.weights[:, None] * np.array(point[3:])
     follows_pose = along is not None or settings.move is not None or settings.turn is not None
     force = np.array(settings.grasp_force or (0.0, 0.0, 0.0))
@@ -130,6 +130,6 @@ def _ramp(settings: SimulateSettings, duration: float) -> tuple[np.ndarray, np.n
 
 def _prescribed_path(pose: np.ndarray, changes: np.ndarray, mode: str) -> np.ndarray:
     """Return the grasp's poses [frames, 6], starting at its pose on the loaded branch."""
-    if mode == "pinned":
+    if mode == "point":
         pose = np.concatenate([pose[:3], np.zeros(3)])
     return np.hstack([pose[:3] + changes[:, :3], composed(changes[:, 3:], pose[3:])])

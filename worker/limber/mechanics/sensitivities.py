@@ -276,7 +276,7 @@ def reactions(grasps: Sequence[Grasp], out: np.ndarray) -> np.ndarray:
     """Return the force on each grasp [N], shape [grasps, 3], from forces ``out`` on all nodes."""
     return np.array([
         grasp.weights @ out[grasp.nodes] / (grasp.weights @ grasp.weights)
-        if grasp.mode == "pinned" else out[grasp.nodes].sum(axis=0)
+        if grasp.mode == "point" else out[grasp.nodes].sum(axis=0)
         for grasp in grasps]).reshape(-1, 3)
 
 

@@ -1,6 +1,6 @@
 """Settings of a simulated pull, without heavy imports."""
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
@@ -26,7 +26,6 @@ class SimulateSettings(Settings):
         "solver": ("step", "scheme", "newmark_beta", "newmark_gamma"),
     }
     common = ("name", "move", "grasp_force", "young")
-    retired: ClassVar[dict[str, Any]] = {"lumped_mass": False}
 
     name: str = Field("simulate", pattern=r"^[\w-]+$",
                       description="Name of the result files: frames/NAME.pc2 and frames/NAME.json.")
@@ -45,7 +44,7 @@ class SimulateSettings(Settings):
         0.01, gt=0, description="Radius of the grasp and of the patches of --hold-at and "
         "--load-at [m].")
     grasp_mode: GraspMode = Field(
-        "clamped", description="rigid (clamped): hold position and rotation. point (pinned): hold "
+        "rigid", description="rigid: hold position and rotation. point: hold "
             "the position only.")
     hold_at: tuple[Point, ...] = Field(
         (), description="Position X Y Z [m] of another gripper or a tie, with the same grasp "

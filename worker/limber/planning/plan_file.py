@@ -24,8 +24,6 @@ branch's own: ``along_m`` [n] of approach and path, ``offsets_rad`` [n][3] in th
 and the energy and torque that they cost.
 ``limits`` has for each requested limit its value, the peak of the motion at standstill at each
 pose, and the margin. ``robot`` is null for plans that were not made in a robot's cell.
-
-Format 1 had no version, no motion, and the sizes of forces alone. It is read as well.
 """
 
 import json
@@ -59,7 +57,6 @@ class PlanPath:
     Attributes:
         poses: [m, rad], shape [n, 6].
         energies: Potential of strain and weight above the hanging state [J], shape [n].
-        force_sizes: Magnitude of the gripper's force [N], shape [n].
         strains: Largest strain in the branch, shape [n].
         forces, torques: Force and torque of the gripper on the branch [N, Nm], shape [n, 3].
         times: [s], ascending, shape [n].
@@ -74,9 +71,8 @@ class PlanPath:
 
     poses: np.ndarray
     energies: np.ndarray
-    force_sizes: np.ndarray
     strains: np.ndarray
-    forces: np.ndarray | None = None
+    forces: np.ndarray
     torques: np.ndarray | None = None
     times: np.ndarray | None = None
     tips: np.ndarray | None = None
@@ -86,6 +82,11 @@ class PlanPath:
     phases: tuple[str, ...] | None = None
     stresses: np.ndarray | None = None
     axial_forces: np.ndarray | None = None
+
+    @property
+    def force_sizes(self) -> np.ndarray:
+        """Magnitude of the gripper's force [N], shape [n]."""
+        return np.linalg.norm(self.forces, axis=1)
 
 
 class _Told(BaseModel):
@@ -233,17 +234,15 @@ class PlanFile:
     """A plan as read.
 
     Attributes:
-        version: Version of the file's format.
         summary: All of the file except the columns.
         baseline, plan: Between start and goal.
-        motion: The whole motion, None in format 1.
+        motion: The whole motion.
     """
 
-    version: int
     summary: dict[str, Any]
     baseline: PlanPath
     plan: PlanPath
-    motion: PlanPath | None
+    motion: PlanPath
 
 
 def path_record(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
@@ -256,8 +255,8 @@ def path_record(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
         targets: Names, in the order of the solution's targets.
     """
     return PlanPath(
-        poses=solved.poses, energies=solved.energies, force_sizes=solved.force_sizes,
-        strains=solved.strains, forces=solved.forces, torques=solved.torques,
+        poses=solved.poses, energies=solved.energies, strains=solved.strains, forces=solved.forces,
+        torques=solved.torques,
         times=times_along(solved.poses[:, :3], pace, stops), tips=solved.tips,
         targets={name: solved.targets[:, k] for k, name in enumerate(targets)},
         field_energies=field_energies, phases=phases, stresses=solved.stresses,
@@ -310,27 +309,27 @@ def plan_text(summary: dict[str, Any], baseline: PlanPath, plan: PlanPath, motio
 
 
 def read_plan(path: Path) -> PlanFile:
-    """Read a plan of format 1 or 2.
+    """Read a plan of format 2.
 
     Raises:
         InputError: it is not a plan, is damaged, or is from a newer program.
     """
     try:
         content = read_json(path, "a plan")
-        version = content.get("format_version", 1)
+        version = content.get("format_version")
     except AttributeError as error:
         raise _not_a_plan(path, str(error)) from error
-    if version not in (1, FORMAT):
+    if isinstance(version, int) and version > FORMAT:
         raise InputError(f"{path} is a plan in format {version}.",
-                         f"This program reads formats 1 and {FORMAT}.", "Update Limber.")
+                         f"This program reads format {FORMAT}.", "Update Limber.")
     try:
         paths = {name: _path_from(content[name]) for name in _WAYS}
-        motion = _path_from(content["motion"]) if version > 1 else None
+        motion = _path_from(content["motion"])
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _not_a_plan(path, f"{type(error).__name__}: {error}") from error
     checked_as(path, PlanSummary, content, "a plan", strict=True)
     kept = {name: value for name, value in content.items() if name != "motion"}
-    return PlanFile(version, kept, paths["baseline"], paths["plan"], motion)
+    return PlanFile(kept, paths["baseline"], paths["plan"], motion)
 
 
 def read_plan_summary(path: Path) -> dict[str, Any]:
@@ -356,17 +355,17 @@ def _path_from(content: dict[str, Any]) -> PlanPath:
               if content.get(column) is not None}
     count = len(values["poses"])
     forces = number_array(content["forces_n"])
-    known = forces.ndim == 2
     targets = {name: number_array(positions)
                for name, positions in content.get("targets_m", {}).items()}
     phases = tuple(content["phases"]) if "phases" in content else None
     columns = [*values.values(), forces, *targets.values(), *([] if phases is None else [phases])]
     if values["poses"].shape != (count, 6) or any(len(column) != count for column in columns):
         raise ValueError("columns of unequal length")
+    if forces.shape != (count, 3):
+        raise ValueError("forces that are no vectors")
     if any(not np.isfinite(column).all() for column in [*values.values(), forces]):
         raise ValueError("values that are not finite")
-    return PlanPath(force_sizes=np.linalg.norm(forces, axis=1) if known else forces,
-               forces=forces if known else None, targets=targets, phases=phases, **values)
+    return PlanPath(forces=forces, targets=targets, phases=phases, **values)
 
 
 def _not_a_plan(path: Path, why: str) -> InputError:

@@ -95,16 +95,12 @@ class CostToGo:
 
     @classmethod
     def read(cls, path: Path) -> "CostToGo":
-        """Read a file that :meth:`write` wrote, or an older version with one grid of cubes.
+        """Read a file that :meth:`write` wrote.
 
         Raises:
             InputError: the file is damaged.
         """
         arrays = read_arrays(path, _WHAT)
-        if "known" not in arrays:
-            require_shapes(path, arrays, {"spacing_m": (), "costs": ("x", "y", "z")}, _WHAT)
-            own = arrays["costs"] >= 0.0
-            arrays |= {"edges_m": np.full(3, arrays["spacing_m"]), "has_cost": own, "known": own}
         grids: list[BoundGrid] = []
         while not grids or _numbered("costs", len(grids)) in arrays:
             origin, edges, costs, has_cost, known = names = [

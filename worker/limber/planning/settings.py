@@ -1,6 +1,6 @@
 """Settings of the energy field and of paths; they import nothing heavy."""
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -47,7 +47,6 @@ class PlanSettings(Settings):
         "solver": ("planner", "iterations", "engine", "field_error", "seed"),
     }
     common = ("goal", "tip_goal", "target", "max_force", "max_strain")
-    retired: ClassVar[dict[str, Any]] = {"slowings": 4, "replans": 3}
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the grasp, in the branch's frame [m]. Without any goal, a distant pose "

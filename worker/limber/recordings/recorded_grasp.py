@@ -22,7 +22,7 @@ def grasp_on(mesh: TetMesh, entry: GraspEntry) -> Grasp:
     """
     point = np.array(entry.point_m)
     distance = np.sort(np.linalg.norm(mesh.nodes - point, axis=1))
-    if entry.mode == "clamped":
+    if entry.mode == "rigid":
         is_off = distance[0] > 3 * entry.radius_m
         return Grasp.gripping(mesh, point, entry.radius_m, 1 if is_off else LEAST_NODES)
     if distance[0] > 3 * entry.radius_m:
@@ -34,12 +34,12 @@ def grasp_on(mesh: TetMesh, entry: GraspEntry) -> Grasp:
 def pose_on(grasp: Grasp, entry: GraspEntry, pose: np.ndarray) -> np.ndarray:
     """Return the pose [m, rad] of a mesh's patch for a recorded pose of the grasp point."""
     arm = grasp.centre - np.array(entry.point_m)
-    turn = rotation_matrix(pose[3:]) if grasp.mode == "clamped" else np.eye(3)
+    turn = rotation_matrix(pose[3:]) if grasp.mode == "rigid" else np.eye(3)
     return np.concatenate([pose[:3] + turn @ arm, pose[3:]])
 
 
 def point_of(grasp: Grasp, entry: GraspEntry, pose: np.ndarray) -> np.ndarray:
     """Return the recorded grasp point [m], shape [3], for a pose of a mesh's patch [m, rad]."""
     arm = np.array(entry.point_m) - grasp.centre
-    turn = rotation_matrix(pose[3:]) if grasp.mode == "clamped" else np.eye(3)
+    turn = rotation_matrix(pose[3:]) if grasp.mode == "rigid" else np.eye(3)
     return pose[:3] + turn @ arm

@@ -36,7 +36,7 @@ class GraspEntry(BaseModel):
     radius_m: float = Field(
         gt=0, description="Nodes within this distance are held. A clamped grasp holds the branch "
         "over this length to both sides along its axis.")
-    mode: Literal["clamped", "pinned"] = "clamped"
+    mode: Literal["rigid", "point"] = "rigid"
 
 
 class SensorEntry(BaseModel):

@@ -68,8 +68,8 @@ class ImportSettings(Settings):
         0.01, gt=0, description="Radius of the grasp patch, or half the length of the piece that "
         "a clamping gripper holds [m].")
     grasp_mode: GraspMode = Field(
-        "clamped", description="rigid (clamped): the gripper holds position and rotation. point "
-            "(pinned): it holds the position only.")
+        "rigid", description="rigid: the gripper holds position and rotation. point: "
+            "it holds the position only.")
     weight: float | None = Field(
         None, ge=0, description="Weight [N] that hangs at --grasp-point instead of a robot's "
         "pull. SOURCE begins without it and ends at rest under it. 0 with --own-weight: the "

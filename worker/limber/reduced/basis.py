@@ -49,12 +49,12 @@ class GraspCoordinates:
 
     @property
     def count(self) -> int:
-        return 12 if self.grasp.mode == "clamped" else 3
+        return 12 if self.grasp.mode == "rigid" else 3
 
     def at(self, pose: np.ndarray) -> np.ndarray:
         """Return a at a pose [m, rad], shape [count]."""
         move = pose[:3] - self.grasp.centre
-        if self.grasp.mode == "pinned":
+        if self.grasp.mode == "point":
             return move
         return np.concatenate([move, (rotation_matrix(pose[3:]) - np.eye(3)).ravel()])
 
@@ -63,7 +63,7 @@ class GraspCoordinates:
 
         The turn is about the pose's own position: work-conjugate to the torque there.
         """
-        if self.grasp.mode == "pinned":
+        if self.grasp.mode == "point":
             return np.eye(3)
         result = np.zeros((12, 6))
         result[:3, :3] = np.eye(3)
@@ -158,7 +158,7 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
 
 def _let_go(grasp: Grasp, lifts: np.ndarray, fields: np.ndarray) -> np.ndarray:
     """Take out what single precision has left of motion at the grasp."""
-    if grasp.mode == "pinned":
+    if grasp.mode == "point":
         return fields - np.tensordot(np.einsum("k,fki->fi", grasp.weights,
                                                fields[:, grasp.nodes]), lifts, 1)
     fields[:, grasp.nodes] = 0.0
@@ -182,7 +182,7 @@ def elastic_lifts(model: BranchModel, coordinates: GraspCoordinates) -> np.ndarr
     """Return the linear elastic displacement per grasp coordinate, shape [count, n, 3]."""
     grasp, zero = coordinates.grasp, np.zeros((model.mesh.node_count, 3))
     tangent = model.equations([grasp]).tangent(model, zero)
-    if grasp.mode == "pinned":
+    if grasp.mode == "point":
         return np.array([tangent.solve(zero, unit[None]) for unit in np.eye(3)])
     lifts = []
     for patch in coordinates.fields(model.mesh.nodes):

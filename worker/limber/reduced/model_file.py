@@ -49,7 +49,7 @@ def read_model(path: Path) -> ReducedModel:
     if int(arrays.get("format", -1)) != FORMAT:
         raise InputError(f"{path} has a different format.", "", "Build it again.")
     grasp = Grasp(arrays["grasp_nodes"], arrays["grasp_weights"], arrays["grasp_centre"],
-                  "pinned" if str(arrays["grasp_mode"]) == "pinned" else "clamped")
+                  "point" if str(arrays["grasp_mode"]) == "point" else "rigid")
     basis = Basis(arrays["columns"], int(arrays["lift_count"]), arrays["states"],
                   float(arrays["captured"]), arrays["reach"])
     linear, quadratic, by_lambda, by_mu = (

@@ -151,7 +151,7 @@ def sample_poses(model: BranchModel, grasp: Grasp, count: int, rng: np.random.Ge
             if 0.2 * np.linalg.norm(arm) < np.linalg.norm(chord) < 0.98 * np.linalg.norm(arm):
                 break
         pose[:3] = grasp.centre + move
-        if grasp.mode == "clamped":
+        if grasp.mode == "rigid":
             away = _unit(rng.normal(size=3)) * settings.turn * rng.uniform()
             pose[3:] = rotation_vector(rotation_matrix(away)
                                        @ rotation_matrix(natural_turn(arm, chord)))
@@ -311,7 +311,7 @@ class Trainer:
         model = self.model.with_young(self.weights @ young)
         u = result.displacement
         moved = [self._pose_tangent(tangent, model, u, pose, axis)
-                 for axis in range(6 if self.grasp.mode == "clamped" else 3)]
+                 for axis in range(6 if self.grasp.mode == "rigid" else 3)]
         stiffer = []
         shares = zip(self.weights.T, young, strict=True) if self.young_tangents else ()
         for share, modulus in shares:
@@ -326,7 +326,7 @@ class Trainer:
 
     def _pose_tangent(self, tangent: Tangent, model: BranchModel, u: np.ndarray,
                       pose: np.ndarray, axis: int) -> np.ndarray:
-        if self.grasp.mode == "pinned":
+        if self.grasp.mode == "point":
             return tangent.solve(np.zeros_like(u), np.eye(3)[axis][None])
         held = np.zeros_like(u)
         if axis < 3:

@@ -29,7 +29,7 @@ _GRACE_SECONDS = 3.0
 class InteractiveSession:
     """A branch in a separate process that follows its grasps. ::
 
-        with InteractiveSession("apple.branch", mode="pinned") as session:
+        with InteractiveSession("apple.branch", mode="point") as session:
             frame = session.wait(session.move(pose))
             second = session.grab(point=(0.0, 0.1, 0.4))
             session.move(second["pose"], grasp=second["grasp"])
@@ -49,7 +49,7 @@ class InteractiveSession:
         WorkError: the session did not start, or speaks another protocol.
     """
 
-    def __init__(self, branch_folder: str | Path, *, mode: str = "clamped",
+    def __init__(self, branch_folder: str | Path, *, mode: str = "rigid",
                  start_seconds: float = 60.0, **settings: Any):
         self.events: list[dict[str, Any]] = []
         self._said = threading.Condition()
@@ -101,7 +101,7 @@ class InteractiveSession:
         return self._send(command="move", pose=np.asarray(pose, float).tolist(), grasp=grasp)
 
     def grab(self, *, vertex: int | None = None, point: Sequence[float] | None = None,
-             mode: str = "pinned", radius: float = 0.01) -> dict[str, Any]:
+             mode: str = "point", radius: float = 0.01) -> dict[str, Any]:
         """Hold the branch in its current position; return the reply with ``grasp`` and ``pose``.
 
         Args:

@@ -90,7 +90,7 @@ class Answering:
         """Return the rest shape, solved for the held grasps."""
         return self.held.solve()
 
-    def hold_marked(self, mode: Literal["clamped", "pinned"]) -> None:
+    def hold_marked(self, mode: Literal["rigid", "point"]) -> None:
         """Hold the patch that the mesh marks, if it marks one."""
         if np.any(self.held.model.mesh.point_data.get("grasp", 0)):
             self.held.hold(self.held.loaded.marked_grasp(mode))
@@ -101,7 +101,7 @@ class Answering:
         self._is_due = self._is_new = True
 
     def grab(self, vertex: int | None, point: tuple[float, float, float] | None, radius: float,
-             mode: Literal["clamped", "pinned"]) -> int:
+             mode: Literal["rigid", "point"]) -> int:
         """Hold a patch in its current position; return its number."""
         number = self.held.grab(vertex, point, radius, mode)
         self._changed()

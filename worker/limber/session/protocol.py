@@ -63,7 +63,7 @@ class Grab(_Command, _OnBranch):
     """Hold the branch at the current location of a position."""
 
     command: Literal["grasp"]
-    mode: GraspMode = "pinned"
+    mode: GraspMode = "point"
     radius_m: float = Field(0.01, ge=0, le=_FAR)
 
 

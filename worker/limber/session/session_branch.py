@@ -95,7 +95,7 @@ class HeldBranch:
         self._carried = carried_strain(model)
 
     def grab(self, vertex: int | None, point: tuple[float, float, float] | None, radius: float,
-             mode: Literal["clamped", "pinned"]) -> int:
+             mode: Literal["rigid", "point"]) -> int:
         """Hold a patch in its current position; return the number of the grasp.
 
         Args:
@@ -114,7 +114,7 @@ class HeldBranch:
         """Hold a known patch; as :meth:`grab`."""
         self.model.equations([*(held.grasp for held in self.grasps.values()), grasp])
         pose = grasp.pose_of(self.model.mesh.nodes, self.displacement)
-        if grasp.mode == "pinned":
+        if grasp.mode == "point":
             pose[3:] = 0.0
         self._count += 1
         self.grasps[self._count] = Held(grasp, pose, pose)
@@ -149,7 +149,7 @@ class HeldBranch:
         """Set the target pose of a grasp (the first, if not named) [m, rad]."""
         number = self.number(number)
         held = self.grasps[number]
-        if held.grasp.mode == "pinned":
+        if held.grasp.mode == "point":
             pose = np.concatenate([pose[:3], held.pose[3:]])
         self.grasps[number] = replace(held, goal=pose)
 

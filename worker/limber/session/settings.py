@@ -13,8 +13,8 @@ class SessionSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     mode: GraspMode = Field(
-        "clamped", description="rigid (clamped): the marked grasp holds position and rotation. "
-            "point (pinned): it holds the position only.")
+        "rigid", description="rigid: the marked grasp holds position and rotation. "
+            "point: it holds the position only.")
     grasp: bool = Field(True, description="Start with the marked grasp held. Otherwise no grasp "
         "is held.")
     gravity: bool = Field(True, description="The branch carries its own weight, as when it was "

@@ -9,7 +9,7 @@ Commands, one JSON object a line (UTF-8, at most 1 MiB) on standard input. Each 
 
 - ``{"command": "hello", "protocol": 2}``: state the client's protocol. The reply is an
   error if it is not this one.
-- ``{"command": "grasp", "vertex": 17, "mode": "pinned", "radius_m": 0.01}``: hold the branch there,
+- ``{"command": "grasp", "vertex": 17, "mode": "point", "radius_m": 0.01}``: hold the branch there,
   where it is now; ``"point": [x, y, z]`` instead of a vertex is a position on the branch as it
   was scanned [m]. The reply contains ``grasp`` (a number), its ``pose``, and its ``rest_pose``
   on the branch as it was scanned. At most eight at once.

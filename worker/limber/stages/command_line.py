@@ -17,7 +17,7 @@ from typing import Any, Literal
 import click
 from pydantic import BaseModel
 
-from limber.core.settings import OneOf, Renamed, Settings, checked_settings
+from limber.core.settings import OneOf, Settings, checked_settings
 from limber.stages.registry import StageDescription
 
 
@@ -176,20 +176,11 @@ def stage_options(stage: StageDescription) -> Callable[[Callable], Callable]:
 def _with_options(function: Callable, fields: Mapping[str, type[BaseModel]],
                   prefix: str) -> Callable:
     """Add an option per field of a model; the function gets ``values``, those that were given."""
-    former = {name: value for model in fields.values() if issubclass(model, Settings)
-              for name, value in model.former().items() if name not in fields}
-
     @functools.wraps(function)
     def body(*args: Any, **options: Any) -> Any:
-        chosen = {field: options.pop(f"{prefix}__{field}") for field in (*fields, *former)}
+        chosen = {field: options.pop(f"{prefix}__{field}") for field in fields}
         values = {field: value for field, value in chosen.items() if value is not None}
         return function(*args, values=values, **options)
-    for name, value in former.items():
-        # Old command lines may state the constant; the model refuses any other value.
-        flag, kind = "--" + name.replace("_", "-"), str if value is None else type(value)
-        declared = f"{flag}/--no-{flag[2:]}" if isinstance(value, bool) else flag
-        body = click.option(declared, f"{prefix}__{name}", hidden=True, default=None,
-                            type=kind)(body)
     for name, model in reversed(fields.items()):
         body = _parameter(model, name, model.model_fields[name], f"{prefix}__{name}")(body)
     return body
@@ -258,11 +249,6 @@ def _parameter(model: type[BaseModel], name: str, field: Any, destination: str) 
     for part in field.metadata:
         if isinstance(part, OneOf):
             return click.option(*flags, destination, type=click.Choice(part.names()), **common)
-        if isinstance(part, Renamed):
-            # Scripts may continue to use the old names that files keep.
-            taken = click.Choice([*part.kept, *typing.get_args(kind)])
-            common = {"metavar": f"[{'|'.join(part.kept)}]", **common}
-            return click.option(*flags, destination, type=taken, **common)
     return click.option(*flags, destination, type=_click_type(kind), **common)
 
 
@@ -319,15 +305,9 @@ def _help(name: str, field: Any, kind: Any, default: Any) -> str:
             between = "," if typing.get_args(kind)[-1] is Ellipsis else " "
             parts.append(f"default: {between.join(map(_shown, default))}")
         else:
-            parts.append(f"default: {_shown(_new_name(field, default))}")
+            parts.append(f"default: {_shown(default)}")
     parts += _bounds(field)
     return f"{field.description or ''}  [{'; '.join(parts)}]" if parts else field.description or ""
-
-
-def _new_name(field: Any, value: Any) -> Any:
-    """Today's name of a value that files keep under an old one."""
-    kept = next((part.kept for part in field.metadata if isinstance(part, Renamed)), {})
-    return next((new for new, old in kept.items() if old == value), value)
 
 
 def _bounds(field: Any) -> list[str]:

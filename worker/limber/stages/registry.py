@@ -79,13 +79,12 @@ class StageDescription:
 
         kinds = (self.inputs, self.settings, self.options)
         known = [name for kind in kinds for name in kind.model_fields]
-        former = {name for kind in kinds for name in kind.former()}
         for name in values:
-            if name not in known and name not in former:
+            if name not in known:
                 raise InputError(f"{self.name} has no {name!r}.", nearest(name, known))
         inputs, settings, options = (
             checked_settings(kind, {name: value for name, value in values.items()
-                                    if name in kind.model_fields or name in kind.former()})
+                                    if name in kind.model_fields})
             for kind in kinds)
         return inputs, settings, options
 

@@ -16,6 +16,7 @@ next writer finishes or removes the leftovers of killed programs.
 import os
 import shutil
 import time
+import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -29,7 +30,6 @@ from limber.core.errors import BranchFolderError
 from limber.core.files.atomic import file_digest
 from limber.core.files.temporary_names import owned_name, sweep
 from limber.core.json_values import plain
-from limber.core.settings import Settings
 from limber.store import journal
 from limber.store.disk_errors import gone, in_words, require_room, require_there
 from limber.store.folder_state import (
@@ -115,8 +115,8 @@ class Branch:
         return self.manifest.name
 
     @property
-    def uuid(self) -> str | None:
-        """Identifier of the branch, independent of its folder; None in format 1 until written."""
+    def uuid(self) -> str:
+        """Identifier of the branch, independent of its folder."""
         return self.manifest.uuid
 
     @property
@@ -146,7 +146,7 @@ class Branch:
                 f"It contains files but no {MANIFEST}. Writing there could overwrite them.",
                 "Name a new folder with -o, for example NAME.branch.")
         name = folder.name.removesuffix(".branch") or folder.resolve().name.removesuffix(".branch")
-        begin(folder, Manifest(name=name))
+        begin(folder, Manifest(uuid=str(uuid.uuid4()), name=name))
         return cls.open(folder)
 
     @classmethod
@@ -320,9 +320,7 @@ class Branch:
         intact = all(name in self.manifest.files
                      and not self._checker.trouble(name, self.manifest.files[name])
                      for name in entry.writes if self._owner(name) == key)
-        stored = (settings.without_retired(entry.settings) if isinstance(settings, Settings)
-                  else entry.settings)
-        return (intact and entry.reads == current and stored == plain(settings or {})
+        return (intact and entry.reads == current and entry.settings == plain(settings or {})
                 and entry.programs.get(RESULTS, "1") == results_version(settings))
 
     @contextmanager

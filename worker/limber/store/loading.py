@@ -85,7 +85,7 @@ def load_found_skeleton(branch: Branch, alignment: Alignment, unit: str) -> Skel
         unit: Unit of the scan's file, in which they are kept.
 
     Raises:
-        BranchFolderError: they were not kept: an older Limber made the branch.
+        BranchFolderError: they were not kept.
     """
     found = read_skeleton(branch.require(f"{FOUND_SKELETON}.csv", "reconstruct"),
                           scale=UNIT_METRES[unit])
@@ -292,13 +292,10 @@ def load_estimated_subject(branch: Branch, known: dict[str, Any], *, gravity: bo
         known: Content of ``estimate.json``.
         gravity: Whether the branch's weight acts, unless the estimate had to leave it out.
     """
-    subject = load_subject(branch, EstimateSettings(
+    return load_subject(branch, EstimateSettings(
         fractions=tuple(known["fractions"]), gravity=gravity and not known.get("is_weightless"),
         field="open" if known.get("field_form") else "inverse_distance",
         orders=known.get("orders", False), **known.get("section", {})))
-    if subject.field is not None and known.get("field_form_deviations") is None:
-        return replace(subject, field=subject.field.same_at_any_step())
-    return subject
 
 
 def known_pulls(branch: Branch) -> list[str]:

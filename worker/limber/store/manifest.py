@@ -4,7 +4,6 @@ import functools
 import hashlib
 import json
 import platform
-import uuid
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
@@ -21,7 +20,6 @@ from limber.core.machine_errors import machine_error
 from limber.version import VERSION
 
 FORMAT_VERSION = 2
-"""1: until 0.1; 2: with the branch's UUID. Older ones are read, and written as this one."""
 MANIFEST = "branch.json"
 RESULTS = "results"
 """Among a stage's programs: the version of its settings' results; see limber.core.settings."""
@@ -57,14 +55,13 @@ class StageEntry(BaseModel):
 class Manifest(BaseModel):
     """Content of ``branch.json``.
 
-    ``uuid`` identifies the branch independent of the path and name of its folder; a folder of
-    format 1 has none until a stage writes to it.
+    ``uuid`` identifies the branch independent of the path and name of its folder.
     """
 
     model_config = ConfigDict(extra="forbid")
 
     format_version: int = FORMAT_VERSION
-    uuid: str | None = None
+    uuid: str
     name: str
     unit: str = "m"
     created_with: str = f"limber {VERSION}"
@@ -74,9 +71,7 @@ class Manifest(BaseModel):
     files: dict[str, FileEntry] = Field(default_factory=dict)
 
     def text(self) -> str:
-        """Return the manifest as it is written: in this format, with a UUID."""
-        self.format_version = FORMAT_VERSION
-        self.uuid = self.uuid or str(uuid.uuid4())
+        """Return the manifest as it is written."""
         return json.dumps(plain(self.model_dump(mode="json")), indent=1, allow_nan=False) + "\n"
 
     def content_digest(self) -> str:

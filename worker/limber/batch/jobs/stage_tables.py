@@ -14,7 +14,7 @@ from limber.batch.jobs.job_paths import JobPaths
 from limber.batch.jobs.problems import Problems
 from limber.batch.jobs.toml_positions import KeyPath
 from limber.core.files.safe_names import same_named
-from limber.core.settings import Settings, nearest, why_constant
+from limber.core.settings import Settings, nearest
 from limber.core.units import in_unit
 from limber.stages.registry import (
     StageDescription,
@@ -98,16 +98,11 @@ class _StageValues:
 
     def tasks(self) -> list[StageTask]:
         own = self._own_inputs()
-        former = {name: value for model in self._models() for name, value in model.former().items()}
         values: dict[str, Any] = {}
         for key, value in self._values.items():
             if key in own:
                 self._problems.add(self._key_paths[key],
                                    f"The batch sets {key!r} itself. Remove it.")
-            elif key in former:
-                if value != former[key]:
-                    self._problems.add(self._key_paths[key], f"{self._stage.name} {key}: "
-                                       f"{why_constant(former[key])}.")
             elif key not in self._fields:
                 self._problems.add(self._key_paths[key], f"{self._stage.name} has no {key!r}. "
                                    f"{nearest(key, list(self._fields))}")

@@ -253,7 +253,7 @@ def _read(path: Path | None, forward: QuasiStaticForward) -> ReducedModel | None
     try:
         found = read_model(path)
     except (InputError, KeyError):
-        # Truncated, or of an older version: it is made again.
+        # Truncated: it is made again.
         return None
     same = (found.rest.shape == forward.mesh.nodes.shape
             and np.array_equal(found.grasp.nodes, forward.grasp.nodes))

@@ -43,12 +43,12 @@ class DynamicForward(Forward):
             raise InputError(f"{name}: {np.sum(~measured)} frames have no force.",
                              "A force-driven motion needs the force in every frame.",
                              "Use --drive pose.")
-        if self.drive == "force" and entry.grasp.mode == "clamped":
+        if self.drive == "force" and entry.grasp.mode == "rigid":
             raise InputError(
                 f"{name}: the force of a clamped gripper drives a dynamic simulation.",
                 "A clamped gripper also bends the branch by a torque, but only a force can drive "
                 "a dynamic simulation.",
-                'Use --drive pose. If the branch could turn in the gripper, set mode = "pinned" '
+                'Use --drive pose. If the branch could turn in the gripper, set mode = "point" '
                 "under [grasp] in pull.toml.")
         self._forces = frames.wrenches[:, :3]
         self._arguments = (name, model, weights, entry)
@@ -119,7 +119,7 @@ class DynamicForward(Forward):
         """
         name, model, weights, entry = self._arguments
         measured = np.isfinite(self.frames.wrenches[:, :3]).all()
-        if measured and entry.grasp.mode == "pinned":
+        if measured and entry.grasp.mode == "point":
             entry = entry.model_copy(update={"drive": "force"})
         return DynamicForward(name, model, weights, entry, self.frames[:count], self.rest_points,
                               field=self.field)

@@ -169,7 +169,7 @@ def _poses(model: BranchModel, grasp: Grasp, point: np.ndarray,
     """Poses of the grasp point, which moves with the patch, and of the patch's centre."""
     centres = np.array([grasp.pose_of(model.mesh.nodes, displacement)
                         for displacement in displacements])
-    if grasp.mode == "pinned":
+    if grasp.mode == "point":
         # Held by its weighted mean: the position of the point, whatever the rotation.
         poses = centres.copy()
         poses[:, :3] += point - grasp.centre
@@ -184,7 +184,7 @@ def _about_centre(grasp: Grasp, point: np.ndarray, poses: np.ndarray) -> np.ndar
     """Poses of the patch's centre for those of the grasp point."""
     held = poses.copy()
     for pose in held:
-        turn = rotation_matrix(pose[3:]) if grasp.mode == "clamped" else np.eye(3)
+        turn = rotation_matrix(pose[3:]) if grasp.mode == "rigid" else np.eye(3)
         pose[:3] += turn @ (grasp.centre - point)
     return held
 

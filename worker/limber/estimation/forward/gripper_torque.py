@@ -14,7 +14,7 @@ def uses_torque(entry: PullEntry, frames: Frames) -> bool:
     """Whether the gripper's torque counts: for a clamped grasp, and a sensor with a stated torque
     noise. Driven by pose it is an observation; driven by force it acts as a load.
     """
-    return (entry.grasp.mode == "clamped" and entry.sensor.torque_sigma_nm is not None
+    return (entry.grasp.mode == "rigid" and entry.sensor.torque_sigma_nm is not None
             and bool(np.isfinite(frames.wrenches[:, 3:]).all(axis=1).any()))
 
 
@@ -31,7 +31,7 @@ def require_torque(name: str, entry: PullEntry, frames: Frames) -> None:
             "A clamped gripper also bends the branch by a torque. A simulation with the force "
             "alone would not reproduce the pull.",
             "Use --drive pose, or record the torque and give torque_sigma_nm under [sensor] in "
-            'pull.toml. If the branch could turn in the gripper, set mode = "pinned" under '
+            'pull.toml. If the branch could turn in the gripper, set mode = "point" under '
             "[grasp].")
 
 

@@ -114,7 +114,7 @@ class ObservedPathForward(QuasiStaticForward):
         A branch that is compressed buckles under a steady force and torque, but not between base
         and gripper. Simulated by force, it would end in another state.
         """
-        if self.grasp.mode != "clamped":
+        if self.grasp.mode != "rigid":
             return False
         held = QuasiStaticForward(self.name, self._model, self.weights, self.entry, self.frames,
                                   self.rest_points, key_count=FEW_KEYS, field=self.field)

@@ -91,7 +91,7 @@ class QuasiStaticForward(Forward):
             raise InputError(f"{name} has no measured force for a force-driven simulation.",
                              "Nothing would pull the branch.",
                              "Use --drive pose, or record the force.")
-        if self.drive == "force" and entry.grasp.mode == "clamped":
+        if self.drive == "force" and entry.grasp.mode == "rigid":
             require_torque(name, entry, frames)
         self.weights = weights
         self.field = field or YoungField(weights)

@@ -182,7 +182,7 @@ class Prospects:
         for forward in self._objective.forwards:
             full = forward.full
             if (isinstance(full, QuasiStaticForward) and full.drive == "pose"
-                    and full.entry.grasp.mode == "clamped" and not full.uses_torque):
+                    and full.entry.grasp.mode == "rigid" and not full.uses_torque):
                 if full.simulate(values, (), False) is None:
                     return None
                 full, is_new = _torque_recorded(full, values), True

@@ -149,7 +149,7 @@ class _Pulled:
         if not self.is_held:
             return held, np.empty((0, 3))
         pose = self.forward.load_at(key)
-        if grasp.mode == "pinned":
+        if grasp.mode == "point":
             return held, (pose[:3] - grasp.centre - grasp.weights @ state[grasp.nodes])[None]
         held[grasp.nodes] = grasp.displacement(self.model.mesh.nodes, pose)
         return held, np.empty((0, 3))
@@ -202,7 +202,7 @@ def grip_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
         None if no gripper clamps or its length is known, or as for
         :func:`limber.estimation.uncertainty.shape_sensitivity.compensation`.
     """
-    if not any(forward.entry.grasp.mode == "clamped"
+    if not any(forward.entry.grasp.mode == "rigid"
                and calibration_of(forward.entry).held_length_sigma_m > 0
                for forward in objective.forwards):
         return None

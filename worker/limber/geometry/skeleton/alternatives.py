@@ -50,7 +50,7 @@ class SearchDoubts:
 
     @classmethod
     def of(cls, result: dict[str, Any]) -> "SearchDoubts":
-        """The same from a stage's result; one of an older version leaves nothing open."""
+        """The same from a stage's result; empty for a skeleton that was not searched."""
         root = result.get("other_root")
         return cls(result.get("bridges") or (), result.get("unlikely_twigs") or (),
                    None if root is None else np.array(root, float),

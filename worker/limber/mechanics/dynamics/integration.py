@@ -205,7 +205,7 @@ class _Run:
             for number, grasp in enumerate(grasps):
                 arm = positions[grasp.nodes] - grasp.pose_of(model.mesh.nodes,
                                                              state.displacement)[:3]
-                share = (out[grasp.nodes] if grasp.mode == "clamped"
+                share = (out[grasp.nodes] if grasp.mode == "rigid"
                          else grasp.weights[:, None] * forces[number])
                 torques[number] = np.cross(arm, share).sum(axis=0)
         frame = {

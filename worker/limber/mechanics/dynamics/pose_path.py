@@ -42,8 +42,8 @@ class PosePath:
                              "Give x, y, z [m] and a rotation vector [rad] for each.")
         self.grasps, self._rest = list(grasps), rest
         self.poses = unwrapped(poses.reshape(expected))
-        self.clamped = [g for g in self.grasps if g.mode == "clamped"]
-        self.pinned = [g for g in self.grasps if g.mode == "pinned"]
+        self.clamped = [g for g in self.grasps if g.mode == "rigid"]
+        self.pinned = [g for g in self.grasps if g.mode == "point"]
         self._spline = None
         if len(times) > 1:
             self._spline = CubicSpline(times, self.poses, axis=0,
@@ -71,7 +71,7 @@ class PosePath:
         poses = self.poses[0] if self._spline is None else self._spline(instant)
         held, pins = [], []
         for grasp, pose in zip(self.grasps, poses, strict=True):
-            if grasp.mode == "clamped":
+            if grasp.mode == "rigid":
                 held.append(grasp.displacement(self._rest, pose))
             else:
                 pins.append(pose[:3] - grasp.centre)

@@ -162,9 +162,9 @@ class Equations:
                  fixed: np.ndarray, grasps: Sequence[Grasp]):
         self.held = fixed.copy()
         for grasp in grasps:
-            if grasp.mode == "clamped":
+            if grasp.mode == "rigid":
                 self.held[grasp.nodes] = True
-        self.pinned = [grasp for grasp in grasps if grasp.mode == "pinned"]
+        self.pinned = [grasp for grasp in grasps if grasp.mode == "point"]
         self.pattern = Pattern(tets, len(fixed), ~self.held, [g.nodes for g in self.pinned])
         self.layout = LaneLayout(self.pattern, tets, gradients, weights)
         self.factorisation_count = 0

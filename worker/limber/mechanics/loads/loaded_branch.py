@@ -75,7 +75,7 @@ class LoadedBranch:
         """Return it with other moduli [Pa]; the hanging shape is unchanged."""
         return replace(self, model=self.model.with_young(young))
 
-    def marked_grasp(self, mode: Literal["clamped", "pinned"]) -> Grasp:
+    def marked_grasp(self, mode: Literal["rigid", "point"]) -> Grasp:
         """Return the grasp that the mesh marks.
 
         Raises:

@@ -71,7 +71,7 @@ class StaticProblem:
     def constraint(self, poses: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
         held, pins = np.zeros((self.model.mesh.node_count, 3)), []
         for grasp, pose in zip(self.grasps, poses, strict=True):
-            if grasp.mode == "clamped":
+            if grasp.mode == "rigid":
                 held[grasp.nodes] = grasp.displacement(self.model.mesh.nodes, pose)
             else:
                 pins.append(pose[:3] - grasp.centre)
@@ -162,7 +162,7 @@ def grasp_wrench(problem: StaticProblem, grasp: Grasp, positions: np.ndarray, ou
     if not problem.is_held:
         return np.zeros(3), np.zeros(3)
     forces = out[grasp.nodes]
-    if grasp.mode == "pinned":
+    if grasp.mode == "point":
         total = grasp.weights @ forces / (grasp.weights @ grasp.weights)
         forces = grasp.weights[:, None] * total
     return forces.sum(axis=0), np.cross(positions[grasp.nodes] - centre, forces).sum(axis=0)

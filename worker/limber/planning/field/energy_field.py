@@ -243,10 +243,6 @@ class EnergyField:
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],
                 **{name: arrays.get(stored) for name, stored in _OPTIONAL.items()})
-            if "chart_layers" not in arrays:  # written by an older version
-                return fit_field(samples, arrays["chart_base_m"])
-            if arrays.get("load_fit_value_weights", np.empty((0, 0))).shape[1] != len(LOADS):
-                return fit_field(samples, arrays["chart_pivot_m"], float(arrays["chart_radius_m"]))
             fits = [RadialInterpolant.from_arrays(arrays, f"{name}_")
                     for name in ("energy_fit", "shape_fit", "load_fit")]
             region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3],

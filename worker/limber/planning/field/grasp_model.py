@@ -226,5 +226,5 @@ def grasp_model_of(branch: LoadedBranch, skeleton: Skeleton) -> GraspModel:
     Raises:
         InputError: the mesh marks no grasp.
     """
-    grasp = branch.marked_grasp("pinned")
+    grasp = branch.marked_grasp("point")
     return GraspModel(branch, grasp, Reach.of(skeleton, grasp.centre))

@@ -8,7 +8,7 @@ nearest to any solved one, and starts from that solution. So every step is short
 would have to jump, and the branch stays in the equilibrium that bends out of rest.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,8 +35,6 @@ _TAUT = 2.0  # times the median force
 _SHARE_POSES = 30
 """Poses of one tree. The number of trees must not depend on the processes, nor on their results."""
 _SECOND_TRIES = 3  # other solutions tried as start for a pose that was not reached
-_SAME_PLACE = 1e-9  # fraction of the mesh's size; last digits differ between machines
-_GRASP_INPUT = "grasp nodes"
 TWO_SHAPES = "two shapes"
 """One of the reasons for refusing poses: which of two shapes results depends on the path."""
 
@@ -269,24 +267,6 @@ def _slack(forces: np.ndarray, usual: np.ndarray, drawn: float) -> np.ndarray:
     return slack
 
 
-def is_sampled_on(reads: Mapping[str, str], rest: np.ndarray, grasp_model: GraspModel) -> bool:
-    """Whether a field was sampled on this model.
-
-    Args:
-        reads: :func:`energy_inputs` when it was sampled.
-        rest: Position of the field's grasp at rest [m], shape [3].
-        grasp_model: The model as it is now.
-    """
-    inputs = energy_inputs(grasp_model)
-    if _GRASP_INPUT not in reads:
-        # Of an earlier version, which digested the weights; the grasp's position is as good.
-        del inputs[_GRASP_INPUT]
-        away = np.linalg.norm(rest - grasp_model.grasp.centre)
-        if away > _SAME_PLACE * np.ptp(grasp_model.mesh.nodes, axis=0).max():
-            return False
-    return all(reads.get(name) == value for name, value in inputs.items())
-
-
 def energy_inputs(grasp_model: GraspModel) -> dict[str, str]:
     """Return digests of what the field depends on: geometry, grasp, material, weight, targets.
 
@@ -301,6 +281,6 @@ def energy_inputs(grasp_model: GraspModel) -> dict[str, str]:
     grasp = grasp_model.grasp
     nodes = hashlib.sha256(np.ascontiguousarray(grasp.nodes, np.int64).tobytes())
     return {"mesh geometry": grasp_model.mesh.geometry_digest(), "material": material.hexdigest(),
-            _GRASP_INPUT: f"{grasp.mode} {nodes.hexdigest()}",
+            "grasp nodes": f"{grasp.mode} {nodes.hexdigest()}",
             "weight": str((model.gravity.tolist(), model.point_masses)),
             "targets": str(grasp_model.branch.targets)}

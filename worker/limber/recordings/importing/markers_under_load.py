@@ -137,7 +137,7 @@ def _write(request: ImportRequest, found: _Placed, times: np.ndarray, moved: np.
     nodes = _nodes(request)
     # A branch under its own weight has no point of load: use the marker that moves most.
     grasp = request.grasp_or(lambda: _nearest(nodes, found.rest[_farthest(moved)]))
-    entry = request.entry("markers", found.rest, drive="force", mode="pinned", grasp=grasp,
+    entry = request.entry("markers", found.rest, drive="force", mode="point", grasp=grasp,
                           sigma=sigma)
     entry = request.as_stated(entry.model_copy(
         update={"calibration": WITHOUT_GRIPPER, **further}))
@@ -171,7 +171,7 @@ def import_gauge(table: ForceTable, request: ImportRequest) -> dict[str, Any]:
     if settings.coordinates == "scan":
         direction = np.array(request.branch.alignment.rotation) @ direction
     point = np.array(request.grasp_or(lambda: nodes[0]))
-    entry = request.entry("markers", point[None], drive="force", mode="pinned",
+    entry = request.entry("markers", point[None], drive="force", mode="point",
                           sigma=settings.position_sigma or 1e-3, grasp=tuple(point.tolist()))
     entry = request.as_stated(entry.model_copy(update={
         "calibration": WITHOUT_GRIPPER.model_copy(update={

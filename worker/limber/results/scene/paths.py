@@ -72,10 +72,8 @@ def _add_path(data: SceneData, key: str, table: dict[str, np.ndarray]) -> None:
 
 
 def _add_trees(data: SceneData, branch: Branch, plan: str) -> None:
-    """Add the search trees; plans of older versions have none."""
+    """Add the search trees."""
     data.info["trees"] = {}
-    if not branch.has(f"plans/{plan}-trees.csv"):
-        return
     trees = read_trees(branch.path(f"plans/{plan}-trees.csv"))
     for planner, key in _TREES.items():
         if planner in trees:

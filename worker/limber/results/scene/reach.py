@@ -38,9 +38,6 @@ def _add_energy_grid(data: SceneData, branch: Branch) -> None:
         require_shapes(path, content, {"chart_base_m": (3,), "arc_length_m": ()},
                        "an energy field")
         _add_hemisphere(data, content["chart_base_m"], float(content["arc_length_m"]))
-    if "chart_layers" not in content:
-        # An older version's: it would be fitted again each time.
-        return
     try:
         field = EnergyField.read(path)
     except InputError as error:

@@ -29,8 +29,7 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
     entry = branch.manifest.stages.get(f"execute-preview:{plan}")
     name = f"executions/{plan}-preview.csv"
     grasps = data.arrays.get("grasp_motion")
-    # A dry run of an older version does not state its arm.
-    if entry is None or grasps is None or "model" not in entry.result or not branch.has(name):
+    if entry is None or grasps is None or not branch.has(name):
         return
     if (data.info.get("frames") or {}).get("name") != plan:
         return

@@ -57,7 +57,7 @@ def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
     return None
 
 
-def check_branch(cell: Cell, uuid: str | None, folder: object) -> str | None:
+def check_branch(cell: Cell, uuid: str, folder: object) -> str | None:
     """Return a warning if the cell names no branch.
 
     Raises:

@@ -42,7 +42,6 @@ class LoadSettings(Settings):
         "limits": ("strain_limit", "limit_load"),
         "output": ("name",)}
     common = ("wind", "snow", "fruit", "cut", "name")
-    retired: ClassVar[dict[str, Any]] = {"gust_time": 600.0, "most": 50.0}
 
     wind: tuple[float, float, float] | None = Field(
         None, description="Wind velocity in the branch's frame [m/s].",

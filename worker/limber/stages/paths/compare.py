@@ -41,7 +41,6 @@ class CompareSettings(Settings):
 
     groups: ClassVar[Groups] = {"trials": ("trials", "goal", "seed"),
                                 "solver": ("max_detour", "iterations", "engine")}
-    retired: ClassVar[dict[str, Any]] = {"goal_tolerance": 0.01}
 
     trials: int = Field(10, ge=1, le=1000, description=(
         "Number of random deformed start configurations."))

@@ -58,7 +58,6 @@ class ExecuteSettings(Settings):
     """Settings for following the path."""
 
     groups: ClassVar[Groups] = {"motion": ("speed", "hold", "gripper_rotation")}
-    retired: ClassVar[dict[str, Any]] = {"gravity": True}
 
     speed: float | None = Field(None, gt=0, le=0.25, description=(
         "Speed of the gripper [m/s]. Default: the plan's, no faster than the cell allows."))

@@ -75,7 +75,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     from limber.planning.constraints.damage_along import DamageAlong
     from limber.planning.constraints.limits import Limits
     from limber.planning.field.energy_field import EnergyField
-    from limber.planning.field.sampling import energy_inputs, is_sampled_on
+    from limber.planning.field.sampling import energy_inputs
     from limber.planning.make_plan import plan_motion
     from limber.planning.plan_file import whole_motion
     from limber.planning.timing import Pace
@@ -102,13 +102,13 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     grasp_model = load_grasp_model(branch, gravity=bool(energy_stage.settings["gravity"]),
                                    progress=progress)
     field = EnergyField.read(field_path)
-    if not is_sampled_on(energy_stage.reads, field.rest, grasp_model):
+    digests = energy_inputs(grasp_model)
+    if any(energy_stage.reads.get(name) != digest for name, digest in digests.items()):
         raise BranchFolderError(
             "The energy field belongs to another mesh, material, weight or set of targets.",
             "The branch was meshed or estimated again, or its targets changed, after `limber "
             "energy` ran.",
             "Run `limber energy` again.")
-    digests = energy_inputs(grasp_model)
     grasp_model = grasp_model.damped(known_damping(branch))
     digests = digests | {"damping": repr(grasp_model.model.damping)}
     stiffer = _stiffer(branch) if settings.max_stress else 1.0

@@ -91,7 +91,7 @@ def arc_path(branch: Branch, point: np.ndarray, direction: np.ndarray, distance:
 
     progress(0.0, "the arc of the branch")
     model = load_branch(branch, progress=progress).model
-    grasp = Grasp.at(model.mesh, point, GRASP_RADIUS_M, "pinned")
+    grasp = Grasp.at(model.mesh, point, GRASP_RADIUS_M, "point")
     unit = np.asarray(direction, float) / np.linalg.norm(direction)
     size = force_for_travel(model, grasp, unit, distance)
     poses, state = [grasp.rest_pose], None

@@ -49,7 +49,6 @@ class SuggestPullSettings(Settings):
     """Limits of a pull."""
 
     groups: ClassVar[Groups] = {"limits": ("fractions", "max_strain", "max_force")}
-    retired: ClassVar[dict[str, Any]] = {"gravity": True}
 
     fractions: tuple[float, ...] = Field((0.5, 0.67, 0.8, 0.92), min_length=1, description=(
         "Candidate grasps as fractions of the main path."))
@@ -176,7 +175,7 @@ def _for_plan(branch: Branch, name: str, now: Known, after: Known, progress: Pro
     plan = read_plan(branch.path(f"plans/{name}.json"))
     limits = limits_in_file(plan.summary.get("limits") or {})
     confidence = branch.manifest.stages[f"plan:{name}"].settings.get("confidence") or _CONFIDENCE
-    if not limits.asked() or plan.motion is None:
+    if not limits.asked():
         return {"worth": False, "why": "The plan has no limits, so a better known modulus changes "
                 "nothing about it."}
     gravity = bool(branch.manifest.stages["energy"].settings["gravity"])
