@@ -110,8 +110,8 @@ def test_a_stiffer_branch_pulls_harder(session):
 
 def test_what_is_not_understood_is_named_and_survived(session):
     """A broken command gets an error with its id; the session goes on."""
-    session._process.stdin.write('{"command": "move", "id": 77, "pose": [1, 2]}\nnonsense\n')
-    session._process.stdin.flush()
+    session._child.process.stdin.write('{"command": "move", "id": 77, "pose": [1, 2]}\nnonsense\n')
+    session._child.process.stdin.flush()
     assert session.wait_for("error", 5, count=2) is not None
     said = [line for line in session.events if line["event"] == "error"]
     assert said[0]["id"] == 77 and "pose.2" in said[0]["message"]

@@ -8,7 +8,7 @@ import pytest
 from tests.subjects.processes import left_alive
 
 from limber.core.errors import WorkError
-from limber.core.processes.child_module import run_module
+from limber.core.processes.child import run_module
 from limber.core.processes.process_limits import Limits
 
 CHILD = """

@@ -19,7 +19,7 @@ from tests.subjects import behaviours
 from tests.subjects.processes import left_alive
 
 from limber.core.errors import Cancelled, LimberError
-from limber.core.processes import Limits, Pool, stage_process
+from limber.core.processes import Limits, Pool, child
 from limber.core.processes import pool as pool_module
 from limber.core.progress import Progress
 
@@ -87,7 +87,7 @@ class AsProcess:
     name = "process"
 
     def __init__(self, monkeypatch):
-        monkeypatch.setattr(stage_process, "_GRACE_SECONDS", 0.3)
+        monkeypatch.setattr(child, "_GRACE_SECONDS", 0.3)
 
     def run(self, behaviour: str, cancel_at: str = "", limits: Limits | None = None,
             outcome: Outcome | None = None) -> Outcome:
@@ -101,7 +101,7 @@ class AsProcess:
                 threading.Timer(0.2, progress.cancel).start()
         progress = Progress(hear)
         try:
-            outcome.result = stage_process.run_json_process(
+            outcome.result = child.run_json_process(
                 "stage", [sys.executable, "-u", str(PROGRAM), behaviour], progress,
                 limits=limits or Limits())
         except LimberError as error:

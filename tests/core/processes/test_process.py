@@ -1,5 +1,6 @@
 """A stage as a process: result, progress, errors by exit code, crash, cancel."""
 
+import subprocess
 import sys
 import threading
 import time
@@ -8,7 +9,7 @@ import psutil
 import pytest
 
 from limber.core.errors import BranchFolderError, Cancelled, InputError, SafetyStop, WorkError
-from limber.core.processes import stage_process
+from limber.core.processes import child
 from limber.core.progress import Progress
 
 
@@ -18,9 +19,9 @@ def stand_in(monkeypatch, tmp_path):
     def use(body: str) -> None:
         path = tmp_path / "stage.py"
         path.write_text("import json, os, sys, time\n" + body)
-        real = stage_process.subprocess.Popen
+        real = subprocess.Popen
         monkeypatch.setattr(
-            stage_process.subprocess, "Popen",
+            subprocess, "Popen",
             lambda command, **options: real([sys.executable, "-u", str(path)], **options))
     return use
 
@@ -28,7 +29,7 @@ def stand_in(monkeypatch, tmp_path):
 @pytest.mark.slow
 def test_real_command_returns_its_result():
     """`limber doctor` run as a process gives its JSON result."""
-    result = stage_process.run_stage(["doctor"])
+    result = child.run_stage(["doctor"])
     assert result["status"] == "done"
     assert result["packages"]["numpy"].startswith(("1.", "2."))
 
@@ -40,7 +41,7 @@ def test_progress_is_relayed_and_noise_is_skipped(stand_in):
              "print(json.dumps({'command': 'x', 'status': 'done', 'error': None, 'n': 3}))\n")
     seen = []
     sink = Progress(lambda fraction, message, numbers: seen.append((fraction, message, numbers)))
-    result = stage_process.run_stage(["x"], sink.part(0.0, 0.5))
+    result = child.run_stage(["x"], sink.part(0.0, 0.5))
     assert seen == [(0.25, "half", {"loss": 2.0})]
     assert result["n"] == 3
 
@@ -52,14 +53,14 @@ def test_errors_keep_their_kind(stand_in, code, kind):
     stand_in("print(json.dumps({'command': 'x', 'status': 'failed', 'error': 'too wet'}))\n"
              f"sys.exit({code})\n")
     with pytest.raises(kind, match="too wet"):
-        stage_process.run_stage(["x"])
+        child.run_stage(["x"])
 
 
 def test_a_crash_shows_the_last_words(stand_in):
     """A child that dies without a result is an error that shows its last words and a way on."""
     stand_in("print('segfault in mesher', file=sys.stderr); os._exit(139)\n")
     with pytest.raises(WorkError, match=r"139.*segfault in mesher.*limber mesh a\.stl"):
-        stage_process.run_stage(["mesh", "a.stl"])
+        child.run_stage(["mesh", "a.stl"])
 
 
 def test_cancel_ends_the_child(stand_in):
@@ -70,7 +71,7 @@ def test_cancel_ends_the_child(stand_in):
     timer = threading.Timer(0.3, progress.cancel)
     timer.start()
     with pytest.raises(Cancelled):
-        stage_process.run_stage(["x"], progress)
+        child.run_stage(["x"], progress)
     time.sleep(0.1)
     commands = [p.as_dict(["cmdline"])["cmdline"] or [] for p in psutil.Process().children()]
     assert not [words for words in commands if "stage.py" in " ".join(words)]
@@ -80,5 +81,5 @@ def test_cancel_ends_the_child(stand_in):
 def test_missing_branch_folder_is_an_input_error(tmp_path):
     """Through the real command line: exit code 2 with what to do becomes InputError."""
     with pytest.raises(InputError, match="limber reconstruct") as error:
-        stage_process.run_stage(["verify", str(tmp_path / "none.branch")])
+        child.run_stage(["verify", str(tmp_path / "none.branch")])
     assert not isinstance(error.value, BranchFolderError)

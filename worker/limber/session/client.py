@@ -1,12 +1,9 @@
 """Python client of an interactive session (limber.session.worker)."""
 
 import contextlib
-import json
+import itertools
 import os
-import subprocess
 import sys
-import tempfile
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError, WorkError
-from limber.core.json_lines import json_objects
 from limber.core.not_none import present
-from limber.core.processes.end_with_parent import end_by_closing
+from limber.core.processes.child import Child
 from limber.session.frame_buffer import Frame, FrameReader
 from limber.session.protocol import PROTOCOL
 from limber.session.settings import SessionSettings
 from limber.version import VERSION
 
 _GRACE_SECONDS = 3.0
+_MOST_EVENTS = 1000
 
 
 class InteractiveSession:
@@ -51,17 +48,12 @@ class InteractiveSession:
 
     def __init__(self, branch_folder: str | Path, *, mode: str = "rigid",
                  start_seconds: float = 60.0, **settings: Any):
-        self.events: list[dict[str, Any]] = []
-        self._said = threading.Condition()
-        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
         chosen = SessionSettings(mode=mode, **settings)
-        self._process = subprocess.Popen(
+        self._child = Child(
             [sys.executable, "-m", "limber.session.worker", str(branch_folder),
-             "--settings", chosen.model_dump_json()],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True,
-            encoding="utf-8", errors="replace")
-        self._listener = threading.Thread(target=self._listen, daemon=True)
-        self._listener.start()
+             "--settings", chosen.model_dump_json()], most_objects=_MOST_EVENTS,
+            keeps_errors=True)
+        self.events = self._child.objects
         self._ids = 0
         self._frames: FrameReader | None = None
         self._is_closed = False
@@ -83,11 +75,11 @@ class InteractiveSession:
     @property
     def alive(self) -> bool:
         """Whether the session's process is running."""
-        return self._process.poll() is None
+        return self._child.alive
 
     @property
     def process_id(self) -> int:
-        return self._process.pid
+        return self._child.process.pid
 
     def move(self, pose: np.ndarray, grasp: int | None = None) -> int:
         """Request a grasp (the first, if not named) at a pose [m, rad].
@@ -173,18 +165,13 @@ class InteractiveSession:
             WorkError: the session has ended, or did not reply in time.
         """
         number = self._send(command=command, **fields)
-        end = time.monotonic() + seconds
-        with self._said:
-            while True:
-                for line in reversed(self.events):
-                    if line.get("id") == number and line.get("event") == "reply":
-                        return line
-                    if line.get("id") == number and line.get("event") == "error":
-                        raise InputError(line["message"])
-                left = end - time.monotonic()
-                if left <= 0 or not self._listener.is_alive():
-                    break
-                self._said.wait(min(left, 0.2))
+        found = self._child.wait(lambda: next((
+            line for line in reversed(self.events) if line.get("id") == number
+            and line.get("event") in ("reply", "error")), None), seconds)
+        if found is not None and found["event"] == "error":
+            raise InputError(found["message"])
+        if found is not None:
+            return found
         self._check()
         raise WorkError(f"The session did not reply to `{command}` within {seconds:g} s.",
                         "It may still be solving.", "Wait longer, or close it.")
@@ -210,44 +197,22 @@ class InteractiveSession:
 
     def wait_for(self, event: str, seconds: float = 10.0, count: int = 1) -> dict | None:
         """Return the ``count``-th event of a kind, waiting for it; None if it does not come."""
-        end = time.monotonic() + seconds
-        with self._said:
-            while True:
-                found = [line for line in self.events if line.get("event") == event]
-                if len(found) >= count:
-                    return found[count - 1]
-                left = end - time.monotonic()
-                if left <= 0 or not self._listener.is_alive():
-                    return None
-                self._said.wait(min(left, 0.2))
+        return self._child.wait(lambda: next(itertools.islice(
+            (line for line in self.events if line.get("event") == event), count - 1, None), None),
+            seconds)
 
     def close(self) -> None:
         """End the session; safe to call again."""
         if self.alive:
-            with contextlib.suppress(WorkError, OSError):  # it is just ending
+            with contextlib.suppress(WorkError):  # it is just ending
                 self._send(command="close")
-            end_by_closing(self._process, _GRACE_SECONDS)
-        self._process.wait()
+        self._child.close(_GRACE_SECONDS)
         if self._frames is not None:
             self._frames.close()
             # A killed session could not clean up.
             Path(self.hello["positions"]).unlink(missing_ok=True)
             self._frames = None
             self._is_closed = True
-        self._listener.join(1.0)
-        for stream in (self._process.stdin, self._process.stdout, self._errors):
-            if stream and not stream.closed:
-                with contextlib.suppress(OSError):  # nobody reads what was not sent
-                    stream.close()
-
-    def _listen(self) -> None:
-        for content in json_objects(self._process.stdout or ()):
-            with self._said:
-                self.events.append(content)
-                del self.events[:-1000]
-                self._said.notify_all()
-        with self._said:
-            self._said.notify_all()
 
     def _send(self, **command: Any) -> int:
         self._check()
@@ -255,10 +220,8 @@ class InteractiveSession:
         line = {"id": self._ids} | {name: value for name, value in command.items()
                                     if value is not None}
         try:
-            stdin = present(self._process.stdin, "standard input")
-            stdin.write(json.dumps(line) + "\n")
-            stdin.flush()
-        except (OSError, ValueError) as error:
+            self._child.send(line)
+        except ConnectionError as error:
             raise WorkError(f"The session has ended: {self._trouble()}") from error
         return self._ids
 
@@ -267,17 +230,14 @@ class InteractiveSession:
             raise WorkError("The session is closed.", "", "Start a new one.")
         if not self.alive:
             raise WorkError(
-                f"The session has ended with exit code {self._process.returncode}:"
+                f"The session has ended with exit code {self._child.process.returncode}:"
                 f" {self._trouble()}", "", "Close it and start a new one.")
 
     def _trouble(self) -> str:
         messages = [line["message"] for line in self.events if line.get("event") == "failed"]
         if messages:
             return messages[-1]
-        if self._errors.closed:
-            return "no message"
-        self._errors.seek(0)
-        return " | ".join(self._errors.read().strip().splitlines()[-4:]) or "no message"
+        return self._child.tail() or "no message"
 
 
 def other_protocol(hello: dict[str, Any]) -> str:

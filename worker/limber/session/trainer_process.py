@@ -1,9 +1,7 @@
 """The trainer's process as a session sees it, and the thread that listens to it."""
 
-import json
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import LimberError
-from limber.core.json_lines import json_objects
-from limber.core.not_none import present
+from limber.core.processes.child import Child
 from limber.mechanics.grasp import Grasp
 from limber.reduced.model_file import read_model
 from limber.reduced.reduced_model import ReducedModel
@@ -66,16 +63,13 @@ class Learning:
         self._last_check = 0.0
         self._checked: np.ndarray | None = None
         self._busy, self._closed = True, False
-        self._process = subprocess.Popen(
+        self._child = Child(
             [sys.executable, "-m", "limber.session.trainer", str(folder),
-             settings.model_dump_json()],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+             settings.model_dump_json()], self._hear, self._ended,
             # Windows has no `nice` for the trainer to call itself.
             creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0))
         self._write({"nodes": grasp.nodes.tolist(), "weights": grasp.weights.tolist(),
                      "mode": grasp.mode})
-        self._listener = threading.Thread(target=self._listen, daemon=True)
-        self._listener.start()
 
     def check(self, state: ReducedState) -> None:
         """Request a comparison with the full model, if the trainer is free and the pose is new."""
@@ -89,38 +83,23 @@ class Learning:
     def close(self) -> None:
         """End the process."""
         self._closed = True
-        self._process.kill()
-        self._process.wait()
-        self._listener.join(1.0)
-        for stream in (self._process.stdin, self._process.stdout):
-            try:
-                if stream is not None:
-                    stream.close()
-            except (OSError, ValueError):
-                continue  # nobody reads what was not sent
+        self._child.kill()
 
     def _write(self, line: dict[str, Any]) -> None:
         try:
-            stdin = present(self._process.stdin, "standard input")
-            stdin.write(json.dumps(line) + "\n")
-            stdin.flush()
-        except (OSError, ValueError):
-            self._checked = None  # it has ended; its listener reports it
+            self._child.send(line)
+        except ConnectionError:
+            self._checked = None  # it has ended, which `_ended` reports
 
-    def _listen(self) -> None:
-        try:
-            for content in json_objects(self._process.stdout or ()):
-                self._hear(content)
-        except (OSError, ValueError):
-            pass  # closed while it was read
+    def _ended(self) -> None:
         if not self._closed:
             self.has_failed = True
             self._say(event="warning", message="the trainer has ended; the reduced model is no "
                       "longer checked, or does not exist")
 
-    def _hear(self, content: dict[str, Any]) -> None:
+    def _hear(self, content: dict[str, Any]) -> bool:
         if self._closed:
-            return
+            return True
         kind = content.get("event")
         if kind == "model":
             self._adopt(content)
@@ -134,6 +113,7 @@ class Learning:
             self._say(event="warning", message=f"there is no reduced model: {content['message']}")
         else:
             self._say(**content)
+        return True
 
     def _adopt(self, content: dict[str, Any]) -> None:
         try:

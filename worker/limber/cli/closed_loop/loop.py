@@ -30,7 +30,7 @@ from limber.cli.closed_loop.task_sizes import TaskSizes, wish_for
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.json_values import plain
 from limber.core.numerics.rigid import matrices
-from limber.core.processes.stage_process import run_stage
+from limber.core.processes.child import run_stage
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import VirtualPullSettings
 from limber.estimation.simulated_pull import TrueBranch, true_branch

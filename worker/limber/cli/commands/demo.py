@@ -16,7 +16,7 @@ from limber.core.errors import Cancelled, InputError, LimberError, MissingDepend
 from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_json
 from limber.core.optional import require_extra
-from limber.core.processes.stage_process import run_stage
+from limber.core.processes.child import run_stage
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.command_line import (
     GroupedOption,

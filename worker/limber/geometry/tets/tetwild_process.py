@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import MeshingError, MissingDependencyError, WorkError
-from limber.core.processes.child_module import run_module
+from limber.core.processes.child import run_module
 from limber.core.processes.end_with_parent import end_by_kernel
 from limber.core.processes.process_limits import Limits
 from limber.core.progress import SILENT, Progress

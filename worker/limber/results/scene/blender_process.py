@@ -32,7 +32,7 @@ def make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
     Raises:
         MissingDependencyError: there is no bpy package and no Blender, or bpy does not load.
     """
-    from limber.core.processes.stage_process import run_json_process
+    from limber.core.processes.child import run_json_process
 
     progress(0.0, "starting Blender")
     command = blender_command()
