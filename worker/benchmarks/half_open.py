@@ -1,17 +1,17 @@
 """A cable to a robot that can be cut in one direction: connections stay, sent data vanishes.
 
 The relay is a process of its own, ``python -m benchmarks.half_open ADDRESS ROBOT``, since a delay
-of its parent would delay the robot. It reads directions to cut as lines on standard input and ends
-with it.
+of its parent would delay the robot. It reads directions to cut as lines of JSON on standard input
+and ends with it.
 """
 
+import json
 import selectors
 import socket
-import subprocess
 import sys
 from typing import Literal
 
-from limber.core.processes.end_with_parent import end_by_closing
+from limber.core.processes.child import Child
 from limber.robot.driver.real_time import (
     VIRTUAL_ROBOT_PRIORITY,
     claim_real_time,
@@ -21,7 +21,7 @@ from limber.robot.driver.real_time import (
 Direction = Literal["to the robot", "from the robot"]
 DIRECTIONS: tuple[Direction, ...] = ("to the robot", "from the robot")
 _PORTS = (30004, 30003, 29999)  # of e-Series arms; importing them would load the whole controller
-_CONNECT_SECONDS = 1.0
+_CONNECT_SECONDS, _START_SECONDS = 1.0, 30.0
 
 
 class Cable:
@@ -34,29 +34,22 @@ class Cable:
 
     def __init__(self, address: str, robot: str):
         self.address = address
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.half_open", address, robot], text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._child = Child([sys.executable, "-m", "benchmarks.half_open", address, robot])
         self._hear()
 
     def __enter__(self) -> "Cable":
         return self
 
     def __exit__(self, *_exception: object) -> None:
-        end_by_closing(self._process)
-        assert self._process.stdout is not None
-        self._process.stdout.close()
+        self._child.close()
 
     def cut(self, direction: Direction) -> None:
         """From now on, data sent in ``direction`` vanishes, also on new connections."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(direction + "\n")
-        self._process.stdin.flush()
+        self._child.send({"cut": direction})
         self._hear()
 
     def _hear(self) -> None:
-        assert self._process.stdout is not None
-        if self._process.stdout.readline() != "ready\n":
+        if self._child.wait(self._child.first, _START_SECONDS) is None:
             raise RuntimeError("the relay has ended")
 
 
@@ -71,14 +64,14 @@ class _Relay:
         self._selector.register(sys.stdin, selectors.EVENT_READ)
 
     def run(self) -> None:
-        print("ready", flush=True)
+        print("{}", flush=True)
         while True:
             for key, _ in self._selector.select():
                 if key.fileobj is sys.stdin:
                     if not (line := sys.stdin.readline()):
                         return
-                    self._cut.add(line.strip())
-                    print("ready", flush=True)
+                    self._cut.add(json.loads(line)["cut"])
+                    print("{}", flush=True)
                 elif isinstance(key.data, int):
                     self._accept(key.fileobj, key.data)
                 elif key.fileobj in self._selector.get_map():

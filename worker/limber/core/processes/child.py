@@ -79,16 +79,17 @@ class Child:
         """Whether the process is running."""
         return self.process.poll() is None
 
-    def send(self, content: dict[str, Any]) -> None:
-        """Write an object to its standard input.
+    def send(self, content: dict[str, Any] | str) -> None:
+        """Write an object, or its JSON, to its standard input.
 
         Raises:
             ConnectionError: it has ended, or its input is closed.
         """
+        line = content if isinstance(content, str) else json.dumps(content)
         try:
             with self._writing:
                 assert self.process.stdin is not None
-                self.process.stdin.write(json.dumps(content) + "\n")
+                self.process.stdin.write(line + "\n")
                 self.process.stdin.flush()
         except (OSError, ValueError) as error:
             raise ConnectionError(str(error)) from error

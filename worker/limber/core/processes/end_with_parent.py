@@ -8,7 +8,6 @@ import _thread
 import ctypes
 import os
 import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -63,18 +62,3 @@ def _when_closed(handle: int, then: Callable[[], None]) -> None:
         then()
 
     threading.Thread(target=watch, name="parent watch", daemon=True).start()
-
-
-def end_by_closing(process: subprocess.Popen, seconds: float = 5.0) -> None:
-    """Close a child's standard input, which makes it exit; kill it if it does not exit in time."""
-    if process.stdin is not None and not process.stdin.closed:
-        try:
-            process.stdin.close()
-        except OSError:
-            # It exited while a line was being written.
-            process.kill()
-    try:
-        process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()

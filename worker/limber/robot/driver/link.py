@@ -1,18 +1,16 @@
 """The parent's side of the driver's pipe: used by `record`, `execute` and the session."""
 
-import json
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
-from limber.core.json_lines import json_objects
-from limber.core.processes.end_with_parent import end_by_closing
+from limber.core.processes.child import Child
 from limber.robot.cell.cell import Cell
 from limber.robot.driver.controls import stop_from_outside
 from limber.robot.driver.deadline import CALL_SECONDS, ended_by_deadline
@@ -22,7 +20,6 @@ _CONNECT_SECONDS = 25.0
 _BEAT_SECONDS = 0.2
 _STANDS_SECONDS = 0.3
 _DASHBOARD_SECONDS = 0.5
-_LAST_WORDS_SECONDS = 1.0  # messages still in the pipe when the process has ended
 _ERRORS: dict[int, type[LimberError]] = {2: InputError, 4: SafetyStop}
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
@@ -55,21 +52,16 @@ class RobotLink:
     def __init__(self, cell: Cell, on_samples: Callable[[np.ndarray], None] | None = None,
                  python: str | None = None):
         self._on_samples = on_samples
-        self._news = threading.Condition()
         self._sampled = threading.Event()
         self._latest = np.empty(0)
-        self._events: list[dict[str, Any]] = []
         self.warnings: list[str] = []
-        self._ended = self._has_started = False
+        self._has_started = False
         self._cell = cell
-        command = [python or sys.executable, "-m", "limber.robot.driver.driver"]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                                        stderr=subprocess.DEVNULL, text=True, encoding="utf-8")
-        self._write_lock = threading.Lock()
         self._closing = threading.Event()
+        command = [python or sys.executable, "-m", "limber.robot.driver.driver"]
+        self._child = Child(command, self._hear, self._ended, stderr=subprocess.DEVNULL)
+        self.process = self._child.process
         self._write(cell.model_dump_json())
-        self._reader = threading.Thread(target=self._read, name="robot samples", daemon=True)
-        self._reader.start()
         try:
             self.facts = self.wait("connected", seconds=_CONNECT_SECONDS)
         except BaseException as error:
@@ -86,7 +78,7 @@ class RobotLink:
     @property
     def has_ended(self) -> bool:
         """Whether its process has ended; another link can then replace it."""
-        return self._ended
+        return self._child.has_ended
 
     def __enter__(self) -> "RobotLink":
         return self
@@ -181,28 +173,27 @@ class RobotLink:
         Raises:
             LimberError: the driver refused or failed, or its process ended.
         """
-        end = time.monotonic() + seconds
-        with self._news:
-            while True:
-                while self._events:
-                    event = self._events.pop(0)
-                    kind = event["event"]
-                    if kind in kinds:
-                        return event
-                    if kind == "refused":
-                        raise SafetyStop(event["reason"])
-                    if kind == "failed":
-                        raise _ERRORS.get(event.get("code", 3), WorkError)(event["reason"])
-                    if kind in ("warning", "second_channel"):
-                        self.warnings.append(event.get("text") or event["reason"])
-                if self._ended:
-                    raise self._why_it_ended()
-                left = end - time.monotonic()
-                if left <= 0:
-                    raise WorkError(f"The robot's driver reported neither {' nor '.join(kinds)} "
-                                    f"within {seconds:.0f} s.", "The connection may be silent.",
-                                    "Check the robot.")
-                self._news.wait(left)
+        event = self._child.wait(lambda: self._taken(kinds), seconds)
+        if event is not None:
+            return event
+        if self._child.has_ended:
+            raise self._why_it_ended()
+        raise WorkError(f"The robot's driver reported neither {' nor '.join(kinds)} within "
+                        f"{seconds:.0f} s.", "The connection may be silent.", "Check the robot.")
+
+    def _taken(self, kinds: Sequence[str]) -> dict[str, Any] | None:
+        """The next event of one of ``kinds``; those before it are heeded."""
+        while (event := self._child.first()) is not None:
+            kind = event["event"]
+            if kind in kinds:
+                return event
+            if kind == "refused":
+                raise SafetyStop(event["reason"])
+            if kind == "failed":
+                raise _ERRORS.get(event.get("code", 3), WorkError)(event["reason"])
+            if kind in ("warning", "second_channel"):
+                self.warnings.append(event.get("text") or event["reason"])
+        return None
 
     def _why_it_ended(self) -> LimberError:
         try:
@@ -222,31 +213,24 @@ class RobotLink:
     def abandon(self) -> None:
         """Close the pipe without a message, as a killed program does."""
         self._closing.set()
-        with self._write_lock:
-            assert self.process.stdin is not None
-            self.process.stdin.close()
+        self._child.close_input()
 
     def close(self) -> None:
         """Stop the motion and end the process; its last warnings are kept."""
         self._closing.set()
-        with self._write_lock:
-            end_by_closing(self.process)
-        self._reader.join(_LAST_WORDS_SECONDS)
-        with self._news:
-            self.warnings += [event["text"] for event in self._events
+        self._child.close()
+        with self._child.news:
+            self.warnings += [event["text"] for event in self._child.objects
                               if event["event"] == "warning"]
 
     def _order(self, **content: Any) -> None:
-        self._write(json.dumps(content))
+        self._write(content)
 
-    def _write(self, line: str) -> None:
-        assert self.process.stdin is not None
-        with self._write_lock:
-            try:
-                self.process.stdin.write(line + "\n")
-                self.process.stdin.flush()
-            except (OSError, ValueError) as error:
-                raise WorkError(f"The robot's driver has ended ({error}).") from error
+    def _write(self, content: dict[str, Any] | str) -> None:
+        try:
+            self._child.send(content)
+        except ConnectionError as error:
+            raise WorkError(f"The robot's driver has ended ({error}).") from error
 
     def _beat(self) -> None:
         while not self._closing.wait(_BEAT_SECONDS):
@@ -255,28 +239,22 @@ class RobotLink:
             except WorkError:
                 return
 
-    def _read(self) -> None:
-        for content in json_objects(self.process.stdout or ()):
-            if "samples" in content:
-                rows = np.array([[np.nan if x is None else x for x in row]
-                                 for row in content["samples"]], float)
-                if self._on_samples is not None:
-                    self._on_samples(rows)
-                self._latest = rows[-1]
-                self._sampled.set()
-                continue
-            with self._news:
-                self._has_started = True
-                self._events.append(content)
-                self._news.notify_all()
-        with self._news:
-            self._ended = True
-            self._news.notify_all()
-        if ended_by_deadline(self.process.wait()):
-            self._stop_from_outside()
+    def _hear(self, content: dict[str, Any]) -> bool:
+        if "samples" not in content:
+            self._has_started = True
+            return False
+        rows = np.array([[np.nan if x is None else x for x in row]
+                         for row in content["samples"]], float)
+        if self._on_samples is not None:
+            self._on_samples(rows)
+        self._latest = rows[-1]
+        self._sampled.set()
+        return True
 
-    def _stop_from_outside(self) -> None:
-        """The driver got no answer and could send no stop: try the dashboard again."""
+    def _ended(self) -> None:
+        """If the driver got no answer it could send no stop: try the dashboard again."""
+        if not ended_by_deadline(self._child.process.wait()):
+            return
         sent = stop_from_outside(self._cell, _DASHBOARD_SECONDS)
         self.warnings.append("The driver got no answer from the controller. The dashboard was "
                              "asked to stop the arm as well." if sent else

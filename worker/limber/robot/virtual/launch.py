@@ -6,7 +6,6 @@ process ends when its input does, so it never outlives its parent.
 
 import asyncio
 import json
-import subprocess
 import sys
 import threading
 import time
@@ -16,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import LimberError, WorkError
-from limber.core.json_lines import json_objects
-from limber.core.processes.end_with_parent import end_by_closing
+from limber.core.processes.child import Child
 from limber.robot.driver.real_time import spare_what_is_loaded
 from limber.robot.virtual.arm_motions import Servo, nearest_joints
 from limber.robot.virtual.controller import Controller
@@ -40,12 +38,8 @@ class VirtualRobot:
         self.model, self.address = model, address
         command = [sys.executable, "-m", "limber.robot.virtual", "--model", model,
                    "--address", address, *map(str, options)]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                                        text=True, encoding="utf-8")
-        self._answers: list[dict[str, Any]] = []
-        self._news = threading.Condition()
-        self._reader = threading.Thread(target=self._read, name="virtual robot", daemon=True)
-        self._reader.start()
+        self._child = Child(command)
+        self.process = self._child.process
         try:
             started = self._answer(_START_SECONDS)
         except WorkError:
@@ -67,11 +61,9 @@ class VirtualRobot:
         Raises:
             WorkError: the process does not answer, or refuses.
         """
-        assert self.process.stdin is not None
         try:
-            self.process.stdin.write(json.dumps({"action": action, **values}) + "\n")
-            self.process.stdin.flush()
-        except OSError as error:
+            self._child.send({"action": action, **values})
+        except ConnectionError as error:
             raise WorkError(f"The connection to the virtual robot was lost ({error}).") from error
         state = self._answer(10.0)
         if "error" in state:
@@ -90,26 +82,16 @@ class VirtualRobot:
 
     def close(self) -> None:
         """End the process."""
-        end_by_closing(self.process)
-        self._reader.join(5.0)
-        if self.process.stdout is not None:
-            self.process.stdout.close()
-
-    def _read(self) -> None:
-        for content in json_objects(self.process.stdout or ()):
-            with self._news:
-                self._answers.append(content)
-                self._news.notify_all()
-        with self._news:
-            self._answers.append({"error": "The virtual robot's process has ended."})
-            self._news.notify_all()
+        self._child.close()
 
     def _answer(self, seconds: float) -> dict[str, Any]:
-        with self._news:
-            if not self._news.wait_for(lambda: self._answers, seconds):
-                raise WorkError("The virtual robot does not answer.",
-                                f"It has been silent for {seconds:.0f} s.", "See its output.")
-            return self._answers.pop(0)
+        answer = self._child.wait(self._child.first, seconds)
+        if answer is None and self._child.has_ended:
+            return {"error": "The virtual robot's process has ended."}
+        if answer is None:
+            raise WorkError("The virtual robot does not answer.",
+                            f"It has been silent for {seconds:.0f} s.", "See its output.")
+        return answer
 
 
 def serve(controller: Controller, address: str, *, control: bool = False,
