@@ -94,7 +94,7 @@ def test_data_of_accuracy_say_where_they_are_from(path):
 
 def test_the_strains_of_species_are_those_of_the_code():
     """The table of `--wood` has every species that it takes, to two digits."""
-    from limber.mechanics.materials.species import SPECIES, strain_limit
+    from limber.mechanics.materials.materials import SPECIES, strain_limit
 
     text = (GUIDE / "howto" / "limits.md").read_text(encoding="utf-8")
     told = dict(re.findall(r"^\| `(\w+)` \| (\S+) %", text, re.MULTILINE))

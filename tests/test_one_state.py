@@ -9,8 +9,8 @@ from limber.core.progress import Progress
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull
-from limber.geometry.tets.cylinder_mesh import curved_beam
-from limber.geometry.tets.marks import mark
+from limber.geometry.tets.tet_mesh import mark
+from limber.geometry.tets.tree_sweep import curved_beam
 from limber.mechanics.pull_simulation import load_case_of, motion_of
 from limber.mechanics.settings import SimulateSettings
 from limber.recordings.recorded_grasp import grasp_on

@@ -20,8 +20,8 @@ import pytest
 
 import limber
 from limber.cli.main import call
-from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.store import Branch
 
 ROOT = Path(__file__).parents[2]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from limber.core.files.atomic import file_digest
+from limber.geometry.cloud.preparation import LONGEST
 from limber.geometry.io.clouds import read_cloud
-from limber.geometry.plausible_size import LONGEST
 from limber.store import Branch
 
 POINTS = np.random.default_rng(7).random((40, 3)) * 300

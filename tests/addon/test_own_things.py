@@ -301,7 +301,7 @@ def test_a_thing_of_the_users_stays(bpy, shown, beam, write_pc2, thing):
 def test_another_mesh_comes_into_the_same_object(bpy, shown, beam):
     """Reconstructed anew: modifiers, material, place and name of the user's are around it; the
     motion, which belonged to the other mesh, is gone, with all that belonged to the plan."""
-    from limber.geometry.tets.cylinder_mesh import straight_beam
+    from limber.geometry.tets.tree_sweep import straight_beam
 
     surface = part("branches").find_surface(bpy.context.scene)
     mesh, mine = surface.data, bpy.data.materials.new("mine")

@@ -20,7 +20,7 @@ print(hashlib.sha256(found.nodes.tobytes() + found.parent.tobytes()
 """
 _LIBRARIES = "import numpy, scipy.linalg\nimport cvxopt.cholmod\n"
 _SOLVED = """
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel, solve_static
 mesh = straight_beam(0.2, 0.01, slice_count=3)
 solve_static(BranchModel(mesh, young=1e8, poisson=0.3, density=900.0)).require()

@@ -13,10 +13,10 @@ from benchmarks.paper_branches import FRACTIONS, measured
 from limber.core.errors import LimberError
 from limber.estimation.fit import fit_branch
 from limber.estimation.fit_assessment import judge_model, require_result
-from limber.estimation.fitting.evaluations import EvaluationLog
+from limber.estimation.fitting.objective import EvaluationLog
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.simulated_pull import marked_points
 from limber.estimation.uncertainty.model_error import total_interval
-from limber.estimation.virtual_cell import marked_points
 from limber.recordings.cell_errors import CalibrationEntry
 
 OFF_M = 11e-3

@@ -11,9 +11,9 @@ from limber.cli.main import call
 from limber.estimation.control_point_count import equal_fractions, is_open, supported
 from limber.estimation.estimated_branch import subject_of
 from limber.estimation.fit import fit_branch
-from limber.estimation.fitting.evaluations import EvaluationLog
+from limber.estimation.fitting.objective import EvaluationLog
 from limber.estimation.settings import EstimateSettings
-from limber.geometry.skeleton.control_points import FRACTIONS
+from limber.geometry.skeleton.skeleton import FRACTIONS
 from limber.recordings.cell_errors import EXACT
 
 QUICK = EstimateSettings(key_frames=6, hold_out=False, mesh_check=False, gravity=False,

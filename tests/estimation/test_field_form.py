@@ -10,7 +10,7 @@ from benchmarks.paper_branches import Bench, PaperBranch
 from limber.core.errors import InputError
 from limber.estimation.interpolation_prior import YoungField, open_field
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
-from limber.mechanics.materials.layered_section import LayeredSection
+from limber.mechanics.materials.materials import LayeredSection
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)

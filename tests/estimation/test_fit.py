@@ -8,9 +8,8 @@ import pytest
 from benchmarks.paper_branches import measured
 from limber.core.errors import Cancelled, InputError
 from limber.core.progress import Progress
-from limber.estimation.fit_preparation import require_scale_in_principle
-from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.objective import Objective, Stopped
+from limber.estimation.estimated_branch import require_scale_in_principle
+from limber.estimation.fitting.objective import EvaluationLog, Objective, Stopped
 from limber.estimation.fitting.optimise import best_so_far, gauss_newton, nelder_mead
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings

@@ -9,14 +9,17 @@ from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force, without_cel
 
 from limber.core.errors import InputError, WorkError
 from limber.core.progress import Progress
-from limber.estimation.estimated_branch import Subject
+from limber.estimation.estimated_branch import Subject, tell_doubts
 from limber.estimation.fit_assessment import Estimate, judge_fit, require_result
-from limber.estimation.fit_preparation import tell_doubts
 from limber.estimation.fitting.optimise import Fit, FitStatus
 from limber.estimation.parameters import Values
 from limber.estimation.uncertainty.covariance import uncertainty
-from limber.estimation.uncertainty.force_checks import other_frame, require_own_frame
-from limber.estimation.uncertainty.identifiability import identifiability, require_scale
+from limber.estimation.uncertainty.identifiability import (
+    identifiability,
+    other_frame,
+    require_own_frame,
+    require_scale,
+)
 
 
 @pytest.fixture(scope="module")

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import FRACTIONS
-from limber.estimation.estimated_branch import Subject
-from limber.estimation.fit_preparation import forwards_of, parameter_space
+from limber.estimation.estimated_branch import Subject, forwards_of, parameter_space
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull
-from limber.estimation.uncertainty.shape_sensitivity import grip_error
-from limber.geometry.skeleton.control_points import control_points
+from limber.estimation.uncertainty.shape_error import grip_error
+from limber.geometry.skeleton.skeleton import control_points
 from limber.recordings.cell_errors import EXACT
 
 SETTINGS = EstimateSettings(hold_out=False, poisson=0.36, key_frames=4)

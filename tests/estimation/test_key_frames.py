@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from limber.estimation.forward.key_frames import key_frames, smoothed, travel
+from limber.estimation.forward.forward_model import key_frames, smoothed, travel
 
 
 def test_travel_ignores_jitter_and_counts_turns():

@@ -12,13 +12,12 @@ from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.simulated_pull import VirtualPullSettings, simulate_pull
 from limber.estimation.uncertainty.covariance import uncertainty
-from limber.estimation.uncertainty.model_error import ModelError
+from limber.estimation.uncertainty.model_error import ModelError, path_error
 from limber.estimation.uncertainty.next_actions import (
     ANOTHER_PULL,
     TORQUE_SIGMA_NM,
     Prospects,
 )
-from limber.estimation.uncertainty.path_error import path_error
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.synchronisation import frames_of
 

@@ -10,12 +10,15 @@ from scipy.spatial.transform import Rotation
 from benchmarks.paper_branches import FRACTIONS, measured
 from limber.core.errors import WorkError
 from limber.core.numerics.rigid import rotated
-from limber.estimation.estimated_branch import Subject
+from limber.estimation.estimated_branch import Subject, forwards_of, observes_path
 from limber.estimation.fit import fit_branch, fit_pulls
-from limber.estimation.fit_preparation import forwards_of, is_path_observed
-from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.initial_modulus import prescribed_start, standing_start
-from limber.estimation.fitting.large_errors import far_points, fitted_frame, put_right
+from limber.estimation.fitting.initial_modulus import (
+    far_points,
+    fitted_frame,
+    prescribed_start,
+    put_right,
+    standing_start,
+)
 from limber.estimation.fitting.nuisances import (
     _across,
     _Pull,
@@ -24,16 +27,15 @@ from limber.estimation.fitting.nuisances import (
     nuisance_records,
     unlikely,
 )
-from limber.estimation.fitting.objective import Objective
+from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.forward import quasi_static
+from limber.estimation.forward.forward_model import PointDirections
 from limber.estimation.forward.observed_path import ObservedPathForward
-from limber.estimation.forward.point_directions import PointDirections
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
-from limber.estimation.simulated_pull import simulate_pull
-from limber.estimation.uncertainty.path_error import path_error, path_prescribed
-from limber.estimation.uncertainty.variance_parts import ADVICE, largest, variance_parts
-from limber.estimation.virtual_cell import CellErrors, marked_points
+from limber.estimation.simulated_pull import CellErrors, marked_points, simulate_pull
+from limber.estimation.uncertainty.covariance import ADVICE, largest, variance_parts
+from limber.estimation.uncertainty.model_error import path_error, path_prescribed
 from limber.recordings.cell_errors import EXACT, CalibrationEntry, calibration_of
 from limber.recordings.recording import Observations, PullEntry, read_entry, write_entry
 from limber.recordings.synchronisation import frames_of
@@ -326,12 +328,12 @@ def test_a_path_is_watched_where_its_frame_may_be_off(small_pull):
     """Not where it is known exactly, the force was not measured, or the user says what drives."""
     frames = frames_of(small_pull)
     entry = small_pull.entry
-    assert entry.calibration == EXACT and not is_path_observed(entry, frames, SETTINGS)
+    assert entry.calibration == EXACT and not observes_path(entry, frames, SETTINGS)
     entry = entry.model_copy(update={"calibration": None})
-    assert is_path_observed(entry, frames, SETTINGS)
-    assert not is_path_observed(entry, frames, SETTINGS.model_copy(update={"drive": "pose"}))
+    assert observes_path(entry, frames, SETTINGS)
+    assert not observes_path(entry, frames, SETTINGS.model_copy(update={"drive": "pose"}))
     blind = replace(frames, wrenches=np.full_like(frames.wrenches, np.nan))
-    assert not is_path_observed(entry, blind, SETTINGS)
+    assert not observes_path(entry, blind, SETTINGS)
 
 
 def test_a_force_that_leads_nowhere_says_how_well_it_is_known(small_bench, small_pull, monkeypatch):

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import Bench, measured
-from limber.estimation.online.filter import FRAME_ITERATIONS, OnlineEstimator
+from limber.estimation.online.filter import FRAME_ITERATIONS, OnlineEstimator, OnlineFrame
 from limber.estimation.online.full_model import FullBranch, Here
-from limber.estimation.online.information import OnlineFrame
 from limber.estimation.settings import EstimateSettings
 from limber.recordings.synchronisation import frames_of
-from limber.reduced.building import build_reduced
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedSettings
+from limber.reduced.model_cache import build_reduced
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings
 from limber.reduced.training import TrainingSettings
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])

@@ -11,8 +11,7 @@ from limber.core.progress import Progress
 from limber.estimation.fitting.objective import Evaluation
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.uncertainty.covariance import Uncertainty
-from limber.estimation.uncertainty.profile_likelihood import bend_of, limit_of, profiled
+from limber.estimation.uncertainty.covariance import Uncertainty, bend_of, limit_of, profiled
 
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=6)
 NOISE = 40.0

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
-from limber.estimation.vibration.ringing import identify, read_record
-from limber.estimation.vibration.ringing_detection import ringing_columns
+from limber.estimation.vibration.ringing import identify, read_record, ringing_columns
 from limber.recordings.time_series import Stream
 
 

@@ -7,17 +7,20 @@ import pytest
 
 from benchmarks.paper_branches import FRACTIONS, measured
 from limber.core.progress import Progress
-from limber.estimation.estimated_branch import Subject
+from limber.estimation.estimated_branch import Subject, forwards_of, parameter_space
 from limber.estimation.fit_assessment import _tell_largest_part
-from limber.estimation.fit_preparation import forwards_of, parameter_space
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.interpolation_prior import open_field
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty import shape_error as module
-from limber.estimation.uncertainty.bending_stiffness import SectionMean, strain_energy
-from limber.estimation.uncertainty.shape_error import hung_error, shape_error
+from limber.estimation.uncertainty.shape_error import (
+    SectionMean,
+    hung_error,
+    shape_error,
+    strain_energy,
+)
 from limber.mechanics.added_masses import HungTwig
 from limber.mechanics.model import BranchModel
 from limber.recordings.cell_errors import CalibrationEntry

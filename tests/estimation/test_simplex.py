@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from limber.estimation.fitting import optimise
-from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.objective import Evaluation
+from limber.estimation.fitting.objective import Evaluation, EvaluationLog
 from limber.estimation.fitting.optimise import SETTLED_FALL, FitStatus, _Settling, nelder_mead
 from limber.estimation.parameters import ParameterSpace, Values
 

@@ -9,9 +9,8 @@ from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force, without_cel
 
 from limber.core.errors import WorkError
 from limber.core.progress import Progress
-from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.initial_modulus import scaled_start
-from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.fitting.objective import Evaluation, EvaluationLog, Objective
 from limber.estimation.fitting.optimise import LONGEST_STEP, gauss_newton
 from limber.estimation.forward.gripper_path import force_for_travel
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values

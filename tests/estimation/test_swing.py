@@ -7,9 +7,15 @@ import pytest
 from tests.subjects.meshes import box_mesh
 
 from limber.core.errors import InputError
-from limber.estimation.vibration.free_swing import fit_swing
-from limber.estimation.vibration.modal_swing import Ends, ModalSwing, _creeping, _released
-from limber.estimation.vibration.swing_record import SwingSeen, first_guess
+from limber.estimation.vibration.free_swing import (
+    Ends,
+    ModalSwing,
+    SwingSeen,
+    _creeping,
+    _released,
+    first_guess,
+    fit_swing,
+)
 from limber.mechanics import (
     BranchModel,
     EnergyMomentumSettings,

@@ -15,7 +15,7 @@ from benchmarks.truth_scans import ScanTrial, bending_row, width_row
 from benchmarks.truth_trials import FIRST_PULL, FIRST_TURN, SETTINGS, bounds, fitting_subject
 from benchmarks.worlds.plant import Plant
 from limber.core.progress import SILENT
-from limber.estimation.fit_preparation import forwards_of, parameter_space
+from limber.estimation.estimated_branch import forwards_of, parameter_space
 from limber.estimation.fitting.objective import Objective
 from limber.reduced.training import Snapshots
 

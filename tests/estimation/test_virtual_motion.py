@@ -14,7 +14,7 @@ from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.simulated_pull import TrueBranch, VirtualPullSettings, simulate_pull
 from limber.estimation.uncertainty.identifiability import identifiability
-from limber.geometry.skeleton.control_points import control_points
+from limber.geometry.skeleton.skeleton import control_points
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.synchronisation import frames_of
 

@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 
 from limber.core.progress import Progress
-from limber.estimation.estimated_branch import subject_of
+from limber.estimation.estimated_branch import forwards_of, subject_of
 from limber.estimation.fit import fit_branch, fit_pulls
-from limber.estimation.fit_preparation import forwards_of
-from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.objective import Objective
+from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull
-from limber.geometry.tets.cylinder_mesh import curved_beam
-from limber.geometry.tets.marks import mark
+from limber.geometry.tets.tet_mesh import mark
+from limber.geometry.tets.tree_sweep import curved_beam
 from limber.mechanics.added_masses import PointMass
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.stages.pulls.virtual_pull import virtual_pull

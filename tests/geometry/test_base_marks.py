@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.tets.cylinder_mesh import straight_beam
-from limber.geometry.tets.marks import base_nodes
+from limber.geometry.tets.tet_mesh import base_nodes
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
-from limber.geometry.tets.tree_sweep import sweep_tree
+from limber.geometry.tets.tree_sweep import straight_beam, sweep_tree
 
 
 def rod(radius):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from limber.geometry.shape_samples import reshaped, sample_skeletons
-from limber.geometry.skeleton.radii.axis_fit import fit_axes
-from limber.geometry.skeleton.radii.normal_equations import fitted_system
+from limber.geometry.skeleton.radii.axis_fit import fit_axes, fitted_system
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
 

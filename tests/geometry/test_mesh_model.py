@@ -7,8 +7,8 @@ import pytest
 
 from limber.cli.main import call
 from limber.core.errors import InputError
+from limber.geometry.bodies import body_format, mesh_model
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton
-from limber.geometry.mesh_skeleton import body_format, mesh_model
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.stages.results.export import ExportSettings, export
 from limber.stages.shape.mesh import mesh_surface

@@ -11,11 +11,11 @@ from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError, PartlyFailedError
 from limber.core.progress import Progress
 from limber.geometry import reconstruction
+from limber.geometry.bodies import MeshSurfaceSettings
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_points
 from limber.geometry.io.skeletons import read_swc
-from limber.geometry.mesh_surface import MeshSurfaceSettings
 from limber.geometry.reconstruction import ReconstructSettings, reconstruct_cloud
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import solve_static

@@ -7,7 +7,7 @@ from scipy.integrate import cumulative_trapezoid, trapezoid
 from limber.core.constants import STANDARD_GRAVITY
 from limber.core.errors import InputError
 from limber.estimation.settings import EstimateSettings
-from limber.geometry.sections import mesh_sections, read_sections
+from limber.geometry.bodies import mesh_sections, read_sections
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.model import BranchModel

@@ -13,11 +13,15 @@ from limber.geometry.surface.implicit_surface import level_surface
 from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.surface_checks import check_surface
 from limber.geometry.surface.tubes import branch_surface
-from limber.geometry.tets.cylinder_mesh import curved_beam, split_wedges, straight_beam
-from limber.geometry.tets.marks import mark
-from limber.geometry.tets.quality import dihedral_angles, measure_quality, radius_ratios
-from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tet_mesh import (
+    TetMesh,
+    dihedral_angles,
+    mark,
+    measure_quality,
+    radius_ratios,
+)
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch, tetrahedralise
+from limber.geometry.tets.tree_sweep import curved_beam, split_wedges, straight_beam
 from limber.mechanics import BranchModel, solve_static
 
 

@@ -1,7 +1,7 @@
 """Warming up compiles what fits and surfaces need."""
 
-from limber.geometry.cloud.leaf_trees import _voted
-from limber.geometry.skeleton.joining.bridge_kernels import far_sides, nearest_others, priced
+from limber.geometry.cloud.leaves import _voted
+from limber.geometry.skeleton.bridge_kernels import far_sides, nearest_others, priced
 from limber.geometry.skeleton.radii.fit_kernels import (
     mean_on_circle,
     nearest_of,

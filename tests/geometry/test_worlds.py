@@ -10,7 +10,7 @@ from benchmarks.worlds.ray_casting import cast
 from benchmarks.worlds.real_scans import beyond_ends
 from benchmarks.worlds.rows import potted_rows, source_rows
 from benchmarks.worlds.sources import SOURCES, WORLDS
-from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 
 _GOOD = {"forks": 2, "forks_found": 2, "forks_false": 0, "twig_m": 1.0, "twig_found_m": 0.97,
          "twig_false_m": 0.0, "radius_bias": 0.01, "volume": 0.02, "covered": 0.95,

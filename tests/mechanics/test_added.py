@@ -8,7 +8,7 @@ from limber.geometry.pruned_twigs import twig_mass
 from limber.geometry.reconstruction import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel, HungTwig, PointMass, solve_static
 
 MATERIAL = {"young": 1e9, "poisson": 0.35, "density": 900.0}

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from limber.core.numerics.rigid import rotation_matrix
-from limber.estimation.forward.input_force import nodal_loads
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.estimation.forward.forward_model import nodal_loads
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.mechanics.sensitivities import grasp_slopes
 from limber.recordings.recording import GraspEntry

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics.points import point_operator
 
 

@@ -11,8 +11,8 @@ from tests.subjects.meshes import box_mesh
 from limber.cli.main import call
 from limber.core.errors import ConvergenceError, InputError
 from limber.core.progress import Progress
-from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import solve_static
 from limber.mechanics.pull_simulation import SimulateSettings
 from limber.results.motion_files import read_pc2

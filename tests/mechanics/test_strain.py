@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel
 from limber.mechanics.strain import peak_load, strain_state
 

@@ -5,7 +5,7 @@ import pytest
 
 from limber.geometry.cloud.camera import D455
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.tets.cylinder_mesh import curved_beam
+from limber.geometry.tets.tree_sweep import curved_beam
 from limber.perception.simulated_camera import render_depth, with_noise
 
 LENGTH, NODES = 0.6, 81

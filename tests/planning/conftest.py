@@ -7,8 +7,8 @@ import pytest
 
 from limber.core.progress import Progress
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.tets.cylinder_mesh import curved_beam
-from limber.geometry.tets.marks import mark
+from limber.geometry.tets.tet_mesh import mark
+from limber.geometry.tets.tree_sweep import curved_beam
 from limber.mechanics import BranchModel
 from limber.mechanics.loads.loaded_branch import hang
 from limber.planning.baseline_and_plan import PlanSettings

@@ -5,11 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from limber.planning.field import adaptive_sampling
-from limber.planning.field.adaptive_sampling import refined
+from limber.planning.field import sampling
 from limber.planning.field.energy_field import fit_field
-from limber.planning.field.low_energy_surface import LowEnergySurface
-from limber.planning.field.sampling import Sampled
+from limber.planning.field.sampling import LowEnergySurface, Sampled, refined
 from limber.planning.field.stored_states import Solved
 
 
@@ -25,7 +23,7 @@ def followed(ridge, monkeypatch):
                       place, 0.0, np.full((3, 6), np.nan), ridge.force(place[None])[0, 2],
                       result.displacement, np.full((3, 1, 3), np.nan))
 
-    monkeypatch.setattr(adaptive_sampling, "taken", solved)
+    monkeypatch.setattr(sampling, "taken", solved)
     return SimpleNamespace(follow=lambda places, _start: [SimpleNamespace(displacement=places)])
 
 

@@ -5,10 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from limber.planning.field import disagreeing_neighbours
-from limber.planning.field.disagreeing_neighbours import disagreeing, jump, sample_between
-from limber.planning.field.interpolation.chart import Chart
-from limber.planning.field.solver_pool import SolverPool
+from limber.planning.field import sampling
+from limber.planning.field.chart import Chart
+from limber.planning.field.sampling import SolverPool, disagreeing, jump, sample_between
 from limber.planning.field.stored_states import Solved
 
 PLAIN = Chart.about(None, 0.0, np.zeros(3))
@@ -68,7 +67,7 @@ class Bow:
 @pytest.fixture
 def bow(monkeypatch):
     model = Bow(0.02)
-    monkeypatch.setattr(disagreeing_neighbours, "taken",
+    monkeypatch.setattr(sampling, "taken",
                         lambda branch, result: branch.solved(result))
     return model
 
@@ -106,7 +105,7 @@ def test_what_many_poses_lie_near_is_asked_first(bow):
         pairs = disagreeing(known, PLAIN, USUAL[crowd], LENGTH)
         first = np.mean([positions[[a, b], 1].mean() for a, b, _ in pairs[:8]])
         assert first * USUAL[crowd, 1].mean() > 0.0
-        chosen = disagreeing_neighbours._apart(pairs, known, np.empty((0, 3)), PLAIN)
+        chosen = sampling._apart(pairs, known, np.empty((0, 3)), PLAIN)
         about = np.concatenate([pairs[k][2] for k in range(len(pairs))
                                 if any(known[pairs[k][0]] is pair[0] and known[pairs[k][1]] is
                                        pair[1] for pair, _ in chosen)])

@@ -12,12 +12,9 @@ from limber.core.errors import NoPathError
 from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.constraints.obstacles import Box
 from limber.planning.field.energy_field import EnergyField
-from limber.planning.goals.allowed_poses import goal_points, with_near_side
-from limber.planning.goals.cell_region import CellGoal
-from limber.planning.goals.goal import CellPlace, GoalRequest
-from limber.planning.goals.goal_kinds import goal_of
+from limber.planning.goals.goal import CellPlace, GoalRequest, goal_points, with_near_side
+from limber.planning.goals.goal_kinds import CellGoal, TargetGoal, goal_of
 from limber.planning.goals.regions import Ball
-from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.plan_file import read_plan
 from limber.robot.cell.cell import Cell, write_cell

@@ -9,22 +9,24 @@ from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import Progress
 from limber.planning.baseline_and_plan import plan_pair, with_bound
 from limber.planning.certificate import lower_bound
-from limber.planning.certificate.goal_cells import about_goal
-from limber.planning.certificate.grid import first_grid, refined
+from limber.planning.certificate.grid import about_goal, first_grid, refined
 from limber.planning.certificate.lower_bound import certify
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, arc_lengths, path_cost, resample
 from limber.planning.field.energy_field import knowing
-from limber.planning.field.interpolation.valid_region import TrustRegion
-from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.field.valid_region import TrustRegion
+from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
 from limber.planning.goals.regions import Ball
-from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners import refine as refine_module
 from limber.planning.planners.detour import plan_detour
-from limber.planning.planners.eikonal import plan_gentle, plan_gentle_all
-from limber.planning.planners.refine import Limited, refine
-from limber.planning.planners.smoothing import smooth_cost
+from limber.planning.planners.refine import (
+    Limited,
+    plan_gentle,
+    plan_gentle_all,
+    refine,
+    smooth_cost,
+)
 from limber.planning.settings import PlanSettings
 
 START = np.array([-0.06, -0.03, 0.02])

@@ -8,8 +8,8 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.core.progress import Progress
-from limber.planning.experiments.compared_planners import BASELINE, COMPARED, run_trials, summarised
-from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.compared_planners import BASELINE, COMPARED, run_trials, summarised
+from limber.planning.goals.goal_kinds import GraspGoal
 from limber.planning.settings import PlanSettings
 from limber.stages.paths.compare import CompareSettings, compare
 from limber.stages.registry import stage_description
@@ -65,7 +65,7 @@ def test_the_command_writes_table_and_figure(planned_branch, tmp_path, monkeypat
     (title, table), = stage_description("compare").tables(result)
     assert "1 random starts" in title and len(table) == 1 + len(COMPARED)
     assert table[1][0] == "copy" and table[1][3] == "" and float(table[5][5]) != 0.0
-    monkeypatch.setattr("limber.planning.experiments.compared_planners.run_trials", pytest.fail)
+    monkeypatch.setattr("limber.planning.compared_planners.run_trials", pytest.fail)
     assert compare(folder, settings) == result, "it is current"
     with pytest.raises(InputError, match="cannot name"):
         compare(folder, settings, name="../there")

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 
 from limber.planning.certificate import lower_bound
-from limber.planning.certificate.cell_bounds import off_zero
 from limber.planning.certificate.feasibility import judge
+from limber.planning.certificate.subsolution import off_zero
 from limber.planning.cost import CostWeights
+from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_samples import GraspSamples
-from limber.planning.field.interpolation.chart import Chart
-from limber.planning.goals.allowed_poses import allowed_points
-from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.goals.goal import allowed_points
+from limber.planning.goals.goal_kinds import GraspGoal
 from limber.planning.path_problem import GentleProblem
-from limber.planning.planners.eikonal import plan_gentle
-from limber.planning.planners.refine import refine
+from limber.planning.planners.refine import plan_gentle, refine
 
 RADIUS = 0.25  # [m] of the shell about the origin
 ALONG, OFF = 20.0, 3e4  # [N/m] along the shell and across it

@@ -8,8 +8,7 @@ import scipy
 
 from limber.core.errors import InputError
 from limber.core.progress import Progress
-from limber.planning.constraints.damage import Strength, assumed, read_break_tests
-from limber.planning.constraints.damage_along import DamageAlong
+from limber.planning.constraints.damage import DamageAlong, Strength, assumed, read_break_tests
 from limber.planning.constraints.limits import Limits
 from limber.planning.settings import PlanSettings
 from limber.results.report.damage_figure import damage_along_branch

@@ -11,17 +11,15 @@ from limber.planning.baseline_and_plan import plan_within
 from limber.planning.certificate.feasibility import judge
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
+from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.grasp_samples import GraspSamples
-from limber.planning.field.interpolation.chart import Chart
-from limber.planning.goals.chosen_pose import default_goal
-from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.goals.goal_kinds import GraspGoal, default_goal
+from limber.planning.passages import solved_if_undecided
 from limber.planning.path_problem import BlockedError, GentleProblem
-from limber.planning.planners.eikonal import plan_gentle
 from limber.planning.planners.least_violation import easiest_path
-from limber.planning.planners.refine import refine
+from limber.planning.planners.refine import plan_gentle, refine
 from limber.planning.settings import PlanSettings
-from limber.planning.undecided_passages import solved_if_undecided
 
 RADIUS = 0.2  # [m] of the shell about the origin
 ALONG, OFF = 20.0, 4e4  # [N/m] along the shell and off it: it yields a two thousandth as easily

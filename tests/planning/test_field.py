@@ -8,12 +8,12 @@ from tests.planning.conftest import small_grasp_model
 
 from limber.core.errors import InputError, WorkError
 from limber.planning.field import fit_choice
+from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.fit_choice import error_measures
-from limber.planning.field.interpolation.chart import Chart
-from limber.planning.field.interpolation.radial import RadialInterpolant
-from limber.planning.field.interpolation.valid_region import TrustRegion
+from limber.planning.field.radial import RadialInterpolant
 from limber.planning.field.sampling import energy_inputs
+from limber.planning.field.valid_region import TrustRegion
 
 ELSEWHERE = np.random.default_rng(9).uniform(-0.1, 0.1, (80, 3))
 

@@ -5,8 +5,8 @@ import pytest
 
 from limber.core.errors import Cancelled, NoPathError
 from limber.planning import make_plan as planning
-from limber.planning.constraints.full_model_check import learnt
 from limber.planning.constraints.limits import Limits
+from limber.planning.constraints.motion_check import learnt
 from limber.planning.field.energy_field import EnergyField, refit
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.settings import PlanSettings

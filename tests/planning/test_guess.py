@@ -4,8 +4,13 @@ import numpy as np
 import pytest
 
 from limber.planning.field.grasp_model import Guess
-from limber.planning.field.initial_guess import extrapolated, guess_of, midpoint_blend, straight_on
-from limber.planning.field.stored_states import taken
+from limber.planning.field.stored_states import (
+    extrapolated,
+    guess_of,
+    midpoint_blend,
+    straight_on,
+    taken,
+)
 
 ASIDE = np.array([0.03, 0.015, -0.006])
 

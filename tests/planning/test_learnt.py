@@ -10,7 +10,7 @@ from limber.planning.field.reduced_grasp import CorrectedResult, LearntGraspMode
 from limber.planning.field.stored_states import taken
 from limber.reduced import model_cache
 from limber.reduced.model_cache import ReducedCache
-from limber.reduced.state import ReducedSettings
+from limber.reduced.reduced_model import ReducedSettings
 from limber.reduced.training import TrainingSettings
 from limber.stages.paths.energy import EnergySettings, sample_energy_field
 from limber.store import Branch

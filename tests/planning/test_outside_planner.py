@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from limber.planning.planners.tree_search import Searched
+from limber.planning.planners.rrt_star import Searched
 from limber.planning.planners.trees import PLANNERS, chosen_engine
 from limber.planning.settings import PlanSettings
 from limber.stages.paths.plan import plan as plan_paths

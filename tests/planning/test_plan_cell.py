@@ -10,7 +10,7 @@ from limber.core.numerics.rigid import angle_between, pose_vectors
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.constraints.obstacles import Box
-from limber.planning.goals.camera_view import View
+from limber.planning.goals.goal_kinds import View
 from limber.planning.plan_file import read_plan
 from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.known_arms import arm_named

@@ -22,9 +22,9 @@ from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.goals.chosen_pose import default_goal, hemisphere_goal
+from limber.planning.goals.goal_kinds import default_goal, hemisphere_goal
 from limber.planning.path_on_full_model import resolve_path
-from limber.planning.plan_summary import doubts_of
+from limber.planning.plan_file import doubts_of
 from limber.results.report.plan_figures import convergence, report_figures, searched
 from limber.stages.paths.energy import EnergySettings, sample_energy_field
 from limber.stages.paths.plan import plan as plan_paths

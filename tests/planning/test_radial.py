@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import RBFInterpolator
 
 from limber.core.errors import WorkError
-from limber.planning.field.interpolation.radial import KERNELS, RadialInterpolant
+from limber.planning.field.radial import KERNELS, RadialInterpolant
 
 GENERATOR = np.random.default_rng(3)
 POINTS = GENERATOR.uniform(-0.2, 0.2, (100, 3))

@@ -9,14 +9,17 @@ from limber.core.errors import InputError
 from limber.planning.baseline_and_plan import plan_pair
 from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import fit_field
-from limber.planning.goals.allowed_poses import goal_points
-from limber.planning.goals.camera_view import View
-from limber.planning.goals.chosen_pose import default_goal, second_arm_goal, tip_goal
-from limber.planning.goals.goal import GoalRequest
-from limber.planning.goals.goal_kinds import goal_of
+from limber.planning.goals.goal import GoalRequest, goal_points
+from limber.planning.goals.goal_kinds import (
+    TargetGoal,
+    View,
+    default_goal,
+    goal_of,
+    second_arm_goal,
+    tip_goal,
+)
 from limber.planning.goals.regions import Ball, BoxRegion
-from limber.planning.goals.target_goal import TargetGoal
-from limber.planning.path_start import random_start
+from limber.planning.path_problem import random_start
 from limber.planning.settings import PlanSettings
 
 # A camera a metre along x that looks back at the origin; its picture is 0.6 m wide there.

@@ -11,15 +11,12 @@ from limber.core.progress import Progress
 from limber.planning.baseline_and_plan import _shortest_known
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights, arc_lengths, measure_path
-from limber.planning.goals.allowed_poses import goal_points
-from limber.planning.goals.chosen_pose import default_goal
-from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.goals.goal import goal_points
+from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal, default_goal
 from limber.planning.goals.regions import Ball
-from limber.planning.goals.target_goal import TargetGoal
 from limber.planning.path_problem import GentleProblem
-from limber.planning.planners.ompl_engine import OmplRrtStar
-from limber.planning.planners.tree_search import PathProblem, Search
-from limber.planning.planners.trees import FoundPath, plan_path
+from limber.planning.planners.rrt_star import PathProblem, Search
+from limber.planning.planners.trees import FoundPath, OmplRrtStar, plan_path
 
 START = np.array([-0.13, 0.0, 0.0])
 GOAL = GraspGoal((0.13, 0.0, 0.0), 0.01)

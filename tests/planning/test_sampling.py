@@ -9,17 +9,18 @@ from tests.planning.conftest import small_grasp_model
 from limber.core.errors import Cancelled, WorkError
 from limber.core.progress import Progress
 from limber.mechanics import Grasp, solve_static
+from limber.planning.field.chart import Chart, pulled_back_size
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_model import Reach
-from limber.planning.field.interpolation.chart import Chart, pulled_back_size
-from limber.planning.field.low_energy_surface import LowEnergySurface, walk_energy_surface
 from limber.planning.field.sampling import (
+    LowEnergySurface,
+    SolverPool,
     _slack,
     sample_branch,
     sample_field,
     sample_positions,
+    walk_energy_surface,
 )
-from limber.planning.field.solver_pool import SolverPool
 from limber.stages.paths.energy import EnergySettings
 from limber.store import Branch
 from limber.store.loading import load_grasp_model

@@ -10,8 +10,7 @@ from PIL import Image
 
 from limber.cli.main import call
 from limber.core.errors import InputError
-from limber.geometry.cloud.camera import D455, read_camera, write_camera
-from limber.geometry.cloud.pixels import read_mask
+from limber.geometry.cloud.camera import D455, read_camera, read_mask, write_camera
 from limber.geometry.io.depth_images import depth_metres
 from limber.perception.observe import list_frames, write_depth
 from limber.recordings.importing.import_request import ImportRequest

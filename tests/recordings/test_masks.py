@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from limber.core.errors import InputError, MissingDependencyError
-from limber.geometry.cloud.pixels import read_mask
+from limber.geometry.cloud.camera import read_mask
 from limber.recordings.masks import YoloSegmenter, segment_by_depth
 
 

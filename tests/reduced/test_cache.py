@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from limber.core.progress import Progress
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel, Grasp, young_weights
 from limber.mechanics.added_masses import PointMass
 from limber.reduced import model_cache as cache_module
 from limber.reduced.model_cache import ReducedCache, learnt_model, model_key
-from limber.reduced.state import ReducedSettings
+from limber.reduced.reduced_model import ReducedSettings
 from limber.reduced.training import TrainingSettings
 
 SETTINGS = ReducedSettings(size=20, field_count=40, training=TrainingSettings(

@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel, Grasp, solve_static, young_weights
 from limber.reduced.basis import GraspCoordinates, gradient_metric
-from limber.reduced.building import as_control_points, build_reduced, reduce_snapshots
-from limber.reduced.model_file import read_model, write_model
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedSettings, ReducedStaticSettings
+from limber.reduced.model_cache import (
+    as_control_points,
+    build_reduced,
+    read_model,
+    reduce_snapshots,
+    write_model,
+)
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings, ReducedStaticSettings
 from limber.reduced.training import TrainingSettings
 
 YOUNG = np.array([1.2e8, 0.8e8])

@@ -5,13 +5,13 @@ import pytest
 
 from benchmarks.reduced_motion import simulate_reduced
 from limber.core.errors import InputError
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel, Grasp, RayleighDamping, solve_static
 from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
-from limber.reduced.building import build_reduced
+from limber.reduced.model_cache import build_reduced
 from limber.reduced.reduced_dynamics import ReducedStepper
+from limber.reduced.reduced_model import ReducedSettings
 from limber.reduced.refresh import RefreshingModel, checked
-from limber.reduced.state import ReducedSettings
 from limber.reduced.training import Snapshots, TrainingSettings
 
 YOUNG = np.array([1e8])
@@ -109,7 +109,7 @@ def test_measured_error_is_the_error(model, grasp, trained):
     """The estimate by corrections agrees with the full solution, where the error is large."""
     from dataclasses import replace
 
-    from limber.reduced.building import reduce_snapshots
+    from limber.reduced.model_cache import reduce_snapshots
 
     few = replace(SETTINGS, size=20, vibration_count=0, field_count=36)
     weights = np.ones((model.mesh.tet_count, 1))

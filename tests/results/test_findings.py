@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 
 from limber.core.constants import DATA_COLOURS
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.planning.constraints.damage import Strength, assumed
 from limber.results.findings import (
     beyond_sentence,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel
 from limber.mechanics.strain import strain_state
 from limber.results.motion_files import read_pc2, surface_fields, surface_nodes, write_pc2

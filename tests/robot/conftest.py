@@ -15,7 +15,7 @@ from benchmarks.machine_stalls import HELD_UP_SECONDS, Witness
 from benchmarks.robot_cells import sideways
 from benchmarks.robot_faults import new_robot, restored
 from limber.core.numerics.rigid_kernels import pose_between
-from limber.mechanics.solve_status import Status
+from limber.mechanics.statics.result import Status
 from limber.robot.driver.real_time import claim_real_time, may_use_two_processors
 from limber.robot.virtual.controller import Controller
 from limber.store import Branch
@@ -121,7 +121,7 @@ def planned_in(folder, force: float = 1.5) -> None:
 def planned_template(branch_template, tmp_path_factory):
     """The small branch with its true moduli in the mesh, and a plan."""
     from limber.estimation.simulated_pull import VirtualPullSettings
-    from limber.mechanics.materials.young_field import young_weights
+    from limber.mechanics.materials.materials import young_weights
     from limber.stages.pulls.virtual_pull import load_truth
     from limber.store.loading import load_mesh
 

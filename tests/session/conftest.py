@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.store import Branch
 
 

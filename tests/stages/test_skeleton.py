@@ -22,8 +22,7 @@ from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.skeletons import read_skeleton, read_swc
 from limber.geometry.settings import ReconstructSettings
-from limber.geometry.skeleton.checkpoint import FoundSkeleton
-from limber.geometry.skeleton.search_result import result_of_skeleton
+from limber.geometry.skeleton.search_result import FoundSkeleton, result_of_skeleton
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.results.scene.contents import scene_data
 from limber.results.scene.still_objects import EDITED

@@ -9,7 +9,7 @@ from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.core.progress import Progress
 from limber.core.settings import checked_settings
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.stages.shape.target import TargetSettings, set_target
 from limber.store import Branch
 from limber.store.loading import load_branch, load_targets

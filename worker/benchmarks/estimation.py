@@ -24,9 +24,9 @@ from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit_assessment import Estimate
 from limber.estimation.fitting.initial_modulus import scaled_start
 from limber.estimation.fitting.optimise import gauss_newton, nelder_mead
+from limber.estimation.online.filter import OnlineFrame
 from limber.estimation.online.follow import begin
 from limber.estimation.online.full_model import Beside
-from limber.estimation.online.information import OnlineFrame
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.simulated_pull import VirtualPullSettings, simulate_pull, write_depth_frames

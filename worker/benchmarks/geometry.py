@@ -23,7 +23,7 @@ from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.io.clouds import read_points
 from limber.geometry.io.skeletons import read_cylinders, read_swc
 from limber.geometry.settings import SkeletonSettings
-from limber.geometry.skeleton.contraction.laplacian_contraction import contract
+from limber.geometry.skeleton.contraction import contract
 from limber.geometry.skeleton.radii.nearest_points import nearest_point_radii
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise

@@ -11,7 +11,7 @@ from benchmarks.scan_scores import Dense
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.geometry.generated import BranchSpec, scan
-from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.geometry.skeleton.sweep import frames, tangents

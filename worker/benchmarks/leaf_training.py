@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.leaf_training --out DIR`` makes scans of each kind, in leaf and bare, keeps
 their features in DIR (a stopped run continues), writes the trees of
-:mod:`limber.geometry.cloud.leaf_trees`, trained on all sources but those left out, and prints which
+:mod:`limber.geometry.cloud.leaves`, trained on all sources but those left out, and prints which
 leaves are found in these. With ``--in-turn`` it writes nothing, but leaves out each pair of sources
 in turn. It needs scikit-learn, which Limber itself does not; with 1.9 and no options it makes the
 trees of this version, to the byte.
@@ -20,12 +20,9 @@ from scipy.spatial import cKDTree
 from benchmarks.scan_probabilities import OWN
 from benchmarks.scan_runs import KINDS
 from benchmarks.worlds.sources import BARE_VIEWS, SOURCES, WORLDS
-from limber.geometry.cloud.canonical_frame import OwnFrame
-from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.leaf_trees import TREES, surroundings
-from limber.geometry.cloud.leaves import leaves_by_odds, point_spacing
+from limber.geometry.cloud.cloud import Cloud, OwnFrame, thinned
+from limber.geometry.cloud.leaves import TREES, leaves_by_odds, point_spacing, surroundings
 from limber.geometry.cloud.preparation import prepare
-from limber.geometry.cloud.thinning import thinned
 from limber.geometry.leaf_removal import leaf_mask
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT
@@ -87,7 +84,7 @@ def trained(scans: list[Labelled]) -> Any:
 
 
 def exported(model: Any) -> dict[str, np.ndarray]:
-    """The trees as arrays, which :mod:`limber.geometry.cloud.leaf_trees` reads."""
+    """The trees as arrays, which :mod:`limber.geometry.cloud.leaves` reads."""
     columns: dict[str, list] = {name: [] for name in ("feature", "threshold", "low", "high",
                                                       "value")}
     first, depth, begin = [], [], 0

@@ -11,9 +11,9 @@ from benchmarks import mechanics_reduced
 from benchmarks.prescribed import solve_prescribed
 from benchmarks.table import Asked, Row, Setting
 from limber.core.numerics.rigid import rotation_matrix
-from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.element_types import quadrature
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import (
     BranchModel,
     Grasp,

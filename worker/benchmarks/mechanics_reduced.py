@@ -16,10 +16,8 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp, young_weights
 from limber.mechanics.dynamics.integration import simulate_dynamics
-from limber.reduced.building import reduce_snapshots
-from limber.reduced.model_cache import ReducedCache, model_key
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedSettings
+from limber.reduced.model_cache import ReducedCache, model_key, reduce_snapshots
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings
 from limber.reduced.training import Snapshots, Trainer, TrainingSettings, sample_poses, sample_young
 from limber.session.client import InteractiveSession
 from limber.session.session_start import load_held, reduced_settings

@@ -14,8 +14,8 @@ from benchmarks.mechanics_exact import DENSITY, LENGTH, YOUNG
 from benchmarks.mechanics_reduced import bench_branch
 from benchmarks.table import Asked, Row, Setting
 from limber.core.processes import Pool
-from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import (
     BranchModel,
     Grasp,
@@ -106,7 +106,7 @@ def parts_of(model: BranchModel, count: int = 15) -> Parts:
 
 def cholmod_seconds(model: BranchModel) -> float:
     """Return the least time [s] in which CHOLMOD factorises the model's assembled matrix."""
-    from limber.mechanics.linear.factor import CholmodFactor
+    from limber.mechanics.linear.equations import CholmodFactor
 
     equations = model.equations()
     values = equations.assemble(model, np.zeros_like(model.mesh.nodes))

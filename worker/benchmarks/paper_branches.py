@@ -15,12 +15,10 @@ from limber.estimation.settings import EstimateSettings
 from limber.estimation.simulated_pull import TrueBranch, VirtualPullSettings, simulate_pull
 from limber.geometry.reconstruction import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
-from limber.geometry.skeleton.control_points import control_points
-from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.tets.cylinder_mesh import curved_beam
-from limber.geometry.tets.marks import base_nodes
-from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.materials.young_field import young_weights
+from limber.geometry.skeleton.skeleton import Skeleton, control_points
+from limber.geometry.tets.tet_mesh import TetMesh, base_nodes
+from limber.geometry.tets.tree_sweep import curved_beam
+from limber.mechanics.materials.materials import young_weights
 from limber.mechanics.model import BranchModel
 from limber.recordings.recording import Observations, Pull
 from limber.recordings.synchronisation import frames_of

@@ -43,8 +43,7 @@ from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.reduced_grasp import LearntGraspModel
 from limber.planning.field.sampling import Sampled, sample_field, sample_positions
-from limber.planning.goals.chosen_pose import default_goal
-from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.goals.goal_kinds import GraspGoal, default_goal
 from limber.planning.settings import EnergySettings
 from limber.reduced.model_cache import ReducedCache
 

@@ -8,10 +8,8 @@ from benchmarks.paper_branches import BRANCHES, FRACTIONS, PaperBranch
 from limber.core.progress import SILENT, Progress
 from limber.geometry.generated import generate_branch
 from limber.geometry.settings import GRASP_FRACTION
-from limber.geometry.skeleton.control_points import control_points
-from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.tets.marks import mark
-from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.skeleton.skeleton import Skeleton, control_points
+from limber.geometry.tets.tet_mesh import TetMesh, mark
 from limber.geometry.tets.tetrahedra import mesh_branch
 from limber.mechanics import BranchModel, young_weights
 from limber.mechanics.loads.loaded_branch import hang

@@ -10,7 +10,7 @@ from limber.core.errors import LimberError, NoPathError
 from limber.planning.constraints.chance import YoungUncertainty
 from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import EnergyField
-from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.goals.goal_kinds import GraspGoal
 from limber.planning.make_plan import PlannedMotion, plan_motion
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 from limber.planning.settings import PlanSettings

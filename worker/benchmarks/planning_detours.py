@@ -11,8 +11,8 @@ from limber.core.errors import LimberError
 from limber.planning.baseline_and_plan import plan_pair
 from limber.planning.cost import arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField
-from limber.planning.goals.grasp_goal import GraspGoal
-from limber.planning.path_start import random_start
+from limber.planning.goals.goal_kinds import GraspGoal
+from limber.planning.path_problem import random_start
 from limber.planning.settings import PlanSettings
 
 SAVED, ADDED = 35.69, 8.10

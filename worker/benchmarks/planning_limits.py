@@ -15,18 +15,15 @@ from limber.core.errors import LimberError
 from limber.core.progress import SILENT
 from limber.planning.constraints.limits import Limits, sampled_sizes
 from limber.planning.cost import resample
-from limber.planning.field.energy_field import EnergyField
+from limber.planning.field.energy_field import EnergyField, limited
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.field.interpolation.local_error import LocalError
-from limber.planning.field.limited_quantities import limited
-from limber.planning.field.sampling import solve_branch
-from limber.planning.field.solver_pool import SolverPool
+from limber.planning.field.radial import LocalError
+from limber.planning.field.sampling import SolverPool, solve_branch
 from limber.planning.field.stored_states import samples_of
-from limber.planning.goals.grasp_goal import near
+from limber.planning.goals.goal_kinds import near
 from limber.planning.make_plan import plan_motion
 from limber.planning.path_on_full_model import resolve_path
-from limber.planning.path_problem import BlockedError
-from limber.planning.path_start import random_start
+from limber.planning.path_problem import BlockedError, random_start
 from limber.planning.settings import PlanSettings
 
 LIMITED = ("force", "strain", "energy", "axial_force")

@@ -12,12 +12,11 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals.allowed_poses import goal_points
-from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.goals.goal import goal_points
+from limber.planning.goals.goal_kinds import GraspGoal
 from limber.planning.make_plan import plan_motion
 from limber.planning.path_on_full_model import resolve_path
-from limber.planning.path_problem import GentleProblem
-from limber.planning.path_start import random_start
+from limber.planning.path_problem import GentleProblem, random_start
 from limber.planning.settings import PlanSettings
 
 _OPTIMUM_STARTS = 3

@@ -6,9 +6,8 @@ import numpy as np
 
 from limber.core.progress import SILENT
 from limber.mechanics.model import BranchModel
-from limber.mechanics.statics.equilibrium_path import Path
+from limber.mechanics.statics.equilibrium_path import Path, StaticProblem
 from limber.mechanics.statics.solve import DEFAULT_SETTINGS, StaticResult, StaticSettings
-from limber.mechanics.statics.static_problem import StaticProblem
 
 
 def solve_prescribed(model: BranchModel, displacement: np.ndarray, *,

@@ -9,11 +9,10 @@ import scipy
 
 from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
+from limber.mechanics.dynamics.drive import unwrapped
 from limber.mechanics.dynamics.integration import NewmarkSettings
-from limber.mechanics.dynamics.pose_path import unwrapped
 from limber.reduced.reduced_dynamics import ReducedMotionState, ReducedStepper
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedState
+from limber.reduced.reduced_model import ReducedModel, ReducedState
 
 _HALVINGS = 6
 _NEWMARK = NewmarkSettings()

@@ -20,10 +20,10 @@ from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.errors import LimberError, SafetyStop
 from limber.estimation.simulated_pull import VirtualPullSettings
 from limber.geometry.generated import generate_branch
-from limber.geometry.tets.marks import base_nodes
+from limber.geometry.tets.tet_mesh import base_nodes
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
 from limber.mechanics import solve_static
-from limber.mechanics.materials.young_field import young_weights
+from limber.mechanics.materials.materials import young_weights
 from limber.robot.cell.cell import ApproachEntry
 from limber.robot.motion.execution import across
 from limber.robot.virtual.launch import VirtualRobot

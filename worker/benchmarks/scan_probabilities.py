@@ -34,7 +34,7 @@ from limber.geometry.leaf_removal import without_leaves
 from limber.geometry.reconstruction import seen_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.confidence import PLACED, evidence
-from limber.geometry.skeleton.joining.rivals import bridge_evidence
+from limber.geometry.skeleton.joining import bridge_evidence
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
 
 _STEP = 0.001  # [m] between the places on the axes that are compared

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from limber.estimation.prediction import PredictSettings
 from limber.estimation.settings import EstimateSettings
-from limber.geometry.mesh_surface import MeshSurfaceSettings
+from limber.geometry.bodies import MeshSurfaceSettings
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel

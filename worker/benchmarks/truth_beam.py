@@ -13,10 +13,10 @@ from benchmarks.table import Asked, Row, Setting
 from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.errors import Cancelled, LimberError
 from limber.estimation.settings import EstimateSettings, PredictSettings, SwingSettings
-from limber.geometry.sections import Sections, mesh_sections, read_sections
+from limber.geometry.bodies import Sections, mesh_sections, read_sections
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.tets.marks import mark
+from limber.geometry.tets.tet_mesh import mark
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator

@@ -13,8 +13,8 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from benchmarks.paper_branches import PaperBranch
 from limber.estimation.forward.gripper_path import MotionWanted, moved
 from limber.estimation.next_pull import PullChoice
-from limber.estimation.virtual_cell import CellErrors, marked_points
-from limber.geometry.skeleton.control_points import control_points
+from limber.estimation.simulated_pull import CellErrors, marked_points
+from limber.geometry.skeleton.skeleton import control_points
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator

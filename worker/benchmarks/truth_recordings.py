@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.paper_branches import PaperBranch
 from benchmarks.table import Asked, Row, Setting
 from limber.cli.main import call
-from limber.geometry.tets.marks import mark
+from limber.geometry.tets.tet_mesh import mark
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static

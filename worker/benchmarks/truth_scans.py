@@ -22,19 +22,16 @@ from benchmarks.trial_log import go_on, read_trials, source_digest
 from benchmarks.truth_branch import recorded
 from benchmarks.worlds.sources import LEFT_OUT, branch_case
 from limber.core.errors import Cancelled, LimberError
-from limber.estimation.estimated_branch import subject_of
-from limber.estimation.fit_preparation import forwards_of, parameter_space
+from limber.estimation.estimated_branch import forwards_of, parameter_space, subject_of
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
-from limber.estimation.simulated_pull import TrueBranch, simulate_pull
-from limber.estimation.uncertainty.bending_stiffness import SectionMean
+from limber.estimation.simulated_pull import CellErrors, TrueBranch, simulate_pull
 from limber.estimation.uncertainty.covariance import inverse_information
-from limber.estimation.virtual_cell import CellErrors
+from limber.estimation.uncertainty.shape_error import SectionMean
 from limber.geometry.reconstruction import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
-from limber.geometry.skeleton.control_points import FRACTIONS, control_points
-from limber.geometry.skeleton.radii.cylinders import on_cylinders
-from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
+from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, control_points
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import Pull, write_pull
 from limber.recordings.settings import ImportSettings

@@ -13,18 +13,16 @@ from benchmarks.table import Asked, Row, Setting
 from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from benchmarks.truth_branch import FRACTIONS, Truth, drawn_truth, recorded
 from limber.core.errors import LimberError
-from limber.estimation.estimated_branch import Subject
+from limber.estimation.estimated_branch import Subject, forwards_of, parameter_space
 from limber.estimation.fit import fit_branch
 from limber.estimation.fit_assessment import Estimate, require_result
-from limber.estimation.fit_preparation import forwards_of, parameter_space
-from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.objective import Objective
+from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.next_pull import PullChoice
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.simulated_pull import CellErrors
 from limber.estimation.uncertainty.next_actions import ANOTHER_PULL
-from limber.estimation.virtual_cell import CellErrors
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import Pull
 

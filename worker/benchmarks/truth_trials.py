@@ -25,21 +25,20 @@ from benchmarks.truth_branch import (
 )
 from limber.core.errors import Cancelled, LimberError
 from limber.core.json_values import plain
-from limber.estimation.estimate_summary import details, summary
+from limber.estimation.estimate_file import details, summary
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import fit_branch
 from limber.estimation.fit_assessment import Estimate, judge_model, require_result
-from limber.estimation.fitting.evaluations import EvaluationLog
-from limber.estimation.fitting.objective import Objective
+from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.interpolation_prior import open_field
 from limber.estimation.next_pull import Cell, Known, PullChoice, suggest
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.simulated_pull import CellErrors
 from limber.estimation.uncertainty.covariance import inverse_information
 from limber.estimation.uncertainty.model_error import total_interval
-from limber.estimation.virtual_cell import CellErrors
-from limber.geometry.skeleton.control_points import control_points
-from limber.mechanics.materials.young_field import young_weights
+from limber.geometry.skeleton.skeleton import control_points
+from limber.mechanics.materials.materials import young_weights
 from limber.mechanics.model import BranchModel
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import Pull

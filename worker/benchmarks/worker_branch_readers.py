@@ -164,8 +164,7 @@ def _search_file(template: Path, folder: Path) -> list[Path]:
     from limber.geometry.cloud.leaves import Leaf
     from limber.geometry.io.clouds import read_points
     from limber.geometry.io.skeletons import read_skeleton
-    from limber.geometry.skeleton.checkpoint import FoundSkeleton
-    from limber.geometry.skeleton.search_result import result_of_skeleton
+    from limber.geometry.skeleton.search_result import FoundSkeleton, result_of_skeleton
 
     found = result_of_skeleton(read_skeleton(template / "skeleton.csv"),
                                read_points(template / "cloud.ply").points[::10])
@@ -181,7 +180,7 @@ def _search_file(template: Path, folder: Path) -> list[Path]:
 
 def _searched(branch: Branch) -> Any:
     """A search as reconstruct reuses it: moved, reported, and matched with points."""
-    from limber.geometry.skeleton.checkpoint import FoundSkeleton
+    from limber.geometry.skeleton.search_result import FoundSkeleton
 
     found = FoundSkeleton.read(branch.path("scan_skeleton.npz")).result
     return found.moved(lambda points: points + 1.0).report(), found.warnings, found.residual

@@ -118,7 +118,7 @@ def _depth(_template: Path, path: Path) -> Any:
 
 
 def _mask(_template: Path, path: Path) -> Any:
-    from limber.geometry.cloud.pixels import read_mask
+    from limber.geometry.cloud.camera import read_mask
 
     return read_mask(path)
 
@@ -262,8 +262,8 @@ def _ring(_template: Path, path: Path) -> Any:
 
 
 def _wind(_template: Path, path: Path) -> Any:
-    from limber.mechanics.loads.gust_loads import WindRecord
-    from limber.mechanics.loads.gust_response import Swaying, recorded
+    from limber.mechanics.loads.load_effects import WindRecord
+    from limber.mechanics.loads.outdoor import Swaying, recorded
 
     wind = WindRecord.read(path)
     wind.even_wind((1.0, 0.0, 0.0))

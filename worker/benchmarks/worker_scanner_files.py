@@ -51,7 +51,7 @@ def _e57(_template: Path, folder: Path) -> list[Path]:
 
 def _sealed(content: bytes) -> bytes:
     """Pages with their checksums."""
-    from limber.geometry.io.scanners.e57 import checksums
+    from limber.geometry.io.e57 import checksums
 
     inner = _PAGE - 4
     pages = np.frombuffer(content + bytes(-len(content) % inner), np.uint8).reshape(-1, inner)

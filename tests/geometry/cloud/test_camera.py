@@ -12,7 +12,7 @@ from limber.geometry.cloud.camera import (
     read_camera,
     write_camera,
 )
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.perception.simulated_camera import render_depth, with_noise
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.ground import find_ground
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
+from limber.geometry.cloud.surroundings import find_ground
 from limber.geometry.generated import generate_branch
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -14,7 +14,7 @@ from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf, find_leaves, leaves_by_odds
 from limber.geometry.cloud.preparation import Prepared, prepare
-from limber.geometry.cloud.supports import Support
+from limber.geometry.cloud.surroundings import Support
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_cloud
 from limber.geometry.leaf_removal import (
@@ -23,8 +23,13 @@ from limber.geometry.leaf_removal import (
     show_leaves,
     without_leaves,
 )
-from limber.geometry.point_classes import COLOURS, shown_if_refused
-from limber.geometry.reconstruction import _MOSTLY, _most_off, reconstruct_cloud
+from limber.geometry.reconstruction import (
+    _MOSTLY,
+    COLOURS,
+    _most_off,
+    reconstruct_cloud,
+    shown_if_refused,
+)
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.stages.shape.edit_skeleton import review_skeleton

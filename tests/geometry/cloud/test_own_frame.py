@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from limber.geometry.cloud.canonical_frame import OwnFrame
+from limber.geometry.cloud.cloud import OwnFrame
 
 RNG = np.random.default_rng(0)
 POINTS = RNG.normal(size=(3000, 3)) ** 3 * [1.0, 0.3, 0.1]

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from limber.core.files import text_columns
-from limber.geometry.cloud import piecewise_reading
+from limber.geometry.cloud import preparation
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.piecewise_reading import gathered
-from limber.geometry.cloud.preparation import prepare
-from limber.geometry.io import clouds, las, pcd, ply
+from limber.geometry.cloud.preparation import gathered, prepare
+from limber.geometry.io import clouds
 from limber.geometry.io.clouds import read_points
 
 
@@ -49,14 +48,14 @@ def test_of_many_points_an_even_part_stays():
 def test_what_is_held_is_bounded():
     """No more than twice what is kept, and a piece, lies in memory together."""
     points, held, most = _tube(40_000), [], 3000
-    kept = piecewise_reading._together
+    kept = preparation._together
 
     def together(pieces):
         held.append(sum(map(len, pieces)))
         return kept(pieces)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(piecewise_reading, "_together", together)
+        patch.setattr(preparation, "_together", together)
         gathered(_pieces(points, 40), most)
     assert max(held) <= 2 * most + 1000
 
@@ -92,14 +91,12 @@ def test_files_are_read_in_pieces(tmp_path, monkeypatch, suffix):
         content.x, content.y, content.z = points.T
         content.intensity = intensity
         content.write(path)
-    for module in (ply, las, pcd):
-        monkeypatch.setattr(module, "PIECE_POINTS", 700)
+    monkeypatch.setattr(clouds, "PIECE_POINTS", 700)
     monkeypatch.setattr(text_columns, "LINES_AT_ONCE", 700)
     whole = read_points(path)
     np.testing.assert_allclose(whole.points, points, atol=1e-6)
     np.testing.assert_array_equal(whole.attributes["intensity"], intensity)
-    for module in (ply, las, pcd, clouds):
-        monkeypatch.setattr(module, "gathered", lambda pieces: gathered(pieces, 1000))
+    monkeypatch.setattr(clouds, "gathered", lambda pieces: gathered(pieces, 1000))
     some = read_points(path)
     assert len(some) <= 1000 and some.left_out == 5000 - len(some)
     chosen = some.attributes["intensity"].astype(int)

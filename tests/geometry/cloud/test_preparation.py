@@ -8,8 +8,8 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.flat_sheets import find_sheet
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
+from limber.geometry.cloud.surroundings import find_sheet
 from limber.geometry.generated import generate_branch
 
 RNG = np.random.default_rng(0)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from limber.geometry.cloud.camera import D455, depth_to_cloud
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
-from limber.geometry.cloud.scan_lines import scan_line_view
+from limber.geometry.cloud.single_view import scan_line_view
 
 
 def image() -> np.ndarray:

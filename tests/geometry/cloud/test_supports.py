@@ -5,8 +5,8 @@ import pytest
 
 from benchmarks.worlds.sources import bare_case, potted_case
 from limber.core.errors import InputError
-from limber.geometry.cloud.supports import find_supports, named_if_refused, supports_text
-from limber.geometry.point_classes import COLOURS
+from limber.geometry.cloud.surroundings import find_supports, named_if_refused, supports_text
+from limber.geometry.reconstruction import COLOURS
 
 UP = np.array([0.0, 0.0, 1.0])
 

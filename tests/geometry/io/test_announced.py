@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
-from limber.geometry.io.clouds import read_points
+from limber.geometry.io.clouds import las_columns, read_points
 from limber.geometry.io.isolated_readers import read_apart
-from limber.geometry.io.las import las_columns
 
 PLY = "ply\nformat {form} 1.0\nelement vertex {count}\nproperty float x\nproperty float y\n" \
       "property float z\nend_header\n"

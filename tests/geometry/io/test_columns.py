@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
-from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.columns import property_names
+from limber.geometry.cloud.cloud import Cloud, property_names
 from limber.geometry.io.clouds import read_points
 
 COUNT = 40

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
+from limber.geometry.bodies import body_format
 from limber.geometry.io.formats import Format
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton
-from limber.geometry.mesh_skeleton import body_format
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.stages.results.export import ExportSettings, export
 from limber.store import Branch

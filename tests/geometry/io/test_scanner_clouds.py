@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
-from limber.geometry.cloud.piecewise_reading import gathered
+from limber.geometry.cloud.preparation import gathered
+from limber.geometry.io import clouds as clouds_module
+from limber.geometry.io import e57 as e57_module
 from limber.geometry.io.clouds import read_points
-from limber.geometry.io.scanners import e57 as e57_module
-from limber.geometry.io.scanners import ptx as ptx_module
-from limber.geometry.io.scanners.e57 import checksums
+from limber.geometry.io.e57 import checksums
 
 RNG = np.random.default_rng(5)
 POINTS = RNG.uniform(-2, 2, (50, 3)).round(4)
@@ -46,12 +46,12 @@ def test_ptx_in_pieces(tmp_path, monkeypatch):
     """Pieces end within scans; a part of the points is kept; a row may not change its width."""
     ptx(tmp_path / "a.ptx", colour=True, silent=7)
     whole = read_points(tmp_path / "a.ptx")
-    monkeypatch.setattr(ptx_module, "LINES_AT_ONCE", 8)
+    monkeypatch.setattr(clouds_module, "LINES_AT_ONCE", 8)
     pieces = read_points(tmp_path / "a.ptx")
     np.testing.assert_array_equal(pieces.points, whole.points)
     np.testing.assert_array_equal(pieces.attributes["color"], whole.attributes["color"])
     assert pieces.not_finite == 14
-    monkeypatch.setattr(ptx_module, "gathered", lambda pieces: gathered(pieces, 30))
+    monkeypatch.setattr(clouds_module, "gathered", lambda pieces: gathered(pieces, 30))
     some = read_points(tmp_path / "a.ptx")
     assert len(some) <= 30 and some.left_out == len(whole) - len(some) and some.unit == "m"
     lines = (tmp_path / "a.ptx").read_text().splitlines()

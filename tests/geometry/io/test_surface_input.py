@@ -8,9 +8,9 @@ import trimesh
 
 from limber.cli.main import call
 from limber.core.errors import InputError
+from limber.geometry.bodies import MeshSurfaceSettings
+from limber.geometry.cloud.preparation import size_doubts
 from limber.geometry.io.surfaces import usable_surface
-from limber.geometry.mesh_surface import MeshSurfaceSettings
-from limber.geometry.plausible_size import size_doubts
 from limber.geometry.surface.surface import Surface
 from limber.stages.shape.mesh import mesh_surface
 

@@ -5,9 +5,8 @@ import pytest
 
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import fork_matches, main_axis_error, seen_part
-from limber.geometry.skeleton.joining.bridges import filled, hypotheses
-from limber.geometry.skeleton.joining.free_ends import free_ends
-from limber.geometry.skeleton.joining.join_pieces import join_pieces
+from limber.geometry.skeleton.free_ends import free_ends
+from limber.geometry.skeleton.joining import filled, hypotheses, join_pieces
 from limber.geometry.skeleton.skeletonise import skeletonise
 
 Z = np.array([0.0, 0.0, 1.0])

@@ -5,7 +5,7 @@ import pytest
 
 from limber.geometry.io.skeletons import read_cylinders, write_cylinders
 from limber.geometry.skeleton.confidence import assessed, doubted, likely, shares
-from limber.geometry.skeleton.repair.run_radii import tapered
+from limber.geometry.skeleton.run_ends import tapered
 from limber.geometry.skeleton.skeleton import (
     BRIDGED,
     INTERPOLATED,

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from limber.geometry.skeleton.confidence import DoubtfulKind, doubtful_parts
 from limber.geometry.skeleton.skeleton import BRIDGED, LIMITED, UNRESOLVED, Skeleton
-from limber.geometry.skeleton.uncertain_parts import DoubtfulKind, doubtful_parts
 
 
 def test_a_sound_skeleton_has_no_doubtful_parts(y_skeleton) -> None:

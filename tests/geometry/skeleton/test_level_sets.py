@@ -7,9 +7,8 @@ from tests.subjects.leafy import curved_leaves
 
 from benchmarks.geometry_crowns import axis_scores, explained, generated_crown
 from limber.geometry.generated import generate_branch
-from limber.geometry.skeleton.contraction.laplacian_contraction import contract
-from limber.geometry.skeleton.contraction.level_sets import is_sparse, level_graph
-from limber.geometry.skeleton.radii.normal_equations import NormalEquations
+from limber.geometry.skeleton.contraction import contract, is_sparse, level_graph
+from limber.geometry.skeleton.radii.axis_fit import NormalEquations
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.geometry.skeleton.confidence import assessed
-from limber.geometry.skeleton.radii.likeliest_shape import ShapeEvidence, likeliest_shape
+from limber.geometry.skeleton.radii.wood import ShapeEvidence, likeliest_shape
 from limber.geometry.skeleton.skeleton import (
     INTERPOLATED,
     LIMITED,

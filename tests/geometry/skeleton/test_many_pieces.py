@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.joining import bridge_kernels, pieces
-from limber.geometry.skeleton.joining import join_pieces as joining
-from limber.geometry.skeleton.joining.boxes import boxes
-from limber.geometry.skeleton.joining.free_ends import free_ends
-from limber.geometry.skeleton.joining.join_pieces import join_pieces
+from limber.geometry.skeleton import bridge_kernels, joining
+from limber.geometry.skeleton.bridge_kernels import boxes
+from limber.geometry.skeleton.free_ends import free_ends
+from limber.geometry.skeleton.joining import join_pieces
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -145,7 +144,7 @@ def test_what_is_remembered_changes_nothing(monkeypatch):
         return joining._joined(state.rounds[0].before.copy([]), rules, refused | {pair}, dearest)
 
     monkeypatch.setattr(joining, "_without", anew)
-    monkeypatch.setattr(pieces.Joined, "ends", lambda state: pieces.free_ends(
+    monkeypatch.setattr(joining.Joined, "ends", lambda state: joining.free_ends(
         state.nodes, state.edges, state.thickness, state.joints))
     for seed, state in enumerate(states):
         again = _joined(8, seed)

@@ -6,10 +6,9 @@ import pytest
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.radii import visible_sides
-from limber.geometry.skeleton.radii.axis_fit import fit_axes
-from limber.geometry.skeleton.radii.cylinders import match_cylinders
+from limber.geometry.skeleton.radii.axis_fit import fit_axes, normal_equations
+from limber.geometry.skeleton.radii.fit_kernels import match_cylinders
 from limber.geometry.skeleton.radii.noisy_rings import mean_positions, weighted_target_distances
-from limber.geometry.skeleton.radii.normal_equations import normal_equations
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise

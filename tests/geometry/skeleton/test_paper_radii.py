@@ -15,7 +15,7 @@ from limber.geometry.io.skeletons import read_swc
 from limber.geometry.radius_estimators import ESTIMATORS
 from limber.geometry.reconstruction import reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings, SkeletonSettings
-from limber.geometry.skeleton.contraction.laplacian_contraction import contract
+from limber.geometry.skeleton.contraction import contract
 from limber.geometry.skeleton.radii.nearest_points import nearest_point_radii
 from limber.geometry.skeleton.skeleton import LIMITED, MEASURED, Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise

@@ -9,11 +9,9 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.point_classes import COLOURS
-from limber.geometry.reconstruction import reconstruct_cloud
+from limber.geometry.reconstruction import COLOURS, reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings, SkeletonSettings
-from limber.geometry.skeleton.joining.join_pieces import join_pieces
-from limber.geometry.skeleton.joining.plants import second_base
+from limber.geometry.skeleton.joining import join_pieces, second_base
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 

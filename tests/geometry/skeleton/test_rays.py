@@ -5,7 +5,7 @@ import pytest
 
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.projected_widths import by_projected_widths, sight_field
-from limber.geometry.skeleton.radii.ray_fit import fit_of_rays
+from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
 
 _RADIUS, _LENGTH = 0.006, 0.5  # [m]

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
-from limber.geometry.skeleton.contraction.root_end import root_node
+from limber.geometry.skeleton.curve_graph import CurveGraph
 from limber.geometry.skeleton.plausibility import OPEN, root_question
+from limber.geometry.skeleton.root_end import root_node
 
 _UP = np.array([0.0, 0.0, 1.0])
 

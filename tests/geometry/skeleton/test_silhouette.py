@@ -9,7 +9,7 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
 from limber.geometry.cloud.single_view import View
 from limber.geometry.generated import generate_branch
-from limber.geometry.skeleton.radii.silhouette import without_hidden_twigs
+from limber.geometry.skeleton.radii.projected_widths import without_hidden_twigs
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.perception.simulated_camera import render_depth
 from limber.stages.shape.reconstruct import reconstruct

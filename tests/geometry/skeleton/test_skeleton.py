@@ -5,9 +5,8 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.geometry.io.skeletons import read_cylinders, read_swc, write_cylinders
-from limber.geometry.skeleton.control_points import control_points
-from limber.geometry.skeleton.repair.attachment import attached
-from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.repair import attached
+from limber.geometry.skeleton.skeleton import Skeleton, control_points
 
 
 def test_runs_orders_and_main_path(y_skeleton):

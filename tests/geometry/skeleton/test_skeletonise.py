@@ -9,11 +9,10 @@ from benchmarks.scan_cases import round_case
 from benchmarks.scan_scores import score
 from limber.core.errors import Cancelled, InputError
 from limber.core.progress import Progress
-from limber.geometry.cloud.thinning import thinned
+from limber.geometry.cloud.cloud import thinned
 from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.settings import SkeletonSettings
-from limber.geometry.skeleton.contraction.laplacian_contraction import cloud_laplacian, contract
-from limber.geometry.skeleton.contraction.tangent_laplacian import tangent_laplacian
+from limber.geometry.skeleton.contraction import cloud_laplacian, contract, tangent_laplacian
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -195,10 +194,10 @@ def test_radius_uncertainty_by_far_apart_probes(monkeypatch, forked_branch, of_f
                         rounds=0).skeleton.radius_sigma
 
     quick = deviations()
-    monkeypatch.setattr("limber.geometry.skeleton.radii.normal_equations._PROBE", 10**9)
+    monkeypatch.setattr("limber.geometry.skeleton.radii.axis_fit._PROBE", 10**9)
     exact = deviations()
     np.testing.assert_allclose(quick, exact, rtol=0.02)
-    monkeypatch.setattr("limber.geometry.skeleton.radii.normal_equations._PROBE", 2)
+    monkeypatch.setattr("limber.geometry.skeleton.radii.axis_fit._PROBE", 2)
     assert not np.allclose(deviations(), exact, rtol=0.02)
 
 
@@ -230,8 +229,8 @@ def test_a_scan_moved_and_turned_gives_the_same_skeleton() -> None:
 
 def _root_of_stem(foot: np.ndarray, thick: list[float], support: list[int]) -> int:
     """The root's node of a stem with one twig, to whose foot a chain of nodes was contracted."""
-    from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
-    from limber.geometry.skeleton.contraction.root_end import root_node
+    from limber.geometry.skeleton.curve_graph import CurveGraph
+    from limber.geometry.skeleton.root_end import root_node
 
     z, x = np.arange(0, 0.6, 0.005), 0.005 * np.arange(1, 41)
     count = len(foot)
@@ -267,7 +266,7 @@ def test_a_ragged_foot_that_contraction_led_around_its_rim_may_be_the_root() -> 
 
 def test_an_end_is_not_left_beyond_the_points() -> None:
     """Where contraction overshoots a cut end, the root is brought back to where points are."""
-    from limber.geometry.skeleton.repair.run_ends import with_full_tips
+    from limber.geometry.skeleton.run_ends import with_full_tips
 
     points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
     z = np.concatenate([[-0.03, -0.001], np.linspace(0.01, 0.29, 29)])
@@ -278,7 +277,7 @@ def test_an_end_is_not_left_beyond_the_points() -> None:
 
 def test_an_end_that_slid_beyond_the_points_is_drawn_back() -> None:
     """Both ends of an axis 12 mm past a tube: they come back to it; ends within it stay."""
-    from limber.geometry.skeleton.repair.run_ends import ends_within
+    from limber.geometry.skeleton.run_ends import ends_within
 
     points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
     for over, moved in ((0.012, True), (-0.002, False)):

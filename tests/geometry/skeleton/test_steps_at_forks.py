@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from limber.geometry.skeleton.radii.axis_fit import fit_axes
-from limber.geometry.skeleton.radii.normal_equations import fit_with_steps
+from limber.geometry.skeleton.radii.axis_fit import fit_axes, fit_with_steps
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _BELOW, _ABOVE, _TWIG, _NOISE = 0.008, 0.006, 0.0055, 0.0003

@@ -6,9 +6,9 @@ import pytest
 from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.reconstruction import ReconstructSettings, reconstruct_cloud
-from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.plausibility import surface_share, without_volumes
+from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.surface_evidence import surface_share, without_volumes
 
 _ROD = Skeleton.from_edges(np.column_stack([np.zeros((60, 2)), np.linspace(0, 1.0, 60)]),
                            np.arange(60) - 1, np.full(60, 0.01))

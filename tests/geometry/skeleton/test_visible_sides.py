@@ -6,8 +6,7 @@ import pytest
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.radii import visible_sides
-from limber.geometry.skeleton.radii.axis_fit import fit_axes
-from limber.geometry.skeleton.radii.shared_errors import shared_error
+from limber.geometry.skeleton.radii.axis_fit import fit_axes, shared_error
 from limber.geometry.skeleton.radii.visible_sides import fit_seen_side, side_uncertainty
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise

@@ -13,7 +13,6 @@ from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp
 from limber.mechanics.linear import equations as equations_module
-from limber.mechanics.linear import factor
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.linear.fronts import make_fronts, postordered
 from limber.mechanics.strain import deformation_gradients, principal_stretch
@@ -142,8 +141,9 @@ FACTORS = ("SupernodalFactor", "CholmodFactor", "SuperLuFactor")
 
 def factor_of(name, pattern):
     if name == "SupernodalFactor":
-        return factor.SupernodalFactor(make_fronts(pattern.node_starts, pattern.node_rows))
-    return getattr(factor, name)(*pattern.entries(), pattern.size)
+        fronts = make_fronts(pattern.node_starts, pattern.node_rows)
+        return equations_module.SupernodalFactor(fronts)
+    return getattr(equations_module, name)(*pattern.entries(), pattern.size)
 
 
 @pytest.mark.parametrize("name", FACTORS)
@@ -212,7 +212,7 @@ def test_fronts_hold_all_that_fills_in():
         whole = (part + sp.tril(part, -1).T + 3 * part.shape[0] * sp.eye(part.shape[0])).tocsc()
         values = sp.tril(whole).tocsc()
         values.sort_indices()
-        own = factor.SupernodalFactor(make_fronts(lower.indptr, lower.indices))
+        own = equations_module.SupernodalFactor(make_fronts(lower.indptr, lower.indices))
         own.factorise(values.data)
         right = rng.standard_normal(part.shape[0])
         assert own.solve(right) == pytest.approx(np.linalg.solve(whole.toarray(), right),
@@ -222,11 +222,11 @@ def test_fronts_hold_all_that_fills_in():
 def test_bulky_meshes_go_to_a_general_library(short_box, monkeypatch):
     """Above a number of operations CHOLMOD takes over, without cvxopt SuperLU."""
     pattern = make_model(short_box).equations().pattern
-    assert isinstance(factor.make_factor(pattern), factor.SupernodalFactor)
-    monkeypatch.setattr(factor, "_MOST_FLOPS", 1.0)
-    assert isinstance(factor.make_factor(pattern), factor.CholmodFactor)
+    assert isinstance(equations_module.make_factor(pattern), equations_module.SupernodalFactor)
+    monkeypatch.setattr(equations_module, "_MOST_FLOPS", 1.0)
+    assert isinstance(equations_module.make_factor(pattern), equations_module.CholmodFactor)
     monkeypatch.setitem(sys.modules, "cvxopt.cholmod", None)
-    assert isinstance(factor.make_factor(pattern), factor.SuperLuFactor)
+    assert isinstance(equations_module.make_factor(pattern), equations_module.SuperLuFactor)
 
 
 @pytest.mark.parametrize("mesh", [box_mesh(), box_mesh(quadratic=False), curved_box()],

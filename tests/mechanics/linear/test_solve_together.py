@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from limber.core.numerics.sparse import general_factor
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.supernodal import SupernodalFactor
 from limber.mechanics.model import BranchModel

@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import trapezoid
 
 from limber.core.errors import InputError
-from limber.mechanics.loads.gust_loads import WindRecord
-from limber.mechanics.loads.gust_response import Swaying, recorded, turbulent, wind_spectrum
+from limber.mechanics.loads.load_effects import WindRecord
+from limber.mechanics.loads.outdoor import Swaying, recorded, turbulent, wind_spectrum
 
 LENGTH, SPEED = 27.0, 8.0
 

@@ -9,7 +9,7 @@ from tests.subjects.meshes import box_mesh
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.progress import Progress
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.loads.loaded_branch import NamedTarget, hang, target_masses

@@ -30,9 +30,8 @@ from limber.mechanics import (
     young_weights,
 )
 from limber.mechanics.linear.equations import Viscous
-from limber.mechanics.materials import law as law_module
-from limber.mechanics.materials import material_registry
-from limber.mechanics.materials.law import contracted, determinant, right_cauchy_green
+from limber.mechanics.materials import laws
+from limber.mechanics.materials.laws import contracted, determinant, right_cauchy_green
 from limber.mechanics.pull_simulation import SimulateSettings
 from limber.mechanics.strain import peak_load, strain_state
 from limber.reduced.strain_polynomial import make_polynomial
@@ -95,7 +94,7 @@ NAMES = [law.name for law in LAWS]
 @pytest.fixture(autouse=True)
 def known(monkeypatch):
     """These laws, registered for one test."""
-    monkeypatch.setattr(material_registry, "_registered", {})
+    monkeypatch.setattr(laws, "_registered", {})
     for law in LAWS:
         register_material(law)
 
@@ -386,7 +385,7 @@ def test_another_process_gets_it(mesh):
     """A model goes to the processes of a pool with its law; what they compute is the same."""
     model = make_model(mesh, "mooney_rivlin")
     moved = 0.02 * mesh.nodes
-    material_registry._registered.clear()
+    laws._registered.clear()
     again = pickle.loads(pickle.dumps(model))
     assert np.array_equal(again.internal(moved).force, model.internal(moved).force)
     with pytest.raises(InputError, match="no material 'mooney_rivlin'"):
@@ -396,7 +395,7 @@ def test_another_process_gets_it(mesh):
 def test_the_example_of_a_law_is_one():
     """What the documentation shows as a law is accepted as it stands there."""
     shown = {}
-    for step in doctest.DocTestParser().get_examples(law_module.__doc__):
+    for step in doctest.DocTestParser().get_examples(laws.__doc__):
         exec(step.source, shown)
     assert register_material(shown["Cubic"]()).name == "cubic"
 
@@ -425,4 +424,4 @@ def test_a_wrong_law_is_refused(trouble):
     """Each for its own reason, when it is registered."""
     with pytest.raises(InputError, match=trouble):
         register_material(_law(**WRONG[trouble]))
-    assert register_material(_law()).name in material_registry.material_names()
+    assert register_material(_law()).name in laws.material_names()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.result import StaticSettings

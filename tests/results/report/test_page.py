@@ -9,7 +9,7 @@ from limber.core.errors import BranchFolderError, InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.io.skeletons import write_cylinders
 from limber.geometry.skeleton.skeleton import UNRESOLVED, Skeleton
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.results.report import swing_section
 from limber.results.report.estimate_figures import young_along_branch
 from limber.results.report.page import draw_page

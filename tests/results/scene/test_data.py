@@ -11,7 +11,7 @@ import pytest
 from limber.core.alignment import Alignment
 from limber.core.constants import PATH_COLOURS
 from limber.core.errors import BranchFolderError, InputError
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.results.motion_files import node_average
 from limber.results.report import plan_figures
 from limber.results.scene.colours import linear_of

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.results.scene.contents import scene_data
 from limber.store import Branch
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from benchmarks.scan_cases import ScanCase
 from limber.core.alignment import Alignment
 from limber.geometry.io.clouds import read_points
-from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 
 _SAME = 1e-4  # [m] between a point and its copy in a file of single precision
 _FEW = 8  # points of a twig, under which nothing is lost with it

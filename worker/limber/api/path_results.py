@@ -15,7 +15,7 @@ from limber.store import Branch as Folder
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from limber.planning.constraints.damage_along import DamageAlong
+    from limber.planning.constraints.damage import DamageAlong
     from limber.planning.field.energy_field import EnergyField as FittedField
     from limber.planning.plan_file import PlanFile
 
@@ -125,7 +125,7 @@ class Plan(Result):
 
     @classmethod
     def read(cls, branch: Folder, key: str, values: Mapping[str, Any]) -> "Plan":
-        from limber.planning.constraints.damage_along import DamageAlong
+        from limber.planning.constraints.damage import DamageAlong
         from limber.planning.field.energy_field import EnergyField as FittedField
         from limber.planning.plan_file import read_plan
 

@@ -16,7 +16,7 @@ from limber.core.lazy import exports
 _PLACES = {
     "Estimate": "fit_assessment",
     "EstimateSettings": "settings",
-    "EvaluationLog": "fitting.evaluations",
+    "EvaluationLog": "fitting.objective",
     "OnlineEstimator": "online.filter",
     "PredictSettings": "settings",
     "Subject": "estimated_branch",

@@ -18,7 +18,7 @@ from limber.estimation.interpolation_prior import bump_deviations, hats, station
 from limber.estimation.parameters import LINK_DEVIATION, Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.covariance import repeated, scaled_rows
-from limber.geometry.skeleton.control_points import FRACTIONS
+from limber.geometry.skeleton.skeleton import FRACTIONS
 
 MOST = 6
 """Largest number of control points that is considered."""

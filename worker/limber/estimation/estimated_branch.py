@@ -1,5 +1,6 @@
 """The branch to estimate: its model and the control points of Young's modulus."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -7,19 +8,21 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
+from limber.estimation.forward.forward_model import Forward, PointDirections, under_its_weight
+from limber.estimation.forward.observed_path import ObservedPathForward
+from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
 from limber.estimation.interpolation_prior import YoungField, open_field
-from limber.estimation.parameters import Values
+from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
-from limber.geometry.skeleton.control_points import control_points
-from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.skeleton import Skeleton, control_points
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.loads.loaded_branch import is_stable
-from limber.mechanics.materials.layered_section import LayeredSection
-from limber.mechanics.materials.materials import RayleighDamping
-from limber.mechanics.materials.young_field import young_weights
+from limber.mechanics.materials.materials import LayeredSection, RayleighDamping, young_weights
 from limber.mechanics.model import BranchModel
-from limber.recordings.recording import Pull
+from limber.recordings.cell_errors import CalibrationEntry, calibration_of
+from limber.recordings.recording import Pull, PullEntry
+from limber.recordings.synchronisation import Frames, frames_of
 
 
 @dataclass(frozen=True)
@@ -111,3 +114,207 @@ def observed(folder: Path, pull: Pull, subject: Subject, settings: EstimateSetti
 
 def _or_mean(value: float | None, field: np.ndarray) -> float:
     return float(np.mean(field)) if value is None else value
+
+
+# Prepare a fit: forward simulations and free parameters of a branch and its pulls.
+
+FREE_FRAME_M, FREE_FRAME_RAD = 0.1, 0.3
+"""Standard deviations of the observer's frame if it is fitted freely (--free-frame)."""
+NECK = 0.5
+"""Radius over a larger one farther out that is named: a sixteenth of the stiffness."""
+
+
+def tell_doubts(pulls: list[Pull], subject: Subject, progress: Progress) -> None:
+    """Warn before a fit of what already speaks against the recordings or the reconstruction."""
+    for pull in pulls:
+        frames = frames_of(pull)
+        for message in frames.warnings:
+            progress.warn(message)
+        off = _off_at_rest(pull, frames, _rest_points(pull.entry, subject))
+        if off is not None and np.nanmax(off) > 5e-3 + 5 * pull.entry.sensor.position_sigma_m:
+            progress.warn(
+                f"{pull.name}: at rest, the observed points are up to {np.nanmax(off) * 1e3:.0f} "
+                "mm away from their positions on this branch. Possible causes are a scan whose tip "
+                "is short, another branch, another frame of reference, or another order of the "
+                "markers.")
+    for sentence in neck(subject.skeleton):
+        progress.warn(f"{sentence} If the branch is not so thin there, the moduli come out wrong. "
+                      "Correct the skeleton (`limber skeleton`), or scan from more sides.")
+
+
+def neck(skeleton: Skeleton) -> list[str]:
+    """A sentence if the main path is much thinner somewhere than farther out."""
+    path = skeleton.main_path()
+    radius, along = skeleton.radius[path], skeleton.arc_length[path]
+    beyond = np.maximum.accumulate(radius[::-1])[::-1]
+    thin = int(np.argmin(radius / beyond))
+    if radius[thin] > NECK * beyond[thin]:
+        return []
+    return [f"The reconstructed branch has a radius of {1e3 * radius[thin]:.1f} mm at "
+            f"{1e3 * along[thin]:.0f} mm from its base, but {1e3 * beyond[thin]:.1f} mm farther "
+            "out. Its stiffness goes with the fourth power of the radius."]
+
+
+def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
+                shifts: Mapping[str, np.ndarray] | None = None) -> list[Forward]:
+    """Make the forward simulation of each pull.
+
+    Args:
+        shifts: Name of a pull to distances by which its observed points are farther along the
+            branch than stated [m], shape [m].
+
+    Raises:
+        InputError: a pull has no measurements to compare, or observes other points.
+    """
+    forwards = []
+    for pull in pulls:
+        frames = frames_of(pull)
+        entry = _with_overrides(pull.entry, frames, settings)
+        rest = _rest_points(entry, subject)
+        if frames.positions.shape[1] not in (0, len(rest)):
+            raise InputError(
+                f"{pull.name} observes {frames.positions.shape[1]} points, but {len(rest)} rest "
+                "positions are known.",
+                "Each observed point needs a rest position.",
+                "Give rest_points_m in pull.toml, or one value of --fractions for each marker.")
+        if not frames.positions.shape[1]:
+            raise InputError(
+                f"{pull.name} has nothing that was seen of the branch, only what the gripper did.",
+                "An estimate compares how points of the branch moved.",
+                "Import it with the markers, depth images or clouds of the same time, or name "
+                "other pulls with --pull.")
+        _off_at_rest(pull, frames, rest)
+        moved = (shifts or {}).get(pull.name)
+        if moved is not None:
+            rest = rest + moved[:, None] * PointDirections.at(subject.mesh, rest).rest
+        forward = _forward(pull.name, entry, frames, rest, subject, settings)
+        if moved is not None:
+            forward.point_shifts = moved
+        forwards.append(forward)
+    return forwards
+
+
+def require_scale_in_principle(forwards: list[Forward]) -> None:
+    """Reject pulls that cannot determine the scale of Young's modulus.
+
+    Raises:
+        InputError: all pulls are slow and pose-driven, without gravity or measured force.
+    """
+    for forward in forwards:
+        entry = forward.entry
+        if forward.uses_force or entry.drive == "force" or entry.motion == "dynamic" or (
+                entry.gravity_m_s2 is not None):
+            return
+    raise InputError(
+        "No pull has a measured force, gravity or inertia.",
+        "A branch that moves slowly to prescribed poses takes the same shape whether it is soft "
+        "or stiff. Only the ratios of Young's modulus along the branch can be determined. A fit "
+        "would look perfect with every modulus wrong.",
+        "Record the gripper's force, or let gravity or inertia act (gravity_m_s2 or motion in "
+        "pull.toml).")
+
+
+def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subject: Subject,
+             settings: EstimateSettings) -> Forward:
+    if entry.motion == "swing":
+        raise InputError(f"{name} is a free swing: no gripper holds the branch.",
+                         "Its release, load and damping are fitted together over time.",
+                         f"Use `limber swing --pull {name}`, or name other pulls with --pull.")
+    if entry.motion == "dynamic":
+        from limber.estimation.forward.dynamic_pull import DynamicForward
+
+        return DynamicForward(name, subject.model, subject.weights, entry, frames, rest,
+                              field=subject.field)
+    kind = ObservedPathForward if observes_path(entry, frames, settings) else QuasiStaticForward
+    return kind(name, subject.model, subject.weights, entry, frames, rest,
+                key_count=settings.key_frames, field=subject.field)
+
+
+def observes_path(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> bool:
+    """Whether a slow pull's force is prescribed and the gripper's recorded path is observed.
+
+    This is so if the force was measured (for a clamped grasp the torque too) and the gripper's
+    frame may have an error. Without a force only the path can drive the simulation; it then counts
+    as exact.
+    """
+    measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
+    known = calibration_of(entry)
+    return (entry.drive == "pose" and settings.drive is None and settings.forward == "full"
+            and bool(measured.mean() > 0.8)
+            and (known.pose_sigma_m > 0 or known.pose_sigma_rad > 0)
+            and (entry.grasp.mode == "point" or uses_torque(entry, frames)))
+
+
+def parameter_space(subject: Subject, forwards: list[Forward], settings: EstimateSettings,
+                    ) -> ParameterSpace:
+    """Return the free parameters, with the priors of those that were not requested.
+
+    Poisson's ratio, the density if weight or inertia acts, and the form of the field are free
+    within their priors; requested ones (``--fit-poisson``, ``--fit-density``) are free without a
+    prior.
+    """
+    fitted = {"poisson": settings.fit_poisson, "density": settings.fit_density,
+              "alpha": settings.fit_damping, "beta": settings.fit_damping}
+    chosen = {name for name, is_fitted in fitted.items() if is_fitted}
+    form = subject.field.names if subject.field is not None else ()
+    priors = [(name, 0.0, 1.0) for name in form]
+    if settings.forward == "full" and settings.method == "gauss-newton":
+        weighs = any(forward.is_dynamic or under_its_weight(
+            subject.model, forward.entry).gravity.any() for forward in forwards)
+        if settings.poisson_sigma > 0 and "poisson" not in chosen:
+            priors.append(("poisson", subject.start.poisson, settings.poisson_sigma))
+        if settings.density_sigma > 0 and "density" not in chosen and weighs:
+            priors.append(("density", float(np.log(subject.start.density)),
+                           settings.density_sigma))
+    free = chosen | {name for name, _, _ in priors}
+    extra = (*form, *(name for name in fitted if name in free))
+    return ParameterSpace(subject.start, tuple(range(len(subject.start.young))), extra,
+                          priors=tuple(priors))
+
+
+def _with_overrides(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> PullEntry:
+    overrides = {"drive": settings.drive, "motion": settings.motion,
+                 "calibration": _with_free_errors(entry, frames, settings)}
+    return entry.model_copy(update={k: v for k, v in overrides.items() if v is not None})
+
+
+def _with_free_errors(entry: PullEntry, frames: Frames, settings: EstimateSettings,
+                      ) -> CalibrationEntry | None:
+    """Return the pull's calibration; of what is not calibrated at all, nothing is known."""
+    known = calibration_of(entry)
+    free: dict[str, float] = {}
+    if settings.free_frame:
+        free |= {"camera_sigma_m": max(known.camera_sigma_m, FREE_FRAME_M),
+                 "camera_sigma_rad": max(known.camera_sigma_rad, FREE_FRAME_RAD)}
+    force = np.linalg.norm(frames.wrenches[:, :3], axis=1)
+    if not entry.sensor.tared and np.isfinite(force).any():
+        free |= {"force_bias_sigma_n": max(known.force_bias_sigma_n, float(np.nanmax(force)))}
+    return known.model_copy(update=free) if free else None
+
+
+def _rest_points(entry: PullEntry, subject: Subject) -> np.ndarray:
+    return subject.control_points if entry.rest_points_m is None else np.array(entry.rest_points_m)
+
+
+def _off_at_rest(pull: Pull, frames: Frames, rest: np.ndarray) -> np.ndarray | None:
+    """Distance of each observed point at rest from its position on the branch [m]; None: unknown.
+
+    Raises:
+        InputError: all of them are farther away than the branch is long.
+    """
+    at_rest = np.linalg.norm(frames.poses[:, :3] - pull.entry.grasp.point_m, axis=1) < 2e-3
+    seen = frames.positions[at_rest]
+    if seen.shape[1:2] != (len(rest),) or pull.entry.gravity_m_s2 is not None or (
+            not np.isfinite(seen).any()):
+        return None
+    off = np.linalg.norm(np.nanmedian(seen, axis=0) - rest, axis=1)
+    size = float(np.linalg.norm(np.ptp(np.vstack([rest, pull.entry.grasp.point_m]), axis=0)))
+    if np.nanmin(off) > max(2 * size, 0.1):
+        raise InputError(
+            f"{pull.name}: at rest, the observed points are {np.nanmin(off):.3g} to "
+            f"{np.nanmax(off):.3g} m away from their positions on this branch, which is about "
+            f"{size:.2g} m long.",
+            "The recording uses another unit or another frame of reference.",
+            "Import it with --unit, or with --nominal (the positions of the markers on the "
+            "branch).")
+    return off

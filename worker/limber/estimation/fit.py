@@ -1,7 +1,7 @@
 """Fit Young's modulus along a branch to its pulls: initial values and fit.
 
 :mod:`limber.estimation.fit_assessment` holds the result and its uncertainty.
-:mod:`limber.estimation.estimate_summary` selects the written values.
+:mod:`limber.estimation.estimate_file` selects the written values.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,12 @@ from limber.core.errors import InputError, WorkError
 from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
-from limber.estimation.estimated_branch import Subject
+from limber.estimation.estimated_branch import (
+    Subject,
+    forwards_of,
+    parameter_space,
+    require_scale_in_principle,
+)
 from limber.estimation.fit_assessment import (
     MISFIT_FACTOR,
     Estimate,
@@ -22,28 +27,20 @@ from limber.estimation.fit_assessment import (
     judge_fit,
     require_one_explanation,
 )
-from limber.estimation.fit_preparation import (
-    forwards_of,
-    parameter_space,
-    require_scale_in_principle,
-)
-from limber.estimation.fitting.evaluations import EvaluationLog
 from limber.estimation.fitting.initial_modulus import (
-    prescribed_start,
-    scaled_start,
-    set_all_keys,
-    set_rough_keys,
-    standing_start,
-)
-from limber.estimation.fitting.large_errors import (
     ROUNDS,
     SMALL_RAD,
     FarPoints,
     FarPointsError,
     fitted_frame,
+    prescribed_start,
     put_right,
+    scaled_start,
+    set_all_keys,
+    set_rough_keys,
+    standing_start,
 )
-from limber.estimation.fitting.objective import Evaluation, Objective, Stopped
+from limber.estimation.fitting.objective import Evaluation, EvaluationLog, Objective, Stopped
 from limber.estimation.fitting.optimise import (
     EVALUATION_LIMIT,
     ROUGH_ENDING,
@@ -58,18 +55,16 @@ from limber.estimation.forward.forward_model import Forward, under_its_weight
 from limber.estimation.forward.observed_path import is_path_observed
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.uncertainty.covariance import uncertainty
+from limber.estimation.uncertainty.covariance import averaged, profiled, uncertainty
 from limber.estimation.uncertainty.creep import with_creep
-from limber.estimation.uncertainty.force_checks import require_own_frame
 from limber.estimation.uncertainty.identifiability import (
     SCALE_DEVIATION,
     force_is_measured,
     identifiability,
     link_unresolved,
+    require_own_frame,
     require_scale,
 )
-from limber.estimation.uncertainty.marginal import averaged
-from limber.estimation.uncertainty.profile_likelihood import profiled
 from limber.recordings.cell_errors import calibration_of
 from limber.recordings.recording import Pull
 from limber.recordings.sensor_checks import force_unit_suspicion

@@ -10,9 +10,8 @@ import numpy as np
 from limber.core.errors import WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
-from limber.estimation.estimated_branch import Subject
-from limber.estimation.fit_preparation import forwards_of, neck
-from limber.estimation.fitting.left_out import held_out, without
+from limber.estimation.estimated_branch import Subject, forwards_of, neck
+from limber.estimation.fitting.initial_modulus import held_out, without
 from limber.estimation.fitting.nuisances import CREEP, in_words, nuisance_records, unlikely
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton
@@ -20,29 +19,33 @@ from limber.estimation.forward.forward_model import Forward
 from limber.estimation.forward.observed_path import AT_REST_M
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.uncertainty.bending_stiffness import SectionMean, strain_energy
-from limber.estimation.uncertainty.covariance import Uncertainty, outliers
+from limber.estimation.uncertainty.covariance import Uncertainty, largest, outliers, variance_parts
 from limber.estimation.uncertainty.creep import creep_sentence
-from limber.estimation.uncertainty.force_checks import too_little_said
 from limber.estimation.uncertainty.identifiability import (
     SCALE_DEVIATION,
     Identifiability,
     identifiability,
+    too_little_said,
 )
 from limber.estimation.uncertainty.model_error import (
     ModelError,
     geometry_error,
     mesh_error,
     observer,
+    path_error,
+    path_prescribed,
     steady_loads,
 )
 from limber.estimation.uncertainty.next_actions import Prospects
-from limber.estimation.uncertainty.path_error import path_error, path_prescribed
-from limber.estimation.uncertainty.shape_error import hung_error, shape_error
-from limber.estimation.uncertainty.shape_sensitivity import grip_error
-from limber.estimation.uncertainty.variance_parts import largest, variance_parts
+from limber.estimation.uncertainty.shape_error import (
+    SectionMean,
+    grip_error,
+    hung_error,
+    shape_error,
+    strain_energy,
+)
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.mechanics.materials.layered_section import LayeredSection
+from limber.mechanics.materials.materials import LayeredSection
 from limber.recordings.cell_errors import calibration_of
 from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import GraspEntry, Pull

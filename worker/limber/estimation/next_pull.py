@@ -18,8 +18,7 @@ from scipy.linalg import block_diag
 from limber.core.errors import LimberError, WorkError
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
-from limber.estimation.estimated_branch import Subject
-from limber.estimation.fit_preparation import forwards_of, parameter_space
+from limber.estimation.estimated_branch import Subject, forwards_of, parameter_space
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward.gripper_path import MotionWanted, moved
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values

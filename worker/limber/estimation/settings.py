@@ -114,13 +114,13 @@ class EstimateSettings(Settings):
     @property
     def initial_fractions(self) -> tuple[float, ...]:
         """Positions of the control points of a first fit, as fractions of the main path."""
-        from limber.geometry.skeleton.control_points import FRACTIONS
+        from limber.geometry.skeleton.skeleton import FRACTIONS
 
         return self.fractions or FRACTIONS
 
     @property
     def section(self) -> dict[str, float]:
-        """Layers of the cross-section, as :class:`limber.mechanics.materials.layered_section` takes
+        """Layers of the cross-section, as :class:`limber.mechanics.materials.materials` takes
         them; empty for a solid one.
         """
         layers = {"pith_radius": self.pith_radius, "bark_thickness": self.bark_thickness,

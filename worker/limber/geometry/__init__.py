@@ -19,14 +19,14 @@ _PLACES = {
     "Skeleton": "skeleton.skeleton",
     "Surface": "surface.surface",
     "TetMesh": "tets.tet_mesh",
-    "control_points": "skeleton.control_points",
+    "control_points": "skeleton.skeleton",
     "generate_branch": "generated",
-    "mesh_body": "mesh_surface",
+    "mesh_body": "bodies",
     "mesh_branch": "tets.tetrahedra",
     "read_points": "io.clouds",
     "register_element": "tets.element_types",
     "reconstruct_cloud": "reconstruction",
-    "straight_beam": "tets.cylinder_mesh",
+    "straight_beam": "tets.tree_sweep",
 }
 
 __getattr__, __dir__ = exports(__name__, _PLACES)

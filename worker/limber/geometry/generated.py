@@ -12,8 +12,7 @@ from limber.core.files.reading import checked_as, read_json
 from limber.core.settings import checked_settings
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.settings import BranchSpec
-from limber.geometry.skeleton.control_points import FRACTIONS, control_points
-from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, control_points
 from limber.geometry.skeleton.sweep import arc_lengths, frames, tangents
 from limber.geometry.surface.surface import Surface
 

@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
+from limber.geometry.cloud.cloud import thinned
 from limber.geometry.cloud.leaves import Leaf, find_leaves, leaf_like
 from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
-from limber.geometry.cloud.thinning import thinned
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT

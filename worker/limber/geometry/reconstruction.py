@@ -1,6 +1,7 @@
 """From a scan to tetrahedra: skeleton, surface and mesh of a branch, in its own frame."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,8 +14,8 @@ from limber.core.lazy import loaded
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf
-from limber.geometry.cloud.preparation import Prepared, prepare
-from limber.geometry.cloud.supports import (
+from limber.geometry.cloud.preparation import Prepared, prepare, size_doubts
+from limber.geometry.cloud.surroundings import (
     Support,
     find_supports,
     named_if_refused,
@@ -29,8 +30,6 @@ from limber.geometry.leaf_removal import (
     show_leaves,
     without_leaves,
 )
-from limber.geometry.plausible_size import size_doubts
-from limber.geometry.point_classes import Show, classified, shown_if_refused
 from limber.geometry.pruned_twigs import (
     leave_out_twigs,
     report_pruned_twigs,
@@ -41,32 +40,84 @@ from limber.geometry.pruned_twigs import (
 from limber.geometry.radius_estimators import ESTIMATORS
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.alternatives import alternatives, entries
-from limber.geometry.skeleton.checkpoint import FoundSkeleton
-from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.edits import Edit, SetRoot, edited
 from limber.geometry.skeleton.plausibility import (
     OPEN,
+    RESOLVED,
     check_explained,
     check_surface,
     off_axes,
     root_question,
+    surface_share,
     surface_text,
     unexplained_share,
+    without_volumes,
 )
-from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
-from limber.geometry.skeleton.radii.silhouette import without_hidden_twigs
-from limber.geometry.skeleton.search_result import SkeletonResult, result_of_skeleton
-from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
+from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
+from limber.geometry.skeleton.radii.projected_widths import without_hidden_twigs
+from limber.geometry.skeleton.search_result import FoundSkeleton, SkeletonResult, result_of_skeleton
+from limber.geometry.skeleton.skeleton import (
+    FRACTIONS,
+    INTERPOLATED,
+    LIMITED,
+    Skeleton,
+    upright_rotation,
+)
 from limber.geometry.skeleton.skeletonise import Apart, skeletonise
-from limber.geometry.skeleton.surface_evidence import RESOLVED, surface_share, without_volumes
-from limber.geometry.skeleton.upright import upright_rotation
 from limber.geometry.surface.forks import smooth_forks
 from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.tubes import branch_surface
-from limber.geometry.tets.marks import mark
-from limber.geometry.tets.quality import measure_quality
-from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tet_mesh import TetMesh, mark, measure_quality
 from limber.geometry.tets.tetrahedra import MeshResult, mesh_branch
+
+# The classes of a refused scan's points, as a coloured cloud to look at.
+
+COLOURS = {"wood": (139, 90, 43), "leaf": (60, 170, 60), "on no round axis": (220, 40, 40),
+           "pot": (150, 150, 150), "stake": (60, 110, 230), "post": (30, 50, 140),
+           "wire": (90, 200, 230), "another plant": (170, 90, 200)}
+"""Red, green and blue of each class; its place is the value of the column ``class``."""
+
+Show = Callable[[Cloud], None]
+"""Receives the coloured cloud: metres, with the axes and the origin of the scan's file."""
+
+
+@contextmanager
+def shown_if_refused(show: Show | None, prepared: Prepared, leaves: list[Leaf],
+                     supports: list[Support], off_axes: np.ndarray | None = None,
+                     ) -> Iterator[None]:
+    """Show the points by class if what is done meanwhile refuses the scan.
+
+    Args:
+        show: Receives the cloud; None: nobody looks.
+        prepared: The whole scan.
+        leaves: Its leaves.
+        supports: Its pots, stakes, posts and wires.
+        off_axes: Which of the other points are on no round axis, shape [rest]; None: not known.
+    """
+    try:
+        yield
+    except InputError:
+        if show is not None:
+            show(classified(prepared, leaves, supports, off_axes))
+        raise
+
+
+def classified(prepared: Prepared, leaves: list[Leaf], supports: list[Support],
+               off_axes: np.ndarray | None = None, apart: np.ndarray | None = None) -> Cloud:
+    """Return the points with columns ``class`` and ``color``, see :func:`shown_if_refused`.
+
+    ``apart``: which of the points belong to another plant, shape [n].
+    """
+    kind = leaf_mask(leaves, len(prepared.cloud)).astype(np.uint8)
+    if off_axes is not None:
+        kind[np.flatnonzero(kind == 0)[off_axes]] = 2
+    for support in supports:
+        kind[support.points] = list(COLOURS).index(support.kind)
+    if apart is not None:
+        kind[apart] = list(COLOURS).index("another plant")
+    colour = np.array(list(COLOURS.values()), np.uint8)
+    return Cloud(prepared.cloud.points + prepared.origin, {"color": colour[kind], "class": kind})
+
 
 Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
 """Receives a skeleton as found, and the full result of the search for it."""

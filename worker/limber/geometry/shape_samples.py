@@ -16,8 +16,8 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from limber.geometry.skeleton.confidence import probability_given_carrier
-from limber.geometry.skeleton.radii.cylinders import on_cylinders
-from limber.geometry.skeleton.radii.normal_equations import fitted_system, noise_covariance
+from limber.geometry.skeleton.radii.axis_fit import fitted_system, noise_covariance
+from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.element_types import between_corners
 from limber.geometry.tets.tet_mesh import TetMesh

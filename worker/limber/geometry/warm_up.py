@@ -3,8 +3,8 @@
 import numpy as np
 
 from limber.core.progress import SILENT, Progress
-from limber.geometry.cloud.leaf_trees import leaf_log_odds, surroundings
-from limber.geometry.skeleton.joining.join_pieces import join_pieces
+from limber.geometry.cloud.leaves import leaf_log_odds, surroundings
+from limber.geometry.skeleton.joining import join_pieces
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
 from limber.geometry.skeleton.skeleton import Skeleton

@@ -19,7 +19,7 @@ _PLACES = {
     "BranchModel": "model",
     "DynamicResult": "dynamics.integration",
     "Grasp": "grasp",
-    "MaterialLaw": "materials.law",
+    "MaterialLaw": "materials.laws",
     "EnergyMomentumSettings": "dynamics.motion",
     "NewmarkSettings": "dynamics.motion",
     "ParameterSet": "sensitivities",
@@ -34,8 +34,8 @@ _PLACES = {
     "solve_static": "statics.solve",
     "static_sensitivities": "sensitivities",
     "unloaded_rest_shape": "statics.rest_shape",
-    "register_material": "materials.material_registry",
-    "young_weights": "materials.young_field",
+    "register_material": "materials.laws",
+    "young_weights": "materials.materials",
 }
 
 __getattr__, __dir__ = exports(__name__, _PLACES)

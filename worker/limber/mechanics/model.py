@@ -2,25 +2,26 @@
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from limber.core.constants import GRAVITY
+from limber.core.errors import InputError
 from limber.core.numerics.compiled import for_kernels
-from limber.geometry.tets.mesh_checks import check_mesh, fixed_mask
-from limber.geometry.tets.tet_mesh import TetMesh
+from limber.core.numerics.sparse import NotPositiveDefiniteError
+from limber.geometry.tets.tet_mesh import TetMesh, check_mesh, fixed_mask
 from limber.mechanics.added_masses import PointMass, Tied, mass_entries, nodal_masses, tied
 from limber.mechanics.elements import forces
-from limber.mechanics.elements.principal_strain import largest_principal_strains
-from limber.mechanics.grasp import Grasp
-from limber.mechanics.gripped_piece import stiffening
-from limber.mechanics.internal_state import InternalState, product_with
+from limber.mechanics.elements import shape_functions as elements
+from limber.mechanics.elements.forces import ForceLayout, sparse_times
+from limber.mechanics.elements.stress_kernels import largest_principal_strains
+from limber.mechanics.grasp import Grasp, stiffening
 from limber.mechanics.linear.equations import Equations, Viscous
-from limber.mechanics.materials.law import MaterialLaw, hooke_strain, hooke_stress
-from limber.mechanics.materials.material_registry import material_named
+from limber.mechanics.materials.laws import MaterialLaw, hooke_strain, hooke_stress, material_named
 from limber.mechanics.materials.materials import (
     RayleighDamping,
     check_density,
@@ -29,8 +30,229 @@ from limber.mechanics.materials.materials import (
     lame,
     per_tet,
 )
-from limber.mechanics.mesh_data import MeshData
-from limber.mechanics.prestress import Prestress, carried
+
+# Quantities that a branch's mesh determines: operators, equations, masses.
+
+
+class MeshData:
+    """Quantities that depend on the mesh only; shared by all its models."""
+
+    def __init__(self, mesh: TetMesh, fixed: np.ndarray):
+        self.fixed = fixed
+        self.equations: dict[tuple, Equations] = {}
+        self._set_mesh(mesh)
+
+    def _set_mesh(self, mesh: TetMesh) -> None:
+        self.mesh = mesh
+        self.tets = np.ascontiguousarray(mesh.tets, np.int32)
+        self.rule = elements.stiffness_quadrature(mesh)
+        self.gradients, self.weights = elements.element_gradients(mesh, self.rule)
+        self.layout = ForceLayout(self.tets, self.gradients, self.weights)
+        self.volume_weights = elements.volume_weights(mesh)
+        edge = mesh.nodes[mesh.tets[:, 1]] - mesh.nodes[mesh.tets[:, 0]]
+        self.edge = float(np.linalg.norm(edge, axis=1).mean())
+        self.extent = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+
+    def __getstate__(self) -> dict[str, object]:
+        # Another process makes its own equations: their factors hold compiled memory.
+        return {**vars(self), "equations": {}}
+
+    def moved(self, nodes: np.ndarray) -> "MeshData":
+        """Return the data of the mesh with other node positions; patterns are shared."""
+        other = copy.copy(self)
+        other._set_mesh(replace(self.mesh, nodes=nodes))
+        other.equations = {key: equations.placed(other.gradients, other.weights)
+                           for key, equations in self.equations.items()}
+        return other
+
+    def mass_matrix(self, density: np.ndarray) -> sp.csr_matrix:
+        """Return the mass matrix [kg] of each axis for densities [kg/m^3], shape [tet_count]."""
+        consistent, _ = elements.node_weights(self.mesh)
+        tets, n = self.mesh.tets, self.mesh.node_count
+        per_tet = tets.shape[1]
+        rows = np.repeat(tets, per_tet, axis=1).ravel()
+        columns = np.tile(tets, (1, per_tet)).ravel()
+        return sp.csr_matrix(((consistent * density[:, None, None]).ravel(), (rows, columns)),
+                             (n, n))
+
+    def equations_of(self, grasps: Sequence[Grasp]) -> Equations:
+        """As :meth:`limber.mechanics.model.BranchModel.equations`."""
+        key = tuple(grasp.key() for grasp in grasps)
+        if key not in self.equations:
+            self._check_grasps(grasps)
+            self.equations[key] = Equations(self.tets, self.gradients, self.weights, self.fixed,
+                                            grasps)
+        return self.equations[key]
+
+    def _check_grasps(self, grasps: Sequence[Grasp]) -> None:
+        taken = self.fixed.copy()
+        for grasp in grasps:
+            if taken[grasp.nodes].any():
+                where = "the fixed base" if self.fixed[grasp.nodes].any() else "another grasp"
+                raise InputError(f"A grasp overlaps {where}.",
+                                 "A node cannot follow two masters.",
+                                 "Move the grasp, or reduce its radius.")
+            taken[grasp.nodes] = True
+        if taken.all():
+            raise InputError("Every node is fixed or grasped.", "No free node remains to compute.",
+                             "Use a smaller grasp or a finer mesh.")
+
+
+# A rest shape prestressed by gravity: how the weight acts in later states.
+#
+# The scanned shape x is an equilibrium: a stress S0 in it carries the weight,
+#
+#     integral S0 : sym grad v = weight . v      for every displacement v from x.
+#
+# With x as the reference, no rest shape is needed. With the Green-Lagrange strain E(u) of the
+# displacement u that a gripper causes, E = sym grad u + (grad u)^T grad u / 2, the stress is S0 + C
+# : E, and the potential energy above the hanging state is
+#
+#     integral C : E : E / 2  +  integral S0 : E  -  weight . u
+#         = strain energy of E  +  u . G u / 2,       G = integral (grad N)^T S0 grad N,
+#
+# since the part of S0 that is linear in u balances the weight. The only effect of the weight is the
+# geometric stiffness G: a constant, symmetric matrix, the same in each of the three axes. It
+# stiffens a hanging branch and softens an upright one. It does not contain Young's modulus: for any
+# modulus, the branch hangs as scanned, so estimates need neither a rest shape nor its derivative.
+#
+# S0 is that of linear elasticity in a branch of one material. In a branch (a tree of beams)
+# equilibrium alone determines the forces and moments of each section, so Young's modulus along it
+# does not change them. The error is of the order of the strain that the weight causes (0.1 to 1 %).
+# Tests check this for pulls of a sagging branch against the stress-free shape by inverse statics,
+# from :mod:`limber.mechanics.statics.rest_shape`. Wood that grew while it hung has no stress-free
+# shape at all, only S0.
+
+_YOUNG, _POISSON = 1e9, 0.35
+"""Values for a branch of one material; the modulus cancels, the ratio has almost no effect."""
+
+
+@dataclass(frozen=True)
+class CarriedWeight:
+    """The prestress that carries a load in the scanned shape; linear in the load.
+
+    Attributes:
+        stress: S0 [Pa] at the quadrature points, shape [tet_count, q, 6] (00 11 22 01 02 12).
+        stiffness: G [N/m] of each axis, sparse, shape [node_count, node_count].
+        base: Force of the base on its nodes while the branch hangs [N], [node_count, 3].
+    """
+
+    stress: np.ndarray
+    stiffness: sp.csr_matrix
+    base: np.ndarray
+
+    def scaled(self, factor: float) -> "CarriedWeight":
+        """Return the prestress that carries ``factor`` times the load."""
+        return CarriedWeight(factor * self.stress, factor * self.stiffness, factor * self.base)
+
+    def __add__(self, other: "CarriedWeight") -> "CarriedWeight":
+        return CarriedWeight(self.stress + other.stress,
+                             (self.stiffness + other.stiffness).tocsr(), self.base + other.base)
+
+
+@dataclass(frozen=True)
+class Prestress:
+    """The prestress that carries the weight of a hanging branch.
+
+    Attributes:
+        own: Prestress for the branch's own mass.
+        added: Prestress for the masses that hung on it when it was scanned; None: none.
+        mass_count: Number of the model's added masses included.
+    """
+
+    own: CarriedWeight
+    added: CarriedWeight | None
+    mass_count: int
+
+    @cached_property
+    def total(self) -> CarriedWeight:
+        return self.own if self.added is None else self.own + self.added
+
+    def with_density(self, factor: float) -> "Prestress":
+        """Return the same for a branch ``factor`` times as dense."""
+        return replace(self, own=self.own.scaled(factor))
+
+
+def carried(model: "BranchModel") -> Prestress:
+    """Return the prestress of a model that is assumed to hang in its mesh's shape.
+
+    Raises:
+        NotPositiveDefiniteError: the mesh cannot carry any load.
+    """
+    mesh = model.mesh
+    plain = model.linear(_YOUNG, _POISSON)
+    equations = plain.equations()
+    tangent = equations.tangent(plain, np.zeros_like(mesh.nodes))
+    if not tangent.is_positive_definite:
+        raise NotPositiveDefiniteError("the stiffness of the scanned shape has no positive pivots")
+    own, added = model.nodal_masses
+
+    def carrying(load: np.ndarray) -> CarriedWeight:
+        return _carried(plain, load, tangent.solve(equations.free_part(load)))
+
+    own_load, added_load = (mass[:, None] * model.gravity for mass in (own, added))
+    return Prestress(carrying(own_load), carrying(added_load) if added_load.any() else None,
+                   len(model.point_masses))
+
+
+def _carried(model: "BranchModel", load: np.ndarray, moved: np.ndarray) -> CarriedWeight:
+    strain = model.strains(moved)
+    lam, mu = lame(_YOUNG, _POISSON)
+    stress = 2 * mu * strain
+    stress[..., :3] += lam * strain[..., :3].sum(axis=2, keepdims=True)
+    force = model.tangent_times(np.zeros_like(moved), moved)
+    base = np.where(model.fixed[:, None], force - load, 0.0)
+    return CarriedWeight(stress, geometric_stiffness(model, stress), base)
+
+
+def geometric_stiffness(model: "BranchModel", stress: np.ndarray) -> sp.csr_matrix:
+    """Return the integral of grad N_a . S grad N_b [N/m], shape [node_count, node_count]."""
+    tets, count = model.mesh.tets, model.mesh.node_count
+    full = stress[..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]] * model.weights[..., None, None]
+    gradients = model.gradients
+    blocks = np.einsum("eqia,eqij,eqjb->eab", gradients, full, gradients, optimize=True)
+    width = tets.shape[1]
+    rows, columns = np.repeat(tets, width, axis=1).ravel(), np.tile(tets, (1, width)).ravel()
+    matrix = sp.csr_matrix((blocks.ravel(), (rows, columns)), (count, count))
+    matrix.sum_duplicates()
+    return matrix
+
+
+# The elastic state of a branch at one displacement.
+
+
+@dataclass(frozen=True)
+class InternalState:
+    """Internal forces of one state.
+
+    Attributes:
+        force: Internal force on the nodes [N], shape [node_count, 3]; the gradient of ``energy``.
+        tet_energy: Strain energy of each tetrahedron relative to the mesh's shape [J], [tet_count].
+        min_det_f: Smallest determinant of the deformation gradient at a quadrature point.
+        weight_energy: Contribution of the weight of a hanging branch to the potential [J].
+    """
+
+    force: np.ndarray
+    tet_energy: np.ndarray
+    min_det_f: float
+    weight_energy: float = 0.0
+
+    @property
+    def strain_energy(self) -> float:
+        return float(self.tet_energy.sum())
+
+    @property
+    def energy(self) -> float:
+        """Potential above the mesh's shape [J]: strain and the weight of a hanging branch."""
+        return self.strain_energy + self.weight_energy
+
+
+def product_with(matrix: sp.csr_matrix, field: np.ndarray) -> np.ndarray:
+    """Return the product of a matrix for each axis and a nodal field of shape [node_count, 3]."""
+    product = np.empty((matrix.shape[0], 3))
+    sparse_times(matrix.indptr, matrix.indices, matrix.data, for_kernels(field), product)
+    return product
+
 
 _NO_MEMORY = np.zeros((0, 0, 6))
 DEFAULT_DAMPING = RayleighDamping()
@@ -136,7 +358,7 @@ class BranchModel:
     def gripped(self, *grasps: Grasp) -> "BranchModel":
         """Return the model stiffened by these clamping grippers, and no others.
 
-        See :mod:`limber.mechanics.gripped_piece`. Pinned grasps, and grasps of
+        See :mod:`limber.mechanics.grasp`. Pinned grasps, and grasps of
         which only the nodes are known, change nothing.
         """
         held = [grasp.held for grasp in grasps
@@ -157,7 +379,7 @@ class BranchModel:
     def as_scanned(self) -> "BranchModel":
         """Return the model that hangs in its mesh's shape: weight acts, and is carried there.
 
-        The weight of masses added later bends it further. See :mod:`limber.mechanics.prestress`.
+        The weight of masses added later bends it further. See :mod:`limber.mechanics.model`.
 
         Raises:
             NotPositiveDefiniteError: the mesh cannot carry any load.
@@ -395,4 +617,3 @@ class BranchModel:
             ratio = self.density / before
             self.prestress = (self.prestress.with_density(float(ratio[0])) if np.ptp(ratio) < 1e-12
                             else carried(self))
-

@@ -6,7 +6,7 @@ from pydantic import Field, field_validator
 
 from limber.core.constants import STANDARD_GRAVITY
 from limber.core.settings import GraspMode, Groups, OneOf, Settings, possible_force, possible_young
-from limber.mechanics.materials.material_registry import material_names
+from limber.mechanics.materials.laws import material_names
 
 Point = tuple[float, float, float]
 PointLoad = tuple[float, float, float, float, float, float]

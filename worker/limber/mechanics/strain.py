@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from limber.mechanics.materials.law import MULTIPLICITY, hooke_stress
+from limber.mechanics.materials.laws import MULTIPLICITY, hooke_stress
 from limber.mechanics.model import BranchModel
 
 ALL = slice(None)

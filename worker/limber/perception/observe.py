@@ -9,8 +9,7 @@ import numpy as np
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import poses_at, rotation_angle, rotation_matrix
 from limber.core.progress import SILENT, Progress
-from limber.geometry.cloud.camera import Camera, SeenCloud, depth_to_cloud, read_camera
-from limber.geometry.cloud.pixels import read_mask
+from limber.geometry.cloud.camera import Camera, SeenCloud, depth_to_cloud, read_camera, read_mask
 from limber.geometry.io.depth_images import depth_metres
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.perception.tracking import Anchor, CurveTracker, rest_offset

@@ -5,7 +5,7 @@ Positions for the grasp within a branch's reach:
 >>> import numpy as np
 >>> from limber.planning import sample_positions
 >>> from limber.planning.field.grasp_model import Reach
->>> from limber.planning.field.low_energy_surface import LowEnergySurface
+>>> from limber.planning.field.sampling import LowEnergySurface
 >>> reach = Reach(np.zeros(3), arc_length=0.5, chord=0.48, tip=np.array([0, 0, 0.6]))
 >>> shell = LowEnergySurface(np.array([0, 0, 0.1]), radius=0.38)
 >>> sample_positions(reach, np.array([0, 0, 0.48]), 32, shell, deflection=0.4).shape
@@ -17,12 +17,12 @@ from limber.core.lazy import exports
 _PLACES = {
     "EnergyField": "field.energy_field",
     "EnergySettings": "settings",
-    "GraspGoal": "goals.grasp_goal",
+    "GraspGoal": "goals.goal_kinds",
     "GraspModel": "field.grasp_model",
     "GraspSamples": "field.energy_field",
     "PlanSettings": "settings",
     "PlannedMotion": "make_plan",
-    "TargetGoal": "goals.target_goal",
+    "TargetGoal": "goals.goal_kinds",
     "fit_field": "field.energy_field",
     "grasp_model_of": "field.grasp_model",
     "plan_motion": "make_plan",

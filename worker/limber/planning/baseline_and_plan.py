@@ -12,23 +12,33 @@ from limber.planning.certificate.feasibility import judge
 from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights, arc_lengths, resample
-from limber.planning.field.energy_field import EnergyField, FieldArrays
-from limber.planning.field.interpolation.local_error import LocalError
-from limber.planning.field.limited_quantities import UNITS
-from limber.planning.goals.allowed_poses import (
+from limber.planning.field.energy_field import UNITS, EnergyField, FieldArrays
+from limber.planning.field.radial import LocalError
+from limber.planning.goals.goal import (
+    Goal,
     GoalOverLimitsError,
     allowed_points,
     goal_points,
     with_near_side,
 )
-from limber.planning.goals.goal import Goal
-from limber.planning.goals.grasp_goal import near
-from limber.planning.path_problem import UNPROVEN, BlockedError, GentleProblem, not_found
-from limber.planning.path_start import check_start
+from limber.planning.goals.goal_kinds import near
+from limber.planning.path_problem import (
+    UNPROVEN,
+    BlockedError,
+    GentleProblem,
+    check_start,
+    not_found,
+)
 from limber.planning.planners.detour import DetourPath, plan_detour
-from limber.planning.planners.eikonal import GentlePath, plan_gentle, separated
-from limber.planning.planners.refine import distinct, is_along, refine
-from limber.planning.planners.tree_search import PathProblem, Search
+from limber.planning.planners.refine import (
+    GentlePath,
+    distinct,
+    is_along,
+    plan_gentle,
+    refine,
+    separated,
+)
+from limber.planning.planners.rrt_star import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, chosen_engine, found_again, plan_path
 from limber.planning.settings import PlanSettings
 

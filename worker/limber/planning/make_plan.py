@@ -17,33 +17,38 @@ from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.baseline_and_plan import PathPair, plan_within, with_bound
 from limber.planning.certificate.lower_bound import ENOUGH
-from limber.planning.closed_passages import checked_wall, confirmed, not_confirmed
 from limber.planning.constraints.chance import Risk, YoungUncertainty
-from limber.planning.constraints.full_model_check import (
+from limber.planning.constraints.limits import Limits
+from limber.planning.constraints.motion_check import (
+    MotionCheck,
     as_samples,
     broken_on_full_model,
+    check_motion,
     field_error,
     learnt,
     with_constraints,
 )
-from limber.planning.constraints.limits import Limits
-from limber.planning.constraints.motion_check import MotionCheck, check_motion
 from limber.planning.cost import STEP, arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField, refit
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.goals.goal import CellPlace, Goal, GoalRequest
-from limber.planning.goals.goal_kinds import goal_of
-from limber.planning.goals.target_goal import TargetGoal
+from limber.planning.goals.goal_kinds import TargetGoal, goal_of
+from limber.planning.passages import (
+    Passages,
+    checked_wall,
+    confirmed,
+    not_confirmed,
+    solved_if_undecided,
+    with_added_poses,
+)
 from limber.planning.path_on_full_model import ResolvedPath, resolve_side_by_side
-from limber.planning.path_problem import BlockedError
-from limber.planning.path_start import start_of
-from limber.planning.plan_summary import doubts_of, summary_of
+from limber.planning.path_problem import BlockedError, start_of
+from limber.planning.plan_file import doubts_of, summary_of
 from limber.planning.planners.least_violation import easiest_path
-from limber.planning.planners.tree_search import SearchTree
+from limber.planning.planners.rrt_star import SearchTree
 from limber.planning.search_files import CostToGo
 from limber.planning.settings import PlanSettings
 from limber.planning.timing import DEFAULT_PACE, Pace
-from limber.planning.undecided_passages import Passages, solved_if_undecided, with_added_poses
 
 _REPLANS = 3  # of the same plan at most: each takes as long as the first
 _SLOWINGS = 4  # of the motion at most, until it keeps the limits
@@ -88,7 +93,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     :data:`_REPLANS` times. The same holds for a plan along which the field's error is too large
     for it to be the gentlest; the last of those is passed on with a warning. If no path keeps the
     limits on the field, and its error leaves that undecided, the states along the path that comes
-    nearest join the samples likewise (:mod:`limber.planning.undecided_passages`). The same holds
+    nearest join the samples likewise (:mod:`limber.planning.passages`). The same holds
     for a motion that breaks a limit by the branch's inertia at any pace tried.
 
     Cancelled (or by Ctrl-C) while the bound closes, it takes the best path so far, which is checked

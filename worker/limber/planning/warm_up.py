@@ -6,7 +6,7 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.baseline_and_plan import PlanSettings, plan_pair
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_samples import GraspSamples
-from limber.planning.goals.grasp_goal import GraspGoal
+from limber.planning.goals.goal_kinds import GraspGoal
 
 
 def warm_up(progress: Progress = SILENT) -> None:

@@ -14,8 +14,7 @@ from limber.core.files.safe_names import inside
 from limber.core.json_values import number_array, validated
 from limber.core.numerics.rigid import composed, rotation_matrix
 from limber.core.progress import SILENT, Progress
-from limber.geometry.cloud.camera import Camera, read_camera, write_camera
-from limber.geometry.cloud.pixels import read_pixels
+from limber.geometry.cloud.camera import Camera, read_camera, read_pixels, write_camera
 from limber.geometry.io.clouds import read_points, unit_of
 from limber.geometry.io.depth_images import depth_metres
 

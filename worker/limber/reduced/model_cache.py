@@ -15,7 +15,7 @@ import contextlib
 import hashlib
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,12 +27,149 @@ from limber.core.errors import InputError
 from limber.core.files.reading import read_arrays
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.grasp import Grasp
+from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
-from limber.reduced.building import build_reduced
-from limber.reduced.model_file import FORMAT, read_model, write_model
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedSettings
-from limber.reduced.training import Snapshots, TrainingSettings
+from limber.reduced.basis import Basis, make_basis
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings
+from limber.reduced.strain_polynomial import StrainPolynomial, make_polynomial, reduced_mass
+from limber.reduced.training import Snapshots, Trainer, TrainingSettings, sample_poses, sample_young
+
+# A reduced model as a file of plain arrays.
+
+FORMAT = 4
+
+
+def write_model(model: ReducedModel, path: Path,
+                beside: Mapping[str, np.ndarray] | None = None) -> None:
+    """Write a model as plain arrays (npz, nothing pickled); ``beside`` goes into the file
+    too, under names that begin with ``snapshot_``, which :func:`read_model` leaves alone."""
+    arrays = {
+        "format": FORMAT, "grasp_nodes": model.grasp.nodes, "grasp_weights": model.grasp.weights,
+        "grasp_centre": model.grasp.centre, "grasp_mode": model.grasp.mode, "rest": model.rest,
+        "columns": model.basis.columns, "lift_count": model.basis.lift_count,
+        "states": model.basis.states, "captured": model.basis.captured, "reach": model.basis.reach,
+        **{f"polynomial_{k}": v for k, v in vars(model.polynomial).items()},
+        "load": model.load, "weight_stiffness": model.weight_stiffness, "mass": model.mass,
+        "damping": [model.damping.mass, model.damping.stiffness],
+        "control_young": model.control_young, "poses": model.poses,
+        "training_young": model.training_young, "energies": model.energies,
+        "young_spread": model.young_spread, "extent": model.extent,
+        "error_names": list(model.error), "error_values": list(model.error.values())}
+    if model.strain_fields is not None:
+        arrays["strain_fields"] = model.strain_fields
+    with open(path, "wb") as stream:
+        np.savez(stream, **arrays, **(beside or {}))
+
+
+def read_model(path: Path) -> ReducedModel:
+    """Read a model that :func:`write_model` wrote.
+
+    Raises:
+        InputError: it is not one, or of another format.
+    """
+    arrays = {name: values for name, values in read_arrays(path, "a reduced model").items()
+              if not name.startswith("snapshot_")}
+    if int(arrays.get("format", -1)) != FORMAT:
+        raise InputError(f"{path} has a different format.", "", "Build it again.")
+    grasp = Grasp(arrays["grasp_nodes"], arrays["grasp_weights"], arrays["grasp_centre"],
+                  "point" if str(arrays["grasp_mode"]) == "point" else "rigid")
+    basis = Basis(arrays["columns"], int(arrays["lift_count"]), arrays["states"],
+                  float(arrays["captured"]), arrays["reach"])
+    linear, quadratic, by_lambda, by_mu = (
+        arrays[f"polynomial_{name}"] for name in ("linear", "quadratic", "by_lambda", "by_mu"))
+    polynomial = StrainPolynomial(linear, quadratic, by_lambda, by_mu,
+                                  float(arrays["polynomial_poisson"]))
+    error = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
+                     strict=True))
+    return ReducedModel(
+        grasp, arrays["rest"], basis, polynomial, arrays["load"], arrays["weight_stiffness"],
+        arrays["mass"], RayleighDamping(*arrays["damping"]), arrays["control_young"],
+        arrays["poses"], arrays["training_young"], arrays["energies"],
+        float(arrays["young_spread"]), float(arrays["extent"]), error,
+        strain_fields=arrays.get("strain_fields"))
+
+
+# Construction of a reduced model: full solutions at training grasps, and their span.
+
+_DEFAULT = ReducedSettings()
+
+
+def build_reduced(model: BranchModel, grasp: Grasp, weights: np.ndarray,
+                  control_young: np.ndarray,
+                  settings: ReducedSettings = _DEFAULT,
+                  progress: Progress = SILENT) -> tuple[ReducedModel, Snapshots]:
+    """Solve the full model at training grasps and make the reduced model of them.
+
+    Args:
+        model: The branch (St. Venant-Kirchhoff).
+        grasp: The patch that is held, clamped or pinned.
+        weights: From control points to tetrahedra, shape [tet_count, K]
+            (limber.mechanics.young_weights).
+        control_young: Young's modulus at the control points [Pa], shape [K].
+
+    Raises:
+        ConvergenceError: no training grasp has an equilibrium. InputError: other materials.
+    """
+    training = settings.training
+    rng = np.random.default_rng(training.seed)
+    trainer = Trainer(model, grasp, weights, control_young,
+                      young_tangents=training.young_spread > 1)
+    poses = sample_poses(model, grasp, training.grasp_count, rng, training)
+    young = sample_young(control_young, len(poses), rng, training.young_spread)
+    snapshots = trainer.take(poses, young, vibration_every=training.vibration_every,
+                             vibration_count=training.vibration_count,
+                             progress=progress.part(0.0, 0.9))
+    progress(0.9, "reducing", snapshots=len(snapshots))
+    reduced = reduce_snapshots(model, grasp, weights, control_young, snapshots, settings,
+                               keeps_strain=True)
+    progress(1.0, "reduced model ready", size=reduced.size)
+    return reduced, snapshots
+
+
+def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
+                     control_young: np.ndarray, snapshots: Snapshots,
+                     settings: ReducedSettings, *, keeps_strain: bool = False) -> ReducedModel:
+    """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`.
+
+    ``keeps_strain``: Whether :meth:`ReducedModel.strains` is needed, which doubles its size.
+    """
+    control_young = np.asarray(control_young, float)
+    if not settings.vibration_count:
+        snapshots = snapshots.without_vibrations()
+    basis = make_basis(model, grasp, snapshots, settings.size,
+                       settings.vibration_count if len(snapshots.vibrations) else 0)
+    polynomial, fields = make_polynomial(model, basis, weights, control_young, snapshots,
+                                         settings.field_count, keeps_fields=keeps_strain)
+    flat = basis.columns.reshape(basis.size, -1)
+    spread = float(np.exp(np.abs(np.log(snapshots.young / control_young)).max()))
+    weight = model.weight_stiffness
+    carried = np.zeros((basis.size, basis.size)) if weight is None else flat @ np.array(
+        [weight @ column for column in basis.columns]).reshape(basis.size, -1).T
+    return ReducedModel(
+        grasp, model.mesh.nodes, basis, polynomial, flat @ model.weight_force.ravel(), carried,
+        reduced_mass(model, basis), model.damping, control_young, snapshots.poses,
+        snapshots.young, snapshots.energy, max(spread, 1.0), model.extent, strain_fields=fields)
+
+
+def as_control_points(model: BranchModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights [tet_count, K] and moduli [K] that give the model's Young's modulus.
+
+    Control points are the mesh's. If they cannot represent the field (or there are none), it
+    becomes one region with its own pattern, and only its level can change.
+    """
+    from limber.mechanics.materials.materials import young_weights
+
+    marks = model.mesh.point_data.get("control_point")
+    if marks is not None and (marks >= 0).any():
+        order = np.argsort(marks[marks >= 0])
+        points = model.mesh.nodes[np.flatnonzero(marks >= 0)[order]]
+        weights = young_weights(model.mesh, points)
+        young = np.linalg.lstsq(weights, model.young, rcond=None)[0]
+        if (young > 0).all() and np.abs(weights @ young / model.young - 1).max() < 1e-6:
+            return weights, young
+    level = float(model.young.mean())
+    return (model.young / level)[:, None], np.array([level])
+
 
 LIMIT_BYTES = 2 << 30
 """Largest size of all models of a folder: a dozen for a branch of some thousand tetrahedra."""

@@ -12,8 +12,7 @@ import numpy as np
 from limber.core.numerics.rigid import pose_between
 from limber.mechanics.dynamics.integration import NewmarkSettings
 from limber.mechanics.grasp import check_pose
-from limber.reduced.reduced_model import ReducedModel, solved_raised
-from limber.reduced.state import ReducedState
+from limber.reduced.reduced_model import ReducedModel, ReducedState, solved_raised
 
 _NEAR = 1e-5
 """Next gain of energy over the energy from which Newton is taken to close in; chosen."""

@@ -3,7 +3,7 @@
 Full solutions span a subspace (limber.reduced.basis) in which the StVK force is a cubic
 polynomial (limber.reduced.strain_polynomial). ::
 
-    reduced = build_reduced(model, grasp, weights, control_young)  # limber.reduced.building
+    reduced = build_reduced(model, grasp, weights, control_young)  # limber.reduced.model_cache
     state = reduced.with_young(young).solve_static(pose)
     state.strain_energy, state.reaction_force, reduced.displacement(state)
 
@@ -21,11 +21,144 @@ from limber.core.not_none import present
 from limber.core.numerics.rigid import pose_between
 from limber.mechanics.grasp import Grasp, check_pose
 from limber.mechanics.materials.materials import RayleighDamping
-from limber.reduced.basis import Basis, GraspCoordinates
-from limber.reduced.reduced_workspace import FoundState, Workspace
-from limber.reduced.state import ReducedSensitivities, ReducedState, ReducedStaticSettings
+from limber.reduced.basis import Basis, GraspCoordinates, TrainingPoses
 from limber.reduced.strain_polynomial import StrainPolynomial, evaluate_strain, strain_only
-from limber.reduced.training_poses import TrainingPoses
+from limber.reduced.training import TrainingSettings
+
+# Settings and results of a reduced model and its solves.
+
+
+@dataclass(frozen=True)
+class ReducedSettings:
+    """Settings of a reduced model.
+
+    Attributes:
+        size: Coordinates, those of the grasp and of the vibrations included.
+        vibration_count: Coordinates for vibrations. Where Young's modulus is known they make
+            motion in time better and cost statics little; where it changes they spoil the
+            position of free ends.
+        field_count: Strain fields; None: no projection, exact on the subspace and stiffer.
+        training: Which full solutions it learns from.
+    """
+
+    size: int = 64
+    vibration_count: int = 0
+    field_count: int | None = 105
+    training: TrainingSettings = TrainingSettings()  # noqa: RUF009 (frozen)
+
+
+@dataclass(frozen=True)
+class ReducedStaticSettings:
+    """Settings of the search for a reduced equilibrium.
+
+    Attributes:
+        tolerance: Energy that a Newton step would still gain, relative to the strain energy.
+        max_iterations: Most Newton iterations per step.
+        max_halvings: Most halvings of the path to the pose before another start is tried.
+        start_count: How many starts are tried, the given state included.
+        novelty_limit: Largest coordinate relative to the training's beyond which the state is
+            taken for false and sought again from other starts.
+        iteration_limit: Newton iterations of the whole search; the best that was found by then
+            counts.
+    """
+
+    tolerance: float = 1e-10
+    max_iterations: int = 25
+    max_halvings: int = 4
+    start_count: int = 4
+    novelty_limit: float = 1.5
+    iteration_limit: int = 10_000
+
+
+@dataclass(frozen=True)
+class ReducedState:
+    """A static state of the reduced model.
+
+    Attributes:
+        converged: Whether it is a stable equilibrium of the reduced model.
+        trusted: Whether it is also within the training of the basis; see ``doubt``.
+        doubt: Why it is not trusted, empty if it is.
+        coordinates: q, shape [size].
+        pose: [m, rad], shape [6].
+        young: At the control points [Pa], shape [K].
+        strain_energy: Energy of the strain relative to the model's mesh [J].
+        energy: Potential of strain and weight, as in StaticResult [J].
+        reaction_force, reaction_torque: Of the gripper on the branch [N, Nm], shape [3]; torque
+            about the pose's position.
+        novelty: Largest mode coordinate relative to the training's.
+        iterations, seconds: Effort.
+    """
+
+    converged: bool
+    trusted: bool
+    uncertainty: str
+    coordinates: np.ndarray
+    pose: np.ndarray
+    young: np.ndarray
+    strain_energy: float
+    energy: float
+    reaction_force: np.ndarray
+    reaction_torque: np.ndarray
+    novelty: float
+    iterations: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class ReducedSensitivities:
+    """Derivatives to log Young's modulus at the control points.
+
+    Attributes:
+        coordinates: Shape [size, K]; displacements by ``ReducedModel.displacement_of``.
+        reaction_force, reaction_torque: [N, Nm], shape [3, K]; about the pose's position.
+        strain_energy: With that of a carried weight [J], shape [K].
+    """
+
+    coordinates: np.ndarray
+    reaction_force: np.ndarray
+    reaction_torque: np.ndarray
+    strain_energy: np.ndarray
+
+
+# Arrays that the solver of a reduced model reuses, and the equilibria that it finds.
+
+
+@dataclass
+class Workspace:
+    """Arrays that the kernel writes to."""
+
+    strain: np.ndarray
+    jacobian: np.ndarray
+    gradient: np.ndarray
+    tangent: np.ndarray
+
+    @classmethod
+    def of(cls, linear: np.ndarray) -> "Workspace":
+        count, size = linear.shape
+        return cls(np.empty(count), np.empty((count, size)), np.empty(size),
+                   np.empty((size, size)))
+
+
+@dataclass(frozen=True)
+class FoundState:
+    """One equilibrium that was found, in reduced coordinates ``q``."""
+
+    q: np.ndarray
+    converged: bool
+    novelty: float
+    iterations: int
+    potential: float
+    steady: bool = False  # every tangent along the path was positive definite
+
+    def agrees(self, other: "FoundState") -> bool:
+        """Whether both are the same equilibrium."""
+        return (self.converged and other.converged
+                and abs(self.potential - other.potential) <= 1e-6 * abs(other.potential))
+
+    def ranking(self, settings: ReducedStaticSettings) -> tuple[bool, bool, float]:
+        """Sort key: converged, then within the training, then the lower potential energy."""
+        return not self.converged, self.novelty >= settings.novelty_limit, self.potential
+
 
 _STATIC = ReducedStaticSettings()
 _NO_INCREMENT = np.empty(0)
@@ -47,7 +180,7 @@ class ReducedModel:
         basis: The subspace.
         polynomial: Strain as a polynomial of the coordinates.
         load: Weight that the mesh's shape does not carry, on the coordinates [N], shape [size].
-        weight_stiffness: Of the weight that it carries (limber.mechanics.prestress) [N/m], shape
+        weight_stiffness: Of the weight that it carries (limber.mechanics.model) [N/m], shape
             [size, size].
         mass: Mass matrix of the coordinates, shape [size, size].
         damping: Rayleigh damping.

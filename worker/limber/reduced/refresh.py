@@ -14,12 +14,10 @@ from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
-from limber.mechanics.solve_status import Status
-from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult
-from limber.mechanics.statics.static_problem import StaticProblem, make_result
-from limber.reduced.building import build_reduced, reduce_snapshots
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedSettings, ReducedState
+from limber.mechanics.statics.equilibrium_path import StaticProblem, make_result
+from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, Status
+from limber.reduced.model_cache import build_reduced, reduce_snapshots
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings, ReducedState
 from limber.reduced.training import Snapshots, Trainer
 
 _CORRECTIONS = 4

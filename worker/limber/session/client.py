@@ -146,7 +146,7 @@ class InteractiveSession:
         record = question.get("gust_record")
         if isinstance(record, str | os.PathLike):
             # It loads the mechanics, which a client does not need otherwise.
-            from limber.mechanics.loads.gust_loads import WindRecord
+            from limber.mechanics.loads.load_effects import WindRecord
 
             wind = WindRecord.read(Path(record))
             question["gust_record"] = {"time_s": wind.times.tolist(),

@@ -12,8 +12,7 @@ from limber.core.numerics.rigid import pose_between
 from limber.mechanics.dynamics.integration import NewmarkSettings
 from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
 from limber.reduced.reduced_dynamics import ReducedStepper
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedState, ReducedStaticSettings
+from limber.reduced.reduced_model import ReducedModel, ReducedState, ReducedStaticSettings
 from limber.session.frame_buffer import HeldAt, Status
 from limber.session.protocol import Load
 from limber.session.session_branch import Answer, HeldBranch

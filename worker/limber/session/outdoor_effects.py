@@ -15,8 +15,14 @@ import numpy as np
 from limber.core.errors import Cancelled, InputError, LimberError
 from limber.core.processes import Pool
 from limber.core.progress import Progress
-from limber.mechanics.loads.gust_loads import Gusts, Turbulence, WindRecord, blown, with_peak
-from limber.mechanics.loads.load_effects import load_effects
+from limber.mechanics.loads.load_effects import (
+    Gusts,
+    Turbulence,
+    WindRecord,
+    blown,
+    load_effects,
+    with_peak,
+)
 from limber.mechanics.loads.outdoor import Outdoors
 from limber.session.event_writer import Events
 from limber.session.protocol import Effects

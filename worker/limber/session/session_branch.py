@@ -18,7 +18,7 @@ from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import solve_static
 from limber.mechanics.strain import carried_strain
-from limber.reduced.building import as_control_points
+from limber.reduced.model_cache import as_control_points
 from limber.session.frame_buffer import HeldAt
 from limber.session.protocol import GRASP_LIMIT, Load
 

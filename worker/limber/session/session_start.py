@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from limber.core.progress import SILENT, Progress
-from limber.reduced.state import ReducedSettings
+from limber.reduced.reduced_model import ReducedSettings
 from limber.reduced.training import TrainingSettings
 from limber.session.session_branch import HeldBranch
 from limber.session.settings import SessionSettings

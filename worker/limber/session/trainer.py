@@ -30,10 +30,10 @@ from limber.core.errors import Cancelled, LimberError
 from limber.core.json_values import plain
 from limber.core.progress import JsonSink, Progress
 from limber.mechanics.grasp import Grasp
-from limber.reduced.building import as_control_points
 from limber.reduced.model_cache import (
     LearntModel,
     ReducedCache,
+    as_control_points,
     default_folder,
     learnt_model,
     model_key,

@@ -13,9 +13,8 @@ import numpy as np
 from limber.core.errors import LimberError
 from limber.core.processes.child import Child
 from limber.mechanics.grasp import Grasp
-from limber.reduced.model_file import read_model
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedState
+from limber.reduced.model_cache import read_model
+from limber.reduced.reduced_model import ReducedModel, ReducedState
 from limber.session.settings import SessionSettings
 
 _CHECK_INTERVAL = 1.0

@@ -193,8 +193,8 @@ def all_schemas() -> dict[str, Any]:
     """Return the schemas of all stages by name, the format's version, the presets of species and
     sensors, and the largest size [m] without a question about the unit.
     """
-    from limber.geometry.plausible_size import LONGEST
-    from limber.mechanics.materials.species import SOURCE, SPECIES
+    from limber.geometry.cloud.preparation import LONGEST
+    from limber.mechanics.materials.materials import SOURCE, SPECIES
     from limber.recordings.sensor_presets import SENSORS
 
     return {"format": FORMAT,

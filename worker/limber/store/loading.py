@@ -25,7 +25,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import HungTwig, PointMass
 from limber.mechanics.loads.loaded_branch import LoadedBranch, NamedTarget, hang, target_masses
-from limber.mechanics.materials.law import MaterialLaw
+from limber.mechanics.materials.laws import MaterialLaw
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
 from limber.planning.field.grasp_model import GraspModel, grasp_model_of

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.repair.fused_forks import separate_fused_forks
+from limber.geometry.skeleton.fused_limbs import separate_fused_forks
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _NOISE = 3e-4

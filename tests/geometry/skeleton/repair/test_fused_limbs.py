@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.geometry.skeleton.repair.test_fused_forks import _tube
 
-from limber.geometry.skeleton.repair.fused_limbs import with_split_limbs
+from limber.geometry.skeleton.fused_limbs import with_split_limbs
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _NOISE = 3e-4

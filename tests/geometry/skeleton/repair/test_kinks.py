@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.repair.kinks import without_kinks
+from limber.geometry.skeleton.confidence import KINK, DoubtfulKind, doubtful_parts, turns
+from limber.geometry.skeleton.repair import without_kinks
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.uncertain_parts import KINK, DoubtfulKind, doubtful_parts, turns
 
 
 def _run(*corners) -> Skeleton:

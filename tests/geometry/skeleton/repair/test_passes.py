@@ -8,11 +8,11 @@ import pytest
 from tests.geometry.skeleton.repair.test_fused_forks import two_in_one, two_limbs
 from tests.geometry.skeleton.repair.test_fused_limbs import limbs_side_by_side
 
+from limber.geometry.skeleton.confidence import KINK, turns
 from limber.geometry.skeleton.radii.axis_fit import AxisFit
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
-from limber.geometry.skeleton.repair.passes import PASSES, Pass, Repaired
+from limber.geometry.skeleton.repair import PASSES, Pass, Repaired
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
-from limber.geometry.skeleton.uncertain_parts import KINK, turns
 
 Z, RADIUS, NOISE = 0.005 * np.arange(81), 0.008, 0.0005
 ALONG = np.stack([0 * Z, 0 * Z, Z], axis=1)

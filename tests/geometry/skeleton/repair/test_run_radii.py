@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
-from limber.geometry.skeleton.repair.run_radii import (
+from limber.geometry.skeleton.run_ends import (
     point_counts,
     steadied,
     tapered,

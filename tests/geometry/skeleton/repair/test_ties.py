@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from limber.geometry.skeleton.repair.false_connections import untied
+from limber.geometry.skeleton.repair import untied
 
 
 def _chain(points: np.ndarray, first: int = 0) -> np.ndarray:

@@ -274,7 +274,7 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
 def _tip_goal(branch: Path) -> list[object]:
     """A place some centimetres from the branch's tip, as options of `limber plan`."""
     from limber.planning.field.energy_field import EnergyField
-    from limber.planning.goals.chosen_pose import tip_goal
+    from limber.planning.goals.goal_kinds import tip_goal
 
     goal = tip_goal(EnergyField.read(branch / "energy.npz"))
     return ["--tip-goal", *goal.region.middle.tolist(), "--goal-tolerance", goal.tolerance]

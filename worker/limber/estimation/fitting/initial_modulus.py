@@ -1,14 +1,24 @@
-"""Initial values of a fit: the uniform modulus that explains the measured force best."""
+"""Around a fit: its initial modulus, errors too large for their squares, pulls it leaves out."""
 
-from dataclasses import replace
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from limber.core.errors import WorkError
-from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.core.not_none import present
+from limber.core.numerics.rigid import rotated
+from limber.estimation.fitting.nuisances import nuisance_records
+from limber.estimation.fitting.objective import Evaluation, Objective, seen_in
 from limber.estimation.fitting.optimise import gauss_newton
+from limber.estimation.forward.forward_model import Forward
 from limber.estimation.forward.observed_path import ObservedPathForward, is_path_observed
+from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, ParameterSpace, Values
+from limber.recordings.recording import Pull
+
+# Initial values of a fit: the uniform modulus that explains the measured force best.
 
 PARTS = (0.25, 0.45, 0.7)
 """Fractions of a fast pull's frames that are fitted first: over a quarter the simulation cannot be
@@ -241,3 +251,118 @@ def _first_standing(objective: Objective, trials: list[Values],
         if found is not None:
             return trial, found
     return None
+
+
+# Errors so large that their squares matter: put right by what was fitted, then fitted again.
+#
+# The errors of a fit are linear. A frame of the observed points that is turned by several degrees
+# is turned back, and a point that is a centimetre off along a bent branch is moved there.
+
+ROUNDS = 4
+"""Most fits. 20 degrees need three."""
+SMALL_RAD = 5e-3
+"""Turn below which its square no longer matters: 0.01 mm at half a metre."""
+FAR_M = 4e-3
+"""Distance along the branch beyond which a point is moved: with a radius of curvature of 15 cm its
+square is 0.05 mm.
+"""
+
+
+def far_points(cell_errors: Sequence[dict], known: Mapping[str, np.ndarray],
+               ) -> dict[str, np.ndarray] | None:
+    """Return each pull's fitted distances of its points along the branch [m], shape [m].
+
+    None: they are near those at which the pulls were simulated.
+
+    Args:
+        known: These, by the pull's name; zero where it has none.
+    """
+    found: dict[str, list[float]] = {}
+    for each in cell_errors:
+        if re.fullmatch("position of point [0-9]+ along the branch", each["name"]):
+            found.setdefault(each["pull"], []).append(each["value"])
+    fitted = {name: np.array(values) for name, values in found.items()}
+    is_far = any(np.abs(values - known.get(name, 0.0)).max() > FAR_M
+                 for name, values in fitted.items())
+    return fitted if is_far else None
+
+
+def fitted_frame(cell_errors: Sequence[dict]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the fitted shift [m] and turn [rad] of the observer's frame, shape [3] each."""
+    def vector(start: str) -> np.ndarray:
+        return np.array([each["value"] for each in cell_errors
+                         if each["name"].startswith(start)] or np.zeros(3))
+
+    return vector("camera position"), vector("camera rotation")
+
+
+def put_right(pull: Pull, shift: np.ndarray, turn: np.ndarray) -> Pull:
+    """Return the pull with its points in the branch's frame, turned back about their middle."""
+    seen = present(pull.observations, "observed points")
+    points = seen.positions - shift
+    middle = np.nanmean(points, axis=(0, 1))
+    back = rotated(-turn, (points - middle).reshape(-1, 3)).reshape(points.shape)
+    return replace(pull, observations=replace(seen, positions=middle + back))
+
+
+class FarPointsError(Exception):
+    """Points are far from where they were simulated: the pulls are fitted again there."""
+
+    def __init__(self, shifts: dict[str, np.ndarray], values: Values, forwards: list[Forward]):
+        super().__init__()
+        self.shifts, self.values, self.forwards = shifts, values, forwards
+
+    def begin(self, forwards: list[Forward]) -> None:
+        """Let simulations of the same pulls start from the states found so far."""
+        for forward, known in zip(forwards, self.forwards, strict=True):
+            if isinstance(forward, QuasiStaticForward) and isinstance(known, QuasiStaticForward):
+                forward.begin_at(known)
+
+
+@dataclass(frozen=True)
+class FarPoints:
+    """Looks whether a fit has moved points far along the branch from ``shifts`` [m]."""
+
+    shifts: dict[str, np.ndarray]
+
+    def look(self, evaluation: Evaluation, objective: Objective) -> None:
+        """Raise FarPointsError if it has."""
+        if evaluation.errors is None:
+            return
+        size = objective.space.size
+        listed = nuisance_records(objective.cell_errors.nuisances, evaluation.errors,
+                                  np.zeros((size, size)))
+        far = far_points(listed, self.shifts)
+        if far is not None:
+            raise FarPointsError(far, objective.space.unpack(evaluation.free),
+                                 objective.forwards)
+
+
+# Pulls that a fit leaves out, and how well it predicts them.
+
+
+def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float, float]:
+    """RMS distance [m] of points and RMS force error [N] of one pull that was not used in a fit.
+
+    Raises:
+        WorkError: the pull has no equilibrium under these values.
+    """
+    forward = objective.forwards[index]
+    simulated = forward.simulate(objective.space.unpack(free), (), False)
+    if simulated is None:
+        raise WorkError(f"{forward.name} cannot be predicted: the simulation finds no equilibrium.",
+                        "The moduli of the other pulls do not carry its forces.",
+                        "Check this pull's grasp point, frame of reference and units.")
+    simulated = forward.under_readings(simulated)
+    off = (simulated.positions - forward.frames.positions)[seen_in(forward.frames)]
+    force = simulated.forces - forward.frames.wrenches[:, :3]
+    force = force[np.isfinite(force).all(axis=1)]
+    return (float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(off) else np.nan,
+            float(np.sqrt(np.mean(np.sum(force**2, axis=1)))) if len(force) else np.nan)
+
+
+def without(objective: Objective, index: int) -> Objective:
+    """Return the objective on all pulls but one; it keeps no log."""
+    kept = [k for k in range(len(objective.forwards)) if k != index]
+    return Objective([objective.forwards[k] for k in kept], objective.space,
+                     force_sigma=[objective.force_sigma[k] for k in kept])

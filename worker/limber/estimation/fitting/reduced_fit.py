@@ -22,17 +22,13 @@ from limber.core.errors import InputError, WorkError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import Fit, FitStatus
-from limber.estimation.forward.corrected_pull import CorrectedForward
-from limber.estimation.forward.forward_model import Forward
-from limber.estimation.forward.key_frames import key_frames, travel
+from limber.estimation.forward.forward_model import Forward, key_frames, travel
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.forward.reduced_pull import ReducedForward
+from limber.estimation.forward.reduced_pull import CorrectedForward, ReducedForward
 from limber.estimation.parameters import Values
 from limber.recordings.recorded_grasp import pose_on
-from limber.reduced.building import reduce_snapshots
-from limber.reduced.model_file import read_model, write_model
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedSettings
+from limber.reduced.model_cache import read_model, reduce_snapshots, write_model
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings
 from limber.reduced.training import Trainer, TrainingSettings, sample_poses, sample_young
 
 # Sizes and limits are chosen. The model's error is measured in every fit and corrected, so they

@@ -6,17 +6,19 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.not_none import present
-from limber.estimation.forward.force_motion import motion_response
 from limber.estimation.forward.forward_model import (
     Forward,
+    Response,
     Simulated,
     carries_its_weight,
+    motion_response,
+    nodal_loads,
     under_its_weight,
 )
-from limber.estimation.forward.input_force import Response, nodal_loads
 from limber.estimation.interpolation_prior import YoungField
 from limber.estimation.parameters import Values, mechanics_names
-from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
+from limber.mechanics.dynamics.integration import simulate_dynamics
+from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator

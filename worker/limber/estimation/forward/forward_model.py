@@ -4,17 +4,403 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
+from scipy import sparse
 
-from limber.estimation.forward.input_force import Response
-from limber.estimation.forward.point_directions import PointDirections
+from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.dynamics.modes import subspace_round
+from limber.mechanics.dynamics.motion import NewmarkSettings
+from limber.mechanics.grasp import Grasp
 from limber.mechanics.loads.loaded_branch import is_stable
 from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.mechanics.sensitivities import refined_solve
 from limber.mechanics.statics.solve import StaticSettings, solve_static
 from limber.recordings.cell_errors import calibration_of
-from limber.recordings.recording import PullEntry
+from limber.recordings.recording import GraspEntry, PullEntry
 from limber.recordings.synchronisation import Frames
+
+# Direction of the branch at its observed points, at rest and in a deformed state.
+#
+# An observed point may be off its control point along the branch: the scan's tip is short, or a
+# camera follows another place. It then moves with the branch at that place. To first order the
+# measurements show the simulated point plus the distance times the direction of the branch there.
+
+SLENDER = 3.0
+"""Extent along the axis over that across it at which nearby tetrahedra show the axis: to 0.1
+degrees on the paper's branches, meshed coarsely and finely; with 2 to 0.6.
+"""
+FEWEST_TETS = 12
+GROWTH = 1.25
+STEP = 0.25
+"""Distance to both sides over which the change of the direction is measured, over that extent."""
+
+
+@dataclass(frozen=True)
+class PointDirections:
+    """Directions of the branch at m points.
+
+    Attributes:
+        rest: Unit vectors at rest, away from the base, shape [m, 3].
+        operator: Their change by nodal displacements, shape [3 m, 3 n].
+    """
+
+    rest: np.ndarray
+    operator: sparse.csr_matrix
+
+    @classmethod
+    def at(cls, mesh: TetMesh, points: np.ndarray) -> "PointDirections":
+        """Return the directions at points [m], shape [m, 3]."""
+        base = mesh.nodes[mesh.point_data["fixed"].astype(bool)].mean(axis=0)
+        found = [_axis(mesh, point, base) for point in points]
+        rest = np.array([axis for axis, _ in found]).reshape(-1, 3)
+        step = STEP * np.array([extent for _, extent in found])[:, None]
+        ahead, behind = (point_operator(mesh, points + sign * step * rest) for sign in (1, -1))
+        scale = sparse.diags(np.repeat(0.5 / step[:, 0], 3))
+        return cls(rest, sparse.csr_matrix(scale @ (ahead - behind)))
+
+    def changed(self, change: np.ndarray) -> np.ndarray:
+        """Return unit vectors after a change, as ``operator`` gives it, shape [3 m]."""
+        moved = self.rest + change.reshape(-1, 3)
+        return moved / np.linalg.norm(moved, axis=1, keepdims=True)
+
+    def bent(self, displacement: np.ndarray) -> np.ndarray:
+        """Return unit vectors under nodal displacements [m], shape [n, 3]."""
+        return self.changed(self.operator @ displacement.ravel())
+
+
+def _axis(mesh: TetMesh, point: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, float]:
+    """Direction of the branch near a point, and the radius of the ball that shows it [m].
+
+    The ball grows until the tetrahedra in it extend along the branch more than across. They count
+    less towards its edge: cut off sharply, a coarse mesh tilted the direction by up to 15 degrees.
+    """
+    centres, volumes = mesh.centroids, np.abs(mesh.volumes)
+    away = np.linalg.norm(centres - point, axis=1)
+    extent = float(np.sort(away)[min(FEWEST_TETS, len(away) - 1)])
+    while True:
+        near = away <= extent
+        weights = volumes[near] * (1 - (away[near] / extent)**2)**2
+        middle = weights @ centres[near] / weights.sum()
+        spread = (centres[near] - middle) * np.sqrt(weights)[:, None]
+        _, sizes, axes = np.linalg.svd(spread, full_matrices=False)
+        if sizes[0] > SLENDER * sizes[1] or near.all():
+            break
+        extent *= GROWTH
+    return axes[0] * (np.sign(axes[0] @ (middle - base)) or 1.0), extent
+
+
+# Effect of errors of a measured force on the motion that it drives.
+#
+# A motion changes with a small change of its force like a linear system. The slowest modes carry
+# nearly all of the change; the others follow quasi-statically. The modes are those of the
+# undeformed branch, which suffices because the change is only used as a weight.
+
+MODES = 16
+"""Number of modes for the change of a motion; the remainder is static. Chosen, not measured."""
+SPARE = 8
+ITERATIONS = 8
+"""Subspace iteration: extra vectors, and number of iterations."""
+
+
+def motion_response(model: BranchModel, loads: np.ndarray, observed: object, times: np.ndarray,
+                    ) -> np.ndarray:
+    """Return the change of observed points during a motion by the force at each frame.
+
+    Args:
+        model: The branch, with its damping.
+        loads: Nodal forces of each of the force's components, shape [c, node_count, 3].
+        observed: Displacement of the points from the nodes', shape [3 m, 3 n]; sparse.
+        times: Times of the frames [s], shape [f]; the force is linear between them.
+
+    Returns:
+        [m per N], shape [f, m, 3, f c]; the force's columns by frame, then component.
+    """
+    squares, modes, static = _modes(model, loads)
+    at_points = np.array([observed @ mode.ravel() for mode in modes])
+    pushed = np.einsum("qni,cni->qc", modes, loads)
+    alpha, beta = model.damping.mass, model.damping.stiffness
+    swing = _swing(squares, alpha + beta * squares, times)
+    count, components = len(times), len(loads)
+    points = np.einsum("qfj,qp,qc->fpjc", swing, at_points, pushed, optimize=True)
+    stiff = np.array([observed @ field.ravel() for field in static]).T
+    stiff = stiff - np.einsum("qp,qc,q->pc", at_points, pushed, 1 / squares)
+    frames = np.arange(count)
+    points[frames, :, frames] += stiff
+    return points.reshape(count, -1, 3, count * components)
+
+
+def _modes(model: BranchModel, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Squared angular frequencies [1/s^2], modes of unit modal mass, and static solutions."""
+    tangent = model.equations(()).tangent(model, np.zeros_like(model.mesh.nodes))
+    static = np.array([tangent.solve(load) for load in loads])
+    rng = np.random.default_rng(0)
+    free = rng.standard_normal((MODES + SPARE - len(loads), *model.mesh.nodes.shape))
+    free[:, model.fixed] = 0.0
+    vectors = np.concatenate([static, free])
+    for _ in range(ITERATIONS):
+        squares, vectors = subspace_round(model, tangent, vectors)
+    return squares[:MODES], vectors[:MODES], static
+
+
+def _swing(squares: np.ndarray, damping: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Each mode's motion under a unit force at one frame that falls linearly to zero at its
+    neighbours.
+
+    By Newmark's average acceleration with the steps of the simulation, starting in equilibrium.
+
+    Returns:
+        Shape [modes, f, f]: at each frame, for the force at each frame.
+    """
+    count = len(times)
+    k, d = squares[:, None], damping[:, None]
+    hats = np.eye(count)
+    target = hats[0] / k
+    speed, push = np.zeros_like(target), np.zeros_like(target)
+    swing = np.empty((len(squares), count, count))
+    swing[:, 0] = target
+    for frame in range(1, count):
+        gap = times[frame] - times[frame - 1]
+        steps = int(np.ceil(gap / NewmarkSettings().max_step - 1e-9))
+        dt = gap / steps
+        for step in range(1, steps + 1):
+            share = step / steps
+            force = (1 - share) * hats[frame - 1] + share * hats[frame]
+            predicted = target + dt * speed + dt**2 / 4 * push
+            going = speed + dt / 2 * push
+            push = (force - d * going - k * predicted) / (1 + dt / 2 * d + dt**2 / 4 * k)
+            target, speed = predicted + dt**2 / 4 * push, going + dt / 2 * push
+        swing[:, frame] = target
+    return swing
+
+
+# Simulate a few frames of a slow pull and interpolate the others.
+#
+# Without inertia a branch's state is a smooth function of the gripper's pose (or force) alone. A
+# few states along the path and a cubic spline through them give the others at a small fraction of
+# the cost. Every observed frame still counts in the fit, so no measurement is discarded.
+
+ROTATION_LENGTH_M = 0.1
+"""Travel equivalent to a rotation of one radian. Chosen; the model checks the spline."""
+
+
+def travel(poses: np.ndarray, step_m: float = 5e-4) -> np.ndarray:
+    """Return the path's length up to each pose, shape [n], without jitter below ``step_m``."""
+    scaled = poses * np.r_[np.ones(3), np.full(3, ROTATION_LENGTH_M)]
+    length = np.zeros(len(poses))
+    last = 0
+    for index in range(1, len(poses)):
+        moved = float(np.linalg.norm(scaled[index] - scaled[last]))
+        if moved >= step_m:
+            since = np.linalg.norm(scaled[last:index + 1] - scaled[last], axis=1)
+            length[last:index + 1] = length[last] + np.maximum.accumulate(since) * (
+                moved / since.max())
+            last = index
+        else:
+            length[index] = length[last]
+    return length
+
+
+def key_frames(along: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Choose the frames to simulate, and the interpolation of all frames.
+
+    Args:
+        along: A parameter that increases along the path, shape [n].
+        count: Largest number of frames to simulate.
+
+    Returns:
+        Indices of the key frames, shape [k], and S, shape [n, k]: values at all frames are
+        S @ values at the key frames.
+    """
+    distances, first = np.unique(along, return_index=True)
+    if len(distances) > count:
+        targets = np.linspace(distances[0], distances[-1], count)
+        near = np.unique(np.abs(distances[:, None] - targets).argmin(axis=0))
+        distances, first = distances[near], first[near]
+    if len(distances) == 1:
+        return first, np.ones((len(along), 1))
+    if len(distances) < 4:
+        spread = np.column_stack([np.interp(along, distances, row) for row
+                                  in np.eye(len(distances))])
+        return first, spread
+    return first, scipy.interpolate.CubicSpline(distances, np.eye(len(distances)))(along)
+
+
+def smoothed(times: np.ndarray, values: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """Return noisy measurements at given instants, each from a local quadratic fit.
+
+    Args:
+        times: [s], shape [n].
+        values: Shape [n, c]; rows with NaN are discarded.
+        keys: Requested instants [s], shape [k].
+    """
+    known = np.isfinite(values).all(axis=1)
+    times, values = times[known], values[known]
+    width = max(2.0 * np.ptp(times) / max(len(keys) - 1, 1), 1e-9)
+    result = np.empty((len(keys), values.shape[1]))
+    for row, key in enumerate(keys):
+        near = np.abs(times - key) <= width / 2
+        if near.sum() < 6:
+            result[row] = [np.interp(key, times, column) for column in values.T]
+        else:
+            result[row] = np.polynomial.polynomial.polyfit(times[near] - key, values[near], 2)[0]
+    return result
+
+
+# Errors of the measured force that drives a simulation, as unknowns of the fit.
+#
+# If it is taken as exact, an error of the force becomes an error of all points of its frame at
+# once, many times their own noise and in one direction; a fit then distorts the moduli to follow
+# it. Here the true force is a smooth course through the key frames. Its values there are unknowns
+# in addition to the moduli, and each reading is an observation of the course. Points are nearly
+# linear in so small a change of force, so the unknowns can be eliminated: residuals and their
+# derivatives are projected onto the complement of what a change of force could explain. That equals
+# weighting the points by their noise plus the force's, carried through the compliance (the
+# effective variance), with all correlations between the points of a frame. After each fit, its
+# estimate of the force updates the course, and the compliance with it, until both settle (Fuller,
+# Measurement Error Models, 1987, ch. 3).
+
+COURSE_MISFIT = 1.5
+"""Mean squared deviation of readings from their course, over the stated one, above which the course
+gets more key frames. Chosen, not measured.
+"""
+CLIPPED = 4.0
+"""Deviations beyond which a reading is an outlier rather than curvature of the force."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """Response of a simulated pull to its L force unknowns, at the point of linearisation.
+
+    Attributes:
+        points: Response of the observed points [m per N], shape [f, m, 3, L].
+        wrenches: Response of force, and of torque if it acts too, at the frames, shape [f, c, L]; c
+            is 3 or 6.
+        grasps: Response of the gripper's position [m per N], shape [f, 3, L]; None if it is not
+        observed.
+    """
+
+    points: np.ndarray
+    wrenches: np.ndarray
+    grasps: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Course:
+    """Force over time, and torque of a clamped grasp.
+
+    Attributes:
+        keys: Key frames, shape [k].
+        spread: Values at all frames from those at the key frames, shape [f, k].
+        values: At the key frames [N, N m], shape [k, c].
+        exact: Whether it is a stated load, not a reading. It then has no unknowns.
+    """
+
+    keys: np.ndarray
+    spread: np.ndarray
+    values: np.ndarray
+    exact: bool = False
+
+
+def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int) -> Course:
+    """Fit a smooth course to the readings of the force.
+
+    A noisy force does not define a path, so the frames are ordered by time. If ``count`` key frames
+    cannot follow the readings to within their noise, there are more.
+
+    Args:
+        frames: Readings may be missing.
+        sigma: Deviation of each reading [N, N m], shape [f, c].
+        count: Requested number of key frames.
+        components: c: 3 for the force, 6 with the torque.
+    """
+    readings = frames.wrenches[:, :components]
+    known = np.isfinite(readings).all(axis=1)
+    if np.ptp(readings[known], axis=0).max() == 0.0:
+        return Course(np.flatnonzero(known)[:1], np.ones((len(frames), 1)),
+                      readings[known][:1], exact=True)
+    along = frames.times - frames.times[0]
+    while True:
+        keys, spread = key_frames(along, count)
+        weight = 1 / sigma[known]
+        values = smoothed(frames.times, readings, frames.times[keys])
+        for axis in range(components):
+            matrix = weight[:, axis, None] * spread[known]
+            missing = weight[:, axis] * (readings[known, axis] - spread[known] @ values[:, axis])
+            values[:, axis] += np.linalg.lstsq(matrix, missing, rcond=1e-3)[0]
+        off = np.clip((readings[known] - spread[known] @ values) * weight, -CLIPPED, CLIPPED)
+        freedom = max(known.sum() - len(keys), 1) * components
+        if len(keys) >= min(len(frames), known.sum()) or (
+                float(np.sum(off**2)) < COURSE_MISFIT * freedom):
+            return Course(keys, spread, values)
+        count = 2 * len(keys)
+
+
+def nodal_loads(grasp: Grasp, entry: GraspEntry, pose: np.ndarray, rest: np.ndarray,
+                components: int) -> np.ndarray:
+    """Nodal forces of each component of the gripper's wrench, shape [c, node_count, 3].
+
+    A force acts on the patch's weighted centre. A clamped gripper's torque, about the recorded
+    point, rotates the patch by couples of forces on its nodes, with their arms at the recorded
+    rotation.
+
+    Args:
+        pose: Recorded [m, rad], shape [6].
+        rest: Nodes of the mesh [m], shape [node_count, 3].
+    """
+    loads = np.zeros((components, *rest.shape))
+    for axis in range(3):
+        loads[axis, grasp.nodes, axis] = grasp.weights
+    if components == 3:
+        return loads
+    turn = rotation_matrix(pose[3:])
+    middle = grasp.weights @ rest[grasp.nodes]
+    arms = (rest[grasp.nodes] - middle) @ turn.T
+    # The force acts on the middle, but the torque was measured about the recorded point.
+    offset = turn @ (np.array(entry.point_m) - middle)
+    inertia = np.einsum("k,kij->ij", grasp.weights, np.einsum("ki,ki->k", arms, arms)[
+        :, None, None] * np.eye(3) - arms[:, :, None] * arms[:, None, :])
+    for axis in range(3):
+        spin = np.linalg.solve(inertia, np.eye(3)[axis])
+        loads[3 + axis, grasp.nodes] = grasp.weights[:, None] * np.cross(spin, arms)
+    for axis in range(3):
+        loads[axis] += np.einsum("t,tni->ni", np.cross(offset, np.eye(3)[axis]), loads[3:])
+    return loads
+
+
+def compliance(model: BranchModel, displacement: np.ndarray, loads: np.ndarray) -> np.ndarray:
+    """Change of an equilibrium by each nodal load, shape [c, node_count, 3]."""
+    tangent = model.equations(()).exact_tangent(model, displacement)
+    if tangent.is_positive_definite:
+        return np.array(tangent.solve_all(list(loads)))
+
+    def force(direction: np.ndarray) -> np.ndarray:
+        return model.tangent_times(displacement, direction)
+
+    return np.array([refined_solve(tangent, force, load, tolerance=1e-5) for load in loads])
+
+
+def response_of(spread: np.ndarray, at_keys: np.ndarray) -> Response:
+    """Return the response at all frames.
+
+    Args:
+        spread: Values at f frames from those at k key frames, shape [f, k].
+        at_keys: Response of the points at the key frames [m per N], shape [k, c, m, 3].
+    """
+    keys, components = at_keys.shape[:2]
+    points = np.einsum("fk,kcmi->fmikc", spread, at_keys)
+    wrenches = np.einsum("fk,cd->fckd", spread, np.eye(components))
+    return Response(points.reshape(*points.shape[:3], keys * components),
+                    wrenches.reshape(len(spread), components, keys * components))
+
+
+def wrench_sigma(entry: PullEntry, frames: Frames, components: int) -> np.ndarray:
+    """Return the standard deviation of the readings [N, N m], shape [f, components]."""
+    sensor = entry.sensor
+    each = [sensor.force_sigma_n] * 3 + [sensor.torque_sigma_nm] * (components - 3)
+    return np.array(each, float) / np.sqrt(np.maximum(frames.wrench_counts, 1))[:, None]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import scipy
 from limber.core.errors import WorkError
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.progress import SILENT, Progress
-from limber.estimation.forward.input_force import compliance
+from limber.estimation.forward.forward_model import compliance
 from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
 from limber.mechanics.dynamics.motion import DynamicResult
 from limber.mechanics.grasp import Grasp

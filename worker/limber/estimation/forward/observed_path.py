@@ -3,7 +3,7 @@
 If the prescribed poses have an error of a millimetre, a slender branch is stretched. The error of
 its force follows from its axial stiffness, a thousand times that of bending, and the moduli are
 wrong with it. The same pull can be driven by its force, an unknown function of time with readings
-as observations (see :mod:`limber.estimation.forward.input_force`), and the recorded positions of
+as observations (see :mod:`limber.estimation.forward.forward_model`), and the recorded positions of
 the gripper are
 observations like the points, with the uncertainty of the gripper's frame. A branch responds softly
 to an error of force, so the problem is well conditioned, and the more informative of force and path
@@ -18,8 +18,7 @@ import numpy as np
 from limber.core.not_none import present
 from limber.core.numerics.rigid import principal_axes
 from limber.core.numerics.sparse import NotPositiveDefiniteError
-from limber.estimation.forward.forward_model import Forward, Simulated
-from limber.estimation.forward.input_force import Response, compliance
+from limber.estimation.forward.forward_model import Forward, Response, Simulated, compliance
 from limber.estimation.forward.quasi_static import FEW_KEYS, QuasiStaticForward
 from limber.estimation.parameters import Values, equal_values, mechanics_names
 from limber.mechanics.model import BranchModel

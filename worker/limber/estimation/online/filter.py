@@ -18,16 +18,191 @@ import numpy as np
 import scipy
 
 from limber.core.not_none import present
-from limber.estimation.online.corrections import COVERED, Corrections
-from limber.estimation.online.full_model import Beside, Here
-from limber.estimation.online.information import Information, Kept, OnlineFrame
+from limber.estimation.online.full_model import Beside, ExactFrame, Here
 from limber.estimation.parameters import YOUNG_BOUNDS_PA
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.points import point_operator
 from limber.recordings.recorded_grasp import pose_on
 from limber.recordings.recording import GraspEntry
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedState, ReducedStaticSettings
+from limber.reduced.reduced_model import ReducedModel, ReducedState, ReducedStaticSettings
+
+# Information of the frames of a pull on the moduli: linearised and summed.
+
+
+@dataclass(frozen=True)
+class OnlineFrame:
+    """Measurements at one instant.
+
+    Attributes:
+        time: [s].
+        pose: Pose of the grasp point [m, rad], shape [6].
+        force: Force of the gripper on the branch [N], shape [3]; NaN if not measured.
+        positions: Observed points [m], shape [m, 3]; NaN if not observed.
+    """
+
+    time: float
+    pose: np.ndarray
+    force: np.ndarray
+    positions: np.ndarray
+
+
+@dataclass
+class Kept:
+    """A frame as linearised at ``centre``, log E of shape [K].
+
+    Attributes:
+        state: State of the reduced model; None: it belongs to another basis.
+        normal, gradient: Normal matrix and gradient of half its squared residuals, shapes [K, K]
+        and [K].
+        residual: Root mean square of the standardised residuals.
+    """
+
+    frame: OnlineFrame
+    state: ReducedState | None
+    centre: np.ndarray
+    normal: np.ndarray
+    gradient: np.ndarray
+    residual: float
+
+
+class Information:
+    """The information on log E: a prior, kept frames, and merged frames.
+
+    Args:
+        centre: Mean of the prior, shape [K].
+        deviation: Its standard deviation.
+        kept_count: Largest number of frames that are kept for another linearisation.
+    """
+
+    def __init__(self, centre: np.ndarray, deviation: float, kept_count: int):
+        count = len(centre)
+        self._prior = centre.copy(), np.eye(count) / deviation**2
+        self._kept_count = kept_count
+        self.kept: list[Kept] = []
+        self.past: list[OnlineFrame] = []
+        self._normal, self._gradient = np.zeros((count, count)), np.zeros(count)
+
+    def add(self, new: Kept) -> None:
+        """Keep a frame; if there are too many, the least informative one is merged."""
+        self.kept.append(new)
+        self.kept.sort(key=lambda kept: kept.frame.time)
+        if len(self.kept) <= self._kept_count:
+            return
+        # The frame whose pose is nearest to its neighbours' adds the least information: it is
+        # merged.
+        poses = np.array([kept.frame.pose for kept in self.kept])
+        steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+        gone = self.kept.pop(int(np.argmin(steps[:-1] + steps[1:])) + 1)
+        self.past.append(gone.frame)
+        self._normal += gone.normal
+        self._gradient += gone.gradient - gone.normal @ gone.centre
+
+    def replace(self, kept: list[Kept]) -> None:
+        """Replace all kept and merged frames by these."""
+        self.kept, self.past = kept, []
+        self._normal[:], self._gradient[:] = 0.0, 0.0
+
+    def normal_gradient(self, log_young: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix and gradient of all information, at these moduli: shapes [K, K] and [K]."""
+        centre, precision = self._prior
+        normal = precision + self._normal
+        gradient = precision @ (log_young - centre)
+        gradient = gradient + self._gradient + self._normal @ log_young
+        for kept in self.kept:
+            normal = normal + kept.normal
+            gradient = gradient + kept.gradient + kept.normal @ (log_young - kept.centre)
+        return normal, gradient
+
+
+# Errors of the reduced model at some frames of a pull, and their interpolation.
+
+UNCHECKED_ERROR = 0.3
+"""Initial error of the reduced model over the noise of a measurement, before it is measured."""
+COVERED = 0.1
+"""Fraction of the path between the last frames of the full model."""
+STALE = 0.25
+"""Change of a log E above which a frame of the full model is solved again at the end."""
+
+
+@dataclass
+class _Correction:
+    """Full model minus reduced model at one frame; rows of points, then of the force."""
+
+    frame: OnlineFrame
+    centre: np.ndarray
+    rows: np.ndarray
+    slopes: np.ndarray
+
+    def at(self, log_young: np.ndarray) -> np.ndarray:
+        return self.rows + self.slopes @ (log_young - self.centre)
+
+
+class Corrections:
+    """Measured at frames of the full model, interpolated between them.
+
+    Args:
+        sigmas: Standard deviations of a frame's measurements, shape [r].
+    """
+
+    def __init__(self, sigmas: np.ndarray):
+        self._sigmas = sigmas
+        self._known: list[_Correction] = []
+        self._surprises: list[float] = []
+
+    @property
+    def error(self) -> float:
+        """Error of the model over the noise of a measurement, from the last full frames."""
+        return float(np.sqrt(np.mean(np.square(self._surprises[-3:])))
+                     ) if self._surprises else UNCHECKED_ERROR
+
+    @property
+    def is_checked(self) -> bool:
+        """Whether the error of the reduced model is known."""
+        return len(self._surprises) >= 3
+
+    def forget(self) -> None:
+        """Discard them, because they belong to another basis."""
+        self._known.clear()
+
+    def at(self, frame: OnlineFrame, log_young: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows [r] and slopes [r, K] to add at a frame: from the two nearest known frames."""
+        count = len(self._sigmas)
+        if not self._known:
+            return np.zeros(count), np.zeros((count, len(log_young)))
+        far = np.array([np.linalg.norm(known.frame.pose[:3] - frame.pose[:3])
+                        for known in self._known])
+        near = np.argsort(far)[:2]
+        share = 1 / np.maximum(far[near], 1e-9)
+        share /= share.sum()
+        chosen = [self._known[index] for index in near]
+        return (sum(part * known.at(log_young) for part, known in zip(share, chosen, strict=True)),
+                sum(part * known.slopes for part, known in zip(share, chosen, strict=True)))
+
+    def add(self, frame: OnlineFrame, found: ExactFrame, rows: np.ndarray,
+            slopes: np.ndarray) -> None:
+        """Add a frame of the full model, with the reduced model's rows and slopes for it."""
+        exact = np.r_[found.moved.ravel(), found.force]
+        d_exact = np.vstack([found.d_moved.reshape(-1, found.d_moved.shape[-1]), found.d_force])
+        new = _Correction(frame, found.log_young, exact - rows, d_exact - slopes)
+        predicted = self.at(frame, found.log_young)[0]
+        self._surprises.append(float(np.sqrt(np.mean(((new.rows - predicted) / self._sigmas)**2))))
+        self._known = [old for old in self._known if old.frame is not frame]
+        self._known.append(new)
+
+    def next_requested(self, kept: list[Kept], log_young: np.ndarray) -> Kept | None:
+        """Return the frame farthest from the known ones. None: none is far."""
+        poses = np.array([each.frame.pose[:3] for each in kept])
+        far = np.full(len(poses), np.inf)
+        for known in self._known:
+            near = np.linalg.norm(poses - known.frame.pose[:3], axis=1)
+            if np.abs(known.centre - log_young).max() < STALE:
+                far = np.minimum(far, near)
+        far[[each.state is None for each in kept]] = -1.0
+        index = int(np.argmax(far))
+        if far[index] < 0 or far[index] < COVERED * np.linalg.norm(np.ptp(poses, axis=0)):
+            return None
+        return kept[index]
+
 
 STEP_LIMIT = 0.7
 """Largest change of a log E by one frame."""

@@ -11,15 +11,13 @@ import numpy as np
 
 from limber.core.errors import Cancelled, InputError
 from limber.core.progress import SILENT, Progress
-from limber.estimation.estimated_branch import Subject
-from limber.estimation.fit_preparation import forwards_of
+from limber.estimation.estimated_branch import Subject, forwards_of
 from limber.estimation.fitting.initial_modulus import scaled_start
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.forward.forward_model import under_its_weight
-from limber.estimation.online.filter import OnlineEstimator, OnlineState
+from limber.estimation.online.filter import OnlineEstimator, OnlineFrame, OnlineState
 from limber.estimation.online.full_model import Beside, FullBranch, Here
-from limber.estimation.online.information import OnlineFrame
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.model_error import ModelError, geometry_error, total_interval
@@ -28,9 +26,8 @@ from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import Observations, Pull, read_pull
 from limber.recordings.sensor_checks import clean
 from limber.recordings.synchronisation import frames_of
-from limber.reduced.building import build_reduced
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedSettings
+from limber.reduced.model_cache import build_reduced
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings
 from limber.reduced.training import TrainingSettings
 
 SAID = {

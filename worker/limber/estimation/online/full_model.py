@@ -19,9 +19,8 @@ from limber.mechanics.sensitivities import static_sensitivities
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.recorded_grasp import grasp_on, pose_on
 from limber.recordings.recording import GraspEntry
-from limber.reduced.building import reduce_snapshots
-from limber.reduced.reduced_model import ReducedModel
-from limber.reduced.state import ReducedSettings
+from limber.reduced.model_cache import reduce_snapshots
+from limber.reduced.reduced_model import ReducedModel, ReducedSettings
 from limber.reduced.training import Trainer, sample_young
 
 REFRESH_STATES = 24

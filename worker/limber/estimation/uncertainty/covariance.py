@@ -1,12 +1,18 @@
 """Uncertainty of an estimate: covariance and intervals, and measurements that do not fit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypedDict
 
 import numpy as np
 import scipy
 
+from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.objective import Evaluation, Objective
+from limber.estimation.fitting.optimise import OUTLYING, Fit
+from limber.estimation.forward.dynamic_pull import DynamicForward
+from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.interpolation_prior import YoungField
+from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace
 from limber.estimation.uncertainty.drift import scale_steps
 from limber.recordings.cell_errors import calibration_of
 
@@ -199,3 +205,363 @@ def _from_images(objective: Objective) -> bool:
 
 def _scale(residual: np.ndarray) -> float:
     return max(1.4826 * float(np.median(np.abs(residual))), 1e-12)
+
+
+# The most likely moduli over all forms of their field, not for the most likely form alone.
+#
+# A fit ends at the most likely combination of moduli and form. But the effect of the form increases
+# with the difference of neighbouring moduli: with steeper moduli a pull leaves a smaller fraction
+# of the prior forms possible, which the most likely form does not show. With the form integrated
+# out by Laplace's approximation, the density of the moduli is that along the fit's valley over the
+# root of the determinant of the information on all other unknowns. Its mode is at smaller steps: by
+# one or two hundredths of a modulus, if the form matters.
+
+LONGEST_STEP = 0.5
+"""In standard deviations; beyond it the approximation is invalid, and the fit is kept."""
+
+
+def averaged(fit: Fit, objective: Objective) -> Fit:
+    """Return the fit moved to the mode of the moduli's marginal density; unchanged if the form of
+    the field is not an unknown.
+    """
+    full = objective.forwards[0].full
+    if not isinstance(full, QuasiStaticForward | DynamicForward):
+        return fit
+    field = full.field
+    if not field.names or not set(field.names) <= set(objective.space.extra):
+        return fit
+    step = marginal_step(fit.evaluation, objective.space, field)
+    if not np.linalg.norm(fit.evaluation.slopes @ step) < LONGEST_STEP:
+        return fit
+    lower, upper = objective.space.bounds()
+    found = objective.evaluate(np.clip(fit.evaluation.free + step, lower, upper), jacobian=True)
+    return fit if found is None else Fit(found, fit.status, fit.reason)
+
+
+def marginal_step(evaluation: Evaluation, space: ParameterSpace, field: YoungField) -> np.ndarray:
+    """Step from the joint mode to the marginal one in the free vector, shape [p].
+
+    Args:
+        evaluation: At the end of the fit, with derivatives.
+        field: Its further unknowns are among the free ones.
+    """
+    count = space.group_count
+    information = evaluation.slopes.T @ evaluation.slopes
+    left_open = np.diag(np.linalg.inv(information[count:, count:]))
+    informed = 1 - left_open[[space.extra.index(name) for name in field.names]]
+    slope = np.zeros(space.size)
+    slope[:count] = -(informed @ field.growth(space.unpack(evaluation.free))) @ space.membership
+    return np.linalg.solve(information, slope)
+
+
+# Causes of the uncertainty of a modulus, as parts that add up to its variance.
+#
+# With the information of all measurements and priors in rows J, the covariance is C = (J^T J)^-1,
+# and C = sum over groups of rows of C J_g^T J_g C: each group's part is the effect of its errors on
+# the result through the fit. The unknown zero of a force sensor uses up part of the information;
+# that is included in the part of the measurements that determine it.
+
+ADVICE = {
+    "noise of the points": "use more frames, more pulls, or more visible markers",
+    "noise of the force": "pull farther, or slower with more readings",
+    "noise of the gripper's poses": "use more pulls",
+    "gripper frame": "calibrate the gripper's frame against the branch's (hand-eye), and state "
+                     "its standard deviation under [calibration] in pull.toml",
+    "force gain": "check the sensor with a known weight",
+    "zero of the force sensor": "tare the sensor before each pull, and state it under "
+                                "[calibration]",
+    "camera frame": "register the camera to the branch (fixed markers), or add a second view",
+    "places of the points": "mark the points on the branch before the scan, and give their "
+                            "positions (--nominal of import-pull)",
+    "clock": "record all sensors with one clock",
+    "slip of the grasp": "grasp without slip, or put a marker at the grasp",
+    "modulus between the control points": "add markers along the branch, or pull at another point",
+    "Poisson's ratio": "give it (--poisson, --poisson-sigma); pulls do not determine it",
+    "density": "weigh a piece of the branch (--density, --density-sigma)",
+    "moduli that the pulls do not determine": "pull at a point farther out",
+    "shape of the scan": "scan from more sides, or with less noise",
+    "skeleton of the scan": "look at the alternatives (`limber skeleton`), and confirm or edit the "
+                            "doubtful parts",
+    "mass of twigs and leaves": "weigh the twigs and leaves, and state the uncertainty "
+                                "(--hung-sigma); or mesh more twigs (--twig-radius of "
+                                "reconstruct)",
+    "length in the gripper": "measure it, and state it under [grasp] (radius_m: half of it) and "
+                             "[calibration] (held_length_sigma_m) in pull.toml",
+    "creep of the branch": "hold the branch at the end of the pull, or pull there and back",
+    "mesh": "use a finer mesh (--mesh-spacing of reconstruct)",
+    "clamp": "scan farther down, so that the clamped position is known",
+}
+"""Advice to narrow an interval, by cause."""
+
+_GROUPS = (("camera clock", "clock"), ("camera", "camera frame"), ("gripper", "gripper frame"),
+           ("grasp position", "gripper frame"), ("position of point", "places of the points"),
+           ("slip", "slip of the grasp"),
+           ("force gain", "force gain"), ("force", "zero of the force sensor"),
+           ("curvature of the force", "zero of the force sensor"),
+           ("torque", "zero of the force sensor"),
+           ("creep", "creep of the branch"),
+           ("form", "modulus between the control points"),
+           ("poisson", "Poisson's ratio"), ("density", "density"))
+
+
+@dataclass(frozen=True)
+class InformationRows:
+    """Rows of the information on all unknowns, with one origin.
+
+    Attributes:
+        cause: Cause of uncertainty.
+        rows: Over the free vector, the errors, and the unknowns of each pull's force.
+        name: Unknown of which they are the prior; empty: measurements, or a link.
+        pull: Number of the pull that they were measured in; None: a prior, or a link.
+    """
+
+    cause: str
+    rows: np.ndarray
+    name: str = ""
+    pull: int | None = None
+
+
+def variance_parts(evaluation: Evaluation, objective: Objective, scale: float = 1.0,
+                   ) -> dict[str, np.ndarray]:
+    """Return the part of each cause in the variance of log E at the control points, [K] each.
+
+    Args:
+        evaluation: At the end of the fit, with derivatives.
+        objective: The minimised objective.
+        scale: Variance of the measurements over the stated one.
+    """
+    rows = information_rows(evaluation, objective, scale)
+    covariance = inverse_information(np.vstack([each.rows for each in rows]))
+    total = covariance[list(objective.space.groups)]
+    parts: dict[str, np.ndarray] = {}
+    for each in rows:
+        part = np.sum((total @ each.rows.T)**2, axis=1)
+        parts[each.cause] = parts.get(each.cause, 0.0) + part
+    return parts
+
+
+class Cause(TypedDict):
+    """One cause of the moduli's variance; see :func:`largest`."""
+
+    cause: str
+    share: float
+    deviation: float
+    advice: str
+
+
+def largest(parts: dict[str, np.ndarray], count: int = 3) -> list[Cause]:
+    """Return the causes of most of the variance over all moduli, with a remedy for each.
+
+    Each has ``cause``, ``share`` (its fraction of the variance, mean over the moduli),
+    ``deviation`` (largest standard deviation of a log E from it) and ``advice``.
+    """
+    total = np.sum(list(parts.values()), axis=0)
+    share = {cause: float(np.mean(part / np.maximum(total, 1e-300)))
+             for cause, part in parts.items()}
+    order = sorted(parts, key=lambda cause: -share[cause])[:count]
+    return [{"cause": cause, "share": share[cause],
+             "deviation": float(np.sqrt(np.max(parts[cause]))), "advice": ADVICE[cause]}
+            for cause in order if share[cause] > 0.01]
+
+
+def cause_of(name: str) -> str:
+    """Return the cause to which an unknown of this name belongs."""
+    return next(cause for start, cause in _GROUPS if name.startswith(start))
+
+
+def information_rows(evaluation: Evaluation, objective: Objective, scale: float,
+                     ) -> list[InformationRows]:
+    """Return rows of all unknowns: free vector, errors, and each pull's course of the force.
+
+    Arguments as for :func:`variance_parts`.
+    """
+    space, count = objective.space, objective.cell_errors.count
+    pieces = objective.raw_slopes(evaluation)
+    unknowns = [0 if piece.response is None else piece.response.shape[1] for piece in pieces]
+    width = space.size + count + sum(unknowns)
+    rows, start = [], space.size + count
+    for number, (piece, unknown) in enumerate(zip(pieces, unknowns, strict=True)):
+        block = np.zeros((len(piece.free), width))
+        block[:, :space.size] = piece.free
+        block[:, space.size:space.size + count] = piece.errors
+        if unknown:
+            block[:, start:start + unknown] = piece.response
+        start += unknown
+        block /= np.sqrt(scale)
+        kinds = np.array(piece.kinds)
+        rows += [InformationRows(kind, block[kinds == kind], pull=number)
+                 for kind in dict.fromkeys(piece.kinds)]
+    for number, nuisance in enumerate(objective.cell_errors.nuisances):
+        row = np.zeros((1, width))
+        row[0, space.size + number] = 1.0
+        rows.append(InformationRows(cause_of(nuisance.name), row, nuisance.name))
+    own, _ = space.own_rows()
+    names = [name for name, _, _ in space.priors] + [""] * len(space.links)
+    for name, row in zip(names, own, strict=True):
+        cause = cause_of(name) if name else "moduli that the pulls do not determine"
+        rows.append(InformationRows(cause, np.r_[row, np.zeros(width - space.size)][None], name))
+    return rows
+
+
+# Intervals of poorly determined moduli, from the profile likelihood instead of its curvature.
+#
+# A pull measures the compliance of a soft piece: the stiffer the piece, the less the data depend on
+# its modulus. The modulus may then be several times the most likely value, where the curvature at
+# the optimum allows a factor of two to both sides; other intervals extend farther to the soft side.
+# The limits are where the likelihood of the measurements has decreased as much as at the limits of
+# a normal distribution, with all other values refitted (the profile likelihood; Venzon and
+# Moolgavkar 1988).
+
+WIDE = 0.4
+"""Half width of an interval of log E, a factor of 1.5, above which its limits are computed. In the
+trials of the bench, limits of narrower ones move by less than a fifth of the half width, to either
+side.
+"""
+TRIES = 4
+"""Most simulations for one limit; observed were 1 to 4."""
+NEAR = 0.1
+"""Change of log E below which a limit has converged."""
+
+
+def profiled(sure: Uncertainty, evaluation: Evaluation, objective: Objective,
+             progress: Progress = SILENT) -> Uncertainty:
+    """Return the uncertainty with the limits of wide intervals from the profile likelihood.
+
+    The covariance is not changed. It applies to quantities that depend on the moduli as the
+    measurements do. These are linear in the compliance, and change by as much as the covariance
+    states even if the modulus is already far beyond it.
+
+    Args:
+        evaluation: At the end of the fit, with derivatives.
+        objective: The minimised objective. It is not changed.
+    """
+    space = objective.space
+    found = _Profile(sure, evaluation, objective, progress)
+    interval = sure.young_interval.copy()
+    for group in range(space.group_count):
+        # A single modulus does not show the spread between recordings that all moduli share.
+        whole = sure.quantile * np.sqrt(sure.covariance[group, group])
+        if whole < WIDE:
+            continue
+        common = np.sqrt(max(whole**2 - (sure.quantile * found.deviations[group])**2, 0.0))
+        low, high = found.limits(group)
+        sides = [-np.hypot(low, common), np.hypot(high, common)]
+        members = np.array(space.groups) == group
+        interval[members] = np.exp(evaluation.free[group] + sides)
+    lower, upper = (np.exp(each[0]) for each in space.bounds())
+    return replace(sure, young_interval=np.clip(interval, lower, upper))
+
+
+class _Profile:
+    """Decrease of the likelihood of the measurements if one log E is held off its optimum."""
+
+    def __init__(self, sure: Uncertainty, evaluation: Evaluation, objective: Objective,
+                 progress: Progress):
+        self._best, self._objective, self._quantile = evaluation, objective, sure.quantile
+        self._progress = progress
+        self._scale = sure.variance_factor * sure.repetition
+        self._slopes = self._scaled(evaluation.slopes)
+        self._covariance = inverse_information(self._slopes)
+        self.deviations = np.sqrt(np.diag(self._covariance))
+        # As in the fit, an outlier has no more weight than a residual just beyond the others.
+        residual = evaluation.residual
+        self._pull = self._scaled(residual / np.sqrt(1 + (residual / OUTLYING)**2))
+        # Priors and links are linear: they have no curvature to account for.
+        self._pull[len(residual) - objective.space.own_row_count:] = 0.0
+
+    def limits(self, group: int) -> tuple[float, float]:
+        """Distances of log E at which the interval of a group ends, to the soft and stiff side."""
+        # The stiff side is safe to evaluate. It keeps the soft side away from moduli without an
+        # equilibrium.
+        high, bend = self._limit(group, 1.0, self._quantile)
+        low, _ = self._limit(group, -1.0, max(limit_of(bend, -self._quantile), -self._quantile))
+        if high > self._quantile and high == self._farthest(group, 1.0):
+            self._progress.warn(
+                f"These pulls give no upper limit of {self._objective.space.names[group]}: a "
+                "stiffer piece would hardly change the measurements. Its interval ends at the "
+                "largest plausible ratio to its neighbour's modulus (a factor of "
+                f"{np.exp(self._quantile * LINK_DEVIATION):.2g}). To determine it, pull at a "
+                "point farther out, or pull farther.")
+        deviation = self.deviations[group]
+        return -low * deviation, high * deviation
+
+    def _limit(self, group: int, side: float, first: float) -> tuple[float, float]:
+        """Limit to one side, in deviations, and the curvature of the profile up to there."""
+        objective, target = self._objective.on_copies(), side * self._quantile
+        farthest, bend = self._farthest(group, side), 0.0
+        at, others = side * min(abs(first), abs(farthest)), np.zeros(len(self._best.free))
+        for _ in range(TRIES):
+            self._progress(1.0, "finding the limits of wide intervals")
+            found = self._rise(objective, group, at, others)
+            if found is None:
+                # There is no equilibrium, or it is not found from so far away.
+                at, others = at / 2, others / 2
+                continue
+            rise, others = found
+            bend = bend_of(at, side * np.sqrt(max(rise, 0.0)))
+            aim = side * min(abs(limit_of(bend, target)), 2 * abs(at), abs(farthest))
+            if abs(aim - at) * self.deviations[group] < NEAR:
+                return aim, bend
+            at, others = aim, others * aim / at
+        return side * min(abs(limit_of(bend, target)), abs(farthest)), bend
+
+    def _farthest(self, group: int, side: float) -> float:
+        """Largest shift that is evaluated, in deviations: neighbours hardly differ by more."""
+        free, count = self._best.free, self._objective.space.group_count
+        beside = [k for k in (group - 1, group + 1) if 0 <= k < count] or [group]
+        away = max(side * (free[k] - free[group]) for k in beside) + self._quantile * LINK_DEVIATION
+        return side * max(away / self.deviations[group], self._quantile)
+
+    def _rise(self, objective: Objective, group: int, at: float, others: np.ndarray,
+              ) -> tuple[float, np.ndarray] | None:
+        """Rise of the squared residuals with log E shifted by ``at`` deviations, and the offset of
+        the others from the linear path there; None if no equilibrium exists.
+
+        Args:
+            others: Expected offset of the others, shape [p].
+        """
+        best = self._best
+        direction = at * self._covariance[group] / self.deviations[group]
+        free = np.clip(best.free + direction + others, *objective.space.bounds())
+        found = objective.evaluate(free, jacobian=True)
+        if found is None:
+            return None
+        slopes = self._scaled(found.slopes)
+        change = self._scaled(found.residual - best.residual)
+        # The optimum is the mode of the moduli's marginal density, not of this one: the rise is
+        # relative to the slope there.
+        bent = change - self._slopes @ (free - best.free)
+        gradient = slopes.T @ change + (slopes - self._slopes).T @ self._pull
+        movable = np.arange(len(free)) != group
+        step = np.zeros(len(free))
+        step[movable] = -np.linalg.lstsq(slopes[:, movable].T @ slopes[:, movable],
+                                         gradient[movable], rcond=None)[0]
+        rise = change @ change + 2 * self._pull @ bent - np.sum((slopes @ step)**2)
+        return float(rise), free - best.free - direction + step
+
+    def _scaled(self, rows: np.ndarray) -> np.ndarray:
+        return scaled_rows(rows, self._objective.space.own_row_count, self._scale)
+
+
+def bend_of(at: float, root: float) -> float:
+    """Curvature of a profile through a point: a of (1 - exp(-a x)) / a.
+
+    That is the root of the rise if the measurements are linear in a power of the modulus: its
+    exponent is -a over the deviation of log E; -1 is the compliance, 0 log E itself.
+
+    Args:
+        at: Shift x of log E in its deviations, not 0.
+        root: Root of the rise of the squared residuals there, with the sign of the shift.
+    """
+    ratio = float(np.clip(root / at, 0.01, 100.0))
+    if abs(ratio - 1) < 1e-6:
+        return 0.0
+    ends = (1e-9, 200.0) if ratio < 1 else (-20.0, -1e-9)
+    return scipy.optimize.brentq(lambda step: -np.expm1(-step) / step - ratio, *ends) / at
+
+
+def limit_of(bend: float, root: float) -> float:
+    """Shift at which such a profile has risen to ``root``; infinite if it never does."""
+    if bend * root >= 1:
+        return float(np.copysign(np.inf, root))
+    return root if bend == 0 else float(-np.log1p(-bend * root) / bend)

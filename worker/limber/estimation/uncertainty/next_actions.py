@@ -18,10 +18,14 @@ from limber.core.not_none import present
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
-from limber.estimation.uncertainty.covariance import Uncertainty, inverse_information, scaled_rows
-from limber.estimation.uncertainty.model_error import ModelError, total_interval
-from limber.estimation.uncertainty.path_error import path_slopes
-from limber.estimation.uncertainty.variance_parts import InformationRows, information_rows
+from limber.estimation.uncertainty.covariance import (
+    InformationRows,
+    Uncertainty,
+    information_rows,
+    inverse_information,
+    scaled_rows,
+)
+from limber.estimation.uncertainty.model_error import ModelError, path_slopes, total_interval
 
 WORTHWHILE = 0.98
 """Mean half width after an action over that before, above which it is not proposed."""

@@ -7,21 +7,300 @@ Errors at neighbouring positions, of axis and radius, and of several moduli are 
 scan.
 """
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
+from scipy import sparse
 
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
+from limber.estimation.fitting.nuisances import ErrorSlopes
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.uncertainty.bending_stiffness import SectionMean
-from limber.estimation.uncertainty.path_error import WIDEST
-from limber.estimation.uncertainty.shape_sensitivity import compensation, hung_slopes, shape_slopes
+from limber.estimation.parameters import Values
+from limber.estimation.uncertainty.model_error import WIDEST
 from limber.geometry.shape_samples import reshaped, sample_skeletons
+from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import HungTwig
+from limber.mechanics.linear.equations import Tangent
+from limber.mechanics.materials.materials import LayeredSection
+from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.mechanics.sensitivities import reactions
+from limber.recordings.cell_errors import calibration_of
+
+# First-order effect of shape and mass, which the fit assumes known, on pulls and moduli.
+#
+# All nodes X of the mesh move by w to another shape of the same tree; or the added masses on the
+# branch become heavier. At an equilibrium state u the internal force f, the loads p and the
+# constraints of the branch change, and the state follows:
+#
+#     K du = dp - df,      df = (f(X + s w, u) - f(X, u)) / s  for a small s,
+#
+# with the tangent stiffness K of the state. One factor per key frame thus serves all shapes, at the
+# cost of one assembled force and one solve each; a separate mesh would have to find its own states.
+# The change of the residuals gives the change of the moduli that the fit would have made.
+
+STEP = 1e-4
+"""Fraction of the change to another shape or mass over which the force's derivative is taken: the
+response of a branch turned by a radian to the whole change of a radius is far from linear.
+"""
+
+
+def compensation(evaluation: Evaluation, objective: Objective,
+                 slopes: Callable[[QuasiStaticForward, Values], ErrorSlopes]) -> np.ndarray | None:
+    """Change of log E at the control points by which a fit compensates S changes, [K, S].
+
+    Linear in the change of the residuals r: d log E = -(J^T J)^-1 J^T dr, at few key frames:
+    differences vary slowly along a pull.
+
+    Args:
+        evaluation: At the end of the fit.
+        objective: The minimised objective.
+        slopes: Change of a pull, simulated for these values, by each of the S.
+
+    Returns:
+        None if a pull is dynamic, since that would take too long, or has no equilibrium.
+    """
+    if any(forward.entry.motion == "dynamic" for forward in objective.forwards):
+        return None
+    forwards = [forward.with_prescribed_poses(forward.frames.poses) for forward
+                in objective.forwards]
+    alone = Objective(forwards, objective.space, force_sigma=objective.force_sigma)
+    expected = alone.evaluate(evaluation.free, jacobian=True)
+    if expected is None:
+        return None
+    values = objective.space.unpack(evaluation.free)
+    changes = alone.residual_slopes(expected, [
+        slopes(forward, values) for forward in forwards if isinstance(forward, QuasiStaticForward)])
+    steps = np.linalg.lstsq(expected.slopes, -changes, rcond=1e-9)[0]
+    return steps[list(objective.space.groups)]
+
+
+def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[TetMesh],
+                 ) -> ErrorSlopes:
+    """Return the change of a pull's observations by each of S other shapes.
+
+    Args:
+        forward: Last simulated for ``values``.
+        values: The physical parameters.
+        meshes: The same tetrahedra with other node positions.
+    """
+    nodes = forward.mesh.nodes
+    operator = point_operator(forward.mesh, forward.rest_points)
+    return _slopes(forward, values,
+                   [forward.aside(nodes + STEP * (mesh.nodes - nodes)) for mesh in meshes],
+                   [point_operator(mesh, forward.rest_points) - operator for mesh in meshes])
+
+
+def hung_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
+    """Return the change of a pull's observations by the relative mass of the added masses.
+
+    Arguments as for :func:`shape_slopes`.
+    """
+    size = 3 * len(forward.rest_points), forward.mesh.nodes.size
+    return _slopes(forward, values, [forward.with_hung_mass(1 + STEP)], [sparse.csr_matrix(size)])
+
+
+def grip_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
+    """Return the change of a pull's observations by the deviation of the length in its gripper.
+
+    Arguments as for :func:`shape_slopes`.
+    """
+    size = 3 * len(forward.rest_points), forward.mesh.nodes.size
+    longer = STEP * calibration_of(forward.entry).held_length_sigma_m
+    return _slopes(forward, values, [forward.with_longer_grip(longer)], [sparse.csr_matrix(size)])
+
+
+def _slopes(forward: QuasiStaticForward, values: Values, asides: Sequence[QuasiStaticForward],
+            elsewhere: Sequence[sparse.csr_matrix]) -> ErrorSlopes:
+    """Changes of pulls by a step; the points may then be elsewhere in the mesh."""
+    here = _Pulled(forward, forward.model_with(values))
+    equations = here.model.equations((forward.grasp,) if here.is_held else ())
+    operator = point_operator(here.model.mesh, forward.rest_points)
+    others = [_Pulled(aside, aside.model_with(values)) for aside in asides]
+    changes = []
+    for key, state in enumerate(forward.displacements()):
+        before = here.out_of_balance(key, state)
+        seen = here.seen(key, state, before)
+        tangent = equations.exact_tangent(here.model, state)
+        for other, paths, (moved, out) in zip(others, elsewhere, _followed(
+                here, others, key, state, tangent, before), strict=True):
+            points = operator @ moved.ravel() + paths @ state.ravel()
+            after = other.seen(key, state + STEP * moved, out)
+            changes.append([points.reshape(-1, 3), *(
+                (now - then) / STEP for now, then in zip(after, seen, strict=True))])
+    return ErrorSlopes(*(
+        np.einsum("fk,ks...->f...s", forward.spread, np.array(each).reshape(
+            -1, len(others), *each[0].shape)) for each in zip(*changes, strict=True)))
+
+
+@dataclass(frozen=True)
+class _Pulled:
+    """A pull on one shape, with the parameters in question."""
+
+    forward: QuasiStaticForward
+    model: BranchModel
+
+    @property
+    def is_held(self) -> bool:
+        return self.forward.drive == "pose"
+
+    def out_of_balance(self, key: int, state: np.ndarray) -> np.ndarray:
+        """Internal force less load [N], shape [n, 3]."""
+        load = self.model.weight_force
+        if not self.is_held:
+            load = load + self.forward.load_at(key)
+        return self.model.internal(state).force - load
+
+    def hold(self, key: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Displacement of the clamped nodes [n, 3], and missing displacement of the means of the
+        pinned ones [p, 3].
+        """
+        held, grasp = np.zeros_like(state), self.forward.grasp
+        if not self.is_held:
+            return held, np.empty((0, 3))
+        pose = self.forward.load_at(key)
+        if grasp.mode == "point":
+            return held, (pose[:3] - grasp.centre - grasp.weights @ state[grasp.nodes])[None]
+        held[grasp.nodes] = grasp.displacement(self.model.mesh.nodes, pose)
+        return held, np.empty((0, 3))
+
+    def seen(self, key: int, state: np.ndarray, out: np.ndarray,
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The gripper's force [N], its torque about the recorded position [N m], and its position
+        [m].
+
+        If a force drives, force and torque do not change.
+        """
+        grasp, position = self.forward.grasp, self.forward.grasp_position(state)
+        if not self.is_held:
+            return np.zeros(3), np.zeros(3), position
+        about = self.forward.frames.poses[self.forward.keys[key], :3]
+        arms = (self.model.mesh.nodes + state)[grasp.nodes] - about
+        return (reactions([grasp], out)[0], np.cross(arms, out[grasp.nodes]).sum(axis=0), position)
+
+
+def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndarray,
+              tangent: Tangent, before: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Response of the state to each of the others [m over the whole path], and the imbalance there
+    after a step.
+    """
+    held, missing = here.hold(key, state)
+    moved, rights, pins, after = [], [], [], []
+    for forward in others:
+        held_there, missing_there = forward.hold(key, state)
+        moved.append((held_there - held) / STEP)
+        pins.append(np.ravel(missing_there - missing) / STEP)
+        after.append(forward.out_of_balance(key, state))
+        rights.append((before - after[-1]) / STEP - here.model.tangent_times(state, moved[-1]))
+    found = tangent.solve_all(rights, np.column_stack(pins))
+    return [(imposed + free, out + STEP * here.model.tangent_times(state, imposed + free))
+            for imposed, free, out in zip(moved, found, after, strict=True)]
+
+
+def grip_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | None:
+    """Relative standard deviation of E from the length in a clamping gripper, shape [K].
+
+    Because of soft pads and the position where the branch leaves the jaws, that length is never
+    known to a millimetre (``held_length_sigma_m`` of the calibration). Its error is the same in all
+    pulls.
+
+    Args:
+        evaluation: At the end of the fit.
+        objective: The minimised objective.
+
+    Returns:
+        None if no gripper clamps or its length is known, or as for
+        :func:`limber.estimation.uncertainty.shape_error.compensation`.
+    """
+    if not any(forward.entry.grasp.mode == "rigid"
+               and calibration_of(forward.entry).held_length_sigma_m > 0
+               for forward in objective.forwards):
+        return None
+    steps = compensation(evaluation, objective, grip_slopes)
+    return None if steps is None else np.minimum(np.abs(steps[:, 0]), WIDEST)
+
+
+# Bending stiffness E I along a branch: what a pull determines even if the radius is uncertain.
+#
+# If the scan is too thick, the estimate of E is too low, and the model bends as the branch does.
+# So the interval of E I is narrower than that of E, and predictions on the same mesh depend on E I.
+#
+# A pull does not determine E I at a position but over a length of the branch: a radius may step at
+# a fork beside a control point. I is therefore the mean over the part for which the control point
+# stands, each piece by its share of the strain energy of the pulls: where the branch is not bent,
+# nothing is determined.
+
+
+@dataclass(frozen=True)
+class SectionMean:
+    """Computes the mean over a control point's section of the main path.
+
+    Attributes:
+        share: Share of each skeleton node in the mean of each control point, [K, node_count].
+    """
+
+    share: np.ndarray
+
+    @classmethod
+    def of(cls, skeleton: Skeleton, mesh: TetMesh, weights: np.ndarray,
+           energy: np.ndarray | None = None) -> "SectionMean":
+        """Prepare the mean for a branch.
+
+        Args:
+            skeleton: The axes and radii of the mesh.
+            mesh: The branch's tetrahedra.
+            weights: Weight of each control point in each tetrahedron, shape [tet_count, K].
+            energy: Strain energy of each tetrahedron [J], shape [tet_count]; None: each piece of
+                the branch counts by its length, as where there is no energy.
+        """
+        low, high, fraction, _ = on_cylinders(skeleton, mesh.centroids)
+        radius = (1 - fraction) * skeleton.radius[low] + fraction * skeleton.radius[high]
+        # A twig's own bending does not contribute to that of the branch which carries it.
+        weights = weights * np.isin(high, skeleton.main_path())[:, None]
+        each = by_length = weights * (np.abs(mesh.volumes) / radius**2)[:, None]
+        if energy is not None:
+            each = weights * energy[:, None]
+            each = np.where(each.sum(axis=0) > 0, each, by_length)
+        share = np.array([
+            np.bincount(low, (1 - fraction) * own, skeleton.node_count)
+            + np.bincount(high, fraction * own, skeleton.node_count) for own in each.T])
+        return cls(share / share.sum(axis=1, keepdims=True))
+
+    def log_second_moment(self, radius: np.ndarray, section: LayeredSection | None = None,
+                          ) -> np.ndarray:
+        """Return the mean log of the second moment of area [log m^4], shape [K].
+
+        Args:
+            radius: At the skeleton's nodes [m], shape [node_count].
+            section: Its layers; their moment is that of as much wood.
+        """
+        carrying = 1.0 if section is None else section.bending_factor(radius)
+        return self.share @ np.log(np.pi / 4 * radius**4 * carrying)
+
+
+def strain_energy(objective: Objective, values: Values) -> np.ndarray | None:
+    """Strain energy of each tetrahedron, summed over the simulated frames [J], shape [tet_count].
+
+    Args:
+        objective: Its pulls were simulated for ``values``.
+
+    Returns:
+        None if a pull is dynamic.
+    """
+    forwards = [forward.full for forward in objective.forwards
+                if isinstance(forward.full, QuasiStaticForward)]
+    if len(forwards) < len(objective.forwards):
+        return None
+    energies = [forward.model_with(values).internal(state).tet_energy for forward in forwards
+                for state in forward.displacements()]
+    return np.sum(energies, axis=0) if energies else None
+
 
 FEWEST = 8
 """Fewest shapes that show the spread."""

@@ -14,24 +14,297 @@ on the camera's noise.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import scipy
+from scipy import sparse
 
-from limber.core.errors import WorkError
+from limber.core.errors import InputError, WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.uncertainty.creep import LIKELIER, TIME_SHARES, creep_sentence
 from limber.estimation.uncertainty.model_error import MeshStiffness, mesh_error
-from limber.estimation.vibration.modal_swing import Ends, ModalSwing
-from limber.estimation.vibration.swing_record import SwingFit, SwingSeen, first_guess
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.dynamics.integration import simulate_dynamics
+from limber.mechanics.dynamics.modes import lowest_modes
 from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.recordings.hung_load import REGISTRATION_SHARE
+
+# A swing by the lowest modes of the branch: a millisecond for what the full model takes seconds.
+#
+# The branch vibrates about the equilibrium at the end, from the shape in which it was released.
+# Both are columns of the basis beside the modes, so that beginning and end are exact for small
+# factors on modulus and density, and the vibration between them is that of the linear branch. A fit
+# by modes is corrected by the full model's difference at its result, which changes little with the
+# parameters.
+
+MODES = 10
+"""Modes of a swing: six more than what 40 steps a period show."""
+STEP = 1e-4
+"""Step of the central differences in the logarithms."""
+_DENSITY_STEP = 1e-2
+_SAME = 1e-6  # norm of a column that the others already contain
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Equilibria at the release and at the end of a swing.
+
+    Attributes:
+        begin: Displacement at the release [m], shape [n, 3]; zero: held in its shape at rest.
+        end: Displacement in which the branch comes to rest [m], shape [n, 3].
+    """
+
+    begin: np.ndarray
+    end: np.ndarray
+
+
+class ModalSwing:
+    """Displacements of the markers in small vibrations.
+
+    Args:
+        model: The branch, with undamped values about which the factors count.
+        ends: Its equilibria.
+        denser: The same for a branch of 1 % more density.
+        operator: Displacements of the markers from those of the nodes, shape [3 m, 3 n].
+    """
+
+    def __init__(self, model: BranchModel, ends: Ends, denser: Ends, operator: sparse.csr_matrix):
+        shapes = lowest_modes(model, MODES, ends.end).shapes
+        basis = _independent(model, [*shapes, ends.end, ends.begin])
+        stiff = np.array([model.tangent_times(ends.end, column).ravel() for column in basis])
+        flat = basis.reshape(len(basis), -1)
+        own = model.without_point_masses()
+        masses = np.array([model.mass_times(column).ravel() for column in basis])
+        body = np.array([own.mass_times(column).ravel() for column in basis])
+        self._stiffness, self._body = flat @ stiff.T, flat @ body.T
+        self._added = flat @ masses.T - self._body
+        # Forces that hold begin and end, and their change with the logarithm of the density.
+        self._forces = [(stiff @ at.ravel(), stiff @ (then - at).ravel() / np.log1p(_DENSITY_STEP))
+                        for at, then in ((ends.begin, denser.begin), (ends.end, denser.end))]
+        self._seen = (operator @ flat.T).reshape(-1, 3, len(basis))
+
+    def moved(self, times: np.ndarray, stretch: float, damping: tuple[float, float],
+              heavier: float, creep: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
+        """Return the markers' displacements from the shape at rest [m], shape [f, m, 3].
+
+        Args:
+            times: Since the release [s], shape [f].
+            stretch: Logarithm of the factor on the modulus.
+            damping: Rayleigh's alpha [1/s] and beta [s].
+            heavier: Logarithm of the factor on the density.
+            creep: Share of the stiffness that a lasting load relaxes, and its time constant [s].
+        """
+        stiffness = np.exp(stretch) * self._stiffness
+        squares, shapes = scipy.linalg.eigh(stiffness, np.exp(heavier) * self._body + self._added)
+        begin, end = (np.linalg.solve(stiffness, force + heavier * change)
+                      for force, change in self._forces)
+        start = np.linalg.solve(shapes, begin - end)
+        squares, decay = np.maximum(squares, 0.0), 0.5 * (damping[0] + damping[1] * squares)
+        course = (_creeping(times, squares, decay, *creep) if creep[0]
+                  else _released(times[:, None], squares, decay))
+        # Both ends were held long enough to be relaxed.
+        return np.einsum("mip,fp->fmi", self._seen,
+                         (course * start) @ shapes.T + end) / (1 - creep[0])
+
+    def slopes(self, times: np.ndarray, stretch: float, damping: tuple[float, float],
+               heavier: float, creep: tuple[float, float] | None = None) -> np.ndarray:
+        """Return derivatives to log factor, log alpha, log beta and log density, [f, m, 3, 4]; with
+        creep also to its share, [f, m, 3, 5].
+        """
+        share, seconds = creep or (0.0, 1.0)
+        centre = np.array([stretch, *np.log(damping), heavier, share])
+        columns = []
+        for step in STEP * np.eye(5)[:4 if creep is None else 5]:
+            ahead, behind = (self.moved(times, at[0], (np.exp(at[1]), np.exp(at[2])), at[3],
+                                        (at[4], seconds))
+                             for at in (centre + step, centre - step))
+            columns.append((ahead - behind) / (2 * STEP))
+        return np.stack(columns, axis=-1)
+
+    @staticmethod
+    def denser(model: BranchModel) -> BranchModel:
+        """Return the model with the density of the argument ``denser``."""
+        return model.with_parameters(density=model.density * (1 + _DENSITY_STEP))
+
+
+def _released(times: np.ndarray, squares: np.ndarray, decay: np.ndarray) -> np.ndarray:
+    """Return oscillators that start at 1 without speed; overdamped ones too.
+
+    Args:
+        times: [s], shape [f, 1].
+        squares: Squared angular frequencies without damping [1/s^2], shape [k].
+        decay: Rates of decay [1/s], shape [k].
+    """
+    root = np.sqrt((decay**2 - squares).astype(complex))
+    # At the limit of overdamping both roots are equal, and the motion is the same beside it.
+    root = np.where(np.abs(root) < 1e-6 * np.sqrt(squares), 1e-6 * np.sqrt(squares), root)
+    fast = -(decay + root)
+    slow = squares / fast
+    return ((slow * np.exp(fast * times) - fast * np.exp(slow * times)) / (slow - fast)).real
+
+
+def _creeping(times: np.ndarray, squares: np.ndarray, decay: np.ndarray, share: float,
+              seconds: float) -> np.ndarray:
+    """Return such oscillators of standard linear solids, shape [f, k]: part of the spring force
+    follows the motion late, y'' + 2 d y' + w^2 (y - share z) = 0 with z' = (y - z) / seconds.
+    """
+    system = np.zeros((len(squares), 3, 3))
+    system[:, 0, 1] = 1.0
+    system[:, 1] = np.column_stack([-squares, -2 * decay, share * squares])
+    system[:, 2, [0, 2]] = 1 / seconds, -1 / seconds
+    rates, shapes = np.linalg.eig(system)
+    parts = np.linalg.solve(shapes, np.tile([[1.0], [0.0], [1.0]], (len(squares), 1, 1)))[..., 0]
+    return np.einsum("kr,fkr->fk", shapes[:, 0] * parts,
+                     np.exp(times[:, None, None] * rates)).real
+
+
+def _independent(model: BranchModel, columns: list[np.ndarray]) -> np.ndarray:
+    """Return the columns made orthogonal in the mass; without those that others contain."""
+    kept: list[np.ndarray] = []
+    for column in columns:
+        size = _norm(model, column)
+        if size == 0.0:
+            continue
+        column = column / size
+        for _ in range(2):
+            for other in kept:
+                column = column - np.vdot(other, model.mass_times(column)) * other
+        left = _norm(model, column)
+        if left > _SAME:
+            kept.append(column / left)
+    return np.array(kept)
+
+
+def _norm(model: BranchModel, column: np.ndarray) -> float:
+    return float(np.sqrt(max(np.vdot(column, model.mass_times(column)), 0.0)))
+
+
+# A recorded swing, the result of its fit, and a first guess of frequency and damping.
+
+_GONE = 0.3
+"""Fraction of its path at which a branch has certainly been released."""
+
+
+@dataclass(frozen=True)
+class SwingSeen:
+    """Observations of a swing.
+
+    Attributes:
+        times: [s], shape [n].
+        moved: Displacement of the markers from the branch's shape at rest [m], shape [n, m, 3]; NaN
+            if a marker was not observed.
+        rest_points: Positions of the markers on the branch [m], shape [m, 3].
+        start: "held": in the shape at rest until weight and load act; "loaded": bent by the load
+            until it is removed.
+        load: The load [N], shape [3].
+        load_mass: Mass that swings with the branch [kg]; 0 if the load is a pull, or removed.
+        noise: Noise of one reading [m].
+        registration: RMS distance of the markers from their positions [m], None: not known.
+    """
+
+    times: np.ndarray
+    moved: np.ndarray
+    rest_points: np.ndarray
+    start: str
+    load: np.ndarray
+    load_mass: float
+    noise: float
+    registration: float | None = None
+
+
+@dataclass(frozen=True)
+class SwingFit:
+    """Result of a swing. Intervals are 95 % intervals.
+
+    Attributes:
+        factor: Factor on the start's Young's modulus, corrected for the mesh's stiffness;
+            factor_interval: shape [2].
+        mesh_factor: The correction; 1 if a finer mesh was not possible.
+        release: [s] on the recording's clock; release_deviation: [s].
+        damping: Rayleigh's alpha [1/s] and beta [s]; damping_interval: shape [2, 2].
+        damping_ratio: Damping ratio of the first vibration; damping_ratio_interval: shape [2].
+        frequency: Frequency of the first vibration about the equilibrium [Hz].
+        residual: RMS of observed minus simulated [m]; over the largest displacement it is
+            ``relative_residual``.
+        readings: Number of independent readings, from the residual's autocorrelation.
+        forward_count: Number of simulations.
+        window: First and last time used [s].
+        times, seen, simulated: For figures [s, m], shapes [f], [f, m, 3].
+        converged: Whether the last fit converged.
+        creep: ``share``, its ``interval`` and ``time_s`` as for a pull; None: the record does not
+            show any.
+    """
+
+    factor: float
+    factor_interval: np.ndarray
+    mesh_factor: float
+    release: float
+    release_deviation: float
+    damping: tuple[float, float]
+    damping_interval: np.ndarray
+    damping_ratio: float
+    damping_ratio_interval: np.ndarray
+    frequency: float
+    residual: float
+    relative_residual: float
+    readings: float
+    forward_count: int
+    window: tuple[float, float]
+    times: np.ndarray
+    seen: np.ndarray
+    simulated: np.ndarray
+    converged: bool
+    creep: dict[str, Any] | None = None
+
+
+def first_guess(seen: SwingSeen) -> tuple[float, float]:
+    """Return a branch's time of release and its period [s], from the tracks alone.
+
+    Raises:
+        InputError: no motion is found, or the branch does not oscillate.
+    """
+    travel = np.linalg.norm(seen.moved - np.nanmedian(seen.moved[:3], axis=0), axis=2)
+    # From the marker that moves farthest: others are disturbed while the branch is still held.
+    far = travel[:, np.argmax(np.nan_to_num(travel).max(axis=0))]
+    far = np.where(np.isfinite(far), far, 0.0)
+    if far.max() < 10 * seen.noise:
+        raise InputError("The recording shows no swing.",
+                         f"No marker moves by more than {1e3 * far.max():.2g} mm.",
+                         "Start the recording before the branch is released.")
+    gone = int(np.argmax(far > _GONE * far.max()))
+    at_rest = np.flatnonzero(far[:gone] < max(6 * seen.noise, 0.02 * far.max()))
+    start = int(at_rest[-1]) + 1 if len(at_rest) else 0
+    marker, axis = np.unravel_index(np.nanargmax(np.nanvar(seen.moved[start:], axis=0)),
+                                    seen.moved.shape[1:])
+    track = seen.moved[start:, marker, axis]
+    times = seen.times[start:][np.isfinite(track)]
+    track = track[np.isfinite(track)]
+    settled = np.median(track[-max(len(track) // 4, 5):])
+    away = track - settled
+    large = np.flatnonzero(np.abs(away) > 0.05 * np.abs(away).max())
+    away, times = away[:large[-1] + 1], times[:large[-1] + 1]
+    turns = np.flatnonzero((away[:-1] < 0) != (away[1:] < 0))
+    if len(turns) < 3:
+        raise InputError("The branch does not oscillate.",
+                         f"It passes its rest position only {len(turns)} times.",
+                         "Release it abruptly, or fit the rest position: --motion quasi_static.")
+    cross = times[turns] - away[turns] * (times[turns + 1] - times[turns]) / (
+        away[turns + 1] - away[turns])
+    # Over whole periods: the equilibrium may be slightly offset, as for a branch that creeps.
+    period = float(np.median(cross[2:] - cross[:-2]))
+    rate = float(np.median(np.diff(seen.times)))
+    if period < 6 * rate:
+        raise InputError(f"The branch swings {1 / period:.3g} times a second.",
+                         f"This is too fast for {1 / rate:.3g} frames a second.",
+                         "Record with more frames a second.")
+    return float(seen.times[max(start - 1, 0)]), period
+
 
 STEPS_PER_PERIOD = 40
 """Steps per period of the first vibration; the error in its frequency is then 0.2 %."""
@@ -397,4 +670,3 @@ def _correlated(left: np.ndarray) -> float:
     values = np.linalg.eigvalsh(flat.T @ flat)
     together = flat.shape[1] * float((values**2).sum()) / float(values.sum()) ** 2
     return total * max(together, 1.0)
-

@@ -1,15 +1,125 @@
 """Point clouds with attributes: the type, and its PLY file."""
 
-from collections.abc import Collection
+import re
+import unicodedata
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
 from limber.core.files.text_columns import three_of
-from limber.geometry.cloud.columns import PARTS, ply_columns, valid_columns
+
+# Columns of a cloud: names and shapes that every writer of clouds accepts.
+
+PARTS = {"normal": ("nx", "ny", "nz"), "color": ("red", "green", "blue")}
+"""Attributes of three numbers per point, and their columns in files."""
+_LONGEST_NAME = 60
+"""Most characters of a name; Blender cuts the names of attributes at 63."""
+_RESERVED = frozenset({"x", "y", "z", *PARTS, *(name for parts in PARTS.values()
+                                              for name in parts)})
+"""Reserved names: positions, normals and colours only."""
+
+
+def property_names(titles: Iterable[str], taken: Collection[str] = ()) -> list[str]:
+    """Return a valid name of a PLY property for each title, all different.
+
+    A name has ASCII letters, digits and underscores; titles that are already such names are kept.
+    Names are compared without case, since some readers ignore it.
+
+    Args:
+        titles: Names of a file's columns: any text, may be empty or repeated.
+        taken: Names that are not to be used.
+    """
+    used = {name.lower() for name in taken}
+    names = []
+    for title in titles:
+        plain = unicodedata.normalize("NFKD", title).encode("ascii", "ignore").decode()
+        if not re.fullmatch(r"\w+", plain, re.ASCII):
+            plain = re.sub(r"[\W_]+", "_", plain, flags=re.ASCII).strip("_") or "unnamed"
+        name, number = plain[:_LONGEST_NAME], 1
+        while name.lower() in used:
+            number += 1
+            end = f"_{number}"
+            name = plain[:_LONGEST_NAME - len(end)] + end
+        used.add(name.lower())
+        names.append(name)
+    return names
+
+
+def valid_columns(attributes: dict[str, np.ndarray], titles: dict[str, str], count: int,
+                  taken: Collection[str] = ()) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Return attributes that every writer accepts, and the file's names of those renamed.
+
+    ``normal`` and ``color`` (in 0..255) are of shape [n, 3]; all other attributes are columns of
+    numbers with valid names. Anything that is not a number per point is dropped.
+
+    Args:
+        attributes: Name to array, from a reader.
+        titles: The file's name of an attribute, where it differs.
+        count: Number of points n.
+        taken: Names that attributes must not have.
+    """
+    kept: dict[str, np.ndarray] = {}
+    columns: list[tuple[str, str, np.ndarray]] = []
+    for name, values in attributes.items():
+        if values.dtype.kind not in "biuf" or values.shape[:1] != (count,):
+            continue
+        if name in PARTS and values.ndim == 2 and values.shape[1] >= 3:
+            kept[name] = _bytes(values[:, :3]) if name == "color" else values[:, :3]
+        else:
+            columns += _split(titles.get(name, name), name, values)
+    names = property_names((name for _, name, _ in columns), _RESERVED | set(taken))
+    renamed = {name: title for name, (title, _, _) in zip(names, columns, strict=True)
+               if name != title}
+    return kept | {name: values for name, (_, _, values) in zip(names, columns, strict=True)
+                   }, renamed
+
+
+def _bytes(color: np.ndarray) -> np.ndarray:
+    """Colours in 0..255, converted from 0..255, fractions of 1 or 16 bits."""
+    if color.dtype == np.uint8:
+        return color
+    values = np.nan_to_num(color.astype(float), posinf=0.0, neginf=0.0)
+    top = values.max(initial=0.0)
+    if top > 255:
+        values = values / 257
+    elif top < 1.01 and color.dtype.kind == "f":  # some programs round to a little over 1
+        values = values * 255
+    return np.clip(np.round(values), 0, 255).astype(np.uint8)
+
+
+def _split(title: str, name: str, values: np.ndarray) -> list[tuple[str, str, np.ndarray]]:
+    """Title, name and numbers of each column of an attribute."""
+    if values.ndim == 1:
+        return [(title, name, values)]
+    flat = values.reshape(len(values), -1)
+    return [(f"{title}_{k}", f"{name}_{k}", flat[:, k]) for k in range(flat.shape[1])]
+
+
+def ply_columns(name: str, values: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Return the PLY properties of a valid attribute, in types that PLY has."""
+    values = _in_ply_type(values)
+    return [(part, values[:, k]) for k, part in enumerate(PARTS[name])] if name in PARTS else [
+        (name, values)]
+
+
+def _in_ply_type(values: np.ndarray) -> np.ndarray:
+    """Numbers in one of PLY's types: up to 32 bits for integers, float or double."""
+    kind, size = values.dtype.kind, values.dtype.itemsize
+    if kind == "b":
+        return values.astype(np.uint8)
+    if kind == "f":
+        return values.astype(np.float64 if size >= 8 else np.float32)
+    if size < 8:
+        return values.astype(values.dtype.newbyteorder("="))
+    low, high = (int(values.min()), int(values.max())) if len(values) else (0, 0)
+    small = np.iinfo(np.int32)
+    return values.astype(np.int32 if small.min <= low and high <= small.max else np.float64)
+
 
 POINTS = "\0points"
 """Name of the coordinates [n, 3] among columns of any name."""
@@ -104,3 +214,103 @@ class Cloud:
                 comments=["unit: m", *comments, *titles]).write(
                     str(path) if isinstance(path, Path) else path)
 
+
+# Order and axes of a cloud that do not depend on its file.
+#
+# Choices point by point, or in cells of a grid, must not depend on the order or rotation of a file:
+# the same plant must give the same result.
+
+_STEP = 1e-6  # fraction of the cloud's size: finer than any scanner resolves, coarser than rounding
+
+
+@dataclass(frozen=True)
+class OwnFrame:
+    """A cloud's points in its own order and axes, from its middle, independent of its pose.
+
+    If a file is moved, rotated or given in another unit, its numbers are rounded differently. A
+    choice that compares two of them may then differ, and each choice affects others. So positions
+    here are on a grid coarse enough to hide rounding.
+
+    Attributes:
+        coordinates: Points in this frame [m], shape [n, 3].
+        order: Index of each point in the cloud, shape [n].
+        middle: The frame's origin [m], shape [3].
+        axes: The frame's axes as columns, shape [3, 3].
+    """
+
+    coordinates: np.ndarray
+    order: np.ndarray
+    middle: np.ndarray
+    axes: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray) -> "OwnFrame":
+        """The frame of points [m], shape [n, 3]."""
+        order = own_order(points)
+        middle = points[order].mean(axis=0)
+        offset = points[order] - middle
+        axes = own_axes(offset)
+        coordinates = offset @ axes
+        step = 2.0**np.floor(np.log2(max(_STEP * np.linalg.norm(np.ptp(coordinates, axis=0)),
+                                         1e-300)))
+        return cls(np.round(coordinates / step) * step, order, middle, axes)
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """Return the positions of points in this frame, shape [..., 3]."""
+        return (points - self.middle) @ self.axes
+
+    def outside(self, coordinates: np.ndarray) -> np.ndarray:
+        """Return the points at positions of this frame, shape [..., 3]."""
+        return coordinates @ self.axes.T + self.middle
+
+
+def own_order(points: np.ndarray) -> np.ndarray:
+    """Return indices of points in an order that depends only on their positions, shape [n].
+
+    If ordered only by distance from the middle, regions grown from the first points would start
+    there.
+
+    Args:
+        points: Positions, shape [n, 3].
+    """
+    order = np.argsort(np.linalg.norm(points - points.mean(axis=0), axis=1), kind="stable")
+    return order[np.random.default_rng(0).permutation(len(points))]
+
+
+def own_axes(points: np.ndarray) -> np.ndarray:
+    """The directions in which a cloud extends, longest first, as columns, shape [3, 3].
+
+    Right-handed; the first two point towards the longer tails of the cloud.
+    """
+    offset = points - points.mean(axis=0)
+    axes = np.linalg.eigh(offset.T @ offset)[1][:, ::-1]
+    axes = axes * np.where(((offset @ axes)**3).sum(axis=0) < 0, -1.0, 1.0)
+    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+    return axes
+
+
+# Even thinning of a cloud.
+
+
+def thinned(points: np.ndarray, limit: int) -> np.ndarray:
+    """Indices of at most ``limit`` points, one from each cell of a grid that fits that number.
+
+    The grid follows the cloud's own axes, so a rotated cloud is thinned in the same way.
+    """
+    if len(points) <= limit:
+        return np.arange(len(points))
+    points = points @ own_axes(points)
+    low = points.min(axis=0)
+    # Points are on a surface: the cell size grows with the square root of the excess of points.
+    size = float(np.median(cKDTree(points).query(
+        points[:: max(len(points) // 2000, 1)], k=2)[0][:, 1])) * np.sqrt(len(points) / limit)
+    size = max(size, 1e-6 * float(np.ptp(points, axis=0).max()), 1e-12)
+    for _ in range(40):
+        cell = np.floor((points - low) / size).astype(np.int64)
+        extent = cell.max(axis=0) + 1
+        key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+        _, first = np.unique(key, return_index=True)
+        if len(first) <= limit:
+            return np.sort(first)
+        size *= max(1.03, np.sqrt(len(first) / limit))
+    return np.sort(first)

@@ -1,18 +1,16 @@
 """From a file's points to a prepared cloud: unit, origin, crop, outliers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
-from limber.geometry.cloud.canonical_frame import own_axes
-from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.flat_sheets import find_sheet
-from limber.geometry.cloud.ground import find_ground
-from limber.geometry.cloud.scan_lines import scan_line_view
-from limber.geometry.cloud.single_view import Sight, View, find_sight, flying_pixels
+from limber.geometry.cloud.cloud import Cloud, own_axes
+from limber.geometry.cloud.single_view import Sight, View, find_sight, flying_pixels, scan_line_view
+from limber.geometry.cloud.surroundings import find_ground, find_sheet
 from limber.geometry.settings import PreparationSettings
 
 POINT_MINIMUM = 50
@@ -320,3 +318,120 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
     if lost > 0.1 * len(points):
         texts.append(f"{lost} points were discarded as outliers.")
     return texts
+
+
+# Scans read in pieces; only the points needed to find axes and leaves are kept.
+
+MOST_POINTS = 5_000_000
+"""Most points kept of a scan: a tenth of a millimetre apart on a branch of one metre."""
+PIECE_POINTS = 1_000_000
+"""Points that readers take from a file at once."""
+_FINEST = 1e-5  # first grid step, as a fraction of the scan's size
+
+
+def gathered(pieces: Iterable[Cloud], most: int = MOST_POINTS) -> Cloud:
+    """Put a scan together from its pieces; one point per cell of a grid if there are too many.
+
+    Needs memory for twice ``most`` points and a piece.
+
+    Args:
+        pieces: At least one, all with the same attributes.
+        most: Most points to keep.
+
+    Returns:
+        The first points in the cells of the finest grid that leaves no more than ``most``, of grids
+        each twice as wide as the last; ``left_out`` has the number of the others. The result does
+        not depend on the pieces: cells of one grid are within cells of the next.
+    """
+    grid = _Grid(most)
+    held: list[Cloud] = []
+    for piece in pieces:
+        held.append(piece)
+        if sum(map(len, held)) > 2 * most:
+            held = [grid.thinned(_together(held))]
+    whole = _together(held)
+    return grid.thinned(whole) if len(whole) > most else whole
+
+
+class _Grid:
+    """A grid that becomes coarser; all points are measured from the first one."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._anchor: np.ndarray | None = None
+        self._size = 0.0
+
+    def thinned(self, cloud: Cloud) -> Cloud:
+        """One point per cell, in cells large enough to keep few enough points."""
+        finite = np.isfinite(cloud.points).all(axis=1)
+        lost = int((~finite).sum())
+        cloud = replace(cloud.subset(finite), not_finite=cloud.not_finite + lost)
+        if len(cloud) <= self._most:
+            return cloud
+        if self._anchor is None:
+            self._anchor = cloud.points[0]
+        extent = float(np.ptp(cloud.points, axis=0).max())
+        if self._size == 0:
+            self._size = 2.0**np.floor(np.log2(max(_FINEST * extent, 1e-300)))
+        chosen = self._firsts(cloud.points)
+        while len(chosen) > self._most and self._size < extent:
+            self._size *= 2
+            chosen = chosen[self._firsts(cloud.points[chosen])]
+        return replace(cloud.subset(chosen), left_out=cloud.left_out + len(cloud) - len(chosen))
+
+    def _firsts(self, points: np.ndarray) -> np.ndarray:
+        cell = np.floor((points - self._anchor) / self._size).astype(np.int64)
+        cell -= cell.min(axis=0)
+        extent = cell.max(axis=0) + 1
+        key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+        return np.sort(np.unique(key, return_index=True)[1])
+
+
+def _together(pieces: list[Cloud]) -> Cloud:
+    if len(pieces) == 1:
+        return pieces[0]
+    first = pieces[0]
+    return replace(
+        first, points=np.concatenate([piece.points for piece in pieces]),
+        attributes={name: np.concatenate([piece.attributes[name] for piece in pieces])
+                    for name in first.attributes},
+        not_finite=sum(piece.not_finite for piece in pieces),
+        left_out=sum(piece.left_out for piece in pieces))
+
+
+# Plausible sizes of a plant: outside them the unit is asked for; impossible sizes are refused.
+
+LONGEST, SHORTEST = 30.0, 0.01
+"""Largest and smallest size [m] without a question about the unit; the add-on reads the largest."""
+_POSSIBLE = (0.003, 100.0)  # m
+_UNUSUAL = 10.0  # m
+
+
+def size_doubts(points: np.ndarray, what: str, unit: str, *, is_stated: bool) -> list[str]:
+    """Return a question about the unit of positions [m], shape [n, 3], of unusual extent.
+
+    Args:
+        points: The positions.
+        what: "surface"; for messages.
+        unit: The unit in which they were read.
+        is_stated: Whether the user or the file stated it.
+
+    Raises:
+        InputError: a plant of this size needs a stated unit, or none has it.
+    """
+    extent = float(np.ptp(points, axis=0).max())
+    is_possible = _POSSIBLE[0] <= extent <= _POSSIBLE[1]
+    if is_possible and (is_stated or SHORTEST <= extent <= _UNUSUAL):
+        return []
+    number = extent / UNIT_METRES[unit]
+    other = [f"--unit {name} ({size:.3g} m)" for name in ("m", "cm", "mm", "in")
+             if name != unit and SHORTEST <= (size := number * UNIT_METRES[name]) <= _UNUSUAL]
+    seen = f"The {what} is {extent:.4g} m long, read in {unit}."
+    if SHORTEST <= extent <= LONGEST:
+        return [f"{seen} Is its unit another: {' or '.join(other)}?"]
+    if is_possible:
+        raise InputError(seen, "Neither the file nor --unit states the unit, and this would be an "
+                         "unusual size.", f"State it: {', '.join([*other, f'--unit {unit}'])}.")
+    raise InputError(seen, f"No plant that a robot moves has this size ({_POSSIBLE[0]:g} to "
+                     f"{_POSSIBLE[1]:g} m).", f"State the unit of its numbers: {', '.join(other)}."
+                     if other else "Check its numbers and its unit (--unit).")

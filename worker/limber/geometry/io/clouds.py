@@ -3,29 +3,468 @@
 All return coordinates as in the file, as float64, and keep normals, colours and scalars.
 """
 
+import io
+import itertools
+import math
+import re
+import struct
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
-from limber.core.files.declared_sizes import check_las, check_pcd, check_ply
-from limber.core.files.reading import read_arrays
-from limber.core.files.text_columns import ColumnsError, Table, stated_unit, three_of
-from limber.geometry.cloud.cloud import LEFT_OUT, POINTS, Cloud
-from limber.geometry.cloud.columns import property_names
-from limber.geometry.cloud.piecewise_reading import gathered
+from limber.core.files.declared_sizes import check_las, check_pcd, check_ply, header_bytes
+from limber.core.files.reading import read_arrays, require_size
+from limber.core.files.text_columns import (
+    LINES_AT_ONCE,
+    ColumnsError,
+    Table,
+    coding_of,
+    lines_of,
+    stated_unit,
+    three_of,
+)
+from limber.geometry.cloud.cloud import LEFT_OUT, POINTS, Cloud, property_names
+from limber.geometry.cloud.preparation import PIECE_POINTS, gathered
+from limber.geometry.io.e57 import read_e57
 from limber.geometry.io.formats import Format, Registry, head_of, starts_with
-from limber.geometry.io.las import is_packed, las_columns
-from limber.geometry.io.las_units import METRES, in_metres
-from limber.geometry.io.mesh_as_cloud import mesh_notes
-from limber.geometry.io.pcd import read_pcd
-from limber.geometry.io.ply import read_ply
-from limber.geometry.io.scanners.colmap import read_points3d
-from limber.geometry.io.scanners.e57 import read_e57
-from limber.geometry.io.scanners.ptx import read_ptx
+
+# A mesh given as a cloud: its vertices may be a scan, or far too few.
+
+_LONG = 0.05
+"""Fraction of the extent: triangles with so long an edge have surface where no vertex is."""
+
+
+def mesh_notes(path: Path, vertices: np.ndarray, faces: np.ndarray) -> list[str]:
+    """Return what a user should know whose cloud is a mesh.
+
+    Args:
+        path: Its file.
+        vertices: Positions, shape [n, 3].
+        faces: Triangles, shape [m, 3].
+
+    Raises:
+        InputError: half of the surface is of triangles so large that vertices do not show it.
+    """
+    good = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
+    corners = np.asarray(vertices, float)[faces[good]]
+    if not len(corners):
+        return []
+    sides = np.roll(corners, -1, axis=1) - corners
+    areas = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    longest = np.linalg.norm(sides, axis=2).max(axis=1)
+    extent = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
+    large = longest > _LONG * extent
+    if areas[large].sum() > 0.5 * areas.sum():
+        raise InputError(
+            f"{path} is a mesh of {len(vertices)} vertices and {len(faces)} faces.",
+            "A point cloud was expected. Most of this surface lies in large faces, where a mesh "
+            "has no points.",
+            "If it is the closed surface of a branch, use `limber mesh`. Otherwise sample points "
+            "on it (CloudCompare: Edit, Mesh, Sample points) and export those.")
+    return [f"{path.name} is a mesh of {len(faces)} faces. Its {len(vertices)} vertices were read "
+            "as a cloud. If it is the closed surface of a branch, `limber mesh` uses it as it is."]
+
+
+# Clouds as PLY files, whose headers may also contain letters other than ASCII.
+
+
+def read_ply(path: Path) -> Cloud:
+    """Return the vertices of a PLY file, with the file's own names of renamed columns."""
+    content, titles = _ply_content(path)
+    if "vertex" not in content:
+        raise InputError(f"{path} has no vertices.", "A PLY point cloud has an element `vertex`.",
+                         "Export it again.")
+    table = content["vertex"].data
+    names = [name for name in table.dtype.names if table.dtype[name].kind in "iuf"]
+    # Binary tables stay in the file until a piece is asked for.
+    cloud = gathered(Cloud.from_columns({name: np.array(part[name]) for name in names}, titles)
+                     for start in range(0, max(len(table), 1), PIECE_POINTS)
+                     for part in [table[start:start + PIECE_POINTS]])
+    # Faces count the file's vertices.
+    notes = () if cloud.left_out else tuple(mesh_notes(path, cloud.points, _triangles(content)))
+    comments = "\n".join([*content.comments, *content.obj_info])
+    return replace(cloud, unit=stated_unit(comments), notes=notes)
+
+
+def _triangles(content: Any) -> np.ndarray:
+    """The first three corners of each face, shape [m, 3]."""
+    if "face" not in content:
+        return np.empty((0, 3), int)
+    faces = content["face"].data
+    lists: Any = next((faces[name] for name in ("vertex_indices", "vertex_index")
+                  if name in (faces.dtype.names or ())), [])
+    return np.array([face[:3] for face in lists if len(face) >= 3], int).reshape(-1, 3)
+
+
+def _ply_content(path: Path) -> tuple[Any, dict[str, str]]:
+    """Read a PLY file, and its names of the properties that are not ASCII.
+
+    A header is ASCII by the standard; programs write comments and names in other letters too.
+    """
+    from plyfile import PlyData
+
+    raw, body = header_bytes(path, b"end_header")
+    if raw.isascii():
+        return PlyData.read(str(path)), {}
+    try:
+        header = raw.decode("utf-8")
+    except UnicodeDecodeError:
+        header = raw.decode("latin-1")
+    lines = re.split(r"(\r\n|\r|\n)", header)
+    words = {k: line.split() for k, line in enumerate(lines) if line.startswith("property")}
+    other = [k for k, parts in words.items() if not parts[-1].isascii()]
+    taken = [parts[-1] for k, parts in words.items() if k not in other]
+    names = property_names((words[k][-1] for k in other), taken)
+    for k, name in zip(other, names, strict=True):
+        lines[k] = " ".join([*words[k][:-1], name])
+    plain = "".join(lines).encode("ascii", "replace")
+    with open(path, "rb") as stream:
+        stream.seek(body)
+        content = PlyData.read(io.BytesIO(plain + stream.read()))
+    return content, {name: words[k][-1] for k, name in zip(other, names, strict=True)}
+
+
+# Clouds as PCD files, of all versions.
+
+_PADDING = "#$%&~~"  # prefix by which pypcd4 names fields that are called _
+
+
+def read_pcd(path: Path) -> Cloud:
+    """Return the points of a PCD file, with the file's own names of renamed columns."""
+    raw, body = header_bytes(path, b"\nDATA")
+    header, titles = _completed(path, raw.decode("utf-8", "replace"))
+    cloud = gathered(_cloud(table, titles) for table in _tables(path, header, body))
+    comments = [line for line in raw.decode("utf-8", "replace").splitlines()
+                if line.startswith("#")]
+    return replace(cloud, unit=stated_unit("\n".join(comments)))
+
+
+def _cloud(table: np.ndarray, titles: dict[str, str]) -> Cloud:
+    """A piece of the points, copied out of the file."""
+    columns = {name: np.array(table[name]) for name in table.dtype.names or ()
+               if not name.startswith(_PADDING)}
+    if "rgb" in columns:
+        packed = columns.pop("rgb")
+        packed = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
+        columns |= {"r": packed >> 16 & 255, "g": packed >> 8 & 255, "b": packed & 255}
+    return Cloud.from_columns(columns, titles)
+
+
+def _tables(path: Path, header: str, body: int) -> Iterator[np.ndarray]:
+    """The points in pieces, structured by field; at least one piece, which may be empty.
+
+    Raises:
+        InputError: there are fewer points than the header declares.
+    """
+    from pypcd4 import MetaData, PointCloud
+
+    meta = MetaData.parse_header(header.splitlines())
+    dtype = meta.build_dtype()
+    whole: Any = np.empty(0, dtype)
+    with open(path, "rb") as stream:
+        stream.seek(body)
+        if meta.data.value == "ascii" and meta.points:
+            listed, rows = 0, (line for line in stream if line.strip())
+            while lines := list(islice(rows, PIECE_POINTS)):
+                piece = np.loadtxt(lines, dtype, ndmin=1)
+                listed += len(piece)
+                yield piece
+            if listed < meta.points:
+                raise InputError(f"{path} announces {meta.points} points and lists {listed}.",
+                                 "It is cut short, or its header is damaged.", "Export it again.")
+            return
+        if meta.data.value == "binary" and meta.points:
+            whole = np.memmap(path, dtype, "r", body, (meta.points,))
+        elif meta.points:
+            content: Any = io.BytesIO(header.encode() + stream.read())
+            whole = PointCloud.from_fileobj(content).pc_data
+    for start in range(0, max(len(whole), 1), PIECE_POINTS):
+        yield whole[start:start + PIECE_POINTS]
+
+
+def _completed(path: Path, source: str) -> tuple[str, dict[str, str]]:
+    """A PCD header as its package reads it, and the file's names of renamed fields.
+
+    Versions before 0.7 lack entries; some programs end lines with blanks, or have special
+    characters in the names of fields.
+    """
+    entries = {words[0]: words[1:] for line in source.splitlines()
+               if (words := line.split()) and not words[0].startswith("#")}
+    for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA"):
+        if not entries.get(key):
+            raise InputError(f"The header of {path} has no entry {key}.",
+                             "A PCD header needs this entry.", "Export it again.")
+    fields = entries["FIELDS"]
+    names = iter(property_names([title for title in fields if title != "_"]))
+    renamed = [title if title == "_" else next(names) for title in fields]
+    height = entries.get("HEIGHT") or ["1"]
+    complete = {"VERSION": ["0.7"], "FIELDS": renamed, "SIZE": entries["SIZE"],
+                "TYPE": entries["TYPE"], "COUNT": entries.get("COUNT") or ["1"] * len(fields),
+                "WIDTH": entries["WIDTH"], "HEIGHT": height,
+                "POINTS": entries.get("POINTS") or [str(int(entries["WIDTH"][0])
+                                                        * int(height[0]))],
+                "DATA": entries["DATA"]}
+    return "".join(f"{key} {' '.join(words)}\n" for key, words in complete.items()), {
+        name: title for name, title in zip(renamed, fields, strict=True) if name != title}
+
+
+# Units of LAS and LAZ files, from the records of their coordinate system.
+#
+# Without a table of coordinate systems: only units that the records spell out are known.
+
+METRES = "\0metres"
+"""Name of the units [2] among the columns of a reader, see :func:`stated_metres`."""
+_DEGREES = 0.0
+_CODES = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
+"""Metres by the EPSG code of a unit: metre, foot, US survey foot."""
+_MODEL, _GEOGRAPHIC, _HORIZONTAL, _VERTICAL = 1024, 2, 3076, 4099
+"""GeoTIFF keys: model type, its value for degrees; units of plane and height."""
+_NESTED = r'\["[^"]*"(?:[^\[\]]|\[(?:[^\[\]]|\[[^\[\]]*\])*\])*\]'
+_BESIDE = re.compile(rf"(?:ELLIPSOID|SPHEROID|PARAMETER|PRIMEM){_NESTED}")
+"""Parts of a WKT whose units are not those of the coordinates."""
+_UNIT = re.compile(r'(?:LENGTH)?UNIT\["([^"]*)",\s*([\d.eE+-]+)')
+_HEIGHTS = re.compile(r"VERT_CS|VERTCRS|VERTICALCRS")
+
+
+def stated_metres(records: Iterable[Any]) -> np.ndarray:
+    """Return what one unit of x and y, and of z, is in metres, shape [2].
+
+    NaN stands for an unknown unit, 0 for degrees.
+
+    Args:
+        records: The variable length records that laspy read.
+    """
+    found = np.full(2, np.nan)
+    for record in records:
+        if getattr(record, "string", ""):
+            return _of_text(record.string)
+        keys = {key.id: key.value_offset for key in getattr(record, "geo_keys", ())}
+        if keys.get(_MODEL) == _GEOGRAPHIC:
+            return np.array([_DEGREES, np.nan])
+        if keys:
+            found = np.array([_CODES.get(keys.get(key, 0), np.nan)
+                              for key in (_HORIZONTAL, _VERTICAL)])
+    return found
+
+
+def _of_text(text: str) -> np.ndarray:
+    """The units of a coordinate system in WKT, version 1 or 2."""
+    plane, *height = _HEIGHTS.split(_BESIDE.sub("", text), maxsplit=1)
+    if re.search(r"GEOG(?:CS|CRS|RAPHICCRS)|GEODCRS", plane) and not re.search(
+            r"PROJ(?:CS|CRS|ECTEDCRS)", plane):
+        return np.array([_DEGREES, np.nan])
+    return np.array([_length_unit(part) for part in (plane, "".join(height))])
+
+
+def _length_unit(text: str) -> float:
+    sizes = [float(size) for name, size in _UNIT.findall(text)
+             if re.search(r"met(?:er|re)|foot|feet|\bft", name, re.IGNORECASE)]
+    return sizes[-1] if sizes and 1e-4 < sizes[-1] < 1e4 else math.nan
+
+
+def in_metres(path: Path, cloud: Cloud, metres: np.ndarray) -> Cloud:
+    """Return the points of a LAS file in metres, if its units are known.
+
+    Raises:
+        InputError: the coordinates are degrees.
+    """
+    plane, height = metres
+    if plane == _DEGREES:
+        raise InputError(f"{path} has its coordinates in degrees of longitude and latitude.",
+                         "A branch needs lengths.",
+                         "Export it in a projected coordinate system, in metres.")
+    if not np.isfinite(plane):
+        return cloud
+    # A coordinate system without heights leaves them in the unit of the plane.
+    height = height if np.isfinite(height) else plane
+    notes = () if plane == height == 1 else (
+        f"The file states that its coordinates have a unit of {plane:.6g} m, its heights of "
+        f"{height:.6g} m. They were converted to metres.",)
+    return replace(cloud, points=cloud.points * [plane, plane, height], unit="m",
+                   notes=(*cloud.notes, *notes))
+
+
+# Clouds as LAS and LAZ files.
+
+
+def is_packed(path: Path) -> bool:
+    """Whether the file is LAZ, whose points compiled code decodes; it aborts on corrupt ones."""
+    with open(path, "rb") as stream:
+        return bool(stream.read(105)[104] & 0xC0)
+
+
+def las_columns(path: Path) -> dict[str, np.ndarray]:
+    """Return coordinates, ``color``, the other dimensions, and units of a LAS or LAZ file."""
+    import laspy
+
+    cloud = gathered(_las_pieces(path))
+    with laspy.open(path) as reader:
+        metres = stated_metres([*reader.header.vlrs, *(reader.evlrs or ())])
+    attributes = {name: values for name, values in cloud.attributes.items()
+                  if name == "color" or values.any()}
+    if "color" in attributes and attributes["color"].max(initial=0) > 255:
+        # 16 bits per channel by the standard, though many programs write 8.
+        attributes["color"] = attributes["color"] // 257
+    return {**attributes, POINTS: cloud.points, LEFT_OUT: np.array(cloud.left_out),
+            METRES: metres}
+
+
+def _las_pieces(path: Path) -> Iterator[Cloud]:
+    import laspy
+
+    with laspy.open(path) as reader:
+        dimensions = reader.header.point_format
+        names = set(dimensions.dimension_names)
+        has_color = {"red", "green", "blue"} <= names
+        others = sorted(names - {"X", "Y", "Z", "red", "green", "blue"})
+        if reader.header.point_count == 0:
+            yield Cloud(np.empty((0, 3)))
+        for part in reader.chunk_iterator(PIECE_POINTS):
+            attributes = {}
+            if has_color:
+                attributes["color"] = np.stack(
+                    [np.asarray(part[c]) for c in ("red", "green", "blue")], axis=1)
+            attributes |= {name: values for name in others
+                           if (values := np.asarray(part[name])).ndim == 1}
+            points = np.stack([np.asarray(getattr(part, axis), np.float64) for axis in "xyz"],
+                              axis=1)
+            yield Cloud(points, attributes)
+
+
+# Clouds as COLMAP's ``points3D.bin``; its text format is read like other text.
+
+_POINT = struct.Struct("<Q3d3BdQ")
+_SEEN_BYTES = 8
+"""For each image that saw a point: its number, and that of the point in it."""
+
+
+def read_points3d(path: Path) -> Cloud:
+    """Return the points of a reconstruction, in its own unit, with colour and error.
+
+    Raises:
+        InputError: the file is cut short.
+    """
+    raw = path.read_bytes()
+    count, = struct.unpack_from("<Q", raw)
+    require_size(path, float(count) * _POINT.size + 8, len(raw), f"{count} points")
+    cut = InputError(f"{path} is cut short.", f"It announces {count} points.", "Export it again.")
+    rows, at = np.empty((count, 7)), 8
+    for row in rows:
+        if at + _POINT.size > len(raw):
+            raise cut
+        _, *row[:], seen = _POINT.unpack_from(raw, at)
+        at += _POINT.size + _SEEN_BYTES * seen
+    if at > len(raw):
+        raise cut
+    return Cloud(rows[:, :3], {"color": rows[:, 3:6].astype(np.uint8), "error": rows[:, 6]})
+
+
+# Clouds as Leica's PTX files: grids of points, each scan with the pose of its scanner.
+
+_MOST = 10**9
+"""Most rows or columns of a scanner's grid."""
+_HEAD = 10
+"""Lines above the points of a scan: columns, rows, position, three axes, a matrix of four rows."""
+
+
+class _Scan(NamedTuple):
+    """A scan: the number of its points, the matrix [4, 4] from points as rows to the common frame,
+    and the number of its columns.
+    """
+
+    size: int
+    matrix: np.ndarray
+    width: int
+
+
+def read_ptx(path: Path) -> Cloud:
+    """Return the points of all scans [m] in their common frame, with intensity and colour.
+
+    Of more than :data:`~limber.geometry.cloud.preparation.MOST_POINTS`, one in
+    each cell of a grid is kept.
+
+    Raises:
+        InputError: a scan is cut short, or a header or a line of it is invalid.
+    """
+    coding = coding_of(path)
+    scans = _scans(path, coding)
+    width = min((scan.width for scan in scans), default=0)
+    if width < 3:
+        raise InputError(f"{path} has no scan.", "A PTX file begins with the numbers of columns "
+                         "and rows of its first scan.", "Export it again.")
+    return replace(gathered(_scan_pieces(path, coding, scans, width)), unit="m")
+
+
+def _lines(path: Path, coding: str) -> Iterator[str]:
+    return filter(str.strip, lines_of(path, coding))
+
+
+def _scans(path: Path, coding: str) -> list[_Scan]:
+    """The headers of all scans."""
+    lines, start, scans = _lines(path, coding), 0, []
+    while head := list(itertools.islice(lines, _HEAD)):
+        count, matrix = _header(path, head, start)
+        first = next(lines, None)
+        found = 0 if first is None else 1 + sum(1 for _ in itertools.islice(lines, count - 1))
+        if first is None or found < count:
+            raise InputError(f"{path}: the scan at line {start + 1} announces {count} points, but "
+                             f"{found} lines follow.", "The file is cut short.",
+                             "Export it again.")
+        scans.append(_Scan(count, matrix, len(first.split())))
+        start += _HEAD + count
+    return scans
+
+
+def _scan_pieces(path: Path, coding: str, scans: list[_Scan], width: int) -> Iterator[Cloud]:
+    """The points of some lines after the other, with ``width`` of their columns."""
+    lines = _lines(path, coding)
+    for scan in scans:
+        rows = itertools.islice(lines, _HEAD, _HEAD + scan.size)
+        while some := list(itertools.islice(rows, LINES_AT_ONCE)):
+            table = _table(path, some, scan)
+            # A direction without an echo is a point at the scanner itself.
+            seen = np.isfinite(table[:, 0])
+            attributes = {"intensity": table[seen, 3]} if width > 3 else {}
+            if width >= 7:
+                attributes["color"] = table[seen, 4:7]
+            yield Cloud(table[seen, :3], attributes, not_finite=int((~seen).sum()))
+
+
+def _header(path: Path, head: list[str], start: int) -> tuple[int, np.ndarray]:
+    """Points of a scan and its matrix [4, 4] from points as rows to the common frame."""
+    try:
+        columns, rows = int(head[0]), int(head[1])
+        matrix = np.array([[float(word) for word in line.split()] for line in head[6:_HEAD]])
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or (
+                min(columns, rows) < 1 or max(columns, rows) > _MOST):
+            raise ValueError
+    except (ValueError, IndexError):
+        raise InputError(f"{path}, line {start + 1}: the header of a scan was expected.",
+                         "It has the numbers of columns and rows, the scanner's position and axes, "
+                         "and a matrix of four rows.", "Export it again.") from None
+    return columns * rows, matrix
+
+
+def _table(path: Path, rows: list[str], scan: _Scan) -> np.ndarray:
+    """Points in the common frame and the other values of a line; NaN where there was no echo."""
+    try:
+        table = np.loadtxt(rows, ndmin=2)
+        if table.shape[1] != scan.width:
+            raise ValueError(f"{table.shape[1]} columns instead of {scan.width}")
+    except ValueError as error:
+        raise InputError(f"{path}: a scan's points are not a table of numbers ({error}).",
+                         "The file is damaged.", "Export it again.") from error
+    silent = ~table[:, :3].any(axis=1)
+    table[:, :3] = table[:, :3] @ scan.matrix[:3, :3] + scan.matrix[3, :3]
+    table[silent, :3] = np.nan
+    return table
+
 
 _FARTHEST = 1e15
 """Largest coordinate, whatever its unit."""

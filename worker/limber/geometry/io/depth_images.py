@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.geometry.cloud.camera import Camera, depth_to_cloud, read_camera
+from limber.geometry.cloud.camera import Camera, depth_to_cloud, read_camera, read_mask, read_pixels
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.pixels import read_mask, read_pixels
 
 NEAREST_M, FARTHEST_M = 0.1, 10.0
 """Distances of a plant from a depth camera: nearer none measures, farther none shows a twig."""

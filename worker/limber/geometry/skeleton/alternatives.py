@@ -15,7 +15,11 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
 from limber.core.json_values import validated
-from limber.geometry.skeleton.confidence import probability_given_carrier
+from limber.geometry.skeleton.confidence import (
+    DoubtfulKind,
+    DoubtfulPart,
+    probability_given_carrier,
+)
 from limber.geometry.skeleton.edits import (
     FAR,
     AddBranch,
@@ -27,7 +31,6 @@ from limber.geometry.skeleton.edits import (
 )
 from limber.geometry.skeleton.plausibility import OPEN
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.uncertain_parts import DoubtfulKind, DoubtfulPart
 
 _DETOUR = 1.5  # longest path over a bridge that is still its own, in its lengths
 _Combination = tuple[float, tuple[Edit, ...]]

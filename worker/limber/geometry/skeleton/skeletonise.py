@@ -9,26 +9,28 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
-from limber.geometry.cloud.canonical_frame import OwnFrame
+from limber.geometry.cloud.cloud import OwnFrame, thinned
 from limber.geometry.cloud.single_view import View
-from limber.geometry.cloud.thinning import thinned
 from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.confidence import likely
-from limber.geometry.skeleton.contraction.curve_graph import CurveGraph, curve_graph, rooted
-from limber.geometry.skeleton.contraction.laplacian_contraction import contract
-from limber.geometry.skeleton.contraction.level_sets import POINT_LIMIT, is_sparse, level_graph
-from limber.geometry.skeleton.contraction.root_end import RootChoice, root_node
-from limber.geometry.skeleton.joining.plants import second_base
-from limber.geometry.skeleton.leaf_axes import through_leaves
+from limber.geometry.skeleton.contraction import (
+    POINT_LIMIT,
+    contract,
+    is_sparse,
+    level_graph,
+    through_leaves,
+)
+from limber.geometry.skeleton.curve_graph import CurveGraph, curve_graph, rooted
+from limber.geometry.skeleton.joining import second_base
 from limber.geometry.skeleton.plausibility import (
     Where,
     check_no_sheet,
     check_one_plant,
     check_round,
 )
-from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
-from limber.geometry.skeleton.repair.passes import LEAF_SHARE, repaired
-from limber.geometry.skeleton.repair.spurs import SPUR_REACH, prune_spurs
+from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
+from limber.geometry.skeleton.repair import LEAF_SHARE, SPUR_REACH, prune_spurs, repaired
+from limber.geometry.skeleton.root_end import RootChoice, root_node
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
 

@@ -7,6 +7,8 @@ step that fails is halved.
 """
 
 import time
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
@@ -15,27 +17,373 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.not_none import present
+from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.dynamics.drive import Drive
-from limber.mechanics.dynamics.energy_momentum import EnergyMomentumStepper
 from limber.mechanics.dynamics.motion import (
     DynamicResult,
     DynamicSensitivities,
     EnergyMomentumSettings,
     MotionSettings,
+    MotionState,
     NewmarkSettings,
 )
 from limber.mechanics.dynamics.motion_tangents import MotionTangents
-from limber.mechanics.dynamics.newmark import NewmarkStepper
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.linear.equations import Viscous
+from limber.mechanics.linear.equations import Tangent, Viscous
+from limber.mechanics.materials.laws import contracted, hooke_strain
 from limber.mechanics.model import BranchModel
-from limber.mechanics.motion_state import MotionState
 from limber.mechanics.sensitivities import ParameterSet, reactions
-from limber.mechanics.solve_status import Status
-from limber.mechanics.statics.result import StaticResult
-from limber.mechanics.statics.static_problem import base_forces, checked_forces, strain_warnings
+from limber.mechanics.statics.equilibrium_path import base_forces, checked_forces, strain_warnings
+from limber.mechanics.statics.result import StaticResult, Status
 from limber.mechanics.strain import principal_stretch
+
+# What the implicit time integration schemes have in common.
+
+
+class Stepper(ABC):
+    """Takes steps and keeps the tangent of the last one.
+
+    Attributes:
+        iteration_count: Iterations so far.
+        status, trouble: Reason for the failure of the last step.
+        tangent: Tangent of the last solve; None before the first.
+    """
+
+    def __init__(self, drive: Drive, settings: MotionSettings):
+        self.drive, self.settings = drive, settings
+        self.model, self.equations = drive.model, drive.equations
+        self.iteration_count = 0
+        self.status, self.trouble = Status.converged, ""
+        self.tangent: Tangent | None = None
+
+    def forget_tangent(self) -> None:
+        """Discard the last tangent."""
+        self.tangent = None
+
+    @abstractmethod
+    def viscous(self, old: MotionState, dt: float) -> Viscous | None:
+        """Return the viscous part of a step of ``dt`` from ``old``; None if there is none."""
+
+    @abstractmethod
+    def step(self, old: MotionState, dt: float, viscous: Viscous | None) -> MotionState | None:
+        """Return the state ``dt`` after ``old``, or None if it is not found."""
+
+    def _is_balanced(self, norm: float, reference: float) -> bool:
+        """Whether a residual is small relative to the forces or to round-off."""
+        # Differences of displacements in an element carry a round-off error of about one unit each.
+        tangent = present(self.tangent, "tangent")
+        floor = 8 * float(np.finfo(float).eps) * tangent.diagonal_norm * self.model.mean_edge
+        return norm <= max(self.settings.tolerance * reference, floor)
+
+    def _change(self, residual: np.ndarray, moved: np.ndarray | None,
+                pins: np.ndarray) -> np.ndarray:
+        """Return the tangent's response to a residual and to the motion ``moved`` of held nodes."""
+        change = present(self.tangent, "tangent").solve(residual, pins)
+        return change if moved is None or not self.equations.held.any() else change + moved
+
+    def _failed(self, trouble: str, status: Status = Status.stalled) -> None:
+        self.trouble, self.status = trouble, status
+
+
+# One implicit Newmark step: mixed-point Newton that reuses a tangent while it converges.
+
+_KEPT_TANGENT_ERROR = 1e-3
+"""Fraction of the residual that a tangent's solve may leave for the next step to start with it.
+Chosen, not measured.
+"""
+
+
+class NewmarkStepper(Stepper):
+    """Steps by Newmark's formulas."""
+
+    settings: NewmarkSettings
+
+    def __init__(self, drive: Drive, settings: NewmarkSettings):
+        super().__init__(drive, settings)
+        self._tangent_step, self._tangent_error = 0.0, np.inf
+
+    def viscous(self, old: MotionState, dt: float) -> Viscous | None:
+        """Return the viscous part of a step of ``dt`` from ``old``."""
+        factor = self.model.damping.stiffness
+        if not factor:
+            return None
+        ahead, now, before = old.rate_formula(dt)
+        return Viscous(1 + factor * ahead, factor * (now * old.strain + before * old.strain_before))
+
+    def step(self, old: MotionState, dt: float,
+             viscous: Viscous | None) -> MotionState | None:
+        """Return the state ``dt`` after ``old``, or None if it is not found.
+
+        The first solve starts from the previous balanced state, not from an extrapolation in time:
+        linear extrapolation stretches rotating parts. Mixed-point Newton then works as well as in
+        statics.
+        """
+        model, equations, settings = self.model, self.equations, self.settings
+        load = self.drive.load_at(old.time + dt)
+        new = replace(old, time=old.time + dt, step_before=dt,
+                      displacement=old.displacement.copy())
+        moved, pins = self.drive.moves(new)
+        self._follow(old, new, dt)
+        increment: np.ndarray | None = None
+        norms: list[float] = []
+        fresh = False
+        for _ in range(settings.max_iterations):
+            out, inertial, min_det_f = self._imbalance(new, load, viscous)
+            residual = equations.free_part(out)
+            norm = float(np.linalg.norm(residual))
+            reference = float(np.linalg.norm(load) + np.linalg.norm(inertial)
+                              + np.linalg.norm(out - residual))
+            if not np.isfinite(norm) or (len(norms) > 4 and norm > 0.9 * min(norms)
+                                         and norms[-1] > 0.9 * min(norms[:-1])):
+                self._failed("the iteration does not converge")
+                return None
+            if increment is not None and self._is_balanced(norm, reference):
+                if fresh:
+                    self._tangent_error = norm / norms[-1] if norms[-1] else 0.0
+                return self._accepted(new, min_det_f)
+            first = increment is None
+            if fresh:
+                self._tangent_error, fresh = norm / norms[-1], False
+            keep = self._may_keep(dt) if first else (
+                norm <= settings.keep_factor * reference and norm < 0.1 * norms[-1])
+            if not keep:
+                if not self._make_tangent(new, increment, viscous, dt):
+                    return None
+                fresh = True
+            norms.append(norm)
+            self.iteration_count += 1
+            if first and moved is not None:
+                residual = equations.free_part(
+                    out - model.tangent_times(old.displacement, moved, viscous))
+            increment = self._change(residual, moved, pins)
+            moved, pins = None, np.zeros_like(pins)
+            new.displacement = new.displacement + increment
+            self._follow(old, new, dt)
+        self._failed(f"no convergence in {settings.max_iterations} iterations")
+        return None
+
+    def _follow(self, old: MotionState, new: MotionState, dt: float) -> None:
+        """Set velocity and acceleration by Newmark's formulas, and held nodes to the path's."""
+        beta, gamma = self.settings.beta, self.settings.gamma
+        new.acceleration = ((new.displacement - old.displacement - dt * old.velocity) / dt**2
+                            - (0.5 - beta) * old.acceleration) / beta
+        new.velocity = old.velocity + dt * (
+            (1 - gamma) * old.acceleration + gamma * new.acceleration)
+        self.drive.hold(new)
+
+    def _may_keep(self, dt: float) -> bool:
+        """Whether the last tangent fits the state before this step.
+
+        It does if its own solve reduced the residual a thousandfold.
+        """
+        return (self.settings.keep_factor > 0 and self.tangent is not None
+                and self._tangent_step == dt and self._tangent_error <= _KEPT_TANGENT_ERROR)
+
+    def _make_tangent(self, new: MotionState, increment: np.ndarray | None,
+                   viscous: Viscous | None, dt: float) -> bool:
+        settings, damping = self.settings, self.model.damping
+        rate, inertia = settings.gamma / (settings.beta * dt), 1 / (settings.beta * dt**2)
+        # Its memory is reused by the new one.
+        self.tangent = None
+        try:
+            self.tangent = self.equations.tangent(
+                self.model, new.displacement, increment=increment, viscous=viscous,
+                mass_factor=inertia + damping.mass * rate)
+        except NotPositiveDefiniteError:
+            self._failed("the stiffness has no positive pivots")
+            return False
+        self._tangent_step = dt
+        return True
+
+    def _imbalance(self, new: MotionState, load: np.ndarray, viscous: Viscous | None,
+                   ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return residual forces, inertial forces, and min det F."""
+        internal = self.model.internal(new.displacement, viscous=viscous)
+        inertial = self.model.mass_times(
+            new.acceleration + self.model.damping.mass * new.velocity)
+        return load - internal.force - inertial, inertial, internal.min_det_f
+
+    def _accepted(self, new: MotionState, min_det_f: float) -> MotionState | None:
+        if min_det_f <= 0:
+            self._failed("an element would turn inside out", Status.inverted)
+            return None
+        self.status = Status.converged
+        return new
+
+
+# One implicit step that conserves energy exactly, for any amplitude and step size.
+#
+# With the mean u_m of two successive displacements and the mean velocity,
+#
+#     M (v_1 - v_0) / dt + alpha M (v_0 + v_1) / 2 + f = load,     (u_1 - u_0) / dt = (v_0 + v_1) /
+#     2,
+#
+# where f is the integral of F(u_m) S grad N. S is the stress of the mean of the strains E_0 and
+# E_1, not of the strain of the mean (Simo and Tarnow 1992). F(u_m) times the change of F is exactly
+# the change of E, so the work of f equals the change of the energy: no energy is gained, and
+# damping only removes it. A rigid rotation of any size has no strain at either end, hence no stress
+# in between. If the energy is not quadratic in E, S has a component along E_1 - E_0 that makes up
+# the difference (Gonzalez 2000).
+
+_STRAIN_CHANGE = 1e-6
+"""Below this change of strain in a step, Gonzalez' correction (its cube) is round-off."""
+_GOOD_REDUCTION = 0.3
+"""Fraction of the residual that a solve may leave for its tangent to be reused."""
+_FRESH = 3
+"""Most new tangents in one step; later ones belong to nearly the same state. Both chosen, not
+measured.
+"""
+_NOTHING = np.zeros(6)
+
+
+class EnergyMomentumStepper(Stepper):
+    """Takes steps that conserve energy and momentum."""
+
+    def __init__(self, drive: Drive, settings: MotionSettings):
+        super().__init__(drive, settings)
+        self._balances: deque[tuple[float, np.ndarray]] = deque(maxlen=2)
+        law = self.model.material
+        # Its stress is expressed by the strain that has this stress in St. Venant-Kirchhoff.
+        self._bearing = (self.model if law.is_hookean
+                         else self.model.with_material("st_venant_kirchhoff"))
+        self._stiff = self._bearing if law.is_compiled else self.model
+
+    def begin(self, start: MotionState, out: np.ndarray) -> None:
+        """Begin with the reactions ``out`` [N] of the holds on each node, shape [node_count, 3]."""
+        self._balances.append((start.time, out))
+
+    def viscous(self, old: MotionState, dt: float) -> None:
+        """Return None: the step computes its own from the strains at its ends."""
+
+    def step(self, old: MotionState, dt: float, viscous: Viscous | None = None,
+             ) -> MotionState | None:
+        """Return the state ``dt`` after ``old``, or None if it is not found.
+
+        Newton's unknown is the mean displacement. Its tangent F(u_m) C F(u_1) is not symmetric. The
+        factorised matrix is F(u_m) C F(u_m), so each iteration reduces the error by a factor of
+        about the rotation in half a step.
+        """
+        equations, settings = self.equations, self.settings
+        new = replace(old, time=old.time + dt, step_before=dt,
+                      displacement=old.displacement.copy())
+        load = self.drive.load_at(old.time + dt / 2)
+        moved, pins = self.drive.moves(new)
+        moved, pins = None if moved is None else moved / 2, pins / 2
+        before = self.model.strains(old.displacement)
+        increment: np.ndarray | None = None
+        norms: list[float] = []
+        made = 0
+        for _ in range(settings.max_iterations):
+            self._follow(old, new, dt)
+            middle = 0.5 * (old.displacement + new.displacement)
+            bearing = self._bearing_strain(before, self.model.strains(new.displacement), dt)
+            out, inertial = self._imbalance(old, new, dt, load, middle, bearing)
+            residual = equations.free_part(out)
+            norm = float(np.linalg.norm(residual))
+            if not np.isfinite(norm):
+                self._failed("the motion grew without bound")
+                return None
+            reference = float(np.linalg.norm(load) + np.linalg.norm(inertial)
+                              + np.linalg.norm(out - residual))
+            if (len(norms) > 6 and norm > 0.9 * min(norms)
+                    and norms[-1] > 0.9 * min(norms[:-1])):
+                self._failed("the iteration does not converge")
+                return None
+            if increment is not None and self._is_balanced(norm, reference):
+                return self._accepted(new, old, out)
+            first = increment is None
+            if first or (norm > _GOOD_REDUCTION * norms[-1] and made < _FRESH):
+                made += 1
+                if not self._make_tangent(middle, increment, bearing, dt):
+                    self._failed("the stiffness has no positive pivots")
+                    return None
+            norms.append(norm)
+            self.iteration_count += 1
+            if first and moved is not None:
+                residual = equations.free_part(
+                    out - self._bearing.tangent_times(middle, moved))
+            increment = self._change(residual, moved, pins)
+            moved, pins = None, np.zeros_like(pins)
+            new.displacement = new.displacement + 2 * increment
+        self._failed(f"no convergence in {settings.max_iterations} iterations")
+        return None
+
+    def borne(self, instant: float) -> np.ndarray | None:
+        """Return the reactions of the holds on each node [N], shape [node_count, 3].
+
+        Extrapolated from the mid-points of the last two steps, where forces balance; None before
+        there are two. At the ends of a step, modes that the mesh cannot resolve ring.
+        """
+        if len(self._balances) < 2:
+            return None
+        (before, was), (last, now) = self._balances
+        return now + (now - was) * (instant - last) / (last - before)
+
+    def _bearing_strain(self, before: np.ndarray, after: np.ndarray, dt: float) -> np.ndarray:
+        """Return the strain whose linear elastic stress equals that of the step, including
+        viscosity.
+        """
+        mean, change = 0.5 * (before + after), after - before
+        if not self.model.material.is_hookean:
+            mean = self._bearing_mean(before, after)
+        return mean + self.model.damping.stiffness / dt * change
+
+    def _bearing_mean(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return the strain whose linear elastic stress times the change gives the change of
+        energy.
+        """
+        model, law = self.model, self.model.material
+        lam, mu = model.lame_lambda[:, None], model.lame_mu[:, None]
+        change = after - before
+        # A motion that grows without bound is detected by its imbalance.
+        with np.errstate(over="ignore", invalid="ignore"):
+            size = contracted(change, change)
+            stress = law.stress(0.5 * (before + after), lam, mu)
+            left = (law.energy(after, lam, mu) - law.energy(before, lam, mu)
+                    - contracted(stress, change))
+        part = np.where(size > _STRAIN_CHANGE**2, left / np.maximum(size, _STRAIN_CHANGE**2), 0.0)
+        return hooke_strain(stress + part[..., None] * change, lam, mu)
+
+    def _follow(self, old: MotionState, new: MotionState, dt: float) -> None:
+        new.velocity = 2 / dt * (new.displacement - old.displacement) - old.velocity
+        self.drive.hold(new)
+
+    def _imbalance(self, old: MotionState, new: MotionState, dt: float, load: np.ndarray,
+                   middle: np.ndarray, bearing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residual and inertial forces."""
+        force = self._bearing.internal(middle, viscous=Viscous(0.0, bearing)).force
+        inertial = self.model.mass_times(
+            (new.velocity - old.velocity) / dt
+            + 0.5 * self.model.damping.mass * (new.velocity + old.velocity))
+        return load - force - inertial, inertial
+
+    def _make_tangent(self, middle: np.ndarray, increment: np.ndarray | None,
+                      bearing: np.ndarray, dt: float) -> bool:
+        damping = self.model.damping
+        growth = 1 + 2 * damping.stiffness / dt
+        model = self._stiff
+        memory = bearing - model.bearing_strain(model.strains(middle), Viscous(growth, _NOTHING))
+        # The mean strain is quadratic in the increment, with twice the factor of the strain itself.
+        mixed = None if increment is None else np.sqrt(2) * increment
+        self.tangent = None
+        try:
+            self.tangent = self.equations.tangent(
+                model, middle, increment=mixed, viscous=Viscous(growth, memory),
+                mass_factor=4 / dt**2 + 2 * damping.mass / dt)
+        except NotPositiveDefiniteError:
+            return False
+        return True
+
+    def _accepted(self, new: MotionState, old: MotionState,
+                  out: np.ndarray) -> MotionState | None:
+        if self.model.internal(new.displacement).min_det_f <= 0:
+            self._failed("an element would turn inside out", Status.inverted)
+            return None
+        self.status = Status.converged
+        new.acceleration = (new.velocity - old.velocity) / new.step_before
+        self._balances.append((0.5 * (old.time + new.time), -out))
+        return new
 
 
 def simulate_dynamics(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = None,

@@ -4,14 +4,14 @@ An element may have any number of nodes and quadrature points.
 
 All refer to the rest shape: with H = du/dX and F = I + H, the second Piola-Kirchhoff stress S
 follows from the Green-Lagrange strain E = (H + H^T + H^T H) / 2, and the force of node a is the
-integral of F S grad N_a. See :mod:`limber.mechanics.elements.stiffness_pairs` for the memory layout
+integral of F S grad N_a. See :mod:`limber.mechanics.elements.stiffness` for the memory layout
 of runs of numbers.
 
 Shared arguments:
     displacement: Node displacements [m], shape [node_count, 3].
     gradients, weights, nodes: From :class:`ForceLayout`.
     lame_lambda, lame_mu: Lamé coefficients [Pa], shape [batch, LANES].
-    material: ``kernel`` of a limber.mechanics.materials.law.MaterialLaw.
+    material: ``kernel`` of a limber.mechanics.materials.laws.MaterialLaw.
     growth, memory: In motion the stress is that of the strain ``growth * E + memory``. Viscous
         stress (Kelvin-Voigt) follows the strain rate, which a difference formula gives from the
         current strain and the previous strains; the previous strains are the memory, [tet_count, q,
@@ -26,8 +26,7 @@ from functools import cached_property
 import numpy as np
 
 from limber.core.numerics.compiled import compiled
-from limber.mechanics.elements.stiffness import deformation, gather, gradient, green_strain
-from limber.mechanics.elements.stiffness_pairs import LANES
+from limber.mechanics.elements.stiffness import LANES, deformation, gather, gradient, green_strain
 from limber.mechanics.elements.stress_kernels import (
     add_pull,
     add_stress,
@@ -36,7 +35,7 @@ from limber.mechanics.elements.stress_kernels import (
     small_strain,
     volume_stress,
 )
-from limber.mechanics.materials.law import NEO_HOOKE, SMALL_STRAIN
+from limber.mechanics.materials.laws import NEO_HOOKE, SMALL_STRAIN
 
 
 class ForceLayout:

@@ -8,8 +8,7 @@ Hooke's two; a law's own formulas in numpy take longer than both.
 import numpy as np
 
 from limber.core.numerics.compiled import compiled
-from limber.mechanics.elements.stiffness import deformation, gather
-from limber.mechanics.elements.stiffness_pairs import LANES, scatter_block
+from limber.mechanics.elements.stiffness import LANES, deformation, gather, scatter_block
 
 
 @compiled

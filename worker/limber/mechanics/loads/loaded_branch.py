@@ -10,7 +10,7 @@ that are followed wherever it moves. ::
 Energies are potentials of strain and weight above the hanging state, which has energy 0. They are
 the work of a gripper that moves the branch there slowly. The gradient to the pose is the force that
 the gripper exerts; that of the strain energy alone is not, since the gripper also lifts. How
-weight acts: :mod:`limber.mechanics.prestress`.
+weight acts: :mod:`limber.mechanics.model`.
 """
 
 from dataclasses import dataclass, replace

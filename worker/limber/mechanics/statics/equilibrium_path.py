@@ -1,24 +1,325 @@
 """The path from an equilibrium to the target, in steps of adapted length."""
 
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Required, TypedDict, Unpack
 
 import numpy as np
 
+from limber.core.errors import InputError
 from limber.core.numerics.rigid import pose_between
 from limber.core.numerics.sparse import NotPositiveDefiniteError
-from limber.core.progress import Progress
-from limber.mechanics.internal_state import InternalState
-from limber.mechanics.linear.equations import Tangent
-from limber.mechanics.solve_status import Status
-from limber.mechanics.statics.result import StaticResult
-from limber.mechanics.statics.snap_through import settle
-from limber.mechanics.statics.static_problem import (
-    StaticProblem,
-    Target,
-    make_result,
-    strain_warnings,
-)
-from limber.mechanics.strain import principal_stretch
+from limber.core.progress import SILENT, Progress
+from limber.mechanics.grasp import Grasp, check_pose
+from limber.mechanics.linear.equations import Equations, Tangent
+from limber.mechanics.model import BranchModel, InternalState
+from limber.mechanics.statics.result import StaticResult, StaticSettings, Status
+from limber.mechanics.strain import Place, principal_stretch
+
+# A static problem: constraints, loads, target, and the reactions at its end.
+
+
+@dataclass(frozen=True)
+class Target:
+    """The target of a solve: held nodes, means of pinned patches, loads.
+
+    Attributes:
+        held: Displacement of held nodes [m] (others unused), shape [node_count, 3].
+        pins: Displacement of the pinned means [m], shape [pinned, 3].
+        load: Forces on the nodes [N], shape [node_count, 3].
+    """
+
+    held: np.ndarray
+    pins: np.ndarray
+    load: np.ndarray
+
+
+class StaticProblem:
+    """One set of constraints; solves for a target from a start."""
+
+    def __init__(self, model: BranchModel, grasp: Grasp | Sequence[Grasp] | None,
+                 is_held: bool, settings: StaticSettings):
+        self.model, self.settings = model, settings
+        self.grasps = ([] if grasp is None else [grasp] if isinstance(grasp, Grasp)
+                       else list(grasp))
+        self.single = isinstance(grasp, Grasp)
+        if is_held and not self.grasps:
+            raise InputError("A pose is given without a grasp.", "No node would follow it.",
+                             "Also give the grasp.")
+        self.is_held = is_held
+        self.equations: Equations = model.equations(self.grasps if is_held else ())
+        self.mixed = settings.mixed and model.material.has_cubic_force
+
+    def poses(self, pose: np.ndarray) -> list[np.ndarray]:
+        poses = np.asarray(pose, float).reshape(-1, 6) if np.size(pose) % 6 == 0 else [pose]
+        if len(poses) != len(self.grasps):
+            raise InputError(f"{len(poses)} poses are given for {len(self.grasps)} grasps.",
+                             "Each grasp needs one pose.", "Give an array [grasps, 6].")
+        return [check_pose(item) for item in poses]
+
+    def target(self, pose: np.ndarray | None, grasp_force: np.ndarray | None,
+               nodal_forces: np.ndarray | None) -> Target:
+        shape = (self.model.mesh.node_count, 3)
+        held = np.zeros(shape)
+        pins: list[np.ndarray] = []
+        load = self.model.weight_force
+        if nodal_forces is not None:
+            load = load + checked_forces(nodal_forces, shape)
+        if pose is not None:
+            held, pins = self.constraint(self.poses(pose))
+        if grasp_force is not None:
+            load = load + self.spread(grasp_force)
+        return Target(held, np.reshape(pins, (-1, 3)), load)
+
+    def constraint(self, poses: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+        held, pins = np.zeros((self.model.mesh.node_count, 3)), []
+        for grasp, pose in zip(self.grasps, poses, strict=True):
+            if grasp.mode == "rigid":
+                held[grasp.nodes] = grasp.displacement(self.model.mesh.nodes, pose)
+            else:
+                pins.append(pose[:3] - grasp.centre)
+        return held, pins
+
+    def spread(self, grasp_force: np.ndarray) -> np.ndarray:
+        """Return nodal forces of forces [N] at the grasps, spread over the patches."""
+        forces = np.asarray(grasp_force, float).reshape(-1, 3)
+        if self.is_held or len(forces) != len(self.grasps) or not np.isfinite(forces).all():
+            raise InputError(f"{len(forces)} grasp forces are given for "
+                             f"{len(self.grasps)} grasps.",
+                             "Each grasp needs a force, and a grasp with a force has no pose.",
+                             "Give an array [grasps, 3] [N] and omit the poses.")
+        load = np.zeros((self.model.mesh.node_count, 3))
+        for grasp, force in zip(self.grasps, forces, strict=True):
+            load[grasp.nodes] += grasp.weights[:, None] * force
+        return load
+
+    def displacement_of(self, start: "StaticResult | np.ndarray | None") -> np.ndarray:
+        if start is None:
+            return np.zeros((self.model.mesh.node_count, 3))
+        values = start.displacement if isinstance(start, StaticResult) else start
+        return checked_forces(values, (self.model.mesh.node_count, 3), "start displacements")
+
+
+def strain_warnings(stretch: Place) -> list[str]:
+    """Return a warning if the largest stretch exceeds the strength of wood, else an empty tuple."""
+    if stretch.value <= 1.5:
+        return []
+    return [f"The strain reaches {100 * (stretch.value - 1):.0f} % {stretch.at}, far more than "
+            "wood withstands. Check the units of the loads and of Young's modulus."]
+
+
+class HowFound(TypedDict, total=False):
+    """The fields of a result that state how it was found; see StaticResult."""
+
+    status: Required[Status]
+    iterations: Required[int]
+    residual_history: Required[list[float]]
+    seconds: Required[float]
+    reached: float
+    message: str
+    warnings: list[str]
+    snapped_at: list[float]
+    uncertainty: str
+
+
+def make_result(problem: StaticProblem, displacement: np.ndarray, state: InternalState,
+                load: np.ndarray, **found: Unpack[HowFound]) -> StaticResult:
+    """Return a result with the reactions that belong to a displacement."""
+    model = problem.model
+    positions = model.mesh.nodes + displacement
+    out = state.force - load
+    base = base_forces(model, out)
+    pose, force, torque = None, np.zeros(3), np.zeros(3)
+    if problem.grasps:
+        poses = [g.pose_of(model.mesh.nodes, displacement) for g in problem.grasps]
+        parts = [grasp_wrench(problem, grasp, positions, out, p[:3])
+                 for grasp, p in zip(problem.grasps, poses, strict=True)]
+        pose, force, torque = (np.array(poses), np.array([p[0] for p in parts]),
+                               np.array([p[1] for p in parts]))
+        if problem.single:
+            pose, force, torque = pose[0], force[0], torque[0]
+    return StaticResult(
+        displacement=displacement, pose=pose, strain_energy=state.strain_energy,
+        energy=state.energy - float((model.weight_force * displacement).sum()),
+        reaction_force=force, reaction_torque=torque, base_force=base.sum(axis=0),
+        base_torque=np.cross(positions, base).sum(axis=0), min_det_f=state.min_det_f, **found)
+
+
+def base_forces(model: BranchModel, out: np.ndarray) -> np.ndarray:
+    """Return the force of the base on its nodes [N], 0 elsewhere, shape [node_count, 3].
+
+    Args:
+        out: Internal and inertial force less loads on all nodes [N], shape [node_count, 3].
+    """
+    base = np.where(model.fixed[:, None], out, 0.0)
+    return base if model.prestress is None else base + model.prestress.total.base
+
+
+def grasp_wrench(problem: StaticProblem, grasp: Grasp, positions: np.ndarray, out: np.ndarray,
+                 centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return force [N] and torque [Nm] about ``centre`` of a gripper on the branch.
+
+    Args:
+        out: Internal force less loads on all nodes [N], shape [node_count, 3].
+    """
+    if not problem.is_held:
+        return np.zeros(3), np.zeros(3)
+    forces = out[grasp.nodes]
+    if grasp.mode == "point":
+        total = grasp.weights @ forces / (grasp.weights @ grasp.weights)
+        forces = grasp.weights[:, None] * total
+    return forces.sum(axis=0), np.cross(positions[grasp.nodes] - centre, forces).sum(axis=0)
+
+
+def checked_forces(values: np.ndarray, shape: tuple[int, ...],
+                   name: str = "nodal forces") -> np.ndarray:
+    """Return a nodal field as floats.
+
+    Raises:
+        InputError: the shape is wrong, or a value is not finite.
+    """
+    values = np.asarray(values, float)
+    if values.shape != shape or not np.isfinite(values).all():
+        raise InputError(f"The {name} have shape {values.shape} or are not finite.",
+                         f"The mesh needs {shape}.", "Give three numbers for each node.")
+    return values
+
+
+# The end of a path of stable equilibria: a column buckles, a bow turns over.
+#
+# No small step continues the path there. The branch moves as in a viscous fluid until it is at
+# rest. If that state is a saddle (a straight column under too much load), it is perturbed along the
+# mode of negative tangent stiffness and moves on to the bent state.
+
+
+# Chosen on the columns and bows of tests/mechanics/statics; none was measured in a series.
+_FIRST_DRAG = 1e-5
+"""Drag of the first creep step, as a fraction of the mean diagonal of the stiffness."""
+_CREEPS = 60
+"""Most creep steps to the equilibrium."""
+_CREEP_ITERATIONS = 9
+"""Most Newton iterations per creep step; if it takes more, it is repeated with more drag."""
+_RESTING = 1e-2
+"""Imbalance relative to loads and reactions below which the branch is at rest or on a saddle."""
+_PUSHES = 3
+"""Most perturbations off saddles."""
+_PUSH = 2e-3
+"""Size of the perturbation off a saddle, as a fraction of the branch's extent."""
+_MODE_ITERATIONS = 30
+"""Inverse iterations for the unstable mode of a saddle."""
+
+
+def settle(path: "Path", part: float) -> float | None:
+    """Let the branch snap to its equilibrium at the fraction ``part`` of the path.
+
+    Each creep step is an implicit Euler step of the gradient flow of the potential, so the
+    potential only falls. Return the length of the step; None if the branch does not come to rest.
+    """
+    if path.model.material.is_linear:
+        return None
+    target, pins = path.constraint_at(part)
+    load, before = path.load_at(part), (path.status, path.trouble)
+    trial, drag, pushes = path.displacement, _FIRST_DRAG, 0
+    for _ in range(_CREEPS):
+        if path.iterations > path.settings.total_iterations:
+            break
+        crept = _creep(path, trial, target, pins, load, drag)
+        if crept is None:
+            drag *= 8
+            if drag > 1:
+                break
+            continue
+        trial, quick, error, stable, diagonal_norm = crept
+        if error < _RESTING and not stable and pushes < _PUSHES:
+            trial, pushed = pushed_off(path.model, path.equations, trial, load)
+            pushes += pushed
+        elif error < _RESTING and stable:
+            taken = path.correct(trial, np.zeros_like(trial), part, diagonal_norm,
+                                 stable)
+            if taken is not None:
+                path.snaps.append((path.reached + taken, pushes > 0))
+                return taken
+        drag *= 0.25 if quick else 0.7
+    path.status, path.trouble = before
+    return None
+
+
+def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray,
+           load: np.ndarray, drag: float,
+           ) -> tuple[np.ndarray, bool, float, bool, float] | None:
+    """Return the state after one creep step, whether it converged quickly, and its imbalance.
+
+    And whether its tangent is positive definite and the norm of its diagonal [N/m].
+    """
+    model, equations, held = path.model, path.equations, path.equations.held
+    moved = np.where(held[:, None], target - start, 0.0)
+    now = np.array([g.weights @ start[g.nodes] for g in equations.pinned]).reshape(-1, 3)
+    trial, increment, honey = start, None, 0.0
+    for count in range(_CREEP_ITERATIONS):
+        state = model.internal(trial)
+        out = load - state.force
+        pull = equations.free_part(out - honey * (trial - start))
+        norm = float(np.linalg.norm(pull))
+        reference = float(np.linalg.norm(out - equations.free_part(out)) + np.linalg.norm(load))
+        if not np.isfinite(norm):
+            return None
+        if increment is not None and norm <= 1e-4 * reference:
+            left = float(np.linalg.norm(equations.free_part(out)))
+            # Without load there is no scale for the imbalance.
+            part = left / max(reference, 1e-300)
+            tangent = equations.tangent(model, trial)
+            return (trial, count <= 4, part, tangent.is_positive_definite,
+                    tangent.diagonal_norm)
+        path.iterations += 1
+        try:
+            tangent = equations.tangent(model, trial, increment=increment, drag=drag)
+        except NotPositiveDefiniteError:
+            return None
+        if not tangent.is_positive_definite:
+            return None
+        honey = tangent.drag
+        if increment is None:
+            right = out - model.tangent_times(start, moved) if moved.any() else out
+            increment = tangent.solve(right, pins - now) + moved
+        else:
+            increment = tangent.solve(pull)
+        # Its memory is reused by the next one.
+        del tangent
+        trial = trial + increment
+    return None
+
+
+def pushed_off(model: BranchModel, equations: Equations, state: np.ndarray,
+               load: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return a state perturbed off a saddle to the side where the potential falls more.
+
+    And whether there was a mode to push it along.
+    """
+    mode, curvature = lowest_mode(model, equations, state)
+    if curvature >= 0:
+        return state, False
+    push = _PUSH * model.extent * mode / np.linalg.norm(mode, axis=1).max()
+    sides = [state + push, state - push]
+    potentials = [model.internal(side).energy - float((load * side).sum())
+                  for side in sides]
+    return sides[int(np.argmin(potentials))], True
+
+
+def lowest_mode(model: BranchModel, equations: Equations, state: np.ndarray,
+                ) -> tuple[np.ndarray, float]:
+    """Return the mode of least tangent stiffness [node_count, 3] and its stiffness [N/m].
+
+    Inverse iteration on the tangent whose diagonal was raised until it could be factorised: raising
+    does not change the eigenvectors. The Rayleigh quotient is that of the tangent itself.
+    """
+    tangent = equations.tangent(model, state)
+    mode = np.random.default_rng(0).normal(size=state.shape)
+    for _ in range(_MODE_ITERATIONS):
+        mode = tangent.solve(mode)
+        mode /= np.linalg.norm(mode)
+    return mode, float((mode * model.tangent_times(state, mode)).sum())
+
 
 _SOFT_DET_F = 0.75
 """Relative volume below which St. Venant-Kirchhoff itself is taken to have collapsed. In pure
@@ -354,3 +655,35 @@ def buckling_warnings(snaps: list[tuple[float, bool]]) -> list[str]:
         return []
     return [f"A straight part buckled at {where[0]} of the path. The side is arbitrary: another "
             "equilibrium with about the same energy exists."]
+
+
+# Whether a branch that snapped would return: the same path, followed backwards.
+#
+# A straight part that buckles straightens again. A bow that turned over stays so: start and end are
+# two stable states of one grasp, and the history of the branch decides which one is real.
+
+_SAME = 1e-3
+"""Distance, as a fraction of the branch's extent, below which the start counts as reached."""
+
+
+def why_uncertain(path: Path, result: StaticResult) -> str:
+    """Return why a converged result may not be the only state of its grasp, or an empty string.
+
+    Free unless the branch snapped; then it costs as much as the path itself.
+    """
+    if not path.snaps:
+        return ""
+    where = f"the branch snapped through at {100 * path.snaps[0][0]:.0f} % of the path"
+    begin, grasps = path.begin, path.problem.grasps
+    pose = None if path.pose is None else np.array(
+        [grasp.pose_of(path.model.mesh.nodes, begin) for grasp in grasps])
+    goal = Target(np.where(path.equations.held[:, None], begin, 0.0), path.begin_pins,
+                  path.goal.load - path.imbalance)
+    back = Path(path.problem, result.displacement, goal, pose).run(SILENT)
+    if not back.converged:
+        return f"{where}, and no return path was found ({back.message})"
+    away = float(np.linalg.norm(back.displacement - begin, axis=1).max())
+    if away <= _SAME * path.model.extent:
+        return ""
+    return (f"{where}, and on the return path it ends {1e3 * away:.0f} mm from its start: another "
+            "stable state exists for the same grasp")

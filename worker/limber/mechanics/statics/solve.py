@@ -15,11 +15,8 @@ import numpy as np
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
-from limber.mechanics.solve_status import Status
-from limber.mechanics.statics.equilibrium_path import Path
-from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
-from limber.mechanics.statics.return_path import why_uncertain
-from limber.mechanics.statics.static_problem import StaticProblem, Target
+from limber.mechanics.statics.equilibrium_path import Path, StaticProblem, Target, why_uncertain
+from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings, Status
 
 
 def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = None,

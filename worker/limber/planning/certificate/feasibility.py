@@ -2,13 +2,13 @@
 
 Off the shell, a force grows a hundred times as fast as along it. Cubic cells must therefore be tiny
 before they show that a limit is broken in all of them. Here cells are cut in the chart's
-coordinates (:mod:`limber.planning.field.interpolation.chart`), along the undecided axes, and only
+coordinates (:mod:`limber.planning.field.chart`), along the undecided axes, and only
 where they are open. If open cells do not connect the start's cell to one that may contain a point
 of the goal, no path exists. If cells that keep all limits at their corners do, a path usually
 exists.
 
 Values and slopes at a cell's corners bound the limited quantity from below in the cell
-(:mod:`limber.planning.certificate.cell_bounds`). This holds for the field. The branch itself may
+(:mod:`limber.planning.certificate.subsolution`). This holds for the field. The branch itself may
 keep a limit where the field does not. For a proof a cell is therefore closed only where the field
 exceeds the limit by more than its error, and may contain a point of the goal where a target is as
 near as its error.
@@ -22,11 +22,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, off_zero
+from limber.planning.certificate.subsolution import CURVATURE_FACTOR, off_zero
 from limber.planning.cost import resample
-from limber.planning.field.interpolation.chart import Chart
-from limber.planning.field.interpolation.valid_region import nearest_of
-from limber.planning.goals.allowed_poses import allowed_points
+from limber.planning.field.chart import Chart
+from limber.planning.field.valid_region import nearest_of
+from limber.planning.goals.goal import allowed_points
 from limber.planning.path_problem import GentleProblem, least_over
 
 _ALONG, _ACROSS = 20, 40  # cells along the surface in each direction; across it

@@ -21,15 +21,25 @@ import scipy
 
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import SILENT, Progress
-from limber.planning.certificate.cell_bounds import CURVATURE_FACTOR, least_between, least_size
-from limber.planning.certificate.goal_cells import about_goal, short_enough
-from limber.planning.certificate.grid import COARSEST, FINEST, Grid, descent, first_grid, refined
+from limber.planning.certificate.grid import (
+    COARSEST,
+    FINEST,
+    Grid,
+    about_goal,
+    descent,
+    first_grid,
+    refined,
+    short_enough,
+)
 from limber.planning.certificate.subsolution import (
+    CURVATURE_FACTOR,
     RIM,
     Terrain,
     corner_values,
     corners_of,
+    least_between,
     least_in_cells,
+    least_size,
     spline_value,
     subsolution,
     terrain,

@@ -11,13 +11,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.mechanics.materials.species import strain_limit
-from limber.planning.constraints.constraint import Broken, Constraint
-from limber.planning.constraints.obstacles import Obstacle, Obstacles
-from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.mechanics.materials.materials import strain_limit
+from limber.planning.constraints.obstacles import Broken, Constraint, Obstacle, Obstacles
+from limber.planning.field.energy_field import UNITS, EnergyField, FieldArrays
 from limber.planning.field.grasp_samples import GraspSamples
-from limber.planning.field.interpolation.local_error import LocalError, slack_of
-from limber.planning.field.limited_quantities import UNITS
+from limber.planning.field.radial import LocalError, slack_of
 from limber.planning.goals.regions import empty_along
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings

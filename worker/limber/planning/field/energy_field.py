@@ -8,6 +8,7 @@ The field also gives the natural rotation of the grasped piece, and the position
 tip.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ from limber.core.errors import InputError, WorkError
 from limber.core.files.reading import read_arrays, require_shapes
 from limber.core.numerics.compiled import compiled
 from limber.core.progress import SILENT, Progress
+from limber.planning.field.chart import Chart, mapped, pulled_back_size
 from limber.planning.field.fit_choice import (
     CHARTS_TRIED,
     SMOOTHING,
@@ -30,10 +32,16 @@ from limber.planning.field.fit_choice import (
     with_slopes,
 )
 from limber.planning.field.grasp_samples import LOADS, GraspSamples
-from limber.planning.field.interpolation.chart import Chart, mapped, pulled_back_size
-from limber.planning.field.interpolation.local_error import LocalError, Slack, slack_at, slack_of
-from limber.planning.field.interpolation.radial import RadialInterpolant, gradient_at, value_at
-from limber.planning.field.interpolation.valid_region import TrustRegion, trusted_at
+from limber.planning.field.radial import (
+    LocalError,
+    RadialInterpolant,
+    Slack,
+    gradient_at,
+    slack_at,
+    slack_of,
+    value_at,
+)
+from limber.planning.field.valid_region import TrustRegion, trusted_at
 
 _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
@@ -268,7 +276,7 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
     Args:
         samples: Results of the branch model.
         base: Pivot of the shell along which the branch yields
-            (:class:`~limber.planning.field.low_energy_surface.LowEnergySurface`), or the branch's
+            (:class:`~limber.planning.field.sampling.LowEnergySurface`), or the branch's
             root [m]; None: no chart is tried.
         radius: Radius of the shell [m]; by default the distance of the rest position.
 
@@ -391,3 +399,43 @@ def _slack(point, row, field):
     if field.slack.factors[row] == 0.0:
         return 0.0
     return slack_at(mapped(point, *field.region[0]), row, field.slack)
+
+
+# The limited quantities of the field, one by one.
+
+UNITS = {"energy": "J", "force": "N", "strain": "", "stress": "Pa", "axial_force": "N",
+         "torque": "Nm", "closeness": ""}
+"""Built-in limited quantities; a plan's constraints bring their own."""
+
+
+@dataclass(frozen=True)
+class Limited:
+    """A quantity of poses on the field, and its limit."""
+
+    field: EnergyField
+    name: str
+    limit: float
+
+    @property
+    def words(self) -> str:
+        return self.name.replace("_", " ")
+
+    def size(self, points: np.ndarray) -> np.ndarray:
+        """Return the limited quantity at ``points`` [n, 3], shape [n]."""
+        if self.name == "energy":
+            return self.field.energy(points)
+        if self.name == "force":
+            return np.linalg.norm(self.field.force(points), axis=1)
+        return np.abs(self.field.load(points, self.name))
+
+    def with_unit(self, value: float) -> str:
+        """Return a value of it in words."""
+        return f"{value:.3g} {UNITS.get(self.name, '')}".rstrip()
+
+
+def limited(field: EnergyField, limits: FieldArrays) -> Iterator[Limited]:
+    """Yield the quantities with a finite limit: energy, force, and loads."""
+    of_loads = zip(field.load_names, limits.max_loads, strict=True)
+    for name, limit in (("energy", limits.max_energy), ("force", limits.max_force), *of_loads):
+        if limit < np.inf:
+            yield Limited(field, name, float(limit))

@@ -7,10 +7,10 @@ import numpy as np
 
 from limber.core.errors import WorkError
 from limber.core.progress import Progress
+from limber.planning.field.chart import Chart
 from limber.planning.field.grasp_samples import GraspSamples
-from limber.planning.field.interpolation.chart import Chart
-from limber.planning.field.interpolation.radial import RadialInterpolant
-from limber.planning.field.interpolation.valid_region import TrustRegion
+from limber.planning.field.radial import RadialInterpolant
+from limber.planning.field.valid_region import TrustRegion
 
 KERNELS_TRIED = (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0), ("multiquadric", 2.0))
 CHARTS_TRIED = ((1.0, np.inf), (2.0, np.inf), (4.0, np.inf), (8.0, np.inf), (5.0, 0.02),

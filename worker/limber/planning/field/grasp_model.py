@@ -27,7 +27,7 @@ from limber.mechanics import (
 )
 from limber.mechanics.loads.loaded_branch import LoadedBranch
 from limber.mechanics.materials.materials import RayleighDamping
-from limber.mechanics.solve_status import Status
+from limber.mechanics.statics.result import Status
 from limber.mechanics.strain import peak_load
 
 # A pose that needs finer steps than this is beyond a snap. It is rejected early.

@@ -17,11 +17,15 @@ import numpy as np
 from limber.core.progress import SILENT, Progress
 from limber.mechanics import StaticResult
 from limber.planning.field.grasp_model import GraspModel, Guess
-from limber.reduced.building import as_control_points
-from limber.reduced.model_cache import SHARED, ReducedCache, default_folder, learnt_model
-from limber.reduced.reduced_model import ReducedModel
+from limber.reduced.model_cache import (
+    SHARED,
+    ReducedCache,
+    as_control_points,
+    default_folder,
+    learnt_model,
+)
+from limber.reduced.reduced_model import ReducedModel, ReducedState, ReducedStaticSettings
 from limber.reduced.refresh import corrected_once
-from limber.reduced.state import ReducedState, ReducedStaticSettings
 
 _SETTINGS = ReducedStaticSettings(tolerance=1e-7)  # the correction removes the rest
 

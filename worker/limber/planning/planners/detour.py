@@ -27,8 +27,7 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.lower_bound import ENERGY
 from limber.planning.cost import arc_lengths, resample
 from limber.planning.path_problem import GentleProblem
-from limber.planning.planners.eikonal import GentlePath, plan_gentle_all
-from limber.planning.planners.refine import distinct, refine
+from limber.planning.planners.refine import GentlePath, distinct, plan_gentle_all, refine
 
 _LIGHT = 1e-2  # fraction of the given weight of a metre: energy alone counts, nearly
 _HEAVY = 1e3  # the same: length alone counts

@@ -14,9 +14,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from limber.planning.cost import resample
-from limber.planning.field.energy_field import EnergyField, FieldArrays
-from limber.planning.field.interpolation.local_error import slacks_at
-from limber.planning.field.limited_quantities import limited
+from limber.planning.field.energy_field import EnergyField, FieldArrays, limited
+from limber.planning.field.radial import slacks_at
 from limber.planning.goals.goal import Goal
 
 _ALONG, _ACROSS = 64, 48  # grid points along the surface in each direction, and across it

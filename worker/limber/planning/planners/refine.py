@@ -8,7 +8,7 @@ path often runs along the face of the sampled region or in a valley a tenth of a
 wide: steps that are merely refused there stop far from it.
 
 The variables are corners in the chart of the shell that the grasp follows
-(:mod:`limber.planning.field.interpolation.chart`), off it in units that are smaller in proportion
+(:mod:`limber.planning.field.chart`), off it in units that are smaller in proportion
 to the branch's stiffness: chords in space leave the valley between their ends.
 """
 
@@ -19,11 +19,113 @@ import numpy as np
 import scipy
 from scipy.spatial import cKDTree
 
-from limber.planning.cost import arc_lengths, resample
-from limber.planning.field.interpolation.local_error import slack_slopes, slacks_at
-from limber.planning.field.interpolation.valid_region import nearest_of
-from limber.planning.path_problem import GentleProblem
-from limber.planning.planners.smoothing import smooth_cost
+from limber.core.not_none import present
+from limber.core.progress import SILENT, Progress
+from limber.planning.certificate.feasibility import Verdict, judge
+from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify_all
+from limber.planning.cost import EdgeWeights, arc_lengths, edge_cost, path_cost, resample
+from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.field.radial import slack_slopes, slacks_at
+from limber.planning.field.valid_region import nearest_of
+from limber.planning.path_problem import BlockedError, GentleProblem, no_path_error, not_found
+from limber.planning.planners.least_violation import easiest_path
+
+# From the corners of a tree to a path for a robot: shortcuts, then the nearest local optimum.
+#
+# The same steps for the baseline and for D-RRT*, so that they differ by their costs and not by the
+# luck of sampling.
+
+_POLISH_POINTS = 40  # corners of the path while it is smoothed
+_MIN_GAP = 1e-9  # [m] keeps the length's gradient finite where two corners meet
+
+
+def shortcut(path: np.ndarray, field: FieldArrays, weights: EdgeWeights, *, attempts: int,
+             seed: int) -> np.ndarray:
+    """Return the polyline after random shortcuts that lower the cost, evenly spaced [n, 3]."""
+    generator = np.random.default_rng([seed, 1])
+    path = resample(path, weights.step)
+    # Spans shrink: long ones straighten, short ones round the corners that the long ones leave.
+    for span in np.geomspace(1.0, 0.05, max(attempts, 1))[:attempts]:
+        first = int(generator.integers(len(path)))
+        last = first + max(int(span * generator.uniform() * len(path)), 2)
+        if last >= len(path):
+            continue
+        old = path_cost(path[first:last + 1], field, weights)
+        new = edge_cost(path[first], path[last], field, weights)
+        if new < old:
+            straight = np.linspace(path[first], path[last], last - first + 1)
+            path = np.concatenate([path[:first], straight, path[last + 1:]])
+    return resample(path, weights.step)
+
+
+def slide_end(path: np.ndarray, goals: np.ndarray, limits: FieldArrays, weights: EdgeWeights,
+              ) -> np.ndarray:
+    """Return the path bent to end in that one of ``goals`` [g, 3] which makes it cheapest.
+
+    A tree ends where its samples happened to fall in the goal region; all of the region is equally
+    good, but the paths to it are not.
+    """
+    part = (arc_lengths(path) / max(arc_lengths(path)[-1], _MIN_GAP))[:, None]
+    best, least = path, path_cost(path, limits, weights)
+    for goal in goals:
+        bent = path + part * (goal - path[-1])
+        if (cost := path_cost(bent, limits, weights)) < least:
+            best, least = bent, cost
+    return best
+
+
+def polish(path: np.ndarray, energy_field: EnergyField, limits: FieldArrays,
+           weights: EdgeWeights) -> np.ndarray:
+    """Return the path moved to the nearest local optimum of its cost; ends stay, [n, 3].
+
+    L-BFGS with the field's gradient. Trust and limits are not in the gradient: of the line from the
+    old path to the optimum, the farthest tenth that is allowed and cheaper is taken.
+    """
+    spacing = max(weights.step, np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+                  / _POLISH_POINTS)
+    corners = resample(path, spacing)
+    if len(corners) < 3:
+        return path
+    inner = corners[1:-1].shape
+
+    def cost(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        moved = np.concatenate([corners[:1], flat.reshape(inner), corners[-1:]])
+        value, gradient = smooth_cost(moved, energy_field, weights)
+        return value, gradient[1:-1].ravel()
+
+    best = scipy.optimize.minimize(cost, corners[1:-1].ravel(), jac=True, method="L-BFGS-B",
+                                   options={"maxiter": 200}).x.reshape(inner)
+    before = path_cost(path, limits, weights)
+    for share in np.linspace(1.0, 0.1, 10):
+        moved = corners.copy()
+        moved[1:-1] += share * (best - corners[1:-1])
+        moved = resample(moved, weights.step)
+        if path_cost(moved, limits, weights) < before:
+            return moved
+    return path
+
+
+def smooth_cost(path: np.ndarray, energy_field: EnergyField, weights: EdgeWeights,
+                 ) -> tuple[float, np.ndarray]:
+    """Return the trapezoidal cost of a polyline and its gradient to each point, [n, 3]."""
+    edges = np.diff(path, axis=0)
+    lengths = np.sqrt((edges**2).sum(axis=1) + _MIN_GAP**2)
+    direction = edges / lengths[:, None]
+    energy = slope = 0.0
+    rate = np.full(len(edges), weights.length)
+    gradient = np.zeros_like(path)
+    if weights.energy > 0.0:
+        energy = energy_field.energy(path)
+        slope = energy_field.energy_gradient(path)
+        rate += weights.energy * (energy[1:] + energy[:-1]) / 2
+        near = np.zeros(len(path))
+        near[:-1] += lengths / 2
+        near[1:] += lengths / 2
+        gradient += weights.energy * near[:, None] * slope
+    gradient[1:] += rate[:, None] * direction
+    gradient[:-1] -= rate[:, None] * direction
+    return float((rate * lengths).sum()), gradient
+
 
 _EDGES = 48  # edges of the polyline while it is optimised; limits are evaluated half-way too
 _FINE = 0.001  # [m] between returned points: chords in space leave the low-energy surface
@@ -311,3 +413,124 @@ class Limited:
             out[:-1] -= along
             return out
         return _Excess(np.array([(lengths.sum() + self.margin) / self.problem.longest - 1.0]), pull)
+
+
+# The gentlest path with its certificate: eikonal descent, refinement, bound.
+#
+# Each grid of the certificate gives its cheapest path; refined, it becomes a path on the field. The
+# first paths tried are the straight line and those of other planners that keep the limits; if none
+# does, the path that exceeds them least. If that fails, next comes a path through cells that keep
+# them, if there is one (:mod:`limber.planning.certificate.feasibility`).
+
+_GAIN = 1e-3  # relative gain of cost that another refinement must bring
+
+
+@dataclass(frozen=True)
+class GentlePath:
+    """A path [n, 3], its cost, and its gap to the best."""
+
+    points: np.ndarray
+    cost: float
+    certificate: Certificate
+
+
+def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, *,
+                enough: float = ENOUGH, progress: Progress = SILENT) -> GentlePath:
+    """Return the gentlest path found, and a lower bound on every path.
+
+    ``others`` are paths [n, 3] to start from besides the straight line; ``enough`` is the gap
+    below which the bound is refined no further.
+
+    Raises:
+        BlockedError: it is proven that there is none, or none was found; states which.
+    """
+    return plan_gentle_all([problem], others, enough=[enough], progress=progress)[0]
+
+
+def plan_gentle_all(problems: Sequence[GentleProblem], others: list[np.ndarray] | None = None, *,
+                    enough: Sequence[float], progress: Progress = SILENT) -> list[GentlePath]:
+    """Return the same for each of problems that differ in the weight of length alone; their bounds
+    share the energies of the field.
+
+    Raises:
+        BlockedError: as for one.
+    """
+    found = [_Gentlest(problem, others or []) for problem in problems]
+    certificates = certify_all(problems, found, enough=enough, progress=progress)
+    return [GentlePath(present(one.points, "path"), one.cost, certificate)
+            for one, certificate in zip(found, certificates, strict=True)]
+
+
+class _Gentlest:
+    """The gentlest path of a problem so far."""
+
+    def __init__(self, problem: GentleProblem, others: list[np.ndarray]):
+        self.problem, self._others = problem, others
+        self.points: np.ndarray | None = None
+        self.cost = np.inf
+        self._tried: list[np.ndarray] = []
+        self._is_in_vain = False
+
+    def __call__(self, rough: np.ndarray | None) -> float:
+        """Return the cost after refining a ``rough`` path [n, 3]; None: those known before."""
+        problem, before = self.problem, self.cost
+        along = rough is not None and self.points is not None and is_along(rough, self.points)
+        if along and self._is_in_vain:
+            return before  # leads to the same optimum
+        if self._found_from(self._starts() if rough is None else [rough], rough is None):
+            self._is_in_vain |= along and self.cost > (1.0 - _GAIN) * before
+            return self.cost
+        if problem.limits.slack.factors.any():
+            # Cells are asked about the limits as requested, not about extended or tighter ones.
+            raise not_found(problem, "The easiest path does not keep them.")
+        verdict = judge(problem)
+        # A path that keeps the limits is a better proof than cells that separate.
+        if verdict.path is None or not self._found_from([verdict.path]):
+            raise separated(problem, verdict) if verdict.proven else not_found(
+                problem, f"The question is undecided on {_grid(verdict)}.")
+        return self.cost
+
+    def _starts(self) -> list[np.ndarray]:
+        """Return the known paths that keep the limits; if none does, the path that exceeds them
+        least.
+        """
+        # Those of planners first: mostly the straight line then leads to the same optimum.
+        known = [path for path in [*self._others[::-1], _straight(self.problem)]
+                 if len(path) > 1 and np.isfinite(self.problem.cost(path))]
+        return known or _easiest(self.problem)
+
+    def _found_from(self, paths: list[np.ndarray], skips_same: bool = False) -> bool:
+        for path in paths:
+            if len(path) < 2 or not arc_lengths(path)[-1] > 0.0:
+                continue
+            same = self._tried if self.points is None or not skips_same else [
+                *self._tried, self.points]
+            if any(is_along(path, other) for other in same):
+                continue  # leads to the same optimum
+            self._tried.append(path)
+            points, cost = refine(path, self.problem)
+            if cost < self.cost:
+                self.points, self.cost = points, cost
+        return self.points is not None
+
+
+def separated(problem: GentleProblem, verdict: Verdict) -> BlockedError:
+    """Return the error for a goal that cells separate from the start."""
+    return no_path_error(problem,
+                         f"This is proven on {_grid(verdict)}: forbidden cells separate the "
+                         "start from the goal.").behind(verdict.wall, verdict.nearest)
+
+
+def _easiest(problem: GentleProblem) -> list[np.ndarray]:
+    path = easiest_path(problem.energy_field, problem.limits, problem.start, problem.goal)
+    return [] if path is None else [path.points]
+
+
+def _grid(verdict: Verdict) -> str:
+    along, off = 1e3 * verdict.edges[0], 1e3 * verdict.edges[2]
+    return f"a grid of {along:.1f} mm along the low-energy surface and {off:.2g} mm across it"
+
+
+def _straight(problem: GentleProblem) -> np.ndarray:
+    end = problem.goal.centre(problem.energy_field)
+    return problem.start + np.linspace(0.0, 1.0, 40)[:, None] * (end - problem.start)

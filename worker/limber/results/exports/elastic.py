@@ -1,7 +1,7 @@
 """The material laws that can be exported to other programs."""
 
 from limber.core.errors import InputError
-from limber.mechanics.materials.law import MaterialLaw, is_hookean_at_rest
+from limber.mechanics.materials.laws import MaterialLaw, is_hookean_at_rest
 
 
 def require_elastic(law: MaterialLaw, program: str, *, at_any_strain: bool = False) -> None:

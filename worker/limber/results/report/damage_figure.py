@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from limber.planning.constraints.damage_along import DamageAlong
+from limber.planning.constraints.damage import DamageAlong
 from limber.results.report.charts import two_views
 
 if TYPE_CHECKING:

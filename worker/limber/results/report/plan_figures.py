@@ -8,7 +8,7 @@ import numpy as np
 
 from limber.core.constants import PATH_COLOURS
 from limber.core.numerics.rigid import principal_axes
-from limber.planning.constraints.damage_along import DamageAlong
+from limber.planning.constraints.damage import DamageAlong
 from limber.planning.cost import arc_lengths
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.plan_file import PlanFile, PlanPath, read_plan

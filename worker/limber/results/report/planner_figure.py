@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from limber.planning.experiments.compared_planners import BASELINE, COMPARED, ComparedTrial
+from limber.planning.compared_planners import BASELINE, COMPARED, ComparedTrial
 from limber.planning.field.energy_field import EnergyField
 
 if TYPE_CHECKING:

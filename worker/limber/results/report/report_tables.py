@@ -163,7 +163,7 @@ def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
 
     Args:
         estimate: ``causes``, each with ``cause``, ``share``, ``deviation`` and ``advice``
-            (:func:`limber.estimation.uncertainty.variance_parts.largest`).
+            (:func:`limber.estimation.uncertainty.covariance.largest`).
     """
     causes = estimate.get("causes") or []
     if not causes:
@@ -286,7 +286,7 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     Args:
         doubtful: Uncertain parts, each with ``kind``, ``branch``, ``at`` [3], ``length_m``,
             ``radius_m`` and ``value``: those of
-            :class:`limber.geometry.skeleton.uncertain_parts.Doubt`.
+            :class:`limber.geometry.skeleton.confidence.Doubt`.
     """
     value_formats = {"unlikely branch": "probability {:.2f}",
                      "attachment": "probability {:.2f}", "root": "probability {:.2f}",

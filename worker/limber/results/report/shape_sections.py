@@ -7,8 +7,8 @@ import numpy as np
 
 from limber.geometry.skeleton import qsm_tables
 from limber.geometry.skeleton.alternatives import SearchDoubts, open_questions
+from limber.geometry.skeleton.confidence import DoubtfulPart, doubtful_parts
 from limber.geometry.skeleton.qsm_tables import Caliper
-from limber.geometry.skeleton.uncertain_parts import DoubtfulPart, doubtful_parts
 from limber.results.report import figures
 from limber.results.report.report_tables import (
     alternative_rows,

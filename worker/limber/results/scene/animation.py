@@ -4,7 +4,7 @@ import numpy as np
 
 from limber.core.errors import BranchFolderError
 from limber.core.files.reading import read_arrays, require_shapes
-from limber.mechanics.materials.species import STRENGTH_OVER_YOUNG, strength_of
+from limber.mechanics.materials.materials import STRENGTH_OVER_YOUNG, strength_of
 from limber.results.motion_files import FramesFile, read_frames_file, read_pc2
 from limber.results.scene.arrays import SceneData
 from limber.results.scene.colours import colour_scale, levels_of, palette

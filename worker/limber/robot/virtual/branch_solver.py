@@ -65,7 +65,7 @@ class BranchSetting:
             wave: Deviation of log E between the control points from the linear course that a fit
                 assumes.
         """
-        from limber.mechanics.materials.young_field import young_weights
+        from limber.mechanics.materials.materials import young_weights
 
         mesh, count = truth.mesh, truth.mesh.tet_count
         weights = young_weights(mesh, truth.control_points)

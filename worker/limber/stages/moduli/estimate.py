@@ -24,7 +24,7 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from limber.estimation.estimated_branch import Subject
     from limber.estimation.fit_assessment import Estimate
-    from limber.estimation.fitting.evaluations import EvaluationLog
+    from limber.estimation.fitting.objective import EvaluationLog
     from limber.recordings.recording import Pull
 
 
@@ -88,11 +88,11 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
 def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume: bool,
               progress: Progress) -> dict[str, Any]:
     from limber.estimation.control_point_count import is_open
-    from limber.estimation.estimate_summary import details, summary
+    from limber.estimation.estimate_file import details, summary
+    from limber.estimation.estimated_branch import tell_doubts
     from limber.estimation.fit import fit_branch
     from limber.estimation.fit_assessment import judge_model, require_result
-    from limber.estimation.fit_preparation import tell_doubts
-    from limber.estimation.fitting.evaluations import EvaluationLog
+    from limber.estimation.fitting.objective import EvaluationLog
     from limber.stages.moduli.other_skeletons import add_other_skeletons
     from limber.store.loading import load_pulls, load_subject, pull_names, pulls_digest
 
@@ -169,7 +169,7 @@ def _with_supported_points(
     """
     from limber.estimation.control_point_count import supported
     from limber.estimation.fit import complete, fit_branch
-    from limber.estimation.fitting.evaluations import EvaluationLog
+    from limber.estimation.fitting.objective import EvaluationLog
     from limber.store.loading import load_subject
 
     told: list[str] = []

@@ -100,7 +100,7 @@ def _fitted(graph: _Graph, found: Estimate, branch: Branch, pulls: Sequence[Pull
     from limber.estimation.estimated_branch import subject_of
     from limber.estimation.fit import fit_branch
     from limber.estimation.fit_assessment import require_result
-    from limber.estimation.fitting.evaluations import EvaluationLog
+    from limber.estimation.fitting.objective import EvaluationLog
     from limber.geometry.reconstruction import mesh_skeleton
     from limber.geometry.settings import ReconstructSettings
     from limber.geometry.skeleton.edits import edited

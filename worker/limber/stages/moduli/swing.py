@@ -18,7 +18,7 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.estimation.vibration.swing_record import SwingFit
+    from limber.estimation.vibration.free_swing import SwingFit
     from limber.recordings.recording import Pull
 
 
@@ -34,8 +34,7 @@ def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
         converge.
     """
     from limber.estimation.forward.forward_model import under_its_weight
-    from limber.estimation.vibration.free_swing import fit_swing
-    from limber.estimation.vibration.swing_record import SwingSeen
+    from limber.estimation.vibration.free_swing import SwingSeen, fit_swing
     from limber.recordings.recorded_grasp import grasp_on
     from limber.store.loading import load_subject, pulls_digest
 

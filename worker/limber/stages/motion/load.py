@@ -22,7 +22,7 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.mechanics.loads.gust_loads import Gusts
+    from limber.mechanics.loads.load_effects import Gusts
     from limber.mechanics.loads.outdoor import Bent
     from limber.mechanics.model import BranchModel
 
@@ -103,7 +103,7 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
         and strain along the main path, frequencies; with ``limit_load`` how many times the loads it
         bears; each with its interval, None if the uncertainty of the moduli is unknown), and
         ``frequencies_before_hz``. With gusts all values are those of their peak, and ``gusts`` has
-        the output of :func:`~limber.mechanics.loads.gust_loads.with_peak`.
+        the output of :func:`~limber.mechanics.loads.load_effects.with_peak`.
 
     Raises:
         InputError: there is no load, one off the branch, or gusts without wind. WorkError: there is
@@ -111,8 +111,7 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
     """
     from limber.mechanics.added_masses import PointMass
     from limber.mechanics.dynamics.modes import lowest_modes
-    from limber.mechanics.loads.gust_loads import blown, with_peak
-    from limber.mechanics.loads.load_effects import load_effects
+    from limber.mechanics.loads.load_effects import blown, load_effects, with_peak
     from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
     from limber.store.loading import known_damping, load_branch, load_skeleton, stiffness_deviation
 
@@ -190,7 +189,7 @@ def _keep(branch: Branch, settings: LoadSettings, inputs: dict[str, Any], model:
 
 def _gusts(settings: LoadSettings) -> Gusts | None:
     """The requested gusts."""
-    from limber.mechanics.loads.gust_loads import Turbulence, WindRecord
+    from limber.mechanics.loads.load_effects import Turbulence, WindRecord
 
     if settings.gust is not None and settings.gust_record is not None:
         raise InputError("Both --gust and --gust-record were given.", "The record already contains "

@@ -20,9 +20,9 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
-    from limber.mechanics.dynamics.load_case import SimulatedMotion
-    from limber.mechanics.dynamics.pose_table import PoseTable
+    from limber.mechanics.dynamics.drive import PoseTable
     from limber.mechanics.model import BranchModel
+    from limber.mechanics.pull_simulation import SimulatedMotion
 
 
 KEY = "simulate"
@@ -64,8 +64,7 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
         InputError: the options do not fit together. ConvergenceError: the simulation of the branch
             did not converge; the frames up to there are written.
     """
-    from limber.mechanics.materials.law import law_digest
-    from limber.mechanics.materials.material_registry import material_named
+    from limber.mechanics.materials.laws import law_digest, material_named
     from limber.mechanics.pull_simulation import (
         load_case_of,
         motion_of,
@@ -183,7 +182,7 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
     Raises:
         InputError: there is no recording of that name, or its gripper does not drive the branch.
     """
-    from limber.mechanics.dynamics.pose_table import PoseTable
+    from limber.mechanics.dynamics.drive import PoseTable
     from limber.recordings.recording import read_pull
     from limber.store.loading import known_pulls
 
@@ -211,7 +210,7 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
 
 
 def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
-    from limber.mechanics.dynamics.pose_table import PoseTable
+    from limber.mechanics.dynamics.drive import PoseTable
     from limber.recordings.recording import POSE_COLUMNS
     from limber.recordings.robot_tables import robot_stream, with_columns
     from limber.recordings.tables import read_table, time_column

@@ -22,7 +22,7 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from limber.planning.experiments.compared_planners import ComparedTrial
+    from limber.planning.compared_planners import ComparedTrial
 
 _COLUMNS = ("trial", "planner", "length_m", "energy_sum_nmm", "energy_integral_jm",
             "peak_energy_j")
@@ -69,10 +69,9 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
         BranchFolderError: there is no energy field. InputError: the name is invalid.
         NoPathError: no trial has a path; the message gives the reason.
     """
-    from limber.planning.experiments.compared_planners import run_trials, summarised
+    from limber.planning.compared_planners import run_trials, summarised
     from limber.planning.field.energy_field import EnergyField
-    from limber.planning.goals.chosen_pose import second_arm_goal
-    from limber.planning.goals.grasp_goal import near
+    from limber.planning.goals.goal_kinds import near, second_arm_goal
     from limber.results.report.planner_figure import planner_figure
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
@@ -111,7 +110,7 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
 
 
 def _rows(trials: Sequence[ComparedTrial]) -> str:
-    from limber.planning.experiments.compared_planners import COMPARED
+    from limber.planning.compared_planners import COMPARED
 
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -125,7 +124,7 @@ def _rows(trials: Sequence[ComparedTrial]) -> str:
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     """In the paper's form: each planner against RRT*, mean and deviation over the trials."""
-    from limber.planning.experiments.compared_planners import BASELINE, COMPARED
+    from limber.planning.compared_planners import BASELINE, COMPARED
 
     rows = [["branch", "planner", "path length [m]", "longer [%]", "deformation energy [N mm]",
              "saved [%]"]]
@@ -145,7 +144,7 @@ def _spread(row: dict[str, Any], key: str, form: str) -> str:
 
 def _saving(values: Mapping[str, Any]) -> str | None:
     """Say what each planner saves against RRT*."""
-    from limber.planning.experiments.compared_planners import BASELINE, COMPARED
+    from limber.planning.compared_planners import BASELINE, COMPARED
 
     return "Energy saved against RRT*: " + ", ".join(
         f"{COMPARED[path]} {row['saved_percent']:.1f} %"

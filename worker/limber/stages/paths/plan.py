@@ -71,8 +71,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         Cancelled: the best result so far was kept, if there was one and no finished plan of that
         name.
     """
-    from limber.planning.constraints.damage import assumed_strain
-    from limber.planning.constraints.damage_along import DamageAlong
+    from limber.planning.constraints.damage import DamageAlong, assumed_strain
     from limber.planning.constraints.limits import Limits
     from limber.planning.field.energy_field import EnergyField
     from limber.planning.field.sampling import energy_inputs

@@ -17,8 +17,8 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.constraints.limits import Limits
 from limber.planning.constraints.obstacles import Box, Obstacle, Solid, closest
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals.camera_view import View
 from limber.planning.goals.goal import CellPlace
+from limber.planning.goals.goal_kinds import View
 from limber.planning.goals.regions import Ball, position_text
 from limber.planning.plan_file import PlanPath
 from limber.robot.cell.cell import BoxEntry, CameraEntry, Cell, SecondArmEntry, read_cell

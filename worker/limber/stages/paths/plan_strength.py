@@ -8,7 +8,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.progress import Progress
-from limber.mechanics.materials.species import SAFETY
+from limber.mechanics.materials.materials import SAFETY
 from limber.planning.constraints.damage import (
     ASSUMED_SOURCE,
     Strength,

@@ -9,7 +9,7 @@ import numpy as np
 from limber.core.not_none import present
 from limber.planning.cost import arc_lengths
 from limber.planning.plan_file import PlanPath
-from limber.planning.planners.tree_search import SearchTree
+from limber.planning.planners.rrt_star import SearchTree
 from limber.planning.timing import Pace, poses_at, time_law
 
 _MOST_NODES = 2000  # of a search tree in its file; those that carry the most others stay

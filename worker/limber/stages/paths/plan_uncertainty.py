@@ -4,7 +4,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.estimation.estimate_file import read_estimate
-from limber.mechanics.materials.young_field import young_weights
+from limber.mechanics.materials.materials import young_weights
 from limber.planning.constraints.chance import YoungUncertainty
 from limber.planning.constraints.limits import Limits
 from limber.planning.field.grasp_model import GraspModel

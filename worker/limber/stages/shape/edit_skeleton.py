@@ -44,9 +44,9 @@ from limber.stages.shape.reconstruct import EDITS, edits_digest, load_edits, wri
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from limber.geometry.skeleton.confidence import DoubtfulPart
     from limber.geometry.skeleton.edits import Edit
     from limber.geometry.skeleton.skeleton import Skeleton
-    from limber.geometry.skeleton.uncertain_parts import DoubtfulPart
 
 _SHOWN = 30  # doubtful parts in the table; the JSON result has all
 
@@ -102,7 +102,7 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
             folder is then unchanged.
     """
     from limber.geometry.skeleton.alternatives import SearchDoubts, open_questions
-    from limber.geometry.skeleton.uncertain_parts import doubtful_parts
+    from limber.geometry.skeleton.confidence import doubtful_parts
 
     if edits_path is not None or alternative is not None:
         branch = Branch.open(folder)
@@ -230,7 +230,7 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     from limber.geometry.skeleton.alternatives import SearchDoubts, alternatives, entries
     from limber.geometry.skeleton.confidence import shares
     from limber.geometry.skeleton.edits import edited, edits_text
-    from limber.geometry.skeleton.surface_evidence import without_volumes
+    from limber.geometry.skeleton.plausibility import without_volumes
     from limber.geometry.skeleton.totals import totals
     from limber.store.loading import load_found_skeleton, load_masses
 

@@ -45,15 +45,20 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     Raises:
         InputError: the surface cannot be read or is not that of one solid
             (:func:`limber.geometry.io.surfaces.usable_surface`), or the table is not one of
-            sections (:func:`limber.geometry.sections.read_sections`), or the cylinder model cannot
-            be used (:func:`limber.geometry.mesh_skeleton.mesh_model`).
+            sections (:func:`limber.geometry.bodies.read_sections`), or the cylinder model cannot
+            be used (:func:`limber.geometry.bodies.mesh_model`).
         MeshingError: fTetWild failed.
     """
     from limber.core.constants import UNIT_METRES
-    from limber.geometry.mesh_skeleton import body_format, mesh_model
-    from limber.geometry.mesh_surface import mesh_body
-    from limber.geometry.plausible_size import size_doubts
-    from limber.geometry.sections import SECTIONS, mesh_sections, read_sections
+    from limber.geometry.bodies import (
+        SECTIONS,
+        body_format,
+        mesh_body,
+        mesh_model,
+        mesh_sections,
+        read_sections,
+    )
+    from limber.geometry.cloud.preparation import size_doubts
 
     settings = settings or MeshSurfaceSettings()
     path, drawn = require_file(path, "A surface"), None

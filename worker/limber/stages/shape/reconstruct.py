@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
     from limber.geometry.cloud.cloud import Cloud
     from limber.geometry.reconstruction import MeshedBranch
-    from limber.geometry.skeleton.checkpoint import FoundSkeleton
     from limber.geometry.skeleton.edits import Edit
+    from limber.geometry.skeleton.search_result import FoundSkeleton
     from limber.geometry.skeleton.skeleton import Skeleton
 
 SEARCH = f"{FOUND_SKELETON}.npz"
@@ -325,7 +325,7 @@ def load_search(branch: Branch, settings: ReconstructSettings, digests: dict[str
 
     A file that cannot be used counts as none; ``progress`` receives a warning.
     """
-    from limber.geometry.skeleton.checkpoint import FoundSkeleton
+    from limber.geometry.skeleton.search_result import FoundSkeleton
     from limber.store import program_versions
 
     entry = branch.manifest.stages.get("skeleton")

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.geometry.settings import SkeletonSettings
-from limber.geometry.skeleton.repair.run_radii import limited
+from limber.geometry.skeleton.run_ends import limited
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
 
 

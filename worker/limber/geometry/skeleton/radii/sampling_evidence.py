@@ -5,10 +5,19 @@ sensor's sight and scattered along it, as a scanner's or a camera's rays are. Bo
 of the same points in the branches' cross-sections, each about its own axes and radii.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
-from limber.geometry.skeleton.radii.axis_fit import AxisFit
-from limber.geometry.skeleton.radii.projected_widths import SightField, cross_sections
+from limber.geometry.cloud.single_view import View
+from limber.geometry.skeleton.radii.axis_fit import AxisFit, robust_sigma
+from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
+from limber.geometry.skeleton.radii.projected_widths import (
+    SightField,
+    by_projected_widths,
+    cross_sections,
+)
+from limber.geometry.skeleton.radii.visible_sides import PLACES, SeenSides
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _SAMPLE = 1500  # points that tell
@@ -89,3 +98,28 @@ def _log_likelihood(beside: np.ndarray, depth: np.ndarray, radius: np.ndarray, a
     density = (np.exp(-miss / 2) / (2 * np.pi * blur * noise)).mean(axis=1)
     stray = _STRAY / (_AROUND * radius**2)
     return float(np.log((1 - _STRAY) * density + stray).sum())
+
+
+# The fit of axes and radii for one sensor's rays, where the points support that model.
+
+_LIKELIER = 3.0  # logarithm: twenty times
+
+
+def fit_of_rays(fit: AxisFit, points: np.ndarray, certain: bool, view: View | None = None,
+                ) -> AxisFit | None:
+    """Return the fit by the branches' widths across one sensor's sight.
+
+    Args:
+        fit: The fit by the points' distances.
+        points: The scan [m], shape [m, 3].
+        certain: Whether one sensor's rays are known to have made the points; otherwise None is
+            returned where the points do not support it.
+        view: The sensor's view, if it is known.
+    """
+    skeleton, field = by_projected_widths(fit.skeleton, points, view)
+    if not certain and rays_over_skin(fit, skeleton, field, points) < _LIKELIER:
+        return None
+    segment, residual = nearest_cylinders(skeleton, points)
+    return replace(fit, skeleton=skeleton, segment=segment, residual=residual,
+                   noise=robust_sigma(residual, skeleton.radius[segment]),
+                   seen=SeenSides(field.towards, np.ones(PLACES), along_sight=True))

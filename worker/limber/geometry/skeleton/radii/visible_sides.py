@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import i0e
 
-from limber.geometry.skeleton.radii.cylinders import Match
-from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
+from limber.geometry.skeleton.radii.fit_kernels import Match, reach_on_circle
 from limber.geometry.skeleton.skeleton import Skeleton
 
 PLACES = 180  # positions on the circle, each with a weight

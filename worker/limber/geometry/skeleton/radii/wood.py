@@ -9,9 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
+from scipy.sparse.linalg import SuperLU, splu
+from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.radii.smoothness import DISTINCT, FORK, second_differences
-from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.radii.axis_fit import DISTINCT, FORK, second_differences
+from limber.geometry.skeleton.radii.smoothing_sensors import Smoothing
+from limber.geometry.skeleton.skeleton import MEASURED, UNRESOLVED, Skeleton
 
 # In logarithms of radii: a side branch against its carrier and the fall along a whole run (mean and
 # deviation each); deviation of a root from any radius.
@@ -160,3 +163,265 @@ class Bends:
         """Of nodes (x, y, z [m], logarithm of the radius), shape [4 n, 4 n]."""
         bend = self.turns.T @ sparse.diags(self.trust / self.variance) @ self.turns
         return sparse.kron(bend, sparse.diags([1.0, 1.0, 1.0, 0.0])).tocsr()
+
+
+# The likeliest axes and radii of all branches together, given their fits and how wood is shaped.
+#
+# One Gaussian posterior of all positions across the axes and of the logarithms of all radii. The
+# fit at each node is one observation of both, with its own covariance and with errors that it
+# shares: what a sensor smooths or widens at the scale of its points and which diameter one side
+# shows (the whole scan), the effect of noise and of sections that are not round (a run). A shared
+# error moves axis and radius together, as far as the points leave both open: from one side they
+# show the sum of depth and radius, not each. The prior is how wood grows (:mod:`wood`): an axis
+# bends little; a radius changes slowly along a run and falls towards its tip, at a fork by the wood
+# of the side branches. Where points determine a radius, it is theirs. Where they hardly do, it
+# follows from the carrier and the resolved part, with a wide interval.
+
+SPACINGS = 1.0
+"""Diameter in point spacings, under which a radius is not resolved: too few points around it."""
+_BESIDE = 4  # nodes on each side whose points show the spacing
+_NOISES = 1.0  # radius in standard deviations of the noise, under which it is not resolved
+_ALONG = 0.01  # radii that nodes may move along their axis, where no point holds them
+_APART = 8.0  # radii along a run from which fits are independent
+# Fraction of the radius by which fits scatter about the steady radius of wood: least, most, first.
+_LOCAL = (0.01, 0.1, 0.05)
+# Pixels by which a sensor may widen each side of all branches: half a one where any part of a pixel
+# on the branch gives a reading, less than none where mixed ones are dropped. The scan does not show
+# it: a front widened so is that of a thicker branch, to a tenth of a pixel.
+_EDGE = 0.25
+# Fraction of the points' spacing by which a sensor may widen or thin all branches of a scan; and by
+# which the radius of a run may be off besides.
+_RESOLUTION, _COARSE = 0.1, 0.05
+# Fraction of the radius, over (noise / radius)^2: the noise itself is known to 4 %, and the radius
+# of one side changes by 3.7 times that (of half a circle, the scatter is twice the square of the
+# noise and 0.54 of the radius's).
+_BIAS = 0.15
+# Fraction of the radius by which a section that is not round differs: that of a run seen from all
+# around; of all branches from one side, which shows one diameter of sections whose weight makes
+# them oval in one way. Those 1.1 to 1.35 times as long as wide are 0.035 to 0.1 off their mean.
+_OVAL, _OVAL_SIDE = 0.012, 0.06
+_VAGUE = 1.0  # the same, of fits that the points do not resolve
+_LINEAR = 0.3  # the largest for which a change of the axis is one of the logarithm, in proportion
+_ROUNDS = 5
+_AT_ONCE, _EACH = 256, 4  # columns of an inverse; nodes of a run between them
+
+
+@dataclass(frozen=True)
+class ShapeEvidence:
+    """What a scan shows of its branches besides the fits of their radii.
+
+    Attributes:
+        covariance: Of each node's fitted position and radius [m^2], shape [n, 4, 4].
+        spacing: Spacing of the points around each node [m], shape [n].
+        noise: Standard deviation of the points across the branches [m].
+        shared: Standard deviation of what all points around a branch are off together [m].
+        one_sided: Whether one side was seen.
+        pixel: Distance of neighbouring rays at each node [m], shape [n], if the edges of branches
+            determine the radii, as in one sensor's scan; None: they do not.
+        smoothing: What the sensor's smoothing did, which the radii are without; None: nothing.
+    """
+
+    covariance: np.ndarray
+    spacing: np.ndarray
+    noise: float
+    shared: float = 0.0
+    one_sided: bool = False
+    pixel: np.ndarray | None = None
+    smoothing: Smoothing | None = None
+
+
+def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
+    """Return the skeleton with the likeliest axes and radii, deviations of the radii, and states.
+
+    Args:
+        skeleton: Fitted. Nodes whose state is not measured count for nothing.
+        evidence: Its nodes' evidence.
+    """
+    first = radius = skeleton.radius
+    fitted = np.column_stack([skeleton.nodes, np.log(first)])
+    resolution = _RESOLUTION * evidence.spacing if evidence.pixel is None else (
+        _EDGE * evidence.pixel)
+    measured = skeleton.radius_state == MEASURED
+    evidence = replace(evidence, covariance=_coupled(evidence.covariance, first, measured))
+    independent = np.clip(skeleton.steps / first, DISTINCT, _APART) / _APART
+    # As the points show it: what a sensor drew in may have too few around it.
+    seen = first if evidence.smoothing is None else evidence.smoothing.drawn_in(first)
+    vague = np.where(_is_coarse(seen, evidence), _VAGUE**2, 0.0)
+    trust, local, bends = np.ones(len(radius)), _LOCAL[2], Bends.of(skeleton)
+    for _ in range(_ROUNDS):
+        own = evidence.covariance[:, 3, 3] / first**2 + local**2 + vague
+        # A fit that came out too thin or too thick is as unsure as the thinner one.
+        thin = np.minimum(radius, first)
+        errors = _of_runs(skeleton, evidence, thin)
+        known = _information(skeleton, evidence, own / trust - evidence.covariance[:, 3, 3]
+                             / first**2, measured, independent)
+        posterior = _Posterior.of(Wood.of(skeleton, radius), bends, known, fitted,
+                                  errors)
+        radius = np.exp(posterior.mean[:, 3])
+        miss = np.abs(posterior.miss(fitted)[:, 3])
+        trust = (FREEDOM + 1) / (FREEDOM + independent * miss**2 / own)
+        bends = bends.after(posterior.mean[:, :3])
+        if measured.any():
+            local = float(np.clip(1.4826 * np.median(miss[measured]), *_LOCAL[:2]))
+    # A fit that collapsed resolves nothing; one that does not count is no evidence of thin wood.
+    coarse = _is_coarse(np.where(measured, seen, radius), evidence)
+    scan = np.hypot(resolution / thin, _OVAL_SIDE if evidence.one_sided else 0.0)
+    if evidence.smoothing is not None:
+        scan = np.hypot(scan, evidence.smoothing.uncertainty(thin))
+    scan = np.minimum(scan, 1.0)
+    sigma = np.hypot(posterior.deviations(skeleton), posterior.moved_by(np.column_stack(
+        [_of_axes(evidence.covariance, first * scan), scan])))
+    moves, along = posterior.mean[:, :3] - skeleton.nodes, skeleton.axes()
+    moves -= _of_axes(evidence.covariance, first * (errors @ posterior.errors)[3::4])
+    moves -= np.einsum("nj,nj->n", moves, along)[:, None] * along
+    return replace(skeleton.moved(skeleton.nodes + moves), radius=radius,
+                   radius_sigma=radius * sigma,
+                   radius_state=np.where(coarse, UNRESOLVED, skeleton.radius_state))
+
+
+def _coupled(covariance: np.ndarray, radius: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return the covariances, shape [n, 4, 4], without the part that ties axes to radii [m] where a
+    fit counts for nothing, and with little of it where the radius is hardly known: there the bend
+    of an axis would decide the radius.
+    """
+    relative = np.sqrt(covariance[:, 3, 3]) / radius
+    share = np.where(measured, np.minimum(_LINEAR / np.maximum(relative, 1e-12), 1.0)**2, 0.0)
+    out = covariance.copy()
+    out[:, :3, 3] *= share[:, None]
+    out[:, 3, :3] *= share[:, None]
+    return out
+
+
+def _is_coarse(radius: np.ndarray, evidence: ShapeEvidence) -> np.ndarray:
+    """Whether points are too far apart, or scatter too far, to resolve radii [m], shape [n]."""
+    return (2 * radius < SPACINGS * evidence.spacing) | (radius < _NOISES * evidence.noise)
+
+
+def point_spacing(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray, noise: float,
+                  ) -> np.ndarray:
+    """Mean distance of neighbouring points around each node, corrected for noise [m], shape [n]."""
+    distance = cKDTree(points).query(points, k=min(5, len(points)))[0][:, 1:].mean(axis=1)
+    total = np.bincount(segment, distance, skeleton.node_count)
+    count = np.bincount(segment, minlength=skeleton.node_count).astype(float)
+    near = np.full(skeleton.node_count, float(np.median(distance)))
+    for own in skeleton.own_runs():
+        # A node without points has the point spacing of its neighbours.
+        around = np.ones(min(2 * _BESIDE + 1, len(own)))
+        points_near = np.convolve(count[own], around, "same")
+        known = points_near > 0
+        near[own[known]] = np.convolve(total[own], around, "same")[known] / points_near[known]
+    return np.sqrt(np.maximum(near**2 - noise**2, (0.5 * near)**2))
+
+
+def _information(skeleton: Skeleton, evidence: ShapeEvidence, local: np.ndarray,
+                 measured: np.ndarray, share: np.ndarray) -> sparse.bsr_matrix:
+    """Information of the fits on nodes (x, y, z [m], logarithm of the radius), [4 n, 4 n].
+
+    Args:
+        local: Variance of the logarithms of fitted radii besides their covariance, shape [n].
+        measured: Nodes whose fits count, shape [n]. Others hold their axis to a radius.
+        share: Share of an independent fit that a node is, shape [n].
+    """
+    radius, count = skeleton.radius, skeleton.node_count
+    scale = np.ones((count, 4))
+    scale[:, 3] = 1 / radius
+    covariance = evidence.covariance * scale[:, :, None] * scale[:, None, :]
+    covariance[:, 3, 3] += local
+    covariance[:, [0, 1, 2], [0, 1, 2]] += (1e-3 * radius[:, None])**2
+    block = np.linalg.inv(covariance) * share[:, None, None]
+    block[~measured] = 0.0
+    block[~measured, :3, :3] = np.eye(3) / radius[~measured, None, None]**2
+    along = skeleton.axes()
+    block[:, :3, :3] += along[:, :, None] * along[:, None, :] / (
+        _ALONG * radius[:, None, None])**2
+    return sparse.bsr_matrix((block, np.arange(count), np.arange(count + 1)))
+
+
+def _of_axes(covariance: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Errors of the axes that go with errors of the radii [m], shape [n], as the points leave both
+    open, shape [n, 3]."""
+    return covariance[:, :3, 3] * (error / np.maximum(covariance[:, 3, 3], 1e-300))[:, None]
+
+
+def _of_runs(skeleton: Skeleton, evidence: ShapeEvidence, radius: np.ndarray,
+             ) -> sparse.csr_matrix:
+    """Effect on nodes of what each run's fits are off together, shape [4 n, runs].
+
+    Each has a standard deviation of 1. It is of the radii; how an axis bends must not decide it.
+    """
+    # Their sum must not depend on single fits, or it would level their scatter.
+    radius = typical_radius(skeleton, radius)
+    noise = _BIAS * np.minimum(evidence.noise / radius, 1.0)**2
+    coarse = np.minimum(_COARSE * evidence.spacing / radius, 1.0)
+    off = np.sqrt(_OVAL**2 + noise**2 + coarse**2 + (evidence.shared / radius)**2)
+    return sparse.coo_matrix((off, (4 * np.arange(len(off)) + 3, skeleton.branch)),
+                             (4 * len(off), skeleton.branch_count)).tocsr()
+
+
+def typical_radius(skeleton: Skeleton, radius: np.ndarray) -> np.ndarray:
+    """Radii [m] that change by one rate along each run, shape [n]."""
+    typical, arc_length = np.log(radius), skeleton.arc_length
+    for own in skeleton.own_runs():
+        along = arc_length[own] - arc_length[own].mean()
+        rate = float(along @ typical[own]) / max(float(along @ along), 1e-300)
+        typical[own] = typical[own].mean() + rate * along
+    return np.exp(typical)
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Means of the nodes, shape [n, 4], and of the shared errors, shape [runs]; the factorised
+    precision of nodes, shared errors and trends of wood."""
+
+    mean: np.ndarray
+    errors: np.ndarray
+    factor: SuperLU
+    known: sparse.bsr_matrix
+    together: sparse.csr_matrix
+
+    @classmethod
+    def of(cls, wood: Wood, bends: Bends, known: sparse.bsr_matrix, fitted: np.ndarray,
+           together: sparse.csr_matrix) -> "_Posterior":
+        cross, flat, count = (known @ together).tocsc(), fitted.ravel(), len(fitted)
+        own = sparse.identity(together.shape[1]) + together.T @ cross
+        last = sparse.coo_matrix((np.ones(count), (4 * np.arange(count) + 3, np.arange(count))),
+                                 (4 * count, count)).tocsr()
+        of_wood, pull = wood.precision, wood.pull
+        with_trends = last @ of_wood[:count, count:]
+        matrix = sparse.bmat([
+            [last @ of_wood[:count, :count] @ last.T + bends.precision() + known, cross,
+             with_trends], [cross.T, own, None],
+            [with_trends.T, None, of_wood[count:, count:]]]).tocsc()
+        factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        solved = factor.solve(np.concatenate([last @ pull[:count] + known @ flat, cross.T @ flat,
+                                              pull[count:]]))
+        return cls(solved[:len(flat)].reshape(-1, 4),
+                   solved[len(flat):len(flat) + together.shape[1]], factor, known, together)
+
+    def miss(self, fitted: np.ndarray) -> np.ndarray:
+        """What is left of the fits beyond the means and the shared errors, shape [n, 4]."""
+        return fitted - self.mean - (self.together @ self.errors).reshape(-1, 4)
+
+    def moved_by(self, error: np.ndarray) -> np.ndarray:
+        """How far errors of all fits, which the prior must not decide, move the radii's means, [n].
+        """
+        pull = self.known @ error.ravel()
+        shared = self.together.T @ pull
+        trends = np.zeros(self.factor.shape[0] - len(pull) - len(shared))
+        return self.factor.solve(np.concatenate([pull, shared, trends]))[3:len(pull):4]
+
+    def deviations(self, skeleton: Skeleton) -> np.ndarray:
+        """Standard deviation of each radius's logarithm, shape [n]."""
+        runs = skeleton.own_runs()
+        # It changes little from node to node: some are solved for, the others interpolated.
+        solved = np.concatenate([np.union1d(own[::_EACH], own[-1:]) for own in runs])
+        variance = np.empty(len(self.mean))
+        for start in range(0, len(solved), _AT_ONCE):
+            own = solved[start:start + _AT_ONCE]
+            unit = np.zeros((self.factor.shape[0], len(own)))
+            unit[4 * own + 3, np.arange(len(own))] = 1.0
+            variance[own] = self.factor.solve(unit)[4 * own + 3, np.arange(len(own))]
+        for own in runs:
+            among = np.intersect1d(own, solved)
+            variance[own] = np.interp(own, among, variance[among])
+        return np.sqrt(np.maximum(variance, 0.0))

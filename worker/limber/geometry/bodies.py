@@ -1,0 +1,386 @@
+"""Bodies given without a scan, as a surface, cylinders or sections, to tetrahedra."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.core.alignment import Alignment
+from limber.core.constants import UNIT_METRES
+from limber.core.errors import InputError, MeshingError
+from limber.core.files.reading import csv_records
+from limber.core.progress import SILENT, Progress
+from limber.geometry.cloud.preparation import size_doubts
+from limber.geometry.io.formats import Format, known_format
+from limber.geometry.io.skeletons import SKELETONS, read_skeleton
+from limber.geometry.io.surfaces import SURFACES
+from limber.geometry.reconstruction import gravity_after, mesh_skeleton, peak_memory_mb
+from limber.geometry.settings import MeshSurfaceSettings, ReconstructSettings
+from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, upright_rotation
+from limber.geometry.skeleton.sweep import bending_factor, frames, resample, rings, tangents
+from limber.geometry.surface.surface import Surface
+from limber.geometry.tets.tet_mesh import TetMesh, mark, measure_quality
+from limber.geometry.tets.tetrahedra import MeshSettings, tetrahedralise
+from limber.geometry.tets.tree_sweep import swept
+
+# From the closed surface of any slender body to tetrahedra with axis, base and grasp.
+
+_SECTIONS = 24  # cross-sections of an axis
+
+
+@dataclass(frozen=True)
+class MeshedBody:
+    """A solid in its own frame, filled with tetrahedra.
+
+    Attributes:
+        alignment: From the file's coordinates to the body's.
+        skeleton: Its axis.
+        surface: Closed.
+        mesh: Marked with material, base, control points and grasp.
+        numbers: The stage's result.
+    """
+
+    alignment: Alignment
+    skeleton: Skeleton
+    surface: Surface
+    mesh: TetMesh
+    numbers: dict[str, Any]
+
+
+def mesh_body(surface: Surface, settings: MeshSurfaceSettings,
+              progress: Progress = SILENT) -> MeshedBody:
+    """Fill a closed surface [m] with tetrahedra and mark base, control points and grasp.
+
+    Raises:
+        InputError: it has no long axis. MeshingError: fTetWild failed.
+    """
+    scale = UNIT_METRES[settings.unit]
+    skeleton = section_axis(
+        surface, None if settings.root is None else np.array(settings.root) * scale)
+    alignment, surface, skeleton = aligned_body(surface, skeleton, scale, settings)
+    thick = float(np.median(skeleton.radius))
+    limits = MeshSettings(mesh_time_limit=settings.mesh_time_limit,
+                          mesh_memory_limit_mb=settings.mesh_memory_limit_mb)
+    try:
+        mesh, cached = tetrahedralise(
+            surface, edge_length=2 * thick / settings.elements_across, epsilon=0.02 * thick,
+            settings=limits, stop_energy=10.0, progress=progress.part(0.1, 0.9))
+    except MeshingError as error:  # there are no axes to sweep along
+        raise MeshingError(
+            error.seen, error.why, "Raise --mesh-time-limit or --mesh-memory-limit-mb, lower "
+            "--elements-across, or simplify the surface.") from error
+    mesh = mark(mesh, skeleton, young=settings.young, poisson=settings.poisson,
+                density=settings.density, fractions=FRACTIONS,
+                grasp_fraction=settings.grasp_fraction)
+    mesher = "ftetwild (cached)" if cached else "ftetwild"
+    return MeshedBody(alignment, skeleton, surface, mesh, numbers_of(
+        surface, skeleton, mesh, alignment, settings, mesher))
+
+
+def numbers_of(surface: Surface, skeleton: Skeleton, mesh: TetMesh, alignment: Alignment,
+               settings: MeshSurfaceSettings, mesher: str) -> dict[str, Any]:
+    """Result of the stage for a body."""
+    quality = measure_quality(mesh, surface.volume, skeleton, surface)
+    return {
+        "point_count": len(surface.vertices), "node_count": skeleton.node_count,
+        "branch_count": 1, "length_m": skeleton.length, "main_length_m": skeleton.length,
+        "radius_min_m": float(skeleton.radius.min()),
+        "radius_max_m": float(skeleton.radius.max()), "clamped_radius_count": 0,
+        "surface_volume_m3": surface.volume, "mesh_volume_m3": quality.volume_m3,
+        "tet_count": mesh.tet_count, "mesh_node_count": mesh.node_count, "mesher": mesher,
+        "watertight": True, "mesh_quality": quality.as_dict(),
+        "peak_memory_mb": peak_memory_mb(),
+        "gravity_m_s2": gravity_after(alignment, settings.up)}
+
+
+def section_axis(surface: Surface, root: np.ndarray | None) -> Skeleton:
+    """Return the axis of a slender solid: centroids of its cross-sections along its length.
+
+    Radii are those of circles with the sections' areas. The body is one unforked run that starts at
+    ``root``, or at the thicker end.
+
+    Args:
+        surface: Closed.
+        root: A point near the end that is held [m], shape [3], or None.
+    """
+    axis = _long_axis(surface)
+    along = surface.vertices @ axis
+    low, high = float(along.min()), float(along.max())
+    centres, radii = [], []
+    for at in low + (high - low) * (np.arange(_SECTIONS) + 0.5) / _SECTIONS:
+        area, centre = _section(surface, axis, at)
+        if area > 0:
+            centres.append(centre)
+            radii.append(np.sqrt(area / np.pi))
+    if len(centres) < 4:
+        raise InputError("The surface has no clear long axis.", "The body is not slender.",
+                         "Use a surface that is longer than it is thick.")
+    return _to_the_ends(np.array(centres), np.array(radii), axis, low, high, root)
+
+
+def _long_axis(surface: Surface) -> np.ndarray:
+    """Unit vector of the solid's least moment of inertia, from tetrahedra to the origin."""
+    corner = surface.vertices[surface.faces]
+    volume = np.linalg.det(corner) / 6.0
+    mean = corner.sum(axis=1) / 4.0
+    centre = (volume[:, None] * mean).sum(axis=0) / volume.sum()
+    # Second moments of a tetrahedron with one corner at the origin (Tonon 2004).
+    total = corner.sum(axis=1)
+    second = np.einsum("t,tij->ij", volume / 20.0, np.einsum(
+        "tki,tkj->tij", corner, corner) + np.einsum("ti,tj->tij", total, total))
+    spread = second - volume.sum() * np.outer(centre, centre)
+    return np.linalg.eigh(spread)[1][:, -1]
+
+
+def _section(surface: Surface, axis: np.ndarray, at: float) -> tuple[float, np.ndarray]:
+    """Area [m^2] and centroid [m] of the cut by the plane ``axis . x = at``, by Green's theorem."""
+    height = surface.vertices @ axis - at
+    above = height[surface.faces] > 0
+    cut = np.flatnonzero(above.any(axis=1) & ~above.all(axis=1))
+    starts, ends = [], []
+    for k in range(3):
+        a, b = surface.faces[cut, k], surface.faces[cut, (k + 1) % 3]
+        share = height[a] / np.where(height[a] == height[b], 1.0, height[a] - height[b])
+        point = surface.vertices[a] + share[:, None] * (surface.vertices[b] - surface.vertices[a])
+        down, up = above[cut, k] & ~above[cut, (k + 1) % 3], ~above[cut, k] & above[
+            cut, (k + 1) % 3]
+        starts.append((point, down))
+        ends.append((point, up))
+    if len(cut) == 0:
+        return 0.0, np.zeros(3)
+    start = sum(np.where(used[:, None], point, 0.0) for point, used in starts)
+    end = sum(np.where(used[:, None], point, 0.0) for point, used in ends)
+    origin = start.mean(axis=0)
+    p, q = start - origin, end - origin
+    twice = np.cross(p, q) @ axis
+    area = twice.sum() / 2
+    if abs(area) < 1e-300:
+        return 0.0, origin
+    return abs(float(area)), origin + (twice[:, None] * (p + q)).sum(axis=0) / (6 * area)
+
+
+def _to_the_ends(centres: np.ndarray, radii: np.ndarray, axis: np.ndarray, low: float,
+                 high: float, root: np.ndarray | None) -> Skeleton:
+    first = centres[0] + (low - centres[0] @ axis) * axis
+    last = centres[-1] + (high - centres[-1] @ axis) * axis
+    nodes = np.vstack([first, centres, last])
+    radius = np.concatenate([radii[:1], radii, radii[-1:]])
+    if root is not None:
+        turn = np.linalg.norm(nodes[-1] - root) < np.linalg.norm(nodes[0] - root)
+    else:
+        quarter = max(len(radius) // 4, 1)
+        turn = radius[-quarter:].mean() > 1.02 * radius[:quarter].mean()
+    if turn:
+        nodes, radius = nodes[::-1], radius[::-1]
+    return Skeleton.from_edges(nodes, np.arange(len(nodes)) - 1, radius)
+
+
+def aligned_body(surface: Surface, skeleton: Skeleton, scale: float,
+                 settings: MeshSurfaceSettings) -> tuple[Alignment, Surface, Skeleton]:
+    """From a file's coordinates to the body's own: its root at the origin, and upright."""
+    root = skeleton.nodes[0]
+    rotation = upright_rotation(skeleton, np.array(settings.up), settings.upright)
+    alignment = Alignment(scale=scale, origin=tuple(root.tolist()),
+                          rotation=tuple(map(tuple, rotation.tolist())))
+    return (alignment, Surface((surface.vertices - root) @ rotation.T, surface.faces),
+            skeleton.moved((skeleton.nodes - root) @ rotation.T))
+
+
+# From a body drawn as sections along its axis, of width and height, to tetrahedra.
+#
+# Not every branch is round, and a test beam is drawn, not scanned. A table has the axis, at each
+# position the width and the height of the ellipse across it, and the mass attached there.
+
+COLUMNS = ("x", "y", "z", "width", "height")
+MASS = "mass_kg"
+SLICE, SIDES = 5.0, 8 / 3
+"""Length of a slice for one element across, in half the smaller thickness; corners of a section per
+element across.
+"""
+_UPWARDS = 0.3  # sine of the angle between axis and vertical below which the axis has no upper side
+
+
+@dataclass(frozen=True)
+class Sections:
+    """Ellipses across an axis, from the end that is held.
+
+    Attributes:
+        axis: Their centres [m], shape [n, 3].
+        width: Their thickness sideways [m], shape [n].
+        height: Their thickness upwards [m], shape [n].
+        mass: Mass attached at each in addition to the body itself [kg], shape [n].
+    """
+
+    axis: np.ndarray
+    width: np.ndarray
+    height: np.ndarray
+    mass: np.ndarray
+
+    @property
+    def radius(self) -> np.ndarray:
+        """Radii of circles of the same areas [m], shape [n]."""
+        return np.sqrt(self.width * self.height) / 2
+
+
+def read_sections(path: Path, unit: str) -> Sections:
+    """Read a table with the columns x, y, z, width, height and optionally mass_kg.
+
+    Lengths are in ``unit``, or in that of a column's name (``width_mm``).
+
+    Raises:
+        InputError: a column is missing, a value is not a number, or a size is not positive.
+    """
+    rows = csv_records(path, "a table of sections", comment="#")
+    titles = [title.strip() for title in rows[0] if title] if rows else []
+    found = {}
+    for title in titles:
+        head, _, tail = title.rpartition("_")
+        name, scale = (head, UNIT_METRES[tail]) if head and tail in UNIT_METRES else (
+            title, UNIT_METRES[unit])
+        if name in COLUMNS or title == MASS:
+            found[title if title == MASS else name] = (title, 1.0 if title == MASS else scale)
+    missing = [name for name in COLUMNS if name not in found]
+    if missing or len(rows) < 2:
+        raise InputError(
+            f"{path} has {len(rows)} rows and the columns {', '.join(titles) or 'none'}.",
+            "A body needs at least two sections, each with a position on the axis, a width and a "
+            "height.", "Write the columns x,y,z,width,height (and mass_kg for an attached mass).")
+    try:
+        columns = {name: scale * np.array([float(row[title]) for row in rows])
+                   for name, (title, scale) in found.items()}
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: {error}.", "Each row needs a number in every column.",
+                         "Complete the table.") from error
+    mass = columns.pop(MASS, np.zeros(len(rows)))
+    made = Sections(np.column_stack([columns[name] for name in COLUMNS[:3]]), columns["width"],
+                    columns["height"], mass)
+    if not (np.isfinite(made.axis).all() and np.all(np.minimum(made.width, made.height) > 0)
+            and np.all(mass >= 0)):
+        raise InputError(f"{path} has a position that is not finite, a width or height that is not "
+                         "positive, or a negative mass.", "A body cannot have such a section.",
+                         "Correct the table.")
+    if np.any(np.linalg.norm(np.diff(made.axis, axis=0), axis=1) == 0):
+        raise InputError(f"{path} has the same position in two consecutive rows.",
+                         "Consecutive sections must be apart.", "Omit one of them.")
+    return made
+
+
+SECTIONS = Format("sections", (".csv",), read_sections)
+
+
+def mesh_sections(sections: Sections, settings: MeshSurfaceSettings,
+                  ) -> tuple[MeshedBody, list[dict[str, Any]]]:
+    """Sweep tetrahedra along drawn sections and mark base, control points and grasp.
+
+    Width is across axis and up, height across axis and width. If the axis starts upwards, width is
+    along x as far as possible. From there both follow the axis without a twist.
+
+    Returns:
+        The body, and the masses attached to it, as in ``point_masses.json``.
+    """
+    skeleton = Skeleton.from_edges(sections.axis, np.arange(len(sections.axis)) - 1,
+                                   sections.radius)
+    mesh = _swept(sections, settings)
+    faces = mesh.surface_faces()
+    used, corners = np.unique(faces, return_inverse=True)
+    surface = Surface(mesh.nodes[used], corners.reshape(-1, 3))
+    alignment, surface, skeleton = aligned_body(surface, skeleton, UNIT_METRES[settings.unit],
+                                                settings)
+    turn = np.array(alignment.rotation)
+    mesh = mark(TetMesh((mesh.nodes - sections.axis[0]) @ turn.T, mesh.tets).quadratic(), skeleton,
+                young=settings.young, poisson=settings.poisson, density=settings.density,
+                fractions=FRACTIONS, grasp_fraction=settings.grasp_fraction)
+    masses = [{"kind": "table", "attached_m": node.tolist(), "mass_kg": float(mass)}
+              for node, mass in zip(skeleton.nodes, sections.mass, strict=True) if mass > 0]
+    numbers = numbers_of(surface, skeleton, mesh, alignment, settings, "sweep")
+    return MeshedBody(alignment, skeleton, surface, mesh, numbers | {
+        "hung_mass_kg": float(sections.mass.sum())}), masses
+
+
+def _swept(sections: Sections, settings: MeshSurfaceSettings) -> TetMesh:
+    """Linear tetrahedra whose cross-sections bend as the ellipses do."""
+    thin = np.minimum(sections.width, sections.height) / 2
+    spacing = SLICE / settings.elements_across * thin
+    centres, width = resample(sections.axis, sections.width, spacing)
+    height = resample(sections.axis, sections.height, spacing)[1]
+    sides = max(6, round(SIDES * settings.elements_across))
+    tangent = tangents(centres)
+    upper, across = frames(centres, tangent, _upper(tangent[0], np.array(settings.up)))
+    ring = rings(np.zeros_like(centres), np.ones(len(centres)), upper, across, sides,
+                 bending_factor(sides))
+    # If scaled in each direction separately, a polygon keeps the second moments that it has of a
+    # circle.
+    stretched = (np.einsum("nsj,nj->ns", ring, upper)[..., None] * upper[:, None]
+                 * height[:, None, None]
+                 + np.einsum("nsj,nj->ns", ring, across)[..., None] * across[:, None]
+                 * width[:, None, None]) / 2
+    return swept(centres, centres[:, None] + stretched)
+
+
+def _upper(tangent: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Direction of the first section's height, shape [3]."""
+    up = up / np.linalg.norm(up)
+    above = up - (up @ tangent) * tangent
+    if np.linalg.norm(above) >= _UPWARDS:
+        return above
+    sideways = np.eye(3)[0] if abs(tangent[0]) < 0.9 else np.eye(3)[1]
+    return np.cross(sideways - (sideways @ tangent) * tangent, tangent)
+
+
+# From a cylinder model alone, without its scan, to a closed surface and tetrahedra.
+
+
+def body_format(path: Path) -> Format:
+    """Return the kind of a file given to `limber mesh`: a cylinder model, sections or a surface.
+
+    Raises:
+        InputError: the kind is not known.
+    """
+    return known_format(path, "body", [*SKELETONS.readers(), SECTIONS, *SURFACES.readers()])
+
+
+def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = SILENT,
+               ) -> tuple[MeshedBody, list[dict[str, Any]]]:
+    """Return the branch of a cylinder model, and the masses of the pruned twigs.
+
+    Args:
+        path: File in a format of :data:`~limber.geometry.io.skeletons.SKELETONS`.
+        settings: ``unit``, ``up``, ``upright`` and settings of the wood; the model has its own
+        root.
+        progress: Called during the work; receives warnings for the user.
+
+    Raises:
+        InputError: it cannot be read, a radius is 0, its size is not a branch's, or a root is
+        given.
+        MeshingError: it cannot be meshed.
+    """
+    if settings.root is not None:
+        raise InputError("A root (--root) was given for a cylinder model.",
+                         "The model defines its own root.", "Omit --root.")
+    scale = UNIT_METRES[settings.unit]
+    read = read_skeleton(path, scale=scale)
+    if (read.radius <= 0).any():
+        raise InputError(f"{int((read.radius <= 0).sum())} of {read.node_count} nodes of {path} "
+                         "have radius 0.", "A branch has a thickness.",
+                         "Give each node its radius.")
+    for text in size_doubts(read.nodes, "cylinder model", settings.unit,
+                            is_stated="unit" in settings.model_fields_set):
+        progress.warn(text)
+    alignment, skeleton = _aligned(read, scale, settings)
+    meshed = mesh_skeleton(skeleton, ReconstructSettings(
+        young=settings.young, poisson=settings.poisson, density=settings.density,
+        grasp_fraction=settings.grasp_fraction, mesh_time_limit=settings.mesh_time_limit,
+        mesh_memory_limit_mb=settings.mesh_memory_limit_mb, leave_out=True), progress)
+    return MeshedBody(alignment, skeleton, meshed.surface, meshed.mesh, meshed.numbers | {
+        "point_count": len(meshed.surface.vertices),
+        "gravity_m_s2": gravity_after(alignment, settings.up)}), meshed.masses
+
+
+def _aligned(skeleton: Skeleton, scale: float, settings: MeshSurfaceSettings,
+             ) -> tuple[Alignment, Skeleton]:
+    root = skeleton.nodes[0]
+    turn = upright_rotation(skeleton, np.array(settings.up), settings.upright)
+    return (Alignment(scale=scale, origin=tuple(root.tolist()),
+                      rotation=tuple(map(tuple, turn.tolist()))),
+            skeleton.moved((skeleton.nodes - root) @ turn.T))

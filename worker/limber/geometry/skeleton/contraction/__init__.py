@@ -1,1 +1,0 @@
-"""From a cloud to a curve graph: Laplacian contraction and what follows it."""

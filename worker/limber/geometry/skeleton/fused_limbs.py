@@ -1,0 +1,317 @@
+"""Limbs that stand so close together that contraction makes one axis of both, up to their tips.
+
+Their points lie on two circles in a section, not on one. Both are fitted to each section of a run
+that one circle explains badly. Where two explain several sections in a row so much better that
+nothing else can be meant, the run is split into two.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.sweep import any_normal, stretches
+
+# Feet of side branches: their axes are followed down while the points show two limbs, not one.
+#
+# Where a side branch leaves at a small angle, or beside a limb as thick as itself, the contraction
+# makes one axis of both for some way. Its points then lie on two circles in a section, and on one
+# below the fork. The likelihoods of both decide at each node, from the fork towards the root.
+
+_HALF = 1.0  # radii to each side of a section whose points belong to it
+_CIRCLE_POINTS = 10  # points of a circle
+_FORK_GAP = 1.0  # radii of the thicker limb between two axes
+_FORK_EVIDENCE = 3.0  # logarithm: twenty times
+_ALIKE = 3.0  # points whose errors are correlated, so that they count as one
+_ROUGH = 0.08  # fraction of the radius by which sections of wood are not round
+_STRAY = 3.0  # standard deviations from which a point belongs to something else
+_KNOWN = 0.3  # deviation of a limb's radius from that above, logarithm
+_ROUNDS = 12
+_HIDDEN = 2  # sections at the fork that may show one circle
+_FORK_SECTIONS = 3  # sections in a row that must show two: a few stray points are in one
+
+
+@dataclass(frozen=True)
+class FusedFork:
+    """The axes of a side run beside its carrier: carrier's nodes from the fork down, shape [k],
+    and of both limbs there the positions [m], [k, 3], and radii [m], [k].
+    """
+
+    nodes: np.ndarray
+    carrier: np.ndarray
+    carrier_radius: np.ndarray
+    side: np.ndarray
+    side_radius: np.ndarray
+
+
+def separate_fused_forks(skeleton: Skeleton, points: np.ndarray, noise: float,
+                         ) -> tuple[Skeleton, int]:
+    """Return the skeleton with side runs that start where their points meet the carrier's.
+
+    Args:
+        skeleton: Fitted to the points.
+        points: Scanned points [m], shape [m, 3].
+        noise: Standard deviation of the points [m].
+
+    Returns:
+        The skeleton, and the number of side runs that were followed down.
+    """
+    run = skeleton.branch[nearest_cylinders(skeleton, points)[0]]
+    done, forks, starts = np.zeros(skeleton.node_count, bool), [], []
+    for members in skeleton.runs()[1:]:
+        own = np.isin(run, skeleton.branch[members[:2]])
+        fork = _fused_fork(skeleton, members, points[own], noise)
+        if fork is None or done[fork.nodes].any():
+            continue
+        done[fork.nodes] = True
+        forks.append(fork)
+        starts.append(int(members[1]))
+    return (with_side_axes(skeleton, forks, starts), len(forks)) if forks else (skeleton, 0)
+
+
+def with_side_axes(skeleton: Skeleton, forks: list[FusedFork], starts: Sequence[int | None],
+                   ) -> Skeleton:
+    """Return the skeleton with a second axis beside each of some stretches of runs.
+
+    Args:
+        skeleton: With radii.
+        forks: The stretches.
+        starts: For each the first node of the side run that goes on from it; None: it ends there.
+    """
+    nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
+    parent, below, first = skeleton.parent.copy(), [], skeleton.node_count
+    for fork, start in zip(forks, starts, strict=True):
+        nodes[fork.nodes], radius[fork.nodes] = fork.carrier, fork.carrier_radius
+        chain = np.arange(first, first + len(fork.nodes))
+        first += len(fork.nodes)
+        if start is not None:
+            parent[start] = chain[0]
+        below.append(np.append(chain[1:], skeleton.parent[fork.nodes[-1]]))
+    return Skeleton.from_edges(
+        np.vstack([nodes, *(fork.side for fork in forks)]), np.concatenate([parent, *below]),
+        np.concatenate([radius, *(fork.side_radius for fork in forks)]))
+
+
+def _fused_fork(skeleton: Skeleton, members: np.ndarray, points: np.ndarray, noise: float,
+                ) -> FusedFork | None:
+    """The part of a side run that its carrier's axis hides; None if there is none."""
+    fork = int(members[0])
+    run = int(skeleton.branch[fork])
+    side = float(np.median(skeleton.radius[members[1:6]]))
+    at = skeleton.nodes[members[1]]
+    found: list[tuple[int, tuple[np.ndarray, np.ndarray, float, float]]] = []
+    node, hidden = fork, 0
+    way = at - skeleton.nodes[members[min(6, len(members) - 1)]]
+    way /= max(float(np.linalg.norm(way)), 1e-300)
+    while skeleton.parent[node] >= 0 and skeleton.branch[node] == run and hidden < _HIDDEN:
+        step = min(float(np.linalg.norm(at - skeleton.nodes[node])), float(skeleton.steps[node]))
+        both = _two_limbs(skeleton, node, at + way * step, side, points, noise)
+        if both is not None:
+            found.append((node, both))
+            at = both[1]
+        elif found:
+            break
+        else:
+            hidden += 1
+        node = int(skeleton.parent[node])
+    if len(found) < _FORK_SECTIONS:
+        return None
+    return FusedFork(np.array([each for each, _ in found]), *(
+        np.array([both[k] for _, both in found]) for k in (0, 2, 1, 3)))
+
+
+def _two_limbs(skeleton: Skeleton, node: int, at: np.ndarray, side: float, points: np.ndarray,
+               noise: float) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+    """Axes and radii of carrier and side limb in the section at a node; None if it shows one.
+
+    Args:
+        at: Where the side limb's axis is expected [m], shape [3].
+        side: Its radius above [m].
+    """
+    thick = float(skeleton.radius[node])
+    seen = section(skeleton, node, points, 3 * thick + 2 * side, _HALF * min(thick, side))
+    if seen is None:
+        return None
+    (flat, frame), middle = seen, skeleton.nodes[node]
+    spread = float(np.hypot(noise, _ROUGH * min(thick, side)))
+    aside = (at - middle) @ frame.T
+    single = fitted_circles(flat, np.array([[0.0, 0.0, thick]]), spread, np.inf)
+    above = float(skeleton.radius[_outwards(skeleton, node)])
+    first = np.array([[*(-0.3 * aside), above], [*aside, side]])
+    double = fitted_circles(flat, first, spread, _KNOWN)
+    if single is None or double is None:
+        return None
+    (carrier, limb), gap = double[0], float(np.linalg.norm(double[0][0, :2] - double[0][1, :2]))
+    if gap < _FORK_GAP * max(carrier[2], limb[2]) or (
+            (double[1] - single[1]) / _ALIKE - 1.5 * np.log(len(flat)) < _FORK_EVIDENCE):
+        return None
+    return (middle + carrier[:2] @ frame, middle + limb[:2] @ frame, float(carrier[2]),
+            float(limb[2]))
+
+
+def section(skeleton: Skeleton, node: int, points: np.ndarray, reach: float, half: float,
+            ) -> tuple[np.ndarray, np.ndarray] | None:
+    """Points in the section at a node, in its plane [m], shape [k, 2], and the plane's two unit
+    vectors; None where the axis has no direction.
+
+    Args:
+        reach: Largest distance of points from the node [m].
+        half: Half the section's thickness [m], or that of the node's step if larger.
+    """
+    axis = skeleton.nodes[node] - skeleton.nodes[int(skeleton.parent[node])]
+    size = float(np.linalg.norm(axis))
+    if size == 0:
+        return None
+    axis /= size
+    offset = points[np.linalg.norm(points - skeleton.nodes[node], axis=1) < reach
+                    ] - skeleton.nodes[node]
+    one = any_normal(axis)
+    frame = np.stack([one, np.cross(axis, one)])
+    return offset[np.abs(offset @ axis) < max(half, size / 2)] @ frame.T, frame
+
+
+def _outwards(skeleton: Skeleton, node: int) -> int:
+    """The node of the same run some radii above."""
+    own = np.flatnonzero(skeleton.branch == skeleton.branch[node])
+    above = own[own > node]
+    far = skeleton.arc_length[above] - skeleton.arc_length[node] > 3 * skeleton.radius[node]
+    return int(above[far][0]) if far.any() else int(above[-1]) if len(above) else node
+
+
+def fitted_circles(flat: np.ndarray, first: np.ndarray, spread: float, known: float,
+                   ) -> tuple[np.ndarray, float] | None:
+    """Circles fitted to points of a section, each point to the nearest, and the log-likelihood.
+
+    Args:
+        flat: Points [m], shape [k, 2].
+        first: Middle and radius of each circle to start from [m], shape [c, 3].
+        spread: Standard deviation of the points [m].
+        known: Deviation of the radii's logarithms from the first.
+
+    Returns:
+        None if a circle has too few points.
+    """
+    circles = first.copy()
+    for _ in range(_ROUNDS):
+        offset = flat[:, None] - circles[:, :2]
+        distance = np.maximum(np.linalg.norm(offset, axis=2), 1e-12)
+        miss = distance - circles[:, 2]
+        nearest = np.argmin(np.abs(miss), axis=1)
+        for number, circle in enumerate(circles):
+            own = np.flatnonzero((nearest == number) & (
+                np.abs(miss[:, number]) < np.maximum(2 * _STRAY * spread, circle[2])))
+            if len(own) < _CIRCLE_POINTS:
+                return None
+            off = miss[own, number] / spread
+            weight = 1 / (1 + (off / _STRAY)**2)
+            slope = np.column_stack([-offset[own, number] / distance[own, number, None],
+                                     -np.ones(len(own))]) / spread
+            prior = np.diag([0, 0, (known * first[number, 2])**-2]) + 1e-9 / spread**2 * np.eye(3)
+            pull = prior @ (circle - first[number]) * [0, 0, 1]
+            step = np.linalg.solve((slope * weight[:, None]).T @ slope + prior,
+                                   (slope * weight[:, None]).T @ off + pull)
+            circles[number] = circle - np.clip(step, -0.5 * circle[2], 0.5 * circle[2])
+            circles[number, 2] = max(circles[number, 2], 0.2 * first[number, 2])
+    off = np.abs(np.linalg.norm(flat[:, None] - circles[:, :2], axis=2) - circles[:, 2]).min(
+        axis=1) / spread
+    return circles, float(-0.5 * np.minimum(off, _STRAY)**2 @ np.ones(len(off)))
+
+
+_OFF = 0.12  # radii that points are off a section's circle, from which two circles are tried
+_RESOLVED = 3.0  # radius of either limb in deviations of its points
+_LIMB_GAP = 1.2  # radii of the thicker limb between two axes
+_LIMB_EVIDENCE = 10.0  # logarithm of a section's likelihood ratio: twenty thousand times
+_POINTS = 20  # fewest in a section
+_ROUNDEST = 0.02  # fraction of the radius by which no section of wood is rounder
+_LIMB_SECTIONS, _MISSED = 4, 2  # sections in a row that must show two, and between them one
+_FREE = 1.0  # deviation of the limbs' radii from half of the common one, logarithm
+
+
+def with_split_limbs(skeleton: Skeleton, points: np.ndarray, noise: float,
+                     ) -> tuple[Skeleton, int]:
+    """Return the skeleton with runs split where their points show two limbs, and their number.
+
+    Args:
+        skeleton: Fitted to the points.
+        points: Scanned points [m], shape [m, 3].
+        noise: Standard deviation of the points [m].
+    """
+    segment, residual = nearest_cylinders(skeleton, points)
+    count = np.maximum(np.bincount(segment, minlength=skeleton.node_count), 1)
+    off = np.bincount(segment, np.abs(residual), skeleton.node_count) / count
+    tried = (off > _OFF * skeleton.radius) & (skeleton.radius > _RESOLVED * noise)
+    forks = []
+    for number, members in enumerate(skeleton.runs()):
+        own = members[1:]
+        mine = points[skeleton.branch[segment] == number]
+        for part in _stretches(tried[own]):
+            shown = {int(node): both for node in own[part][tried[own[part]]]
+                     if (both := _two(skeleton, int(node), mine)) is not None}
+            forks += [_limbs(skeleton, own[part][inner], shown)
+                      for inner in _stretches(np.isin(own[part], list(shown)))]
+    return (with_side_axes(skeleton, forks, [None] * len(forks)), len(forks)) if forks else (
+        skeleton, 0)
+
+
+def _stretches(chosen: np.ndarray) -> list[slice]:
+    """Stretches of enough chosen sections in a row, with a few others between."""
+    filled = chosen.copy()
+    for part in stretches(~chosen):
+        if part.start > 0 and part.stop < len(chosen) and part.stop - part.start <= _MISSED:
+            filled[part] = True
+    return [part for part in stretches(filled) if chosen[part].sum() >= _LIMB_SECTIONS]
+
+
+def _two(skeleton: Skeleton, node: int, points: np.ndarray) -> np.ndarray | None:
+    """Middles [m] and radii [m] of two limbs in the section at a node, shape [2, 4]; None where one
+    circle may explain it.
+    """
+    thick = float(skeleton.radius[node])
+    seen = section(skeleton, node, points, 2 * thick, thick / 2)
+    if seen is None or len(seen[0]) < _POINTS:
+        return None
+    flat, frame = seen
+    middle = flat.mean(axis=0)
+    along = np.linalg.svd(flat - middle, full_matrices=False)[2][0]
+    reach = float(np.quantile(np.abs((flat - middle) @ along), 0.9)) / 2
+    one = fitted_circles(flat, np.array([[*middle, thick]]), 0.1 * thick, _FREE)
+    two = fitted_circles(flat, np.array([[*(middle + side * reach * along), reach]
+                                         for side in (-1, 1)]), 0.1 * thick, _FREE)
+    if one is None or two is None:
+        return None
+    spread, circles = _scatter(flat, two[0]), two[0]
+    gap, thicker = float(np.linalg.norm(circles[0, :2] - circles[1, :2])), float(
+        circles[:, 2].max())
+    gain = len(flat) / _ALIKE * np.log(_scatter(flat, one[0]) / spread) - 1.5 * np.log(len(flat))
+    if (gap < _LIMB_GAP * thicker or circles[:, 2].min() < _RESOLVED * spread
+            or gain < _LIMB_EVIDENCE):
+        return None
+    return np.column_stack([skeleton.nodes[node] + circles[:, :2] @ frame, circles[:, 2]])
+
+
+def _scatter(flat: np.ndarray, circles: np.ndarray) -> float:
+    """Standard deviation of points [k, 2] about the nearest of circles [m]."""
+    off = np.abs(np.linalg.norm(flat[:, None] - circles[:, :2], axis=2) - circles[:, 2])
+    return max(float(np.sqrt((off.min(axis=1)**2).mean())), _ROUNDEST * float(circles[:, 2].max()))
+
+
+def _limbs(skeleton: Skeleton, nodes: np.ndarray, shown: dict[int, np.ndarray]) -> FusedFork:
+    """Axes and radii of both limbs along nodes, given from the root outwards."""
+    nodes = nodes[::-1]  # the carrier goes on where the run does, beyond the outermost
+    known = np.array([k for k, node in enumerate(nodes) if int(node) in shown])
+    pairs = []
+    beyond = np.flatnonzero(skeleton.parent == nodes[0])
+    last = np.stack([skeleton.nodes[beyond[0]]] * 2) if len(beyond) else None
+    for k in known:
+        pair = shown[int(nodes[k])]
+        if last is not None and np.linalg.norm(pair[0, :3] - last[0]) > np.linalg.norm(
+                pair[1, :3] - last[0]):
+            pair = pair[::-1]
+        pairs.append(pair)
+        last = pair[:, :3]
+    every = np.stack(pairs)
+    filled = np.stack([[np.interp(np.arange(len(nodes)), known, every[:, limb, column])
+                        for column in range(4)] for limb in range(2)])
+    return FusedFork(nodes, filled[0, :3].T, filled[0, 3], filled[1, :3].T, filled[1, 3])

@@ -1,1 +1,0 @@
-"""Joining of a scan's pieces to one tree over its gaps."""

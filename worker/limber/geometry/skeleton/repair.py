@@ -1,0 +1,635 @@
+"""The repairs that fit a skeleton of contracted points to the scan, as an ordered list."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from heapq import heappop, heappush
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from limber.core.progress import SILENT, Progress
+from limber.geometry.cloud.single_view import View
+from limber.geometry.skeleton.confidence import KINK, assessed, doubted, turns
+from limber.geometry.skeleton.fused_limbs import separate_fused_forks, with_split_limbs
+from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
+from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
+from limber.geometry.skeleton.run_ends import (
+    ends_within,
+    limited,
+    steadied,
+    unpinched,
+    with_full_tips,
+    without_bare_ends,
+)
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.sweep import arc_lengths, resample
+
+# Ends connected sideways across a scan's holes, cut apart before pieces are joined.
+#
+# Where the foot of a twig is missing together with a stretch of its carrier, the remains of both
+# begin side by side, and their points may be near enough to be connected. The axis then goes up
+# one, across, and down the other: a turn that wood does not make. After a cut there, each end
+# continues in its own direction. If too little is left of the twig for a direction, it is attached
+# to its carrier's end like a hook, by a long step aside.
+
+_ARM = 6.0  # radii on each side over which the direction is measured
+_LEAVE = 1.0  # radii next to the turn that are skipped
+_LEAST_NODES = 3  # fewest nodes of a side
+_TURN = np.deg2rad(110.0)
+_HOOK, _ASIDE, _STEP = 4.0, np.deg2rad(55.0), 1.5  # hook's radii; its turn; step's radii
+
+
+def untied(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> np.ndarray:
+    """Return the edges of a forest without those that connect two ends, shape [e, 2].
+
+    Args:
+        nodes: Positions [m], shape [n, 3].
+        edges: Node pairs, shape [e, 2].
+        thickness: First radii [m], shape [n].
+    """
+    near: list[list[int]] = [[] for _ in nodes]
+    for a, b in edges.tolist():
+        near[a].append(b)
+        near[b].append(a)
+    turning = []
+    for k, (a, b) in enumerate(edges.tolist()):
+        if _is_hook(nodes, near, thickness, a, b) or _is_hook(nodes, near, thickness, b, a):
+            turning.append((np.inf, k))
+        if len(near[a]) != 2 or len(near[b]) != 2:
+            continue
+        thick = max(thickness[a], thickness[b])
+        arms = [_arm(nodes, near, one, other, thick) for one, other in ((a, b), (b, a))]
+        if any(arm is None for arm in arms):
+            continue
+        cosine = float(arms[0] @ arms[1])
+        if cosine > -np.cos(_TURN):
+            turning.append((float(np.linalg.norm(nodes[a] - nodes[b])) / thick, k))
+    # Of the edges around one turn, the longest is removed: nothing was scanned beside it.
+    keep, cut = np.ones(len(edges), bool), []
+    for _, k in sorted(turning, reverse=True):
+        middle, thick = nodes[edges[k]].mean(axis=0), float(thickness[edges[k]].max())
+        if all(np.linalg.norm(middle - other) > _ARM * thick for other in cut):
+            keep[k] = False
+            cut.append(middle)
+    return edges[keep]
+
+
+def _is_hook(nodes: np.ndarray, near: list[list[int]], thickness: np.ndarray, end: int, first: int,
+             ) -> bool:
+    """Whether the chain that ends at ``end`` continues, by a long step aside, to a short tail."""
+    step, thick = nodes[first] - nodes[end], float(thickness[end])
+    size = float(np.linalg.norm(step))
+    if len(near[end]) != 2 or size < _STEP * thick:
+        return False
+    before, node, length = end, first, 0.0
+    while len(near[node]) == 2 and length < _HOOK * thick:
+        ahead = near[node][0] if near[node][1] == before else near[node][1]
+        length += float(np.linalg.norm(nodes[ahead] - nodes[node]))
+        before, node = node, ahead
+    arm = _arm(nodes, near, end, first, thick)
+    return (len(near[node]) == 1 and length < _HOOK * thick and arm is not None
+            and float(step @ -arm) < np.cos(_ASIDE) * size)
+
+
+def _arm(nodes: np.ndarray, near: list[list[int]], start: int, before: int, thick: float,
+         ) -> np.ndarray | None:
+    """Direction of a chain away from an edge, a unit vector; None if it is too short."""
+    chain, length = [], 0.0
+    node = start
+    while length < (_ARM + _LEAVE) * thick:
+        if length >= _LEAVE * thick:
+            chain.append(node)
+        ahead = [other for other in near[node] if other != before]
+        if len(ahead) != 1:
+            break
+        length += float(np.linalg.norm(nodes[ahead[0]] - nodes[node]))
+        before, node = node, ahead[0]
+    if len(chain) < _LEAST_NODES or length < 0.6 * _ARM * thick:
+        return None
+    vector = nodes[chain[-1]] - nodes[chain[0]]
+    size = float(np.linalg.norm(vector))
+    return vector / size if size > 0 else None
+
+
+# Attachment of twigs to their carriers: the contraction draws a fork towards the twig.
+
+
+# Nodes at a twig's start that may mislead, and nodes that show its direction.
+_MISLEADING_NODES, _NODES_AHEAD = 5, 7
+_KINK = np.deg2rad(50.0)
+# Longest start of a twig, in radii of its carrier; least kink at its end; nodes to each side.
+_HOOK_REACH, _SHARP_KINK, _BESIDE = 6.0, np.deg2rad(45.0), 3
+_LINE = 2.0  # length of a twig's start in carrier radii over which its direction is measured
+
+
+def attached(skeleton: Skeleton) -> Skeleton:
+    """Attach each side run where its own direction meets the carrier's axis.
+
+    The contraction draws a fork towards the twig. The twig's nodes inside the carrier are dropped,
+    and its line is extended back to the carrier's axis.
+    """
+    parent, keep = skeleton.parent.copy(), np.ones(skeleton.node_count, bool)
+    runs = skeleton.runs()
+    for run in range(1, len(runs)):
+        members = runs[run][1:]
+        carrier = runs[int(skeleton.branch[skeleton.parent[members[0]]])]
+        distance, near = cKDTree(skeleton.nodes[carrier]).query(skeleton.nodes[members])
+        outside = distance > 1.05 * skeleton.radius[carrier[near]]
+        first = int(np.argmax(outside)) if outside.any() else len(members) - 1
+        first = _past_hook(skeleton, members, min(first, max(len(members) - 2, 0)))
+        keep[members[:first]] = False
+        # A very thin run's first nodes are so close together that there is only noise between them.
+        along = np.cumsum(np.linalg.norm(np.diff(skeleton.nodes[members[first:]], axis=0), axis=1))
+        least = int(np.searchsorted(along, _LINE * skeleton.radius[carrier[near[first]]])) + 2
+        ahead = members[first:first + max(least, 5)]
+        if len(ahead) < 2:
+            parent[members[first]] = carrier[near[first]]
+            continue
+        direction = skeleton.nodes[ahead[-1]] - skeleton.nodes[ahead[0]]
+        direction /= np.linalg.norm(direction)
+        parent[members[first]] = _meeting(skeleton, carrier, members[first], direction)
+    # A run attached to dropped nodes is attached to the next kept ancestor.
+    for node in range(skeleton.node_count):
+        while parent[node] >= 0 and not keep[parent[node]]:
+            parent[node] = parent[parent[node]]
+    return skeleton.subset(keep, parent)
+
+
+def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
+    """The position in a twig from which its direction continues: its start may be a hook.
+
+    Where the scan lacks a twig's base, the twig is attached to its carrier by a short path across,
+    with a kink where its own axis begins.
+    """
+    nodes = skeleton.nodes
+    last = min(first + _MISLEADING_NODES, len(members) - _NODES_AHEAD)
+    start = max(first, last)
+    for k in range(first, last):
+        step = nodes[members[k + 1]] - nodes[members[k]]
+        ahead = nodes[members[k + _NODES_AHEAD - 1]] - nodes[members[k + 1]]
+        size = np.linalg.norm(step) * np.linalg.norm(ahead)
+        if size > 0 and step @ ahead > np.cos(_KINK) * size:
+            start = k
+            break
+    reach = _HOOK_REACH * skeleton.radius[skeleton.parent[members[0]]]
+    length = 0.0
+    for k in range(start + 1, len(members) - _NODES_AHEAD):
+        step = nodes[members[k]] - nodes[members[k - 1]]
+        length += float(np.linalg.norm(step))
+        if length > reach:
+            break
+        before = nodes[members[k]] - nodes[members[max(k - _BESIDE, start)]]
+        ahead = nodes[members[k + _NODES_AHEAD - 1]] - nodes[members[k]]
+        size = np.linalg.norm(before) * np.linalg.norm(ahead)
+        if size > 0 and before @ ahead < np.cos(_SHARP_KINK) * size:
+            start = k
+    return start
+
+
+def _meeting(skeleton: Skeleton, carrier: np.ndarray, first: int, direction: np.ndarray) -> int:
+    """Carrier node nearest to the twig's line, extended back from its first node outside.
+
+    A twig grows away from its fork: a node that its line meets ahead is excluded, unless all are
+    ahead.
+    """
+    offset = skeleton.nodes[carrier] - skeleton.nodes[first]
+    back = -(offset @ direction)
+    across = np.linalg.norm(offset + back[:, None] * direction, axis=1)
+    # No farther back than the carrier's thickness: at a small angle the lines meet far away.
+    reach = np.linalg.norm(offset, axis=1).min() * 2.5
+    allowed = np.linalg.norm(offset, axis=1) <= reach
+    if (allowed & (back > 0)).any():
+        allowed &= back > 0
+    return int(carrier[np.argmin(np.where(allowed, across, np.inf))])
+
+
+# Two parallel axes in one branch, which the contraction leaves where a scan has holes.
+
+
+def without_duplicate_axes(skeleton: Skeleton) -> tuple[Skeleton, int]:
+    """Drop side runs that lie mostly inside others, thinnest first; also return their number."""
+    count, run = 0, skeleton.branch_count - 1
+    while run > 0:
+        if _is_duplicate(skeleton, run):
+            skeleton, count = skeleton.subset(skeleton.branch != run), count + 1
+            run = skeleton.branch_count
+        run -= 1
+    return skeleton, count
+
+
+def _is_duplicate(skeleton: Skeleton, run: int) -> bool:
+    """Whether a side run has no twigs of its own and is mostly inside the others."""
+    own = np.flatnonzero(skeleton.branch == run)
+    carried = (skeleton.branch[skeleton.parent[1:]] == run) & (skeleton.branch[1:] != run)
+    if carried.any():
+        return False
+    # Other runs that could contain it: only those nearby.
+    middle = skeleton.nodes[own].mean(axis=0)
+    span = np.linalg.norm(skeleton.nodes[own] - middle, axis=1).max()
+    reach = 2 * span + 1.4 * float(skeleton.radius.max())
+    others = np.flatnonzero((skeleton.branch != run)
+                            & (np.linalg.norm(skeleton.nodes - middle, axis=1) < reach))
+    if len(others) == 0:
+        return False
+    gap = np.linalg.norm(skeleton.nodes[own][:, None] - skeleton.nodes[others], axis=2)
+    near = np.argmin(gap, axis=1)
+    # A duplicate may be the thicker one of the two.
+    thick = np.maximum(skeleton.radius[others][near], skeleton.radius[own])
+    share = gap[np.arange(len(own)), near] / thick
+    return float(np.median(share)) < 1.3
+
+
+# Kinks within a branch that wood does not make: folded ends are dropped, others rounded.
+
+_END = 8.0  # radii from a kink to the tip below which the rest is a folded end
+_ROUNDED = 4.0  # radii on each side of a kink that are smoothed
+_ROUNDS = 60
+
+
+def without_kinks(skeleton: Skeleton) -> tuple[Skeleton, int]:
+    """Repair kinks of over 70 degrees within runs.
+
+    Where a run folds back near its tip and carries nothing beyond, contraction led it back along
+    itself: it ends at the kink. Elsewhere nodes around the kink are smoothed to a bend that wood
+    can make.
+
+    Returns:
+        The skeleton, and the number of repaired kinks.
+    """
+    count = 0
+    while True:
+        folded = _folded(skeleton)
+        if not folded:
+            break
+        keep = np.ones(skeleton.node_count, bool)
+        keep[np.concatenate(folded)] = False
+        skeleton, count = skeleton.subset(keep), count + len(folded)
+    nodes = skeleton.nodes.copy()
+    for members in skeleton.runs():
+        sharp = np.flatnonzero(turns(skeleton, members) > KINK)
+        if len(sharp):
+            count += int((np.diff(sharp) > 1).sum()) + 1
+            _round_off(skeleton, nodes, members)
+    return replace(skeleton, nodes=nodes), count
+
+
+def _folded(skeleton: Skeleton) -> list[np.ndarray]:
+    """Nodes of each folded end beyond its kink."""
+    children, found = skeleton.child_counts(), []
+    for members in skeleton.runs():
+        for k in np.flatnonzero(turns(skeleton, members) > KINK):
+            rest = members[k:]
+            step = np.linalg.norm(np.diff(skeleton.nodes[rest], axis=0), axis=1)
+            if k > 1 and len(rest) > 1 and (children[rest] < 2).all() and (
+                    step.sum() < _END * skeleton.radius[rest[0]]):
+                found.append(rest[1:])
+                break
+    return found
+
+
+def _round_off(skeleton: Skeleton, nodes: np.ndarray, members: np.ndarray) -> None:
+    """Smooth a run's ``nodes`` around its kinks, in place."""
+    for _ in range(_ROUNDS):
+        now = skeleton.moved(nodes)
+        sharp = np.flatnonzero(turns(now, members) > KINK)
+        if len(sharp) == 0:
+            return
+        along = arc_lengths(nodes[members])
+        reach = _ROUNDED * skeleton.radius[members[sharp]]
+        near = (np.abs(along[:, None] - along[sharp]) < reach).any(axis=1)
+        near[[0, -1]] = False
+        inner = np.flatnonzero(near)
+        old = nodes[members]
+        nodes[members[inner]] = 0.5 * old[inner] + 0.25 * (old[inner - 1] + old[inner + 1])
+
+
+# Spurs: side twigs that hardly reach out of their carrier.
+
+SPUR_REACH = 2.5
+"""A twig is kept if it reaches this many radii of its carrier beyond the carrier's axis."""
+
+
+def prune_spurs(nodes: np.ndarray, parent: np.ndarray, thickness: np.ndarray, factor: float,
+                ) -> tuple[np.ndarray, int]:
+    """Mark the nodes to keep when twigs shorter than ``factor`` radii of their carrier are dropped.
+
+    Args:
+        nodes: Positions [m], shape [n, 3].
+        parent: Parents, -1 for the root, shape [n].
+        thickness: Radii [m], shape [n].
+        factor: A side twig is kept if it reaches this many times the radius of the node it starts
+            from beyond that node.
+
+    Returns:
+        Mask [n], and the number of dropped spurs.
+    """
+    keep, pruned = np.ones(len(nodes), bool), 0
+    step = np.where(parent >= 0, np.linalg.norm(nodes - nodes[parent], axis=1), 0.0)
+    children = np.bincount(parent[parent >= 0], minlength=len(nodes))
+    spurs: list[tuple[float, int, list[int], int]] = []
+    tips_of: dict[int, set[int]] = {}
+
+    def follow(tip: int) -> None:
+        """Note the end of a tip's twig, and the twig if it is a spur."""
+        chain, length, node = [], 0.0, tip
+        while parent[node] >= 0 and children[node] <= 1:
+            chain.append(node)
+            length += step[node]
+            node = int(parent[node])
+        tips_of.setdefault(node, set()).add(tip)
+        if children[node] > 1 and length < factor * max(
+                thickness[node], float(np.median(thickness[chain]))):
+            heappush(spurs, (length, tip, chain, node))
+
+    for tip in np.flatnonzero((children == 0) & (parent >= 0)):
+        follow(int(tip))
+    while spurs:
+        # The shortest first: the fork may no longer be one afterwards.
+        _, tip, chain, fork = heappop(spurs)
+        if tip not in tips_of.get(fork, ()):
+            continue
+        keep[chain] = False
+        pruned += 1
+        children[fork] -= 1
+        tips_of[fork].remove(tip)
+        if children[fork] == 1:
+            for other in tips_of.pop(fork):
+                follow(other)
+    return keep, pruned
+
+
+# Nodes along runs, at distances proportional to the radius and no closer than the points.
+
+_NEIGHBOURS = 4  # of a point that show how far apart they are
+_NEAR = 8  # points around a node that count
+
+
+def resampled(skeleton: Skeleton, spacing: float = 1.0, least: np.ndarray | float = 0.0,
+              ) -> Skeleton:
+    """Return the skeleton with nodes ``spacing`` local radii apart along each run.
+
+    Args:
+        skeleton: Any.
+        spacing: Distance of nodes in local radii.
+        least: Smallest distance of nodes [m] at each node of ``skeleton``, shape [n], or at all.
+    """
+    least = np.broadcast_to(least, skeleton.node_count)
+    nodes: list[np.ndarray] = []
+    radius: list[np.ndarray] = []
+    parent: list[np.ndarray] = []
+    made: dict[int, np.ndarray] = {}
+    count = 0
+    for run, members in enumerate(skeleton.runs()):
+        points, thick = skeleton.curve(run)
+        new_points, new_radius = resample(
+            points, thick, np.maximum(spacing * thick, least[members]))
+        if run == 0:
+            hang = np.arange(len(new_points)) - 1
+        else:
+            carrier = made[int(skeleton.branch[members[0]])]
+            node = carrier[int(np.argmin(np.linalg.norm(
+                np.vstack(nodes)[carrier] - points[0], axis=1)))]
+            new_points, new_radius = new_points[1:], new_radius[1:]
+            hang = np.concatenate([[node], count + np.arange(len(new_points) - 1)])
+        made[run] = count + np.arange(len(new_points))
+        count += len(new_points)
+        nodes.append(new_points)
+        radius.append(new_radius)
+        parent.append(hang)
+    return Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent), np.concatenate(radius))
+
+
+@dataclass(frozen=True)
+class PointSpacing:
+    """How far apart the points of a scan are.
+
+    Attributes:
+        tree: Of the points [m].
+        distance: Mean distance of each point from its nearest neighbours [m], shape [m].
+    """
+
+    tree: cKDTree
+    distance: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray) -> "PointSpacing":
+        """The spacing of points [m], shape [m, 3]."""
+        tree = cKDTree(points)
+        near = tree.query(points, k=min(_NEIGHBOURS + 1, len(points)))[0]
+        return cls(tree, near[:, 1:].mean(axis=1))
+
+    def at(self, places: np.ndarray) -> np.ndarray:
+        """The spacing around places [m, shape [n, 3]], shape [n]."""
+        near = self.tree.query(places, k=min(_NEAR, len(self.distance)))[1]
+        return self.distance[near.reshape(len(places), -1)].mean(axis=1)
+
+
+LEAF_SHARE = 0.4
+"""Fraction of points over two radii off their axis from which a scan shows leaves, not branches. Of
+eleven bare scans, most with noise as large as their radii, it is at most 0.30; of leaves 0.48 and
+0.73.
+"""
+
+_COARSE = 1.5  # local radii between the nodes of the first fit
+_NOISY = 0.2  # fraction of the median radius
+_ROUNDS_NOISY, _ROUNDS_LATE = 18, 6  # rounds of the last fit
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """A skeleton between two passes, and the state that they use.
+
+    Attributes:
+        skeleton: Its current state.
+        points: The scan, thinned [m], shape [m, 3].
+        radius_limits: Least and largest radius [m].
+        view: The depth camera's view of the points, if they are one's.
+        rays: The points are one sensor's, evenly spaced across its sight and scattered along it.
+        fit: The last fit.
+        pinched: Start of the first fit, where only one side of wood was seen: it may make a stem
+            far too thin.
+        duplicates: Number of duplicate axes that the last search dropped.
+        pruned: Number of twigs dropped.
+        progress: Called during a fit.
+        apart: How far apart the points are; None: not known yet.
+    """
+
+    skeleton: Skeleton
+    points: np.ndarray
+    radius_limits: tuple[float, float]
+    view: View | None = None
+    rays: bool = False
+    fit: AxisFit | None = None
+    pinched: Skeleton | None = None
+    duplicates: int = 0
+    pruned: int = 0
+    progress: Progress = SILENT
+    apart: PointSpacing | None = None
+
+    def of(self, skeleton: Skeleton) -> "Repaired":
+        """The same with another skeleton."""
+        return replace(self, skeleton=skeleton)
+
+    def fitted(self, first: Skeleton, **how: Any) -> "Repaired":
+        """The same after a fit that starts from ``first``."""
+        fit = fit_axes(first, self.points, along_sight=self.view is not None,
+                       progress=self.progress, **how)
+        if self.rays:
+            fit = fit_of_rays(fit, self.points, certain=True, view=self.view) or fit
+        return replace(self, fit=fit, skeleton=fit.skeleton)
+
+    def sampled(self, skeleton: Skeleton, spacing: float = 1.0) -> Skeleton:
+        """A skeleton with nodes ``spacing`` local radii apart, where there are points for each."""
+        apart = self.apart or PointSpacing.of(self.points)
+        return resampled(skeleton, spacing, apart.at(skeleton.nodes))
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of the points [m], as the last fit has it."""
+        return self.last_fit.noise
+
+    @property
+    def off_axis_fraction(self) -> float:
+        """Fraction of points farther off their axis than twice its radius, as on leaves."""
+        fit = self.last_fit
+        return float(np.mean(fit.residual > fit.skeleton.radius[fit.segment]))
+
+    @property
+    def last_fit(self) -> AxisFit:
+        """The last fit, once there is one."""
+        assert self.fit is not None, "the first fit must run before its results are used"
+        return self.fit
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One repair.
+
+    Attributes:
+        name: Its name, for tests and developers.
+        repairs: The fault that it repairs, a sentence.
+        run: The repair.
+        until: Fraction of all passes' work that is done after it; None: it takes hardly any time.
+    """
+
+    name: str
+    repairs: str
+    run: Callable[[Repaired], Repaired]
+    until: float | None = None
+
+
+def _fit_coarsely(now: Repaired) -> Repaired:
+    after = now.fitted(now.sampled(now.skeleton, _COARSE), uncertainty=False)
+    by_rays = fit_of_rays(after.last_fit, now.points, now.view is not None, now.view)
+    if by_rays is not None:
+        return replace(after, rays=True, fit=by_rays, skeleton=by_rays.skeleton)
+    # For leaves too, unpinched radii would make thick stems that seem to have no leaves.
+    may_be = after.last_fit.seen.one_sided and after.off_axis_fraction <= LEAF_SHARE
+    return replace(after, pinched=now.skeleton if may_be else None)
+
+
+def _fit_unpinched(now: Repaired) -> Repaired:
+    if now.pinched is None:
+        return now
+    return now.fitted(now.sampled(unpinched(now.pinched, now.points), _COARSE), uncertainty=False)
+
+
+def _prune_spurs(now: Repaired) -> Repaired:
+    # Noise makes a carrier look thicker, and its outliers look like twigs.
+    reach = now.skeleton.radius + 2 * now.noise
+    keep, count = prune_spurs(now.skeleton.nodes, now.skeleton.parent, reach, SPUR_REACH)
+    return replace(now, skeleton=now.skeleton.subset(keep), pruned=now.pruned + count)
+
+
+def _drop_duplicate_axes(now: Repaired) -> Repaired:
+    skeleton, count = without_duplicate_axes(now.skeleton)
+    return replace(now, skeleton=skeleton, duplicates=count, pruned=now.pruned + count)
+
+
+def _settle(now: Repaired) -> Repaired:
+    # Noise leaves little information per round.
+    noisy = now.noise > _NOISY * float(np.median(now.skeleton.radius))
+    rounds = _ROUNDS_NOISY if noisy else _ROUNDS_LATE if now.duplicates else 0
+    return now.fitted(now.skeleton, rounds=rounds, settled=noisy and not now.duplicates,
+                      seen=now.last_fit.seen)
+
+
+def _mend_kinks(now: Repaired) -> Repaired:
+    skeleton, count = without_kinks(now.skeleton)
+    # Where a folded end carried the run's number, the runs are others now: so is what they state.
+    return now.of(doubted(skeleton, now.points, now.noise) if count else skeleton)
+
+
+STEADY = Pass("steady radii", "Where points are missing, a first radius is far too small.",
+              lambda now: now.of(steadied(now.skeleton, now.points)))
+DROP_BARE_ENDS = Pass("drop bare ends",
+                      "The contraction overshoots an end, beyond the last points.",
+                      lambda now: now.of(without_bare_ends(now.skeleton, now.points)))
+DROP_DUPLICATE_AXES = Pass("drop duplicate axes",
+                           "Where a scan has holes, one branch has two parallel axes.",
+                           _drop_duplicate_axes)
+LIMIT = Pass("limit radii", "A radius is outside the range for a cloud of this size.",
+             lambda now: now.of(limited(now.skeleton, *now.radius_limits)))
+
+PASSES = (
+    STEADY,
+    Pass("fit coarsely", "The contracted axes lie beside the axes that the points show.",
+         _fit_coarsely, until=0.4),
+    Pass("fit unpinched",
+         "Where most of a stem is hidden, the fit to the visible strip is far too thin.",
+         _fit_unpinched, until=0.5),
+    Pass("attach twigs", "The contraction pulls a fork towards its twig.",
+         lambda now: now.of(attached(now.skeleton))),
+    DROP_BARE_ENDS,
+    Pass("lengthen ends", "The contraction shortens an end.",
+         lambda now: now.of(with_full_tips(now.skeleton, now.points, now.noise))),
+    Pass("prune spurs", "A twig hardly extends beyond its parent and the noise.", _prune_spurs),
+    DROP_DUPLICATE_AXES,
+    STEADY,
+    Pass("unpinch radii", "Where only a strip of a stem is visible, the radius is far too small.",
+         lambda now: now if now.pinched is None else now.of(unpinched(now.skeleton, now.points))),
+    LIMIT,
+    Pass("separate fused forks", "Two limbs side by side have one axis, up to a fork too far out.",
+         lambda now: now.of(separate_fused_forks(now.skeleton, now.points, now.noise)[0])),
+    Pass("split limbs", "Two limbs side by side have one axis up to their tips.",
+         lambda now: now.of(with_split_limbs(now.skeleton, now.points, now.noise)[0])),
+    Pass("fit finely",
+         "Axes and radii come from too few nodes, and from forks that have moved since.",
+         lambda now: now.fitted(now.sampled(now.skeleton), uncertainty=False), until=0.8),
+    DROP_DUPLICATE_AXES,
+    Pass("settle", "Noise, or a duplicate axis that was just dropped, leaves the fit unfinished.",
+         _settle, until=1.0),
+    DROP_BARE_ENDS,
+    Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
+         lambda now: now.of(ends_within(now.skeleton, now.points))),
+    LIMIT,
+    Pass("find the likeliest axes and radii",
+         "A radius that few points, the spacing or the noise determine, or that no wood has, is "
+         "treated as measured.",
+         lambda now: now.of(assessed(
+             now.skeleton, now.points, now.noise, rays=now.rays,
+             one_sided=now.last_fit.seen.one_sided, view=now.view))),
+    Pass("mend kinks", "A branch turns more sharply than wood does.", _mend_kinks),
+)
+"""In the order in which they run; some run again after a fit."""
+
+
+def repaired(skeleton: Skeleton, points: np.ndarray, radius_limits: tuple[float, float],
+             view: View | None, progress: Progress = SILENT) -> Repaired:
+    """Run all passes on the skeleton of the contracted points.
+
+    Args:
+        skeleton: With first radii.
+        points: The scan, thinned [m], shape [m, 3].
+        radius_limits: Least and largest radius [m].
+        view: The depth camera's view of the points, if they are one's.
+        progress: Called during fits.
+    """
+    now = Repaired(skeleton, points, radius_limits, view, apart=PointSpacing.of(points))
+    done = 0.0
+    for each in PASSES:
+        until = done if each.until is None else each.until
+        now = each.run(replace(now, progress=progress.part(done, until)))
+        done = until
+    return now

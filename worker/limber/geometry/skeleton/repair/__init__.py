@@ -1,1 +1,0 @@
-"""Repairs of a skeleton: false connections, backward starts, kinks."""

@@ -1,1 +1,0 @@
-"""Interpolation of samples over grasp positions: coordinates, radial functions, trust, errors."""
