@@ -3,12 +3,13 @@
 import importlib
 import json
 
+import numpy as np
 import pytest
 
 from benchmarks import table
-from benchmarks.budget import Budget, parsed_seconds, side_by_side
 from benchmarks.table import Asked, Part, Row, Setting, allowance, rows_of, share_met
-from benchmarks.trial_log import Numbers, numbers_of
+from benchmarks.trials import Budget, go_on, parsed_seconds, side_by_side
+from limber.core.errors import InputError
 from limber.core.progress import SILENT
 
 
@@ -79,7 +80,7 @@ def test_tasks_of_one_worker_stop_as_trials_do(clock):
         clock.now += 4
         return task * task
     done = list(side_by_side(work, range(9), Budget(10, clock), workers=1))
-    assert done == [(0, 0), (1, 1)]
+    assert done == [0, 1]
 
 
 def _square(task: int) -> int:
@@ -89,30 +90,43 @@ def _square(task: int) -> int:
 @pytest.mark.slow
 def test_tasks_of_several_workers_give_their_results():
     """A clock that stands: all fit. One at its end: so many as there have to be."""
-    assert dict(side_by_side(_square, range(4), Budget(60), workers=2)) == {
-        task: task * task for task in range(4)}
-    assert dict(side_by_side(_square, range(4), Budget(-1), workers=2)) == {0: 0}
+    assert sorted(side_by_side(_square, range(4), Budget(60), workers=2)) == [0, 1, 4, 9]
+    assert list(side_by_side(_square, range(4), Budget(-1), workers=2)) == [0]
 
 
-def test_a_run_goes_on_with_kept_trials(clock, tmp_path):
-    """Kept trials cost nothing and count; those of another part, seed or source do not."""
+def test_a_run_goes_on_with_kept_trials(clock, tmp_path, monkeypatch):
+    """Kept trials cost nothing and count; those of another part or source, and a line that was cut
+    off, do not. What is not finite is infinite, however it was read."""
     made, kept = [], tmp_path / "trials.jsonl"
 
-    def trials(seconds: float, source: str = "now", part: str = "p") -> list[int]:
-        def work(seed: int) -> Numbers:
-            made.append(seed)
+    def trials(seconds: float, part: str = "p", at_least: int = 1) -> list[tuple[int, str]]:
+        def work(task: tuple[int, str]) -> dict:
+            made.append(task)
             clock.now += 3
-            return Numbers(part, seed, source, {"error": float("nan")})
-        return [each.seed for each in numbers_of(part, range(4, 9), work, source, kept,
-                                                 Budget(seconds, clock))]
-    assert trials(7) == [4, 5] == made
-    assert trials(7) == [4, 5, 6, 7] == made
-    assert trials(0) == [4, 5, 6, 7] == made
-    assert trials(0, source="later") == [4] and trials(0, part="q") == [4]
-    assert json.loads(kept.read_text().splitlines()[0])["values"] == {"error": None}
+            return {"error": float("nan"), "list": np.arange(2)}
+        tasks = [(seed, "a") for seed in range(4, 9)]
+        found = go_on(part, tasks, work, ("core",), kept, Budget(seconds, clock),
+                      at_least=at_least)
+        assert all(each["error"] == np.inf and each["list"] == [0, 1] for each in found)
+        return [each.task for each in found]
+    assert trials(7) == [(4, "a"), (5, "a")] == made
+    kept.write_text(kept.read_text() + "{\"part\"")
+    kept.write_text(kept.read_text() + "\n")
+    assert trials(7) == [(seed, "a") for seed in range(4, 8)] == made
+    assert trials(0) == made and trials(0, "q") == [(4, "a")]
+    monkeypatch.setattr("benchmarks.trials.source_digest", lambda packages: "later")
+    assert trials(0) == [(4, "a")] and trials(0, "r", 0) == []
     assert len(made) == 6
-    assert numbers_of("r", range(3), made.append, "now", kept, Budget(0, clock), at_least=0) == []
-    assert len(made) == 6
+
+
+def test_a_failure_that_is_expected_is_a_trial(clock, tmp_path):
+    """Others end the campaign; the text of an error of ours needs no name."""
+    def work(seed: int) -> dict:
+        raise (InputError("seen", "why", "do") if seed == 1 else ValueError("odd"))
+    one, other = go_on("p", [1, 2], work, (), tmp_path / "t", Budget(9, clock), catch=Exception)
+    assert one.failure.startswith("seen") and other.failure == "ValueError: odd"
+    with pytest.raises(ValueError, match="odd"):
+        go_on("p", [3], work, (), tmp_path / "t", Budget(9, clock), catch=InputError)
 
 
 def _part(seconds: float, *names: str, grows: bool = False, run=None, alone: bool = False) -> Part:

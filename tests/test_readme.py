@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 import pytest
 
-from benchmarks.worker_readme import shown_commands
+from benchmarks.worker import shown_commands
 from limber.cli.main import main
 from limber.stages.registry import stage_table
 

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from benchmarks import scan_runs, scans
-from benchmarks.budget import Budget
-from benchmarks.same_tree import _CHANGED, SameTreeRun
+from benchmarks import scan_scores, scans
+from benchmarks.real_scans import CHANGED, other_forks
 from benchmarks.scan_probabilities import fitted
-from benchmarks.scan_runs import CaseRun
 from benchmarks.scan_scores import fork_matches
 from benchmarks.table import Row, Setting
+from benchmarks.trials import Budget
 from limber.core.progress import SILENT
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -23,16 +22,14 @@ _SCORES = {"forks": 2, "forks_found": 2, "forks_false": 0, "centre_radii": 0.1, 
 
 
 def test_parts_take_what_other_parts_kept(monkeypatch, tmp_path) -> None:
-    """The root's row counts cases that two parts made before; other sources' are not taken."""
+    """The root's row counts cases that two parts made before."""
     made = []
 
-    def measured(kind: str, seed: int, out: object) -> CaseRun:
-        made.append((kind, seed))
-        far = {"main_axis_radii": np.inf} if seed % 2 else {}
-        return CaseRun(kind, seed, "now", _SCORES | far)
-    monkeypatch.setattr(scan_runs, "case_source", lambda: "now")
-    monkeypatch.setattr(scan_runs, "measured", measured)
-    monkeypatch.setattr("benchmarks.budget.core_budget", lambda: 1)
+    def scored(task: tuple[str, int], out: object) -> dict:
+        made.append(task)
+        return _SCORES | ({"main_axis_radii": np.inf} if task[1] % 2 else {})
+    monkeypatch.setattr(scan_scores, "scored_case", scored)
+    monkeypatch.setattr("benchmarks.trials.core_budget", lambda: 1)
 
     def rows(part: str, seconds: float = 60.0) -> list[Row]:
         return scans.PARTS[part].run(Setting(3, True, Budget(seconds), SILENT, tmp_path))
@@ -45,20 +42,20 @@ def test_parts_take_what_other_parts_kept(monkeypatch, tmp_path) -> None:
     gaps, = rows("gaps")
     again, = rows("gaps")
     assert gaps == again and gaps.measured.startswith("2 of 4 (worst inf")
-    monkeypatch.setattr(scan_runs, "case_source", lambda: "later")
-    rows("gaps")
-    assert len(made) == count + 8
     # Of cases for which there is no time a row says nothing.
-    monkeypatch.setattr(scan_runs, "case_source", lambda: "last")
+    (tmp_path / "trials.jsonl").unlink()
     assert [row.count for row in rows("probabilities", -1.0)] == [1, 1, 1]
 
 
 def test_a_case_that_fails_is_counted(monkeypatch, tmp_path) -> None:
     """Neither a refusal nor a crash ends the bench: the row is not met, and says so."""
-    monkeypatch.setattr(scan_runs, "run_case", lambda case, folder: 1 / 0)
-    run = scan_runs.measured("round", 5, None)
-    assert "ZeroDivisionError" in run.failure and not run.scores
-    row, = scans.gap_rows(scan_runs.Outcomes([dict(_SCORES)], [run.failure]))
+    monkeypatch.setattr(scan_scores, "run_case", lambda case, folder: (
+        (dict(_SCORES), None) if case.seed % 2 else 1 / 0))
+    monkeypatch.setattr("benchmarks.trials.core_budget", lambda: 1)
+    setting = Setting(3, True, Budget(60.0), SILENT, tmp_path)
+    found = scan_scores.outcomes(setting, {"gaps": 2})["gaps"]
+    assert "ZeroDivisionError" in found.failed[0] and len(found.scores) == 1
+    row, = scans.gap_rows(found)
     assert row.met is False and "1 not reconstructed" in row.measured
 
 
@@ -92,13 +89,13 @@ def test_the_fit_of_probabilities_finds_the_odds_that_made_them() -> None:
     assert found[2] == 0
 
 
-@pytest.mark.parametrize("change", list(_CHANGED))
+@pytest.mark.parametrize("change", list(CHANGED))
 def test_a_changed_scan_goes_back_to_the_original(change: str) -> None:
     """Its points, taken back, are the original's; the root that the user states moves along."""
     rng = np.random.default_rng(5)
     points = rng.normal(size=(400, 3)) * [0.1, 0.1, 0.5]
     settings = {"up": (0.0, 0.1, 1.0), "root": tuple(points[7].tolist())}
-    cloud, changed, back = _CHANGED[change](Cloud(points), settings, rng)
+    cloud, changed, back = CHANGED[change](Cloud(points), settings, rng)
     away, _ = cKDTree(points).query(back(cloud.points))
     added = {"outliers": 4, "ground": 200}.get(change, 0)
     assert (away < 1e-9).sum() == len(cloud) - added
@@ -108,8 +105,8 @@ def test_a_changed_scan_goes_back_to_the_original(change: str) -> None:
 
 
 def test_forks_of_two_trees_are_compared_with_their_probabilities() -> None:
-    one = SameTreeRun("a", "b", 0, "", forks=[[0, 0, 0, 0.01, 0.99], [0, 0, 1, 0.01, 0.7]])
-    other = SameTreeRun("a", "c", 0, "", forks=[[0, 0.02, 0, 0.01, 0.95], [0, 1, 0, 0.01, 0.9]])
-    assert one.other_forks(other) == (2, 1)
-    assert one.other_forks(one) == (0, 0)
-    assert one.other_forks(SameTreeRun("a", "d", 0, "")) == (2, 1)
+    one = [[0, 0, 0, 0.01, 0.99], [0, 0, 1, 0.01, 0.7]]
+    other = [[0, 0.02, 0, 0.01, 0.95], [0, 1, 0, 0.01, 0.9]]
+    assert other_forks(one, other) == (2, 1)
+    assert other_forks(one, one) == (0, 0)
+    assert other_forks(one, []) == (2, 1)

@@ -3,18 +3,23 @@
 import numpy as np
 import pytest
 
-from benchmarks.scan_runs import Outcomes
-from benchmarks.worlds.degraded import DEGRADED
-from benchmarks.worlds.plant import Plant, pipe_radii
-from benchmarks.worlds.ray_casting import cast
-from benchmarks.worlds.real_scans import beyond_ends
-from benchmarks.worlds.rows import potted_rows, source_rows
+from benchmarks.real_scans import DEGRADED, beyond_ends
+from benchmarks.scan_scores import Outcomes
+from benchmarks.scans import potted_rows, source_rows
+from benchmarks.trials import Trial
+from benchmarks.worlds.plants import Plant, pipe_radii
+from benchmarks.worlds.sensors import cast
 from benchmarks.worlds.sources import SOURCES, WORLDS
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 
 _GOOD = {"forks": 2, "forks_found": 2, "forks_false": 0, "twig_m": 1.0, "twig_found_m": 0.97,
          "twig_false_m": 0.0, "radius_bias": 0.01, "volume": 0.02, "covered": 0.95,
          "length_held": True, "recall": 0.97, "right": 0.99}
+
+
+def _outcomes(scores: list[dict], *failed: str) -> Outcomes:
+    return Outcomes([*(Trial("cases", ("round", 1), "now", dict(each)) for each in scores),
+                     *(Trial("cases", ("round", 2), "now", {}, why) for why in failed)])
 
 
 def _bar(length: float = 0.5, radius: float = 0.01) -> Plant:
@@ -87,14 +92,13 @@ def test_one_side_of_a_bar_is_seen() -> None:
     seen = DEGRADED["one-sided"](points, rng)
     assert 0.3 < len(seen) / len(points) < 0.6
     assert np.linalg.norm(seen[:, :2].mean(axis=0)) > 0.02
-    assert len(DEGRADED["half"](points, rng)) == 2000
     assert DEGRADED["noisy"](points, rng).shape == points.shape
 
 
 def test_a_row_is_met_only_if_all_of_it_is() -> None:
     """Intervals that hold too little, or one refused case, are not met."""
     def met(scores: list[dict], failed: tuple[str, ...] = ()) -> bool | None:
-        row, = source_rows("opposite", "round", Outcomes(scores, list(failed)))
+        row, = source_rows("opposite", "round", _outcomes(scores, *failed))
         assert row.count == len(scores) + len(failed)
         return row.met
 
@@ -102,8 +106,8 @@ def test_a_row_is_met_only_if_all_of_it_is() -> None:
     assert met([_GOOD, _GOOD | {"covered": 0.4}]) is False
     assert met([_GOOD] * 3, ("refused",)) is False
     assert met([_GOOD | {"twig_false_m": 0.2}]) is False
-    named, = potted_rows([Outcomes([], ["a stake at (0, 0, 0)"])])
-    unnamed, = potted_rows([Outcomes([], ["46 % are leaves"])])
+    named, = potted_rows([_outcomes([], "a stake at (0, 0, 0)")])
+    unnamed, = potted_rows([_outcomes([], "46 % are leaves")])
     assert named.met is True and unnamed.met is False
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.reduced_motion import simulate_reduced
+from benchmarks.mechanics_reduced import simulate_reduced
 from limber.core.errors import InputError
 from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel, Grasp, RayleighDamping, solve_static

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks.scan_cases import KINDS
 from benchmarks.scan_probabilities import OWN
-from benchmarks.scan_runs import KINDS
 from benchmarks.worlds.sources import BARE_VIEWS, SOURCES, WORLDS
 from limber.geometry.cloud.cloud import Cloud, OwnFrame, thinned
 from limber.geometry.cloud.leaves import TREES, leaves_by_odds, point_spacing, surroundings

@@ -22,6 +22,8 @@ _TOGETHER_SECONDS = 0.06
 _MEANWHILE_SECONDS = 10.0
 """Longest delay of a failure after its cause: a loop of minutes has seen many stalls."""
 _MOST_AGAIN = 3
+FAILURES = (AssertionError, LimberError)
+"""Of a run of a virtual robot."""
 _Result = TypeVar("_Result")
 
 _WATCHING = """
@@ -135,7 +137,7 @@ class Voided:
             began = time.monotonic()
             try:
                 return run()
-            except (AssertionError, LimberError) as error:
+            except FAILURES as error:
                 longest = self._witness.longest(
                     max(began, time.monotonic() - _MEANWHILE_SECONDS))
                 if longest < HELD_UP_SECONDS:

@@ -8,42 +8,53 @@ continues with them. Starts take turns over all branches, so that even a part of
 all.
 """
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
-from benchmarks.planning_branches import ARC_NAMES, Subject, arcs, forked
-from benchmarks.planning_confidence import SURE_ROW, Sure, run_sure, sure_rows
-from benchmarks.planning_detours import DETOUR_ROWS, Detour, detour_rows, run_detour
-from benchmarks.planning_goals import GOAL_ROWS, RegionGoal, goal_rows, run_region_goal
-from benchmarks.planning_limits import (
+from benchmarks.planning_trials import (
+    AGAINST,
+    ARC_NAMES,
     COVERED_ROW,
+    DETOUR_ROWS,
+    GOAL_ROWS,
     LIMITED,
     NEAR_ROWS,
-    NearLimit,
+    SURE_ROW,
+    Start,
+    Subject,
+    arcs,
     coverage,
     covered_row,
+    detour_rows,
+    forked,
+    goal_rows,
     near_rows,
+    no_path_seconds,
+    run_detour,
     run_near_limit,
+    run_region_goal,
+    run_sure,
+    run_trial,
+    saved_and_added,
+    spread,
+    sure_rows,
 )
-from benchmarks.planning_trials import Trial, no_path_seconds, run_trial
 from benchmarks.table import Asked, Part, Row, Setting
-from benchmarks.trial_log import go_on, read_trials, source_digest
+from benchmarks.trials import Trial, column, sound, source_digest
 from limber.core.errors import LimberError
-from limber.core.json_values import plain
 from limber.core.progress import Progress
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.reduced_grasp import LearntGraspModel
 from limber.planning.field.sampling import Sampled, sample_field, sample_positions
-from limber.planning.goals.goal_kinds import GraspGoal, default_goal
+from limber.planning.goals.goal_kinds import default_goal
 from limber.planning.settings import EnergySettings
 from limber.reduced.model_cache import ReducedCache
 
@@ -52,9 +63,7 @@ _ERRORS = (("energy", "energy", 100, (1, 5), "%"), ("force", "force", 100, (2, 8
 """Errors of a field at fresh poses: name, description, scale, required median and 95 %, unit."""
 _SEEDS_APART = 101  # of a branch's starts
 _TIMED_STARTS = 3  # of each branch, where only times are asked
-_Start = tuple[str, int, int]
-"""Branch, number, seed."""
-_Kept = TypeVar("_Kept", Trial, Detour, NearLimit, RegionGoal)
+_PACKAGES = ("planning", "mechanics")
 
 
 @dataclass(frozen=True)
@@ -82,7 +91,6 @@ class _Fielded:
 
     subject: Subject
     known: EnergyField
-    goal: GraspGoal
     seconds: float
     all_seconds: float
     fresh: _Fresh
@@ -103,14 +111,6 @@ class _Run:
         self._share = share
 
     @property
-    def starts(self) -> int:
-        return self.setting.at_most(10, 3)
-
-    @property
-    def draws(self) -> int:
-        return self.setting.at_most(100, 30)
-
-    @property
     def largest(self) -> Subject:
         """The forked branch with the most tetrahedra."""
         return max(_forked(self.setting.seed, self.setting.at_most(3, 1)),
@@ -129,7 +129,9 @@ class _Run:
         half = (len(subjects) + 1) // 2
         budget = setting.budget.part(self._share * setting.budget.remaining)
         for number in sorted(range(len(subjects)), key=lambda k: (k % half, k)):
-            name, kept = subjects[number].name, self._field_file(subjects[number].name)
+            name = subjects[number].name
+            kept = setting.kept / (f"field-{setting.seed}-{setting.at_most(40, 15)}-"
+                                   f"{name.replace(' ', '-')}-{_field_source()}.npz")
             if found and not kept.is_file() and budget.remaining <= longest:
                 continue
             part = setting.progress.part(0.5 * len(found) / len(subjects),
@@ -145,28 +147,30 @@ class _Run:
             raise RuntimeError(f"no branch of the bench has a field: {'; '.join(self.failed)}")
         return found
 
-    def _field_file(self, name: str) -> Path:
-        setting = self.setting
-        return setting.kept / (f"field-{setting.seed}-{setting.at_most(40, 15)}-"
-                               f"{name.replace(' ', '-')}-{_field_source()}.npz")
+    def trials(self, part: str, work: Callable[[Start], dict[str, Any]], count: int,
+               names: tuple[str, ...] = ()) -> list[Trial]:
+        """Trials of ``count`` starts of each branch with a field, or of those named, in turn over
+        the branches: as many as there is time for. Their tasks are branch, number and seed.
+        """
+        fields = {one.subject.name: one for one in self.fielded}
+        seeds = {(name, number): _own_seed(self.setting.seed, k, number)
+                 for number in range(count) for k, name in enumerate(fields)
+                 if name in (names or fields)}
 
-    def kept(self, what: str) -> Path:
-        return self.setting.kept / f"planning-{what}.jsonl"
-
-    def starts_of(self, wanted: Callable[[str], bool], starts: int) -> dict[_Start, _Fielded]:
-        """The starts of branches with a field, in turn over the branches."""
-        return {(one.subject.name, number, _own_seed(self.setting.seed, k, number)): one
-                for number in range(starts) for k, one in enumerate(self.fielded)
-                if wanted(one.subject.name)}
-
-
-def _source() -> str:
-    return source_digest(("planning", "mechanics"), *Path(__file__).parent.glob("planning*.py"))
+        def start(task: tuple[str, int, int]) -> Start:
+            name, number, seed = task
+            # One goal for each of the quantities that take turns.
+            return Start(fields[name].subject, fields[name].known, number, seed,
+                         seed - _SEEDS_APART * (number % len(LIMITED)))
+        return self.setting.trials(
+            part, [(*which, seed) for which, seed in seeds.items()], work, *_PACKAGES,
+            workers=None, catch=LimberError, given=start,
+            progress=self.setting.progress.part(0.5, 1.0))
 
 
+@cache
 def _field_source() -> str:
-    return source_digest(("planning/field", "mechanics"),
-                         Path(__file__).parent / "planning_branches.py")
+    return source_digest(("planning/field", "mechanics"))
 
 
 @cache
@@ -183,7 +187,7 @@ def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, fresh
             fresh = _Fresh(*file["fresh"])
             times = float(file["seconds"]), float(file["all_seconds"])
             lost = float(file["lost"])
-        return _Fielded(subject, known, default_goal(known, 0.01), *times, fresh, lost)
+        return _Fielded(subject, known, *times, fresh, lost)
     began = time.perf_counter()
     sampled, known, seconds = _timed_field(subject.model, settings, progress.part(0.0, 0.7))
     fresh, lost = _fresh(subject.model, known, sampled, settings, fresh_count, fresh_seed,
@@ -193,7 +197,7 @@ def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, fresh
     known.write(written, {"seconds": np.array(times[0]), "all_seconds": np.array(times[1]),
                          "lost": np.array(lost), "fresh": np.array(list(asdict(fresh).values()))})
     written.replace(kept)
-    return _Fielded(subject, known, default_goal(known, 0.01), *times, fresh, lost)
+    return _Fielded(subject, known, *times, fresh, lost)
 
 
 def _timed_field(model: GraspModel, settings: EnergySettings, progress: Progress,
@@ -228,135 +232,51 @@ def _fresh(model: GraspModel, known: EnergyField, sampled: Sampled, settings: En
     return _Fresh(*errors), lost
 
 
-def _trials(run: _Run, starts: int, kept: Path | None, limited: bool = True,
-            ) -> dict[str, list[Trial]]:
-    """Trials of as many starts as there is time for, by branch."""
-    found: dict[str, list[Trial]] = {one.subject.name: [] for one in run.fielded}
-    for trial in _planned(run, Trial, partial(_trial_of, limited=limited), kept,
-                          run.starts_of(lambda _: True, starts)):
-        found[trial.branch].append(trial)
-    return {name: trials for name, trials in found.items() if trials}
-
-
-def _trial_of(task: tuple[_Start, GraspModel, EnergyField, GraspGoal], source: str,
-              limited: bool) -> Trial:
-    (name, number, own), model, known, goal = task
-    return run_trial(model, known, goal, number, own, branch=name, source=source, limited=limited)
-
-
-def _detours(run: _Run) -> list[Detour]:
-    """Plan on the paper's arcs within the paper's detour, from the starts of the trials."""
-    return _planned(run, Detour, _detour_of, run.kept("detours"),
-                    run.starts_of(ARC_NAMES.__contains__, run.starts))
-
-
-def _detour_of(task: tuple[_Start, GraspModel, EnergyField, GraspGoal], source: str) -> Detour:
-    (name, number, own), _, known, goal = task
-    return run_detour(known, goal, number, own, branch=name, source=source)
-
-
-def _near_limits(setting: Setting) -> list[Row]:
-    """Limits near the feasible ones, on all branches in turn, as many as there is time for."""
-    run = _Run(setting)
-    return near_rows(_planned(run, NearLimit, _near_limit_of, run.kept("near-limits"),
-                              run.starts_of(lambda _: True, setting.at_most(34, 2))))
-
-
-def _near_limit_of(task: tuple[_Start, GraspModel, EnergyField, GraspGoal], source: str,
-                   ) -> NearLimit:
-    (name, number, own), model, known, _ = task
-    # One goal for each of the limited quantities, on which the numbers take turns.
-    goal_seed = own - _SEEDS_APART * (number % len(LIMITED))
-    return run_near_limit(model, known, number, own, goal_seed, branch=name, source=source)
-
-
-def _region_goals(setting: Setting) -> list[Row]:
-    """Goals in regions of each kind, on all branches in turn, as many as there is time for."""
-    run = _Run(setting)
-    return goal_rows(_planned(run, RegionGoal, _region_goal_of, run.kept("goals"),
-                              run.starts_of(lambda _: True, setting.at_most(12, 2))))
-
-
-def _region_goal_of(task: tuple[_Start, GraspModel, EnergyField, GraspGoal], source: str,
-                    ) -> RegionGoal:
-    (name, number, own), model, known, _ = task
-    return run_region_goal(model, known, number, own, branch=name, source=source)
-
-
-def _stated_errors(setting: Setting) -> list[Row]:
-    return [covered_row([coverage(one.subject.model, one.known, setting.at_most(60, 20),
-                                  setting.seed + 7) for one in _Run(setting).fielded])]
-
-
-def _planned(run: _Run, kind: type[_Kept], work: Callable, kept: Path | None,
-             starts: dict[_Start, _Fielded]) -> list[_Kept]:
-    """Trials of starts, kept ones included, as many as there is time for."""
-    setting, source = run.setting, _source()
-
-    def with_models(missing: list[_Start]) -> list[tuple]:
-        return [(start, one.subject.model, one.known, one.goal) for start in missing
-                for one in [starts[start]]]
-    return go_on(read_trials(kind, kept), list(starts),
-                 lambda each: (each.branch, each.number, each.seed), partial(work, source=source),
-                 source, kept, setting.budget, None, setting.progress.part(0.5, 1.0), with_models)
-
-
-def _sure(run: _Run) -> list[Sure]:
-    """Plan with confidence on each branch from rest, and test the plan on draws of the moduli."""
-    setting, source, kept = run.setting, _source(), run.kept("sure")
-    by_name = {one.subject.name: one for one in run.fielded}
-    tasks = [(name, setting.seed) for name in by_name]
-
-    def with_models(missing: list[tuple[str, int]]) -> list[tuple]:
-        return [(by_name[name].subject, by_name[name].known, by_name[name].goal)
-                for name, _ in missing]
-    return go_on(read_trials(Sure, kept), tasks, lambda each: (each.branch, each.seed), partial(
-        _sure_of, draws=run.draws, seed=setting.seed, source=source), source, kept,
-        setting.budget, None, setting.progress.part(0.5, 1.0), with_models)
-
-
-def _sure_of(task: tuple[Subject, EnergyField, GraspGoal], draws: int, seed: int,
-             source: str) -> Sure:
-    return run_sure(*task, draws, seed, source)
-
-
 def _own_seed(seed: int, branch: int, number: int) -> int:
     """The seed of a start follows from the base seed, the branch and the start's number."""
     return (seed + 1009 * branch + _SEEDS_APART * number) % (1 << 31)
 
 
-def _saved_rows(trials: dict[str, list[Trial]]) -> list[Row]:
-    good = [t for some in trials.values() for t in some if t.saved]
+def _troubles(trials: list[Trial]) -> str:
+    return "; ".join(f"{one.task[0]} {one.task[1]}: {one.failure}" for one in trials if one.failure)
+
+
+def _trial_rows(setting: Setting) -> list[Row]:
+    trials = _Run(setting).trials("plans", run_trial, setting.at_most(10, 3))
+    return [*_bound_rows(trials), *_time_rows(trials), *_full_rows(trials),
+            *_saved_rows(sound(trials))]
+
+
+def _plan_time(setting: Setting) -> list[Row]:
+    """The times of plans alone, of three starts per branch."""
+    return _time_rows(_Run(setting).trials("timed plans", partial(run_trial, limited=False),
+                                           _TIMED_STARTS))
+
+
+def _saved_rows(good: list[Trial]) -> list[Row]:
     table = []
-    for name in _AGAINST:
-        saved = [t.saved[name] for t in good if t.number > 0 and name in t.saved]
-        added = [t.added[name] for t in good if t.number > 0 and name in t.saved]
-        table.append(Row(
-            *_saved_asked(name), f"{np.mean(saved):.1f} %, {np.mean(added):.1f} % longer"
-            if saved else "none", None, len(saved)))
-    rest = [t.saved["straight line"] for t in good if t.number == 0]
-    table.append(Row(*_FROM_REST, ", ".join(f"{value:.1f}" for value in rest) + " %", None,
-                     len(rest)))
-    return table
+    for asked, name in zip(_SAVED, AGAINST, strict=True):
+        saved, added = saved_and_added([one for one in good if one.task[1] > 0], name)
+        table.append(Row(*asked, f"{np.mean(saved):.1f} %, {np.mean(added):.1f} % longer"
+                         if saved else "none", None, len(saved)))
+    rest = [one["saved"]["straight line"] for one in good if one.task[1] == 0]
+    return [*table, Row(*_FROM_REST, ", ".join(f"{value:.1f}" for value in rest) + " %", None,
+                        len(rest))]
 
 
-def _bound_rows(trials: dict[str, list[Trial]]) -> list[Row]:
-    every = [t for some in trials.values() for t in some]
-    good = [t for t in every if np.isfinite(t.gap)]
+def _bound_rows(trials: list[Trial]) -> list[Row]:
+    good = sound(trials)
     if not good:
-        return [Row(*asked, _troubles(trials), False, len(every)) for asked in _BOUND_ROWS]
-    gaps = 100.0 * np.array([t.gap for t in good])
-    tree = np.array([t.tree_to_optimum for t in good if np.isfinite(t.tree_to_optimum)])
-    ratio = np.array([t.to_optimum for t in good if np.isfinite(t.to_optimum)])
-    below = np.array([t.bound_to_optimum for t in good if np.isfinite(t.bound_to_optimum)])
+        return [Row(*asked, _troubles(trials), False, len(trials)) for asked in _BOUND_ROWS]
+    gaps, ratio, below, tree = (column(good, name) for name in (
+        "gap", "to_optimum", "bound_to_optimum", "tree_to_optimum"))
+    gaps, tree = 100 * gaps, 100 * (tree[np.isfinite(tree)] - 1)
     return [
-        Row(*_BOUND_ROWS[0], _troubles(trials) or "100 %", all(not t.trouble for t in every),
-            len(every)),
-        Row(*_BOUND_ROWS[1], f"{np.median(gaps):.2f} / {gaps.max():.2f} %",
+        Row(*_BOUND_ROWS[0], _troubles(trials) or "100 %", len(good) == len(trials), len(trials)),
+        Row(*_BOUND_ROWS[1], spread(gaps, " %", 2),
             bool(np.median(gaps) <= 1.5 and gaps.max() <= 3.0), len(gaps)),
-        Row(*_BOUND_ROWS[2], f"{100 * np.median(tree - 1):.1f} / {100 * (tree.max() - 1):.1f} %, "
-            f"{(tree <= 1.02).sum()} of {len(tree)} within" if len(tree) else "none",
-            bool(len(tree) and np.median(tree) <= 1.02), len(tree)),
+        Row(*_BOUND_ROWS[2], f"{spread(tree, ' %')}, {(tree <= 2).sum()} of {len(tree)} within"
+            if len(tree) else "none", bool(len(tree) and np.median(tree) <= 2), len(tree)),
         Row(*_BOUND_ROWS[3],
             f"{100 * (ratio.max() - 1):.3f} % (best {100 * (ratio.min() - 1):.3f} %)",
             bool(ratio.max() <= 1.01), len(ratio)),
@@ -364,33 +284,28 @@ def _bound_rows(trials: dict[str, list[Trial]]) -> list[Row]:
             bool(below.max() <= 1.0 + 1e-9), len(below))]
 
 
-def _time_rows(trials: dict[str, list[Trial]]) -> list[Row]:
-    good = [t for some in trials.values() for t in some if np.isfinite(t.check_seconds)]
+def _time_rows(trials: list[Trial]) -> list[Row]:
+    good = sound(trials)
     if not good:
-        return [Row(*asked, _troubles(trials), False, sum(map(len, trials.values())))
-                for asked in _TIME_ROWS]
-    seconds = np.array([t.seconds for t in good])
-    soon = np.array([t.seconds_to_close for t in good])
-    checks = np.array([t.check_seconds for t in good])
+        return [Row(*asked, _troubles(trials), False, len(trials)) for asked in _TIME_ROWS]
+    seconds, soon, checks = (column(good, name) for name in (
+        "seconds", "seconds_to_close", "check_seconds"))
+    in_time = soon[np.isfinite(soon)]
     return [
-        Row(*_TIME_ROWS[0], f"{np.median(seconds):.1f} / {seconds.max():.1f} s",
-            bool(seconds.max() <= 10.0), len(good)),
-        Row(*_TIME_ROWS[1],
-            f"{np.nanmedian(soon):.1f} / {np.nanmax(soon):.1f} s, {np.isnan(soon).sum()} never",
-            bool(np.median(soon) <= 1.0), len(good)),
-        Row(*_TIME_ROWS[2], f"{np.median(checks):.1f} / {checks.max():.1f} s",
-            bool(checks.max() <= 10.0), len(good))]
+        Row(*_TIME_ROWS[0], spread(seconds, " s"), bool(seconds.max() <= 10.0), len(good)),
+        Row(*_TIME_ROWS[1], f"{spread(in_time, ' s') if len(in_time) else 'none'}, "
+            f"{len(soon) - len(in_time)} never", bool(np.median(soon) <= 1.0), len(good)),
+        Row(*_TIME_ROWS[2], spread(checks, " s"), bool(checks.max() <= 10.0), len(good))]
 
 
 def _field_rows(setting: Setting) -> list[Row]:
     run = _Run(setting, share=1.0)
     fielded, table = run.fielded, []
-    for name, what, scale, asked, unit in _ERRORS:
+    for row, (name, _, scale, asked, unit) in zip(_FIELD_ERRORS, _ERRORS, strict=True):
         worst = max(fielded, key=lambda one: np.nanquantile(getattr(one.fresh, name), 0.95))
         there = scale * np.nanquantile(getattr(worst.fresh, name), 0.95)
         table.append(_error_row(
-            _error_asked(what, asked, unit), np.concatenate(
-                [getattr(one.fresh, name) for one in fielded]), scale, asked,
+            row, np.concatenate([getattr(one.fresh, name) for one in fielded]), scale, asked,
             unit, f" (worst {worst.subject.name}: {there:.2g})"))
     slowest = max(fielded, key=lambda one: one.seconds)
     table.append(_cost_row(_FIELD_COST, slowest.subject, slowest.known, slowest.seconds, 25.0))
@@ -423,34 +338,30 @@ def _cost_row(row: Asked, subject: Subject, known: EnergyField, seconds: float, 
                f"{scaled:.0f} s scaled{more})", scaled <= asked)
 
 
-def _full_rows(trials: dict[str, list[Trial]]) -> list[Row]:
-    every = [t for some in trials.values() for t in some]
-    good = [t for t in every if np.isfinite(t.check_seconds)]
-    accepted = [t for t in every if t.limited.startswith("accepted")]
-    again = sum("after 1" not in t.limited for t in accepted)
-    refused = [t.limited for t in every if t.limited.startswith("refused")]
-    broken = [t.excess for t in accepted if not t.excess <= 1e-3]
-    errors = [t.field_error for t in good] or [np.nan]
-    first = [t.first_field_error for t in good] or [np.nan]
-    moving = [t.moving_seconds for t in accepted if np.isfinite(t.moving_seconds)] or [np.nan]
+def _full_rows(trials: list[Trial]) -> list[Row]:
+    good = sound(trials)
+    accepted = [one for one in good if "accepted_after" in one.values]
+    refused = [one["refused"] for one in good if "refused" in one.values]
+    again = sum(one["accepted_after"] > 1 for one in accepted)
+    broken = [one["excess"] for one in accepted if not one["excess"] <= 1e-3]
+    errors, first, rounds = (column(good, name) if good else np.full(1, np.nan) for name in (
+        "field_error", "first_field_error", "rounds"))
+    moving, ratio = (column(accepted, name) if accepted else np.full(1, np.nan) for name in (
+        "moving_seconds", "moving_ratio"))
     return [
-        Row(*_FULL_ROWS[0],
-            f"{np.median(moving):.1f} / {np.max(moving):.1f} s; "
-            f"{sum(t.slowings > 0 for t in accepted)} of {len(accepted)} slowed down, force at "
-            f"most {np.max([t.moving_ratio for t in accepted] or [np.nan]):.3f} of the limit",
-            bool(np.max(moving) <= 10.0), len(accepted)),
-        Row(*_FULL_ROWS[2],
-            f"{100 * np.median(errors):.2f} / {100 * np.max(errors):.2f} %, before samples were "
-            f"added {100 * np.median(first):.2f} / {100 * np.max(first):.2f} %; "
-            f"{np.mean([t.rounds for t in good] or [0]):.1f} rounds", None, len(good)),
+        Row(*_FULL_ROWS[0], f"{spread(moving, ' s')}; "
+            f"{sum(one['slowings'] > 0 for one in accepted)} of {len(accepted)} slowed down, force "
+            f"at most {ratio.max():.3f} of the limit", bool(moving.max() <= 10.0), len(accepted)),
+        Row(*_FULL_ROWS[2], f"{spread(100 * errors, ' %', 2)}, before samples were added "
+            f"{spread(100 * first, ' %', 2)}; {rounds.mean():.1f} rounds", None, len(good)),
         Row(*_FULL_ROWS[1],
             f"{len(broken)} of {len(accepted)} accepted ({again} planned anew), "
             f"{len(refused)} refused" + (f"; worst {100 * max(broken):+.2f} %" if broken else "")
-            + (f"; {refused[0]}" if refused else ""), bool(accepted) and not broken, len(every))]
+            + (f"; {refused[0]}" if refused else ""), bool(accepted) and not broken, len(trials))]
 
 
 def _no_path_rows(setting: Setting) -> list[Row]:
-    found = {one.subject.name: no_path_seconds(one.known, one.goal)
+    found = {one.subject.name: no_path_seconds(one.known, default_goal(one.known, 0.01))
              for one in _Run(setting).fielded}
     slowest = max(seconds for cases in found.values() for seconds, _ in cases.values())
     wrong = [f"{name}, {word}: {said}" for name, cases in found.items()
@@ -460,31 +371,15 @@ def _no_path_rows(setting: Setting) -> list[Row]:
         f"; {one}" for one in wrong), not wrong and slowest <= 10.0, count)]
 
 
-def _troubles(trials: dict[str, list[Trial]]) -> str:
-    return "; ".join(f"{name} {t.number}: {t.trouble}" for name, some in trials.items()
-                     for t in some if t.trouble)
+def _stated_errors(setting: Setting) -> list[Row]:
+    return [covered_row([coverage(one.subject.model, one.known, setting.at_most(60, 20),
+                                  setting.seed + 7) for one in _Run(setting).fielded])]
 
 
-def _trial_rows(setting: Setting) -> list[Row]:
-    run = _Run(setting)
-    trials = _trials(run, run.starts, run.kept("trials"))
-    if setting.out is not None:
-        raw = {one.subject.name: {
-            "field_seconds": one.seconds, "errors": one.known.errors, "goal": one.goal.describe(),
-            "fresh": asdict(one.fresh),
-            "trials": [asdict(t) for t in trials.get(one.subject.name, ())],
-        } for one in run.fielded}
-        (setting.out / "planning.json").write_text(json.dumps(plain(raw), indent=1))
-    return [*_bound_rows(trials), *_time_rows(trials), *_full_rows(trials), *_saved_rows(trials)]
-
-
-def _detour_table(setting: Setting) -> list[Row]:
-    return detour_rows(_detours(_Run(setting)))
-
-
-def _sure_table(setting: Setting) -> list[Row]:
-    run = _Run(setting)
-    return sure_rows(_sure(run), run.draws)
+def _sure(setting: Setting) -> list[Row]:
+    """Plan with confidence on each branch from rest, and test the plan on draws of the moduli."""
+    draws = setting.at_most(100, 30)
+    return sure_rows(_Run(setting).trials("sure", partial(run_sure, draws=draws), 1), draws)
 
 
 def _field_time(setting: Setting) -> list[Row]:
@@ -511,18 +406,8 @@ def _reduced_time(setting: Setting) -> list[Row]:
     reduced, whole = int(known.samples.reduced.sum()), len(known.samples.poses)
     return [_cost_row(_REDUCED_COST, largest, known, reading + seconds, 5.0,
                       f"; learnt in {learning:.0f} s; {reduced} of {whole} poses by it"),
-            *(_error_row(_error_asked(f"{what}, field on the reduced model", asked, unit),
-                         getattr(fresh, name), scale, asked, unit)
-              for name, what, scale, asked, unit in _ERRORS)]
-
-
-def _plan_time(setting: Setting) -> list[Row]:
-    """The times of plans alone, of three starts per branch."""
-    return _time_rows(_trials(_Run(setting), _TIMED_STARTS, None, limited=False))
-
-
-def _saved_asked(name: str) -> Asked:
-    return Asked(f"random starts, default weights: saved against {name}", "-")
+            *(_error_row(row, getattr(fresh, name), scale, asked, unit) for row, (
+                name, _, scale, asked, unit) in zip(_REDUCED_ERRORS, _ERRORS, strict=True))]
 
 
 def _error_asked(what: str, asked: tuple[float, float], unit: str) -> Asked:
@@ -530,7 +415,8 @@ def _error_asked(what: str, asked: tuple[float, float], unit: str) -> Asked:
                  f"{asked[0]} / {asked[1]} {unit}")
 
 
-_AGAINST = ("RRT*, not smoothed", "RRT*", "straight line")
+_SAVED = tuple(Asked(f"random starts, default weights: saved against {name}", "-")
+               for name in AGAINST)
 _FROM_REST = Asked("from rest, all branches: saved against the straight line", "-")
 _BOUND_ROWS = (
     Asked("success where a path exists", "100 %"),
@@ -558,21 +444,25 @@ _NOT_TRUSTED = Asked("of the samples' hull not trusted, mean / most; fresh trust
 _NO_PATH = Asked("no path: force too low for the goal, goal outside the workspace",
                  "said with its reason, in 10 s")
 
+_FIELD_ERRORS = tuple(_error_asked(what, asked, unit) for _, what, _, asked, unit in _ERRORS)
+_REDUCED_ERRORS = tuple(_error_asked(f"{what}, field on the reduced model", asked, unit)
+                        for _, what, _, asked, unit in _ERRORS)
+
 PARTS = {
-    "field": Part(_field_rows, 120, (
-        *(_error_asked(what, asked, unit) for _, what, _, asked, unit in _ERRORS), _FIELD_COST,
-        _REST_INSIDE, _WITHOUT_FIELD, _NOT_TRUSTED), grows=True),
-    "detours": Part(_detour_table, 100, DETOUR_ROWS, grows=True),
-    "trials": Part(_trial_rows, 150, (*_BOUND_ROWS, *_TIME_ROWS, *_FULL_ROWS, *map(
-        _saved_asked, _AGAINST), _FROM_REST), grows=True),
-    "near-limits": Part(_near_limits, 150, NEAR_ROWS, grows=True),
-    "goals": Part(_region_goals, 150, GOAL_ROWS, grows=True),
+    "field": Part(_field_rows, 120, (*_FIELD_ERRORS, _FIELD_COST, _REST_INSIDE, _WITHOUT_FIELD,
+                                     _NOT_TRUSTED), grows=True),
+    "detours": Part(lambda setting: detour_rows(_Run(setting).trials(
+        "detours", run_detour, setting.at_most(10, 3), ARC_NAMES)), 100, DETOUR_ROWS, grows=True),
+    "trials": Part(_trial_rows, 150, (*_BOUND_ROWS, *_TIME_ROWS, *_FULL_ROWS, *_SAVED, _FROM_REST),
+                   grows=True),
+    "near-limits": Part(lambda setting: near_rows(_Run(setting).trials(
+        "near limits", run_near_limit, setting.at_most(34, 2))), 150, NEAR_ROWS, grows=True),
+    "goals": Part(lambda setting: goal_rows(_Run(setting).trials(
+        "goals", run_region_goal, setting.at_most(12, 2))), 150, GOAL_ROWS, grows=True),
     "stated-errors": Part(_stated_errors, 60, (COVERED_ROW,), grows=True),
     "no-path": Part(_no_path_rows, 80, (_NO_PATH,), grows=True),
-    "sure": Part(_sure_table, 120, (SURE_ROW,), grows=True),
-    "reduced": Part(_reduced_time, 200, (_REDUCED_COST, *(
-        _error_asked(f"{what}, field on the reduced model", asked, unit)
-        for _, what, _, asked, unit in _ERRORS))),
+    "sure": Part(_sure, 120, (SURE_ROW,), grows=True),
+    "reduced": Part(_reduced_time, 200, (_REDUCED_COST, *_REDUCED_ERRORS)),
     "field-time": Part(_field_time, 60, (_FIELD_ALONE,), alone=True),
     "plan-time": Part(_plan_time, 60, _TIME_ROWS, grows=True, alone=True)}
 """The table, in order of importance; the last two only repeat timings of others, for an otherwise

@@ -8,12 +8,22 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from benchmarks import robot_faults
-from benchmarks.machine_stalls import Voided, Witness
-from benchmarks.robot_branches import FOLLOWED_ROWS, LOST_ROW, followed_paths, lost_branches
+from benchmarks.machine_stalls import FAILURES, Voided, Witness
+from benchmarks.robot_branches import (
+    FOLLOWED_ROWS,
+    LEAST_STREAM_S,
+    LOOP_ROWS,
+    LOST_ROW,
+    STREAM_ROWS,
+    closed_loops,
+    followed_paths,
+    lost_branches,
+    recorded_stream,
+)
 from benchmarks.robot_calibration import CALIBRATION_ROWS, calibrations
 from benchmarks.robot_faults import (
     ENDS_ROBOT,
@@ -26,14 +36,10 @@ from benchmarks.robot_faults import (
     restored,
     straight,
 )
-from benchmarks.robot_loop import LOOP_ROWS, closed_loops
-from benchmarks.robot_retreats import RETREAT_ROW, retreats
 from benchmarks.robot_ros import LEAST_ROS_S, ROS_ROWS, ros_door
-from benchmarks.robot_stream import LEAST_STREAM_S, STREAM_ROWS, recorded_stream
-from benchmarks.robot_wrong_states import STATES_ROW, wrong_states
+from benchmarks.robot_stops import RETREAT_ROW, STATES_ROW, retreats, wrong_states
 from benchmarks.table import Asked, Part, Row, Setting
-from benchmarks.trial_log import Numbers, numbers_of, source_digest
-from limber.core.errors import LimberError
+from benchmarks.trials import Trial, column, sound
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.trajectory import Trajectory, along, densely
@@ -198,74 +204,60 @@ def _path(setting: Setting, _voided: Voided) -> list[Row]:
 
 def _faults(setting: Setting, voided: Voided, names: tuple[str, ...] = tuple(EVERY),
             ) -> list[Row]:
-    runs: dict[str, list[dict]] = {}
+    runs: dict[str, list[Trial]] = {}
     for name, budget in setting.budget.shares(list(names)):
         setting.progress(len(runs) / len(names), name)
-        some = _fault_runs(name, replace(setting, budget=budget), voided, 0 if runs else 1)
-        if not some:
-            continue
-        runs[name] = some
-        print(f"{name}: {len(runs[name])} runs, {sum(map(_is_failed, runs[name]))} failed",
-              flush=True)
+        if some := _fault_runs(name, replace(setting, budget=budget), voided, 0 if runs else 1):
+            runs[name] = some
+            print(f"{name}: {len(some)} runs, {len(some) - len(sound(some))} failed", flush=True)
     every = [run for some in runs.values() for run in some]
-    failed, total = sum(map(_is_failed, every)), len(every)
-    slowest = max((run["standstill_s"] for name, some in runs.items() if name not in ENDS_ROBOT
-                   for run in some if not _is_failed(run)), default=np.nan)
+    good, total = sound(every), len(every)
+    stood = [run for run in good if run.part not in ENDS_ROBOT]
+    slowest = column(stood, "standstill_s").max() if stood else np.nan
     least, most = (size(map(len, runs.values())) for size in (min, max))
     each = f"{least} to {most} runs of {len(runs)} of {len(names)} faults; " if len(
         names) > 1 else ""
     # A case that was not run is not known to be good.
-    is_met = False if failed else True if len(runs) == len(names) else None
+    is_met = False if len(good) < total else True if len(runs) == len(names) else None
     asked = _faults_asked(_faults_told(names))
-    named = [run["is_named"] for run in every if not _is_failed(run)]
-    share = float(np.mean(named)) if named else np.nan
-    return [Row(*asked[0], f"{total - failed} of {total}; {each}"
+    share = float(column(good, "is_named").mean()) if good else np.nan
+    return [Row(*asked[0], f"{len(good)} of {total}; {each}"
                 f"slowest standstill {slowest:.2f} s{voided}", is_met, total),
-            Row(*asked[1], f"{100 * share:.0f} %", share >= _NAMED_SHARE if named else None,
-                len(named))]
+            Row(*asked[1], f"{100 * share:.0f} %", share >= _NAMED_SHARE if good else None,
+                len(good))]
 
 
 def _faults_told(names: tuple[str, ...]) -> str:
     return f"{len(names)} faults" if len(names) > 1 else names[0]
 
 
-def _is_failed(run: dict) -> bool:
-    return "failed" in run
-
-
-def _fault_runs(name: str, setting: Setting, voided: Voided, at_least: int) -> list[dict]:
+def _fault_runs(name: str, setting: Setting, voided: Voided, at_least: int) -> list[Trial]:
     """Provoke a fault as often as there is time for: its standstill time [s], or how it failed."""
-    seed, source = setting.seed + list(EVERY).index(name), source_digest(
-        ("robot",), __file__, robot_faults.__file__)
-    model = model_for(name)
-    robot: VirtualRobot | None = None
+    robots: list[VirtualRobot] = []
 
     def run() -> Outcome:
-        nonlocal robot
-        if robot is None or robot.process.poll() is not None:
-            if robot is not None:
+        if not robots or robots[-1].process.poll() is not None:
+            for robot in robots:
                 robot.close()
-            robot = new_robot(_ADDRESS, model, seed)
-        restored(robot)
-        return provoke(name, robot, cell_for(_ADDRESS, model))
+            robots[:] = [new_robot(_ADDRESS, model_for(name),
+                                   setting.seed + list(EVERY).index(name))]
+        restored(robots[-1])
+        return provoke(name, robots[-1], cell_for(_ADDRESS, model_for(name)))
 
-    def trial(number: int) -> Numbers:
+    def trial(_number: int) -> dict[str, Any]:
         try:
             outcome = voided.again(run, name)
-        except (AssertionError, LimberError) as error:
+        except FAILURES as error:
             print(f"{name}: {error}", flush=True)
-            return Numbers(name, number, source, {"failed": str(error)})
+            raise
         if not outcome.is_named:
             print(f"{name}: reported as: {outcome.report}", flush=True)
-        return Numbers(name, number, source, {"standstill_s": outcome.standstill_s,
-                                              "is_named": outcome.is_named})
-    first = 1000 * setting.seed
+        return {"standstill_s": outcome.standstill_s, "is_named": outcome.is_named}
     try:
-        return [each.values for each in numbers_of(
-            name, range(first, first + setting.at_most(_FAULT_RUNS, 1)), trial, source,
-            setting.kept / "robot.jsonl", setting.budget, at_least=at_least)]
+        return setting.trials(name, setting.seeds(_FAULT_RUNS, 1), trial, "robot",
+                              at_least=at_least, catch=FAILURES)
     finally:
-        if robot is not None:
+        for robot in robots:
             robot.close()
 
 

@@ -1,13 +1,14 @@
 """The base's calibration, by touched points and by pictures of a board: error and interval."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.table import Asked, Row, Setting
-from benchmarks.trial_log import Numbers, numbers_of, source_digest
+from benchmarks.trials import column
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotation_vector
 from limber.core.numerics.rigid_kernels import pose_of
 from limber.robot.cell.base_calibration import fit_base, touched_point
@@ -45,19 +46,15 @@ CALIBRATION_ROWS = tuple(asked for by in _KINDS.values() for asked in _asked(by)
 
 def calibrations(setting: Setting) -> list[Row]:
     """Calibrate random cells in each way."""
-    source, rows = source_digest(("robot",), __file__), []
     works: dict[str, Callable[[int], dict[str, float]]] = {
         "points": _by_points, "stand": partial(_by_pictures, "stand"),
         "gripper": partial(_by_pictures, "gripper")}
-    first = 1000 * setting.seed
+    rows = []
     for kind, budget in setting.budget.shares(list(works)):
-        def trial(seed: int, kind: str = kind) -> Numbers:
-            return Numbers(f"calibration {kind}", seed, source, works[kind](seed))
-        found = [each.values for each in numbers_of(
-            f"calibration {kind}", range(first, first + setting.at_most(_COUNT, 2)), trial, source,
-            setting.kept / "robot.jsonl", budget, at_least=1)]
+        found = replace(setting, budget=budget).trials(
+            f"calibration {kind}", setting.seeds(_COUNT, 2), works[kind], "robot")
         error, held = _asked(_KINDS[kind])
-        far, turned, inside = (np.array([each[name] for each in found])
+        far, turned, inside = (column(found, name)
                                for name in ("off_m", "turned_degrees", "inside"))
         share = float(inside.mean())
         rows += [Row(*error, f"{1e3 * far.max():.2f} mm, {turned.max():.3f} degrees (95 %: "

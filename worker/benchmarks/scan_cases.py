@@ -1,20 +1,26 @@
-"""Generated scans for the bench `scans`: the truth, the points in file form, reader settings.
+"""Generated scans of the project's own generator: truth, points in file form, reader settings.
 
 Seeds are fresh in each run of the bench; the difficulties of a case are drawn from its seed.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.worlds.ray_casting import Hits, cast
+from benchmarks.worlds.sensors import Hits, cast
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.generated import GeneratedBranch, generate_branch
+from limber.geometry.generated import BranchSpec, GeneratedBranch, generate_branch, scan
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.sweep import frames, tangents
 
 _PITCH = 1 / 900  # width of a pixel at a depth of 1
+_THINNEST = 0.0015  # [m] radius of twigs at their tips
+_TREE_TWIGS = (9, 6, 4)  # on each axis of order 0, 1, 2
+_TREE_THINNEST = 0.006  # [m]
 
 
 @dataclass(frozen=True)
@@ -126,3 +132,132 @@ def _case(branch: GeneratedBranch, name: str) -> ScanCase:
     return ScanCase(name, branch.seed, branch.skeleton, branch.cloud.points,
                     branch.surface.volume)
 
+
+def crown_case(seed: int) -> ScanCase:
+    """A branch with twigs on its twigs down to 1.5 mm radius, 1 to 5 spacings thick."""
+    rng = np.random.default_rng([seed, 4])
+    spacing = float(rng.uniform(0.0012, 0.003))
+    base = branch_of(seed, fork_count=int(rng.integers(4, 11)), gap_count=0, radius_tip=0.003,
+                     length=0.8).skeleton
+    nodes, parent, radius = [base.nodes], [base.parent], [base.radius]
+    count = base.node_count
+    for run in base.runs()[1:]:
+        places = np.linspace(0.3, 0.8, int(rng.integers(2, 5)))
+        for share in places:
+            at = run[int(share * len(run))]
+            thick = max(0.6 * base.radius[at], _THINNEST)
+            way = base.nodes[run[-1]] - base.nodes[run[1]]
+            aside = np.cross(way, rng.normal(size=3))
+            direction = way / np.linalg.norm(way) + aside / np.linalg.norm(aside)
+            length = float(rng.uniform(0.05, 0.12))
+            steps = np.linspace(0, length, 15)[1:, None]
+            twig = base.nodes[at] + steps * direction / np.linalg.norm(direction)
+            nodes.append(twig)
+            parent.append(np.concatenate([[at], count + np.arange(len(twig) - 1)]))
+            radius.append(np.linspace(thick, _THINNEST, len(twig)))
+            count += len(twig)
+    truth = Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent), np.concatenate(radius))
+    spec = BranchSpec(length=0.8, noise=0.0004, point_spacing=spacing, occlusion=0.05,
+                      unevenness=0.2, radius_root=float(base.radius[0]), radius_tip=_THINNEST)
+    return ScanCase(f"crown_{seed}", seed, truth, scan(truth, spec, rng).points,
+                    settings={"leave_out": True})
+
+
+def leafy_case(seed: int) -> ScanCase:
+    """A seedling: stems, and a leaf at each tip."""
+    rng = np.random.default_rng([seed, 5])
+    branch = generate_branch(seed, length=0.35, radius_root=0.004, radius_tip=0.0018, bend=0.4,
+                             fork_count=4, noise=0.0003, point_spacing=0.001, occlusion=0.05)
+    truth, leaves = branch.skeleton, []
+    for tip in truth.tips():
+        way = truth.nodes[tip] - truth.nodes[truth.parent[tip]]
+        way /= np.linalg.norm(way)
+        across = np.cross(way, rng.normal(size=3))
+        across /= np.linalg.norm(across)
+        long, wide = rng.uniform(0.05, 0.09), rng.uniform(0.02, 0.035)
+        u, v = rng.uniform(0, 1, 6000), rng.uniform(-1, 1, 6000)
+        inside = np.abs(v) < np.sin(np.pi * u)
+        u, v = u[inside], v[inside]
+        droop = -0.4 * long * u**2
+        leaf = (truth.nodes[tip] + long * u[:, None] * way + wide * v[:, None] * across
+                + (droop + 0.15 * wide * v**2)[:, None] * np.cross(way, across))
+        leaves.append(leaf[::max(int(len(leaf) * 1e-6 / (1.2 * long * wide)), 1)])
+    leaf = np.vstack(leaves)
+    leaf = leaf + rng.normal(0, 0.0003, leaf.shape)
+    on_leaf = np.repeat([False, True], [len(branch.cloud.points), len(leaf)])
+    return ScanCase(f"leafy_{seed}", seed, truth, np.vstack([branch.cloud.points, leaf]),
+                    settings={"leave_out": True, "leaves": "cut"}, leaf=on_leaf)
+
+
+@dataclass
+class _Growing:
+    nodes: list[np.ndarray]
+    parent: list[np.ndarray]
+    radius: list[np.ndarray]
+
+    @property
+    def count(self) -> int:
+        return sum(len(nodes) for nodes in self.nodes)
+
+
+def generated_tree(seed: int, height: float, radius: float, spacing: float, noise: float,
+                    ) -> tuple[Skeleton, np.ndarray]:
+    """Make a tree of four orders and its scan: true skeleton, and points [m], shape [n, 3]."""
+    rng = np.random.default_rng(9000 + seed)
+    growing = _Growing([], [], [])
+    _grow(rng, growing, np.zeros(3), np.array([0.0, 0.0, 1.0]), height, radius, 0, -1)
+    skeleton = Skeleton.from_edges(np.vstack(growing.nodes), np.concatenate(growing.parent),
+                                   np.concatenate(growing.radius))
+    spec = BranchSpec(length=height, radius_root=radius, radius_tip=_TREE_THINNEST, noise=noise,
+                      point_spacing=spacing, occlusion=0.05)
+    return skeleton, scan(skeleton, spec, rng).points
+
+
+def _grow(rng: np.random.Generator, growing: _Growing, start: np.ndarray, direction: np.ndarray,
+          length: float, radius: float, order: int, hang: int) -> None:
+    axis = _axis(rng, start, direction, length, (0.25, 0.6, 0.8, 0.8)[order])
+    thin = max(0.25 * radius, _TREE_THINNEST)
+    thick = radius + (thin - radius) * np.linspace(0, 1, len(axis))**1.1
+    first = 0 if hang < 0 else 1
+    index = growing.count + np.arange(len(axis) - first)
+    if hang >= 0:
+        index = np.concatenate([[hang], index])
+    growing.nodes.append(axis[first:])
+    growing.radius.append(thick[first:])
+    growing.parent.append(np.concatenate([[-1], index[:-1]]) if hang < 0 else index[:-1])
+    if order == len(_TREE_TWIGS):
+        return
+    tangent = tangents(axis)
+    normals, binormals = frames(axis, tangent)
+    turn = rng.uniform(0, 2 * np.pi)
+    count = _TREE_TWIGS[order]
+    for place in np.linspace(0.2, 0.95, count) + rng.uniform(-0.03, 0.03, count):
+        at = int(np.clip(place * len(axis), 1, len(axis) - 2))
+        turn += 2.4 + rng.uniform(-0.4, 0.4)
+        angle = rng.uniform(0.5, 1.0)
+        aside = np.cos(turn) * normals[at] + np.sin(turn) * binormals[at]
+        twig = length * rng.uniform(0.35, 0.6) * (1 - 0.6 * place)
+        if twig > max(8 * thick[at], 0.25):
+            _grow(rng, growing, axis[at], np.cos(angle) * tangent[at] + np.sin(angle) * aside,
+                  twig, max(rng.uniform(0.4, 0.7) * thick[at], _TREE_THINNEST), order + 1,
+                  int(index[at]))
+
+
+def _axis(rng: np.random.Generator, start: np.ndarray, direction: np.ndarray, length: float,
+          bend: float) -> np.ndarray:
+    """A curve that turns by about ``bend`` [rad] to one side, with nodes 5 cm apart."""
+    count = max(round(length / 0.05), 4)
+    share = (np.arange(count) + 0.5) / count
+    side = rng.normal(size=3)
+    side -= (side @ direction) * direction
+    side /= np.linalg.norm(side)
+    turn = bend * share + 0.25 * bend * np.sin(2 * np.pi * share + rng.uniform(0, 2 * np.pi))
+    steps = np.cos(turn)[:, None] * direction + np.sin(turn)[:, None] * side
+    return np.vstack([start, start + np.cumsum(steps, axis=0) * length / count])
+
+
+KINDS: dict[str, Callable[[int], ScanCase]] = {
+    "one-sided": one_sided_case, "2-mm": partial(one_sided_case, noise=0.002),
+    "3-mm": partial(one_sided_case, noise=0.003), "round": round_case, "gaps": gap_case,
+    "single-view": single_view_case, "crowns": crown_case, "leafy": leafy_case}
+"""Cases by kind, from a seed."""

@@ -9,24 +9,21 @@ and what the fit says of it is compared with the outcome, in tenths of the state
 
 import argparse
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
-from benchmarks.budget import Budget
-from benchmarks.scan_cases import ScanCase
-from benchmarks.scan_runs import KINDS, case_source
+from benchmarks.scan_cases import KINDS, ScanCase
 from benchmarks.scan_scores import Dense, bridges_right, doubled, fork_matches, seen_part
-from benchmarks.trial_log import go_on, read_trials
+from benchmarks.trials import Budget, Trial, go_on, sound
 from benchmarks.worlds.sources import BARE_VIEWS, SOURCES, WORLDS
 from limber.core.errors import LimberError
-from limber.core.json_values import plain
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.io.skeletons import read_cylinders, write_cylinders
@@ -46,20 +43,6 @@ OWN = "own"
 _RIDGE = 0.002  # of a slope's square, against the mean loss: weak
 _FIT_KINDS = (*(kind for kind in KINDS if kind != "leafy"), *(
     f"{source}:{view}" for view in BARE_VIEWS for source in SOURCES))
-
-
-@dataclass
-class Skeletonised:
-    """A case's skeleton is in ``KIND_SEED.csv``; this holds the rest of its evidence."""
-
-    kind: str
-    seed: int
-    source: str
-    noise: float = 0.0
-    failure: str = ""
-    seconds: float = 0.0
-    root_probability: float = 1.0
-    bridges: list[dict] = field(default_factory=list)
 
 
 @dataclass
@@ -92,53 +75,44 @@ def skeletonised(case: ScanCase) -> tuple[Skeleton, float, float, list[dict]]:
     return found.skeleton, found.noise, found.root_probability, found.bridges
 
 
-def _collected(task: tuple[str, int], out: Path, source: str) -> Skeletonised:
-    kind, seed = task
-    one, began = Skeletonised(kind, seed, source), time.perf_counter()
-    try:
-        skeleton, one.noise, one.root_probability, bridges = skeletonised(
-            (KINDS | WORLDS)[kind](seed))
-        one.bridges = plain(bridges)
-        write_cylinders(skeleton, _file(one, out))
-    except LimberError as error:
-        one.failure = str(error)
-    one.seconds = time.perf_counter() - began
-    print(f"{kind} {seed}: {one.seconds:.1f} s {one.failure[:80]}", flush=True)
-    return one
+def _collected(task: tuple[str, int], out: Path) -> dict[str, Any]:
+    """Evidence of one case besides its skeleton, which is in ``KIND_SEED.csv``."""
+    skeleton, noise, root_probability, bridges = skeletonised((KINDS | WORLDS)[task[0]](task[1]))
+    write_cylinders(skeleton, _file(task, out))
+    return {"noise": noise, "root_probability": root_probability, "bridges": bridges}
 
 
-def _file(one: Skeletonised, out: Path) -> Path:
-    return out / f"{one.kind.replace(':', '_')}_{one.seed}.csv"
+def _file(task: tuple[str, int], out: Path) -> Path:
+    return out / f"{task[0].replace(':', '_')}_{task[1]}.csv"
 
 
 def collect(first: int, count: int, out: Path, seconds: float, kinds: Sequence[str] = _FIT_KINDS,
-            ) -> list[Skeletonised]:
+            ) -> list[Trial]:
     """Skeletons of ``count`` seeds of each kind, including those in ``out``."""
-    kept, source = out / "skeletons.jsonl", case_source()
     tasks = [(kind, seed) for seed in range(first, first + count) for kind in kinds]
-    return go_on(read_trials(Skeletonised, kept), tasks, lambda one: (one.kind, one.seed), partial(
-        _collected, out=out, source=source), source, kept, Budget(seconds))
+    return go_on("skeletons", tasks, partial(_collected, out=out), ("geometry",),
+                 out / "trials.jsonl", Budget(seconds), catch=LimberError)
 
 
-def outcomes(done: list[Skeletonised], out: Path) -> dict[str, Outcomes]:
+def outcomes(done: list[Trial], out: Path) -> dict[str, Outcomes]:
     """Evidence of each twig, of places on them, of bridges and roots, and the outcomes."""
     told = {name: Outcomes() for name in SIGNS}
-    for one in done:
-        if one.failure:
-            continue
-        case = (KINDS | WORLDS)[one.kind](one.seed)
-        source = one.kind.split(":")[0] if ":" in one.kind else OWN
-        found, truth = read_cylinders(_file(one, out)), seen_part(case.truth, case.points)
-        twig, node = evidence(found, case.points, one.noise)
+    for one in sound(done):
+        kind, seed = one.task
+        case = (KINDS | WORLDS)[kind](seed)
+        source = kind.split(":")[0] if ":" in kind else OWN
+        found, truth = read_cylinders(_file(one.task, out)), seen_part(case.truth, case.points)
+        twig, node = evidence(found, case.points, one["noise"])
         there, near_true, high = _there(truth, found)
         told["twigs"].add(twig[1:], there[1:], source)
         held = there[found.branch[high]]  # a node's own odds are those on a run that is there
         told["nodes"].add(node[high[held]], near_true[held], source)
         told["bridges"].add(np.array([bridge_evidence(*(bridge[name] for name in (
-            "price", "length", "thickness", "rival_price"))) for bridge in one.bridges]).reshape(
-                -1, 3), bridges_right(one.bridges, truth), source)
+            "price", "length", "thickness", "rival_price"))) for bridge in one["bridges"]]).reshape(
+                -1, 3), bridges_right(one["bridges"], truth), source)
         # Right if the fit returns a constant of 0 and a slope of 1.
-        odds = np.log(max(one.root_probability, 1e-12) / max(1 - one.root_probability, 1e-12))
+        chance = one["root_probability"]
+        odds = np.log(max(chance, 1e-12) / max(1 - chance, 1e-12))
         off = np.linalg.norm(found.nodes[0] - truth.nodes[0])
         told["roots"].add(np.array([[odds]]), np.array([off <= 2 * truth.radius[0]]), source)
     return told

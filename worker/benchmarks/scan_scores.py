@@ -1,6 +1,12 @@
-"""Requirements of the bench `scans` on a reconstruction with known truth."""
+"""Reconstructions of cases with known truth, as a user makes them, and their scores."""
 
+import json
+import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -9,11 +15,179 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from benchmarks.scan_cases import KINDS, ScanCase
+from benchmarks.scan_pictures import draw
+from benchmarks.table import Setting
+from benchmarks.trials import Trial, column, sound
+from benchmarks.worlds.sources import WORLDS
+from limber.core.alignment import Alignment
+from limber.geometry.io.clouds import read_points
+from limber.geometry.io.skeletons import read_cylinders
+from limber.geometry.reconstruction import ReconstructSettings
+from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
+from limber.geometry.skeleton.radii.nearest_points import nearest_point_radii
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.stages.shape.reconstruct import reconstruct
 
 _STEP = 0.001  # [m] between the places on the axes that are compared
 _DETOUR, _AROUND = 1.5, 3.0  # longest true path of a true bridge, in its lengths plus these radii
+_FAR = 4.0  # radii from an axis to the nearest node of the mesh, from which that leaves it out
+_SAME = 1e-4  # [m] between a point and its copy in a file of single precision
+_FEW = 8  # points of a twig, under which nothing is lost with it
+_MOST = 0.5  # of a twig's points, that are dropped with it
+
+
+# --- cases ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Trials of one kind of case; a case that could not be reconstructed is a failure."""
+
+    trials: Sequence[Trial]
+
+    @property
+    def scores(self) -> list[Trial]:
+        return sound(self.trials)
+
+    @property
+    def failed(self) -> list[str]:
+        return [f"{trial.task[0]} {trial.task[1]}: {trial.failure}" for trial in self.trials
+                if trial.failure]
+
+    @property
+    def count(self) -> int:
+        return len(self.trials)
+
+    def column(self, key: str) -> np.ndarray:
+        return column(self.scores, key)
+
+    def forks(self) -> tuple[str, float, float]:
+        """As text, with the fractions found and false."""
+        wanted, found, false = (int(self.column(key).sum()) for key in (
+            "forks", "forks_found", "forks_false"))
+        wanted = max(wanted, 1)
+        return (f"{found / wanted:.0%} ({found}/{wanted}) / {false / wanted:.0%}", found / wanted,
+                false / wanted)
+
+    def centre_failures(self) -> int:
+        off = (self.column("centre_radii") > 0.25) & (self.column("centre_m") > 0.0007)
+        return int(off.sum()) + len(self.failed)
+
+    def told(self, most: int = 0) -> str:
+        """Number of failed cases, and the first reasons."""
+        failed = self.failed
+        return f"; {len(failed)} not reconstructed" + (
+            f": {'; '.join(failed[:most])}" if most else "") if failed else ""
+
+
+def outcomes(setting: Setting, counts: dict[str, int]) -> dict[str, Outcomes]:
+    """Reconstruct and score cases of each kind in turn, as many as there is time for.
+
+    Args:
+        setting: Pictures of every case go to its ``out``; cases kept from other parts or an earlier
+            run are not repeated.
+        counts: Most cases of each kind.
+    """
+    seeds = setting.seeds(max(counts.values()), max(counts.values()))
+    trials = setting.trials(
+        "cases", [(kind, seed) for seed in seeds for kind, count in counts.items()
+                  if seed < seeds.start + count],
+        partial(scored_case, out=setting.out), "geometry", workers=None, catch=Exception)
+    return {kind: Outcomes([trial for trial in trials if trial.task[0] == kind])
+            for kind in counts}
+
+
+def scored_case(task: tuple[str, int], out: Path | None) -> dict[str, Any]:
+    """Scores of one case by kind and seed; its picture is written to ``out``."""
+    case = (KINDS | WORLDS)[task[0]](task[1])
+    with tempfile.TemporaryDirectory() as folder:
+        scored, found = run_case(case, Path(folder))
+    if out is not None:
+        draw(out / f"{case.name}.png", case.points, found,
+             f"{case.name}: centre {scored['centre_radii']:.2f} r, radius "
+             f"{scored['radius_bias']:+.1%}, volume {scored['volume']:+.1%},\nforks "
+             f"{scored['forks_found']}/{scored['forks']} + {scored['forks_false']} false, main "
+             f"axis {scored['main_axis_radii']:.1f} r", seen_part(case.truth, case.points))
+    return scored
+
+
+def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
+    """Write a case's file, reconstruct it, score it in the file's frame.
+
+    Raises:
+        LimberError: it could not be reconstructed.
+    """
+    path, branch = case.write(folder), folder / f"{case.name}.branch"
+    result = reconstruct(path, branch, ReconstructSettings(**{"root": "auto"} | case.settings))
+    manifest = json.loads((branch / "branch.json").read_text())
+    aligned = read_cylinders(branch / "skeleton.csv")
+    alignment = Alignment.model_validate(manifest["alignment"])
+    found = aligned.moved(alignment.undo(aligned.nodes))
+    bridges = [bridge | {end: alignment.undo(np.array(bridge[end])) for end in ("from", "to")}
+               for bridge in result["bridges"]]
+    seen = seen_part(case.truth, case.points)
+    # Wood without points is in no mesh; it is reported separately.
+    shown = cylinder_volume(seen) / cylinder_volume(case.truth)
+    scored = score(seen, found)
+    scored["told_bridges"] = [[bridge["probability"], bool(right)] for bridge, right in zip(
+        bridges, bridges_right(bridges, seen), strict=True)]
+    scored |= {"seed": case.seed, "left_out": result["left_out_twigs"], "shown": shown,
+               "unsaid_m": unsaid_length(aligned, branch),
+               "length_held": held(result["length_interval_m"], seen.length),
+               "volume_held": held(result["volume_interval_m3"], shown * case.volume)
+               if case.volume else True,
+               "volume": result["mesh_volume_m3"] / (shown * case.volume) - 1 if case.volume else (
+                   0.0)}
+    if case.leaf is not None:
+        scored["leaf_points_on_stems"] = points_on_axes(case.points[case.leaf], case.truth, found)
+    paper = nearest_point_radii(found, case.points, SkeletonSettings()).radius
+    scored["paper"] = float(np.median(np.abs(paper / found.radius - 1)))
+    scored["watertight"] = result["watertight"]
+    return scored | dropped_points(case, branch), found
+
+
+def held(interval: list[float], value: float) -> bool:
+    """Whether an interval contains a true value."""
+    return interval[0] <= value <= interval[1]
+
+
+def unsaid_length(aligned: Skeleton, branch: Path) -> float:
+    """Length of axes [m] that is neither near the mesh nor on a branch reported as left out."""
+    masses = branch / "point_masses.json"
+    named = {mass["branch"] for mass in json.loads(masses.read_text()) if "branch" in mass} if (
+        masses.is_file()) else set()
+    distance, _ = cKDTree(TetMesh.read(branch / "mesh.vtu").nodes).query(aligned.nodes)
+    bare = (distance > _FAR * aligned.radius) & ~np.isin(aligned.branch, list(named))
+    step = np.linalg.norm(aligned.nodes - aligned.nodes[aligned.parent], axis=1)
+    return float(step[1:][bare[1:]].sum())
+
+
+def dropped_points(case: ScanCase, branch: Path) -> dict[str, float]:
+    """Fractions of wood's points called leaf or dropped before; twigs mostly lost so; leaves kept.
+
+    Args:
+        case: The case.
+        branch: Folder of its reconstruction.
+    """
+    cloud = read_points(branch / "cloud.ply")
+    alignment = Alignment.model_validate(json.loads((branch / "branch.json").read_text())[
+        "alignment"])
+    away, near = cKDTree(alignment.undo(cloud.points)).query(case.points)
+    called = np.asarray(cloud.attributes.get("leaf", np.zeros(len(cloud)))) > 0
+    gone = away > _SAME
+    leaf = ~gone & called[near]
+    wood = np.ones(len(gone), bool) if case.leaf is None else ~case.leaf
+    run = case.truth.branch[nearest_cylinders(case.truth, case.points[wood])[0]]
+    total = np.bincount(run)
+    lost = np.bincount(run, (gone | leaf)[wood], len(total))
+    return {"called_leaf": float(leaf[wood].mean()), "gone": float(gone[wood].mean()),
+            "twigs_lost": int(((total >= _FEW) & (lost > _MOST * total)).sum())}
+
+
+# --- scores -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -212,3 +386,24 @@ def main_axis_error(truth: Skeleton, found: Skeleton) -> float:
     # The ends may be a radius short: no scan shows where exactly a round tip's axis ends.
     inner = slice(int(2 * truth.radius[0] / _STEP), len(back) - int(3 * axis.radius[-1] / _STEP))
     return float(max((away / axis.radius[near]).max(), (back / axis.radius)[inner].max()))
+
+
+def explained(points: np.ndarray, skeleton: Skeleton) -> float:
+    """Fraction of points no farther outside a branch than twice their own spacing."""
+    _, residual = nearest_cylinders(skeleton, points)
+    own = np.median(cKDTree(points).query(points, k=min(5, len(points)))[0][:, 1:], axis=1)
+    return float((residual <= 2 * own).mean())
+
+
+def axes_found(truth: Skeleton, found: Skeleton, spacing: float, step: float = 0.02,
+               ) -> tuple[float, float]:
+    """Fractions of the true axes' length that are found, and of the found axes' that are true.
+
+    An axis is correct if it is within the true radius, or the points' ``spacing`` [m], of a true
+    one, compared every ``step`` [m].
+    """
+    there, here = Dense.of(truth, step=step), Dense.of(found, step=step)
+    missed = cKDTree(here.points).query(there.points)[0] > np.maximum(there.radius, spacing)
+    distance, near = cKDTree(there.points).query(here.points)
+    right = distance <= np.maximum(there.radius[near], spacing)
+    return float(1 - missed.mean()), float(right.mean())

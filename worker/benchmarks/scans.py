@@ -1,25 +1,75 @@
-"""Requirements on real scans: `reconstruct` as a user calls it, on fresh seeds each run.
+"""Requirements on scans: `reconstruct` as a user calls it, on fresh seeds each run.
 
-With ``--out``, every case is also drawn.
+Sources that no constant was set on come first. With ``--out``, every case is also drawn.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from benchmarks.probability_rows import probability_asked, probability_rows
-from benchmarks.same_tree import same_tree_asked, same_tree_rows, subjects
-from benchmarks.scan_files import REAL_ROW, real_rows
-from benchmarks.scan_runs import Outcomes, outcomes
+from benchmarks import real_scans
+from benchmarks.scan_scores import Outcomes, outcomes
 from benchmarks.table import Asked, Part, Row, Setting
-from benchmarks.worlds import rows as worlds
+from benchmarks.worlds.sources import BARE_VIEWS, LEFT_OUT, SOURCES
 
 _COUNTS = {"one-sided": 60, "2-mm": 60, "3-mm": 60, "round": 60, "single-view": 20, "gaps": 60,
-           "crowns": 12, "leafy": 8}
+           "crowns": 12}
 _QUICK = 15  # times as few
+_BINOMIAL = 1.96  # standard deviations of a share of few, that its row tells beside it
+_ALLOWED = 0.08
 
+
+# --- stated probabilities -----------------------------------------------------------------------
+
+def probability_asked(name: str) -> tuple[Asked, ...]:
+    """Requirements for stated probabilities; ``name`` identifies the cases."""
+    return tuple(Asked(f"stated probability of {what}{name} against outcome, 10 bins",
+                       f"within {100 * _ALLOWED:.0f} points (and the binomial error)")
+                 for what in ("forks", "bridges", "nodes"))
+
+
+def probability_rows(name: str, kinds: Sequence[Outcomes]) -> list[Row]:
+    """Stated probabilities of forks, bridges and nodes against their actual frequency, in tenths.
+
+    Nodes are counted by length; the number of their branches gives the certainty of their fraction.
+    """
+    nodes = sum((np.array(score["told_nodes"]) for one in kinds for score in one.scores),
+                np.zeros((10, 4)))
+    count = sum(len(one.scores) for one in kinds)
+    tables = (_binned(kinds, "told_forks"), _binned(kinds, "told_bridges"), nodes)
+    return [_probability_row(asked, bins, count) for asked, bins in zip(
+        probability_asked(name), tables, strict=True)] if count else []
+
+
+def _binned(kinds: Sequence[Outcomes], key: str) -> np.ndarray:
+    """For each tenth: count, sum stated, sum correct, count, shape [10, 4]."""
+    told = np.array([pair for one in kinds for score in one.scores for pair in score[key]],
+                    float).reshape(-1, 2)
+    place = np.minimum((10 * told[:, 0]).astype(int), 9)
+    return np.stack([np.bincount(place, values, 10) for values in (
+        np.ones(len(told)), told[:, 0], told[:, 1], np.ones(len(told)))], axis=1)
+
+
+def _probability_row(asked: Asked, bins: np.ndarray, cases: int) -> Row:
+    """For each tenth: count, sum stated, sum correct, number of independent ones."""
+    texts, good, worst = [], True, 0.0
+    for low, (count, stated, right, members) in enumerate(bins):
+        if count == 0:
+            continue
+        said, was = stated / count, right / count
+        slack = _BINOMIAL * np.sqrt(max(was * (1 - was), 0.25 / (members + 2)) / members)
+        off = abs(said - was)
+        worst = max(worst, off)
+        good &= bool(off <= _ALLOWED + slack)
+        texts.append(f"{low / 10:.1f}: said {100 * said:.0f}, were {100 * was:.0f} "
+                     f"(+-{100 * slack:.0f}) of {members:.0f}")
+    return Row(*asked, f"worst {100 * worst:.0f}; " + "; ".join(texts), good and bool(texts),
+               cases)
+
+
+# --- own generator ------------------------------------------------------------------------------
 
 @dataclass(frozen=True)
 class View:
@@ -47,8 +97,6 @@ ROOT_ROW = Asked("round and one-sided: root within one diameter", "118 of 120")
 GAP_ROW = Asked("gaps of 20 to 80 mm, half at forks: main axis within a radius", "57 of 60")
 CROWN_ROW = Asked("generated crowns, twigs to 1.5 mm, 1 to 5 spacings: radius bias where resolved; "
                   "length recalled / right; left out unsaid", "10 %; 90 / 95 %; 0")
-LEAFY_ROW = Asked("leafy plants: stems recalled / right; leaf points on stems",
-                  "90 / 90 %; under 5 % (or refused)")
 
 
 def noise_asked(kind: str) -> tuple[Asked, ...]:
@@ -136,25 +184,10 @@ def _crown_rows(crowns: Outcomes) -> list[Row]:
                      and unsaid == 0 and not crowns.failed), crowns.count)]
 
 
-def _leafy_rows(leafy: Outcomes) -> list[Row]:
-    refused = f"{len(leafy.failed)} of {leafy.count} refused"
-    if not leafy.scores:
-        return [Row(*LEAFY_ROW, refused, True, leafy.count)] if leafy.count else []
-    recall, right, taken = (float(leafy.column(key).mean()) for key in (
-        "recall", "right", "leaf_points_on_stems"))
-    return [Row(*LEAFY_ROW, f"{recall:.0%} / {right:.0%}; {taken:.0%}; {refused}",
-                recall >= 0.9 and right >= 0.9 and taken < 0.05, leafy.count)]
-
-
 def _nothing(rows: tuple[Asked, ...], one: Outcomes) -> list[Row]:
     """The rows of cases of which none was reconstructed; none if there was no case."""
     return [Row(*asked, f"none reconstructed: {'; '.join(one.failed[:3])}", False, one.count)
             for asked in rows] if one.count else []
-
-
-def _probabilities(done: dict[str, Outcomes]) -> list[Row]:
-    return [*probability_rows("", [one for kind, one in done.items() if kind != "leafy"]),
-            *probability_rows(LEAFY, [done["leafy"]])]
 
 
 def _rows_of(setting: Setting, kinds: tuple[str, ...],
@@ -171,26 +204,160 @@ def _part(kind: str, rows: Callable[[Outcomes], list[Row]], gives: tuple[Asked, 
     return Part(of_kind, seconds, gives, grows=True)
 
 
-LEAFY = " of leafy plants"
+# --- worlds -------------------------------------------------------------------------------------
+
+_WORLD_COUNT, _WORLD_QUICK = 24, 1  # cases of a source and view
+_DRESSED = 6  # cases of a source in leaf, and potted
+# Forks found and false, twigs found and false, radius bias, worst volume.
+_LIMITS = {"one-sided": (0.90, 0.08, 0.90, 0.05, 0.04, 0.10),
+           "round": (0.96, 0.03, 0.95, 0.03, 0.02, 0.05)}
+_HOLD = (0.88, 0.99)  # fraction of true values inside stated intervals
+_SUPPORTS = ("pot", "stake", "post", "wire", "plants")  # words of a refusal that names them
+
+DROPPED = Asked("worlds, bare: points called leaf / dropped before; twigs lost so; refused",
+                "under 1 % each; 0; 0")
+LEAFY = Asked("worlds, leafy: wood's length found / right; leaf points called wood",
+              "85 / 90 %; 5 %")
+POTTED = Asked("worlds, potted with stake and wire: named in a refusal, or wood found / right",
+               "all named, or 90 / 95 %")
+
+
+def source_asked(source: str, view: str) -> Asked:
+    """The measure and the limits of one source from one view."""
+    forks, false, twigs, wrong, bias, volume = _LIMITS[view]
+    told = "left out" if source in LEFT_OUT else "constants set on it"
+    return Asked(f"worlds, {source} ({told}), {view}: forks found / false; twigs by length "
+                 "found / false; radius bias; volume worst; intervals hold radius, length",
+                 f"{forks:.0%} / {false:.0%}; {twigs:.0%} / {wrong:.0%}; {bias:.0%}; "
+                 f"{volume:.0%}; 88-99 %")
+
+
+def source_rows(source: str, view: str, one: Outcomes) -> list[Row]:
+    """One source from one view."""
+    if not one.count:
+        return []
+    asked = source_asked(source, view)
+    if not one.scores:
+        return [Row(*asked, f"none reconstructed: {'; '.join(one.failed[:2])}", False, one.count)]
+    text, got, wrong = one.forks()
+    total, found, false = (float(one.column(f"twig{key}_m").sum()) for key in (
+        "", "_found", "_false"))
+    twigs, untrue = found / max(total, 1e-9), false / max(total, 1e-9)
+    bias = float(np.median(one.column("radius_bias")))
+    volume = float(np.abs(one.column("volume")).max())
+    radius, length = (float(one.column(key).mean()) for key in ("covered", "length_held"))
+    limits = _LIMITS[view]
+    met = (got >= limits[0] and wrong <= limits[1] and twigs >= limits[2] and untrue <= limits[3]
+           and abs(bias) <= limits[4] and volume <= limits[5]
+           and all(_HOLD[0] <= held for held in (radius, length)) and radius <= _HOLD[1])
+    return [Row(*asked, f"{text}; {twigs:.0%} / {untrue:.0%} of {total:.1f} m; {bias:+.1%} (worst "
+                f"{one.column('radius_bias')[np.abs(one.column('radius_bias')).argmax()]:+.1%}); "
+                f"{volume:.1%}; {radius:.0%}, {length:.0%}{one.told(2)}",
+                bool(met and not one.failed), one.count)]
+
+
+def dropped_rows(bare: list[Outcomes]) -> list[Row]:
+    """Points of bare plants that were not used as wood."""
+    one = _together(bare)
+    if not one.count:
+        return []
+    leaf, gone = (one.column(key) if one.scores else np.zeros(1) for key in (
+        "called_leaf", "gone"))
+    lost = int(one.column("twigs_lost").sum()) if one.scores else 0
+    return [Row(*DROPPED, f"mean {leaf.mean():.1%}, worst {leaf.max():.0%} / mean {gone.mean():.1%}"
+                f", worst {gone.max():.0%}; {lost}; {len(one.failed)}{one.told(2)}",
+                bool(leaf.max() < 0.01 and gone.max() < 0.01 and not lost and not one.failed),
+                one.count)]
+
+
+def leafy_rows(leafy: list[Outcomes]) -> list[Row]:
+    """Plants in leaf whose user asked to cut the leaves."""
+    one = _together(leafy)
+    if not one.scores:
+        return [Row(*LEAFY, f"none reconstructed{one.told(2)}", False, one.count)] if (
+            one.count) else []
+    recall, right, taken = (one.column(key) for key in ("recall", "right", "leaf_points_on_stems"))
+    return [Row(*LEAFY, f"{recall.mean():.0%} (worst {recall.min():.0%}) / {right.mean():.0%} "
+                f"(worst {right.min():.0%}); {taken.mean():.0%} (worst {taken.max():.0%})"
+                f"{one.told(2)}",
+                bool(recall.mean() >= 0.85 and right.mean() >= 0.9 and taken.mean() <= 0.05),
+                one.count)]
+
+
+def potted_rows(potted: list[Outcomes]) -> list[Row]:
+    """Potted plants: refused by name, or right."""
+    one = _together(potted)
+    if not one.count:
+        return []
+    named = sum(any(word in text for word in _SUPPORTS) for text in one.failed)
+    recall, right = (float(one.column(key).mean()) if one.scores else 1.0 for key in (
+        "recall", "right"))
+    return [Row(*POTTED, f"{named} of {len(one.failed)} refusals name them; of {len(one.scores)} "
+                f"others {recall:.0%} / {right:.0%}",
+                bool(named == len(one.failed) and recall >= 0.9 and right >= 0.95), one.count)]
+
+
+def world_rows(setting: Setting, source: str | None = None) -> list[Row]:
+    """All rows of generated worlds; of one ``source`` its own."""
+    chosen = [source] if source else list(SOURCES)
+    count = setting.at_most(_WORLD_COUNT, _WORLD_QUICK)
+    dressed = {} if source else {
+        f"{name}:{dress}": setting.at_most(_DRESSED, _WORLD_QUICK)
+        for dress in ("leafy", "potted") for name in chosen}
+    done = outcomes(setting, {f"{name}:{view}": count for view in BARE_VIEWS for name in chosen}
+                    | dressed)
+    rows = [row for view in BARE_VIEWS for name in chosen
+            for row in source_rows(name, view, done[f"{name}:{view}"])]
+    rows += probability_rows(_of_worlds(source), [done[f"{name}:{view}"] for name in chosen
+                                                  for view in BARE_VIEWS])
+    if source:
+        return rows
+    dress = {key: [done[f"{name}:{key}"] for name in chosen]
+             for key in (*BARE_VIEWS, "leafy", "potted")}
+    return [*rows, *dropped_rows(dress["one-sided"] + dress["round"]), *leafy_rows(dress["leafy"]),
+            *potted_rows(dress["potted"])]
+
+
+def _of_worlds(source: str | None) -> str:
+    return f", worlds, {source}" if source else ", worlds"
+
+
+def _together(several: list[Outcomes]) -> Outcomes:
+    return Outcomes([trial for one in several for trial in one.trials])
+
+
+WORLDS = {
+    "worlds": Part(world_rows, 120, (*(source_asked(source, view) for view in BARE_VIEWS
+                                       for source in SOURCES), *probability_asked(
+                                           _of_worlds(None)), DROPPED, LEAFY, POTTED),
+                   grows=True),
+    "worlds-real": Part(real_scans.length_rows, 90, (real_scans.REAL, real_scans.BARE,
+                                                     real_scans.WORSE), grows=True)}
 PARTS = {
+    **WORLDS,
     "one-sided": _part("one-sided", partial(_view_rows, view=ONE_SIDED), ONE_SIDED.rows),
     "round": _part("round", partial(_view_rows, view=ROUND), ROUND.rows),
-    **worlds.PARTS,
-    "real": Part(real_rows, 60, (REAL_ROW,), grows=True),
+    "real": Part(real_scans.real_rows, 60, (real_scans.REAL_ROW,), grows=True),
     "gaps": _part("gaps", gap_rows, (GAP_ROW,)),
     "2-mm": _part("2-mm", partial(_noise_rows, kind="2 mm"), noise_asked("2 mm")),
     "3-mm": _part("3-mm", partial(_noise_rows, kind="3 mm"), noise_asked("3 mm")),
-    "same-tree": Part(same_tree_rows, 60, (same_tree_asked("scans"),), grows=True),
+    "same-tree": Part(real_scans.same_tree_rows, 60, (real_scans.same_tree_asked("scans"),),
+                      grows=True),
     "root": Part(partial(_rows_of, kinds=("one-sided", "round"), rows=lambda done: _root_rows(
         list(done.values()))), 30, (ROOT_ROW,), grows=True),
-    "leafy": _part("leafy", _leafy_rows, (LEAFY_ROW,), 60),
     "crowns": _part("crowns", _crown_rows, (CROWN_ROW,), 90),
-    "probabilities": Part(partial(_rows_of, kinds=tuple(_COUNTS), rows=_probabilities), 30, (
-        *probability_asked(""), *probability_asked(LEAFY)), grows=True),
+    "probabilities": Part(partial(_rows_of, kinds=tuple(_COUNTS), rows=lambda done: (
+        probability_rows("", list(done.values())))), 30, probability_asked(""), grows=True),
     "single-view": _part("single-view", partial(_view_rows, view=SINGLE_VIEW), SINGLE_VIEW.rows)}
 """The table, in order of importance; ``--only`` also accepts one source of the worlds, and one scan
 of the same tree's row.
 """
+PARTS |= {f"worlds:{source}": Part(
+    partial(world_rows, source=source), 60, (
+        *(source_asked(source, view) for view in BARE_VIEWS),
+        *probability_asked(_of_worlds(source))), grows=True, alone=True)
+    for source in SOURCES}
 PARTS |= {f"same-tree:{name}": Part(
-    partial(same_tree_rows, only=name), 60, (same_tree_asked(name),), grows=True, alone=True)
-    for name in subjects()}
+    partial(real_scans.same_tree_rows, only=name), 60, (real_scans.same_tree_asked(name),),
+    grows=True, alone=True)
+    for name in real_scans.subjects()}

@@ -4,20 +4,21 @@ import argparse
 import datetime
 import importlib
 import json
+import os
 import secrets
 import subprocess
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.budget import Budget, parsed_seconds
+from benchmarks.trials import Budget, Trial, go_on, parsed_seconds
 from limber.core.errors import Cancelled
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, BarSink, Progress
@@ -92,6 +93,12 @@ class Setting:
     def generator(self, *which: int) -> np.random.Generator:
         """Return a generator of the base seed; ``which`` separates those of parts."""
         return np.random.default_rng([self.seed, *which])
+
+    def trials(self, part: str, tasks: Iterable[Any], work: Callable[[Any], dict[str, Any]],
+               *packages: str, **more: Any) -> list[Trial]:
+        """Return as many trials as there is time for, as :func:`benchmarks.trials.go_on` says."""
+        return go_on(part, tasks, work, packages, self.kept / "trials.jsonl", self.budget,
+                     **{"progress": self.progress} | more)
 
 
 @dataclass(frozen=True)
@@ -209,6 +216,19 @@ def share_met(share: float, count: int, low: float, high: float) -> bool | None:
     if count < _FEW or (share > high and count * (1 - high) < 1):
         return None
     return bool(low <= share <= high)
+
+
+def limber_command(*words: object, folder: Path | None = None, seconds: float = 600.0,
+                   **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run ``limber`` in a process of its own, at most ``seconds`` [s]; return what it wrote."""
+    return subprocess.run(
+        [sys.executable, "-m", "limber", *map(str, words)], cwd=folder, text=True, check=False,
+        capture_output=True, timeout=seconds, env=os.environ | environment)
+
+
+def last_json(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    """Return the last line that a command with ``--json`` wrote."""
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def _tried(name: str, part: Part, setting: Setting) -> list[Row]:

@@ -1,17 +1,25 @@
-"""Batches: two cores against one, on Dask, memory over many jobs."""
+"""Batches: two cores against one, on Dask, memory over many jobs, kill -9 at random moments."""
 
+import contextlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import psutil
 
 from benchmarks.table import Asked, Row, Setting
+from benchmarks.worker_branch_files import TEMPLATE
 from limber.batch.jobs.branch_jobs import StageTask
 from limber.batch.stage_task import run_task
 from limber.core.processes import Pool
@@ -89,12 +97,12 @@ def _fitting(setting: Setting, folder: Path, at_most: int, times: float) -> int:
     return int(np.clip(setting.budget.remaining / each, 2, at_most))
 
 
-def memory(setting: Setting, template: Path) -> Row:
+def memory(setting: Setting) -> list[Row]:
     """Memory of one worker over many jobs, after the tenth."""
     jobs = setting.at_most(100, 30)
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place, \
             Pool(1, name="a job of the bench") as pool:
-        folder = Path(shutil.copytree(template, Path(place, "a.branch")))
+        folder = Path(shutil.copytree(TEMPLATE, Path(place, "a.branch")))
         stage = stage_description("load")
         used = []
         for number in setting.budget.seeds(0, jobs, at_least=20):
@@ -103,10 +111,11 @@ def memory(setting: Setting, template: Path) -> Row:
                 wind=(3.0 + 0.01 * number, 0.0, 0.0)), stage.options())
             outcome = pool.submit(run_task, task, folder).result()
             if outcome["error"]:
-                return Row(*MEMORY_ROW, outcome["error"], False, number)
+                return [Row(*MEMORY_ROW, outcome["error"], False, number)]
             used.append(outcome["memory_mb"])
     grown = float(np.median(used[-5:]) / np.median(used[9:14]) - 1)
-    return Row(*MEMORY_ROW, f"{100 * grown:+.1f} % ({used[-1]:.0f} MB)", grown < 0.05, len(used))
+    return [Row(*MEMORY_ROW, f"{100 * grown:+.1f} % ({used[-1]:.0f} MB)", grown < 0.05,
+                len(used))]
 
 
 def make_scans(folder: Path, count: int, seed: int) -> None:
@@ -157,3 +166,101 @@ def _contents(out: Path) -> dict[tuple[str, str], str]:
                 entry.pop("seconds", None)
             found[branch, name] = json.dumps(told)
     return found
+
+
+# --- kills --------------------------------------------------------------------------------------
+
+_DRAWS = 4  # for each kill, until the batch is still running at the moment drawn
+_STAGES = RECONSTRUCT + """[[job.stage]]
+run = "load"
+name = "gale"
+wind = [3.0, 0.0, 0.0]
+"""
+KILLS_ROW = Asked("kill -9 of batch and workers, or of a worker, at random moments (30 asked)",
+                  "identical, nothing stored redone")
+_BRANCHES = 2
+
+
+def killed(setting: Setting) -> list[Row]:
+    """Random moments, each in a new run of a batch of two branches, which then continues.
+
+    Only kills while the batch was still running count.
+    """
+    with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
+        folder = Path(place)
+        make_scans(folder, _BRANCHES, setting.seed)
+        started = time.perf_counter()
+        code = start_batch(write_jobs(folder, "undisturbed", _STAGES), 1).wait()
+        whole = time.perf_counter() - started
+        wanted = digests(folder / "undisturbed")
+        kills = setting.trials("kills", setting.seeds(30, 3), partial(
+            _kill, folder=folder, whole=whole, wanted=wanted),
+            "store", "batch", "core", "stages", "geometry")
+    redone, stored = (Counter(key for kill in kills for key in kill[name])
+                      for name in ("redone", "found"))
+    again = ", ".join(f"{key} {count} times" for key, count in redone.items()) or "nothing"
+    apart, alone, ended = (sum(map(bool, wrong)) for wrong in (
+        [kill["apart"] for kill in kills], [kill["is_alone"] for kill in kills],
+        [kill["code"] == 0 for kill in kills]))
+    told = (f"{len(kills)} kills, {alone} of one worker alone, {_BRANCHES} branches each; stored "
+            f"when they fell: "
+            f"{', '.join(f'{key} {count}' for key, count in stored.items()) or 'nothing'}; "
+            f"{apart} runs with other files, redone: {again}, {ended} went on to the end")
+    return [Row(*KILLS_ROW, told, bool(wanted) and code == 0 and apart == 0 and not redone
+                and ended == len(kills), len(kills))]
+
+
+def _kill(seed: int, folder: Path, whole: float, wanted: dict[tuple[str, str], str],
+          ) -> dict[str, Any]:
+    """One kill: ``moment`` is the fraction of an undisturbed run's time.
+
+    ``found`` are the entries stored at the kill, ``redone`` those of them that the next run made
+    again; ``apart`` is the number of files that differ from an undisturbed run's.
+    """
+    rng, name = np.random.default_rng(seed), f"killed-{seed}"
+    jobs, out = write_jobs(folder, name, _STAGES), folder / name
+    for _ in range(_DRAWS):
+        moment = float(rng.uniform(0.2 / whole, 1.0))
+        process = start_batch(jobs, 1)
+        time.sleep(moment * whole)
+        if process.poll() is None:
+            break
+        shutil.rmtree(out)
+    family = _family(process)
+    is_alone = bool(rng.random() >= 0.5 and family)
+    if is_alone:
+        _end([family[int(rng.integers(len(family)))]])
+    else:
+        _end([process.pid, *family])
+    # A batch whose worker was killed first continues to its own end.
+    stored = _entries(out)
+    process.wait()
+    code = start_batch(jobs, 1, "--retry-failed").wait()
+    now, files = _entries(out), digests(out)
+    shutil.rmtree(out)
+    return {"moment": moment, "is_alone": is_alone, "code": code,
+            "found": sorted(key for _, key in stored),
+            "redone": sorted(key for (branch, key), value in stored.items()
+                             if now.get((branch, key)) != value),
+            "apart": sum(files.get(key) != wanted.get(key) for key in files.keys() | wanted.keys())}
+
+
+def _family(process: subprocess.Popen) -> list[int]:
+    """The processes that a batch has started."""
+    try:
+        return [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
+    except psutil.NoSuchProcess:
+        return []
+
+
+def _end(processes: Sequence[int]) -> None:
+    for one in processes:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(one, signal.SIGKILL)
+
+
+def _entries(out: Path) -> dict[tuple[str, str], str]:
+    """Time at which each stored entry was made."""
+    return {(branch, key): f"{entry['finished']} {entry['seconds']}"
+            for branch, manifest in manifests(out).items()
+            for key, entry in manifest["stages"].items()}

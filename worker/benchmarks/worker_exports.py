@@ -4,14 +4,12 @@ import shutil
 import subprocess
 import tempfile
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.linalg import eigh
 
 from benchmarks.table import Asked, Row, Setting
-from benchmarks.trial_log import Numbers, numbers_of, source_digest
 from limber.core.progress import SILENT
 from limber.geometry.generated import generate_branch
 from limber.geometry.reconstruction import mesh_skeleton
@@ -46,18 +44,16 @@ EXPORT_ROWS = tuple(Asked(f"export in {label}, worst: static tip; first frequenc
 
 def exported(setting: Setting) -> list[Row]:
     """Generated branches, weightless and hanging, in MuJoCo; weightless in CalculiX."""
-    source = source_digest(("results/exports", "mechanics", "geometry"), __file__)
-    trials = numbers_of("exports", setting.seeds(20, 2), partial(_bent, source=source), source,
-                        setting.kept / "worker-exports.jsonl", setting.budget,
-                        progress=setting.progress)
-    found = {label: [each.values[label] for each in trials if label in each.values]
+    trials = setting.trials("exports", setting.seeds(20, 2), _bent, "results", "mechanics",
+                            "geometry")
+    found = {label: [each[label] for each in trials if label in each.values]
              for label in _PROGRAMS}
     return [_row(asked, found[label]) if found[label] else
             Row(*asked, "the program is not installed", None, 0)
             for asked, label in zip(EXPORT_ROWS, _PROGRAMS, strict=True)]
 
 
-def _bent(seed: int, source: str) -> Numbers:
+def _bent(seed: int) -> dict[str, tuple[float, float]]:
     """Difference of each program from our elements, for one generated branch."""
     found = {}
     branch = generate_branch(seed)
@@ -67,15 +63,13 @@ def _bent(seed: int, source: str) -> Numbers:
         model = BranchModel(mesh, young=1e9, poisson=0.35, density=800.0, gravity=gravity)
         model = model.as_scanned() if gravity else model
         node, load = _load(model, branch.skeleton)
-        ours = bent_here(model, node, load)
-        theirs = bent_in_mujoco(model, branch.skeleton, mesh.nodes[node], load)
-        if theirs is not None:
-            found[label] = _apart(ours, theirs)
+        bent = {label: bent_in_mujoco(model, branch.skeleton, mesh.nodes[node], load)}
         if gravity is None:
-            found[usd] = _apart(ours, bent_as_usd(model, node, load))
-            if (theirs := bent_in_calculix(model, node, load)) is not None:
-                found[calculix] = _apart(ours, theirs)
-    return Numbers("results/exports", seed, source, found)
+            bent |= {usd: bent_as_usd(model, node, load),
+                     calculix: bent_in_calculix(model, node, load)}
+        ours = bent_here(model, node, load)
+        found |= {name: _apart(ours, theirs) for name, theirs in bent.items() if theirs}
+    return found
 
 
 def _row(asked: Asked, errors: list[tuple[float, float]]) -> Row:

@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.scan_cases import one_sided_case
-from benchmarks.scan_plants import leafy_case
+from benchmarks.scan_cases import leafy_case, one_sided_case
 from limber.core.errors import InputError
 from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import Cloud

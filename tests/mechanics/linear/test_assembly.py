@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from tests.subjects.meshes import box_mesh
+from tests.subjects.prescribed import solve_prescribed
 
-from benchmarks.prescribed import solve_prescribed
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.geometry.tets.tet_mesh import TetMesh

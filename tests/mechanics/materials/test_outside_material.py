@@ -9,8 +9,8 @@ import pytest
 import scipy.sparse as sp
 from scipy.optimize import brentq
 from tests.subjects.meshes import box_mesh
+from tests.subjects.prescribed import solve_prescribed
 
-from benchmarks.prescribed import solve_prescribed
 from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.core.settings import checked_settings

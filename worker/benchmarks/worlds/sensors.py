@@ -1,12 +1,189 @@
-"""Sensors of the worlds: where they stand, what they see, and how they err."""
+"""What stands in a world (wood, leaves, a pot, a stake), and what sensors see of it."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from benchmarks.worlds.ray_casting import Hits, cast
-from benchmarks.worlds.scenes import Scene
+from benchmarks.worlds.plants import Plant, sheet_triangles
+
+WOOD, LEAF, SUPPORT = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Triangles [m], shape [t, 3, 3], and what each belongs to (``WOOD``, ...), shape [t]."""
+
+    triangles: np.ndarray
+    label: np.ndarray
+
+    @classmethod
+    def bare(cls, plant: Plant) -> "Scene":
+        skin = plant.skin()
+        return cls(skin, np.full(len(skin), WOOD))
+
+    def plus(self, triangles: np.ndarray, label: int) -> "Scene":
+        return Scene(np.concatenate([self.triangles, triangles]),
+                     np.concatenate([self.label, np.full(len(triangles), label)]))
+
+
+def leafy(plant: Plant, rng: np.random.Generator) -> Scene:
+    """With curved blades on the outer half of the twigs and at all tips."""
+    scene = Scene.bare(plant)
+    skeleton = plant.skeleton
+    depth = skeleton.arc_length
+    outer = np.flatnonzero((skeleton.radius < np.median(skeleton.radius))
+                           & (depth > 0.3 * depth.max()))
+    at = np.concatenate([skeleton.tips(), rng.choice(outer, min(len(outer), int(
+        rng.integers(8, 30))), replace=False)])
+    for node in at:
+        along = skeleton.nodes[node] - skeleton.nodes[skeleton.parent[node]]
+        scene = scene.plus(_blade(skeleton.nodes[node], along, rng), LEAF)
+    return scene
+
+
+def potted(plant: Plant, rng: np.random.Generator) -> Scene:
+    """In a pot, tied to a stake by a wire."""
+    scene = Scene.bare(plant)
+    base = plant.nodes[0]
+    height, wide = 0.1, rng.uniform(0.05, 0.08)
+    pot = _revolved(base, [(0.75 * wide, -height), (wide, 0.02), (wide - 0.004, 0.02),
+                           (wide - 0.006, 0.0), (0.0, 0.0)])
+    beside = base + [0.6 * wide, 0.0, 0.0]
+    top = float(np.ptp(plant.nodes[:, 2])) * rng.uniform(0.5, 0.8)
+    stake = _revolved(beside, [(0.005, 0.0), (0.005, top), (0.0, top)])
+    stem = plant.nodes[int(np.argmin(np.abs(plant.nodes[:, 2] - base[2] - 0.5 * top)
+                                     + np.linalg.norm(plant.nodes[:, :2] - base[:2], axis=1)))]
+    wire = Plant(np.linspace(beside + [0, 0, 0.5 * top], stem, 12), np.arange(-1, 11),
+                 np.full(12, 0.001))
+    return scene.plus(np.concatenate([pot, stake, wire.skin()]), SUPPORT)
+
+
+def _blade(at: np.ndarray, along: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A leaf with a stalk's gap of 4 mm, arched along and across."""
+    along = along / max(float(np.linalg.norm(along)), 1e-9) + 0.8 * rng.normal(size=3)
+    along /= np.linalg.norm(along)
+    across = np.cross(along, rng.normal(size=3))
+    across /= np.linalg.norm(across)
+    long, wide = rng.uniform(0.03, 0.09), rng.uniform(0.01, 0.03)
+    u, v = np.meshgrid(np.linspace(0, 1, 12), np.linspace(-1, 1, 7), indexing="ij")
+    width = wide * np.sin(np.pi * np.clip(u, 0.02, 0.98))**0.8 * v
+    rise = -0.3 * long * u**2 + 0.25 * wide * v**2
+    grid = (at + 0.004 * along + long * u[..., None] * along + width[..., None] * across
+            + rise[..., None] * np.cross(along, across))
+    return sheet_triangles(grid)
+
+
+def _revolved(base: np.ndarray, profile: list[tuple[float, float]]) -> np.ndarray:
+    """A profile of (radius, height) [m] turned about the vertical through ``base``."""
+    angle = np.linspace(0, 2 * np.pi, 33)[:-1]
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(32)], axis=1)
+    dense = np.array(profile)
+    return sheet_triangles(np.array([base + radius * ring + [0, 0, height]
+                                     for radius, height in dense]), closed=True)
+
+
+# --- rays through the pixels of a view against triangles: the nearest hit of each ---------------
+
+
+@dataclass(frozen=True)
+class Hits:
+    """First hits of a view's rays.
+
+    Attributes:
+        eye: Position of the sensor [m], shape [3].
+        axes: Right, down and forward of the view, shape [3, 3].
+        way: Unit direction of each ray, shape [n, 3].
+        distance: To the hit [m], shape [n].
+        incidence: Cosine between ray and surface normal, 0 to 1, shape [n].
+        triangle: Index of the hit triangle, shape [n].
+        edge: Whether a neighbouring ray misses, or hits a centimetre or more off, shape [n].
+    """
+
+    eye: np.ndarray
+    axes: np.ndarray
+    way: np.ndarray
+    distance: np.ndarray
+    incidence: np.ndarray
+    triangle: np.ndarray
+    edge: np.ndarray
+
+
+def cast(triangles: np.ndarray, eye: np.ndarray, at: np.ndarray, pitch: float,
+         jitter: np.ndarray | None = None) -> Hits:
+    """Look from ``eye`` towards ``at`` [m] with rays ``pitch`` apart (of a distance of 1).
+
+    Args:
+        triangles: Shape [t, 3, 3].
+        eye: Shape [3]. at: Shape [3].
+        pitch: Distance of neighbouring rays in the plane one unit ahead.
+        jitter: Shift of the grid of rays in pitches, shape [2].
+    """
+    axes = _view(at - eye)
+    seen = (triangles - eye) @ axes.T
+    facing = np.flatnonzero((seen[:, :, 2] > 0.02).all(axis=1))
+    seen = seen[facing]
+    flat = seen[:, :, :2] / seen[:, :, 2:] / pitch - (0.0 if jitter is None else jitter)
+    low = np.ceil(flat.min(axis=1)).astype(np.int64)
+    size = np.maximum(np.floor(flat.max(axis=1)).astype(np.int64) - low + 1, 0)
+    count = size.prod(axis=1)
+    owner = np.repeat(np.arange(len(seen)), count)
+    inside = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    pixel = low[owner] + np.stack([inside // size[owner, 1], inside % size[owner, 1]], axis=1)
+    shift = 0.0 if jitter is None else jitter
+    ray = np.column_stack([(pixel + shift) * pitch, np.ones(len(pixel))])
+    depth, normal = _crossing(seen, owner, ray)
+    hit = depth > 0
+    owner, pixel, ray, depth = owner[hit], pixel[hit], ray[hit], depth[hit]
+    order = np.lexsort([depth, pixel[:, 1], pixel[:, 0]])
+    first = np.ones(len(order), bool)
+    first[1:] = (np.diff(pixel[order], axis=0) != 0).any(axis=1)
+    kept = order[first]
+    pixel, ray, depth, owner = pixel[kept], ray[kept], depth[kept], owner[kept]
+    long = np.linalg.norm(ray, axis=1)
+    towards = np.abs(np.einsum("ij,ij->i", ray / long[:, None], normal[owner]))
+    return Hits(eye, axes, ray / long[:, None] @ axes, depth * long, towards, facing[owner],
+                _edges(pixel, depth))
+
+
+def _crossing(seen: np.ndarray, owner: np.ndarray, ray: np.ndarray,
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [m] at which each ray crosses its triangle, -1 where it misses; triangle normals."""
+    one, two = seen[:, 1] - seen[:, 0], seen[:, 2] - seen[:, 0]
+    normal = np.cross(one, two)
+    size = np.linalg.norm(normal, axis=1)
+    across = np.cross(ray, two[owner])
+    scale = np.einsum("ij,ij->i", one[owner], across)
+    scale = np.where(np.abs(scale) < 1e-18, 1e-18, scale)
+    start = -seen[owner, 0]
+    u = np.einsum("ij,ij->i", start, across) / scale
+    turned = np.cross(start, one[owner])
+    v = np.einsum("ij,ij->i", ray, turned) / scale
+    depth = np.einsum("ij,ij->i", two[owner], turned) / scale
+    good = (u >= 0) & (v >= 0) & (u + v <= 1) & (depth > 0)
+    return np.where(good, depth, -1.0), normal / np.maximum(size, 1e-18)[:, None]
+
+
+def _edges(pixel: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Pixels beside a miss or a step of a centimetre."""
+    corner = pixel.min(axis=0) - 1
+    image = np.full(pixel.max(axis=0) - corner + 2, np.inf)
+    row, column = (pixel - corner).T
+    image[row, column] = depth
+    found = np.zeros(len(pixel), bool)
+    for down, right in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        found |= np.abs(image[row + down, column + right] - depth) > 0.01
+    return found
+
+
+def _view(forward: np.ndarray) -> np.ndarray:
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.95 else [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+# --- sensors: where they stand, what they see, and how they err ---------------------------------
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,17 @@ from functools import partial
 import numpy as np
 
 from benchmarks.scan_cases import ScanCase
-from benchmarks.worlds import scenes
-from benchmarks.worlds.allometry import dichotomous, opposite, weber_penn
-from benchmarks.worlds.colonisation import colonised
-from benchmarks.worlds.l_systems import monopodial, sympodial
-from benchmarks.worlds.plant import Plant
-from benchmarks.worlds.scenes import Scene
-from benchmarks.worlds.sensors import ALL_AROUND, ONE_SIDED, Seen
+from benchmarks.worlds import sensors
+from benchmarks.worlds.plants import (
+    Plant,
+    colonised,
+    dichotomous,
+    monopodial,
+    opposite,
+    sympodial,
+    weber_penn,
+)
+from benchmarks.worlds.sensors import ALL_AROUND, ONE_SIDED, Scene, Seen
 
 SOURCES: dict[str, Callable[[np.random.Generator], Plant]] = {
     "colonisation": colonised, "monopodial": monopodial, "sympodial": sympodial,
@@ -52,18 +56,18 @@ def leafy_case(seed: int, source: str) -> ScanCase:
     """A plant in leaf from all around; its user asks to cut leaves."""
     rng = _generator(seed, source, "leafy")
     plant = SOURCES[source](rng)
-    seen = rng.choice(ALL_AROUND)(scenes.leafy(plant, rng), rng, 0.0005)
+    seen = rng.choice(ALL_AROUND)(sensors.leafy(plant, rng), rng, 0.0005)
     return _case(f"{source}_leafy_{seed}", seed, plant, seen,
-                 {"leave_out": True, "leaves": "cut"}, seen.label == scenes.LEAF)
+                 {"leave_out": True, "leaves": "cut"}, seen.label == sensors.LEAF)
 
 
 def potted_case(seed: int, source: str) -> ScanCase:
     """A plant in a pot, tied to a stake."""
     rng = _generator(seed, source, "potted")
     plant = SOURCES[source](rng)
-    seen = rng.choice(ALL_AROUND)(scenes.potted(plant, rng), rng, 0.0005)
+    seen = rng.choice(ALL_AROUND)(sensors.potted(plant, rng), rng, 0.0005)
     return _case(f"{source}_potted_{seed}", seed, plant, seen, {"leave_out": True},
-                 seen.label == scenes.SUPPORT)
+                 seen.label == sensors.SUPPORT)
 
 
 def _generator(seed: int, *words: str) -> np.random.Generator:

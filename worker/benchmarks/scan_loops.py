@@ -8,20 +8,18 @@ errors. A refusal counts as correct if it states what the scan lacks.
 
 import json
 import tempfile
-import time
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from benchmarks import truth_branch
+from benchmarks.drawn_branches import recorded
 from benchmarks.scan_cases import ScanCase
 from benchmarks.table import Asked, Row, Setting, share_met
-from benchmarks.trial_log import go_on, read_trials, source_digest
-from benchmarks.truth_branch import recorded
+from benchmarks.trials import Trial, joined, sound
 from benchmarks.worlds.sources import LEFT_OUT, branch_case
-from limber.core.errors import Cancelled, LimberError
+from limber.core.errors import LimberError
 from limber.estimation.estimated_branch import forwards_of, parameter_space, subject_of
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
@@ -58,44 +56,8 @@ LACKS = ("scan", "cloud", "point")
 SETTINGS = EstimateSettings(hold_out=False)
 
 
-@dataclass(frozen=True)
-class ScanTrial:
-    """One branch from scan to moduli.
-
-    Attributes:
-        seed: Seed of all draws.
-        plant: Its source.
-        view: How it was scanned.
-        noise: Noise of the scan's points [m].
-        errors: Relative errors of the moduli; empty: there is no estimate.
-        covered: Whether each interval contains the truth.
-        widths: Half widths of the intervals in log E.
-        bending_covered: Whether each interval of E I contains the truth.
-        bending_widths: Half widths of the intervals in log E I.
-        bending_errors: Errors of log E I.
-        bounds: Half widths of intervals by the Cramer-Rao bound if the shape were known: those of
-            log E are then those of log E I. NaN: there is none.
-        refusal: Why there is no estimate.
-        seconds: Total time.
-        source: Digest of the sources; trials of other sources are not reused.
-    """
-
-    seed: tuple[int, ...]
-    plant: str
-    view: str
-    noise: float
-    errors: tuple[float, ...]
-    covered: tuple[bool, ...]
-    widths: tuple[float, ...]
-    bending_covered: tuple[bool, ...]
-    bending_widths: tuple[float, ...]
-    bending_errors: tuple[float, ...]
-    bounds: tuple[float, ...]
-    refusal: str
-    seconds: float
-    source: str
-
-
+PARTS = ("sensor", "geometry", "mesh")
+"""Parts of the stated deviation of log E."""
 SCAN_ROW = Asked("scan to moduli, branches of left-out sources, round and one-sided, noise 1 and 2 "
                  "mm: 95 % intervals that hold",
                  "88 to 99 %, or a refusal that says what the scan lacks")
@@ -103,29 +65,40 @@ BENDING_ROW = Asked("the same of bending stiffness E I", "88 to 99 %")
 WIDTH_ROW = Asked("the same: median half width of E I's intervals, over the Cramer-Rao bound with "
                   "known shape", "1.5")
 ROWS = SCAN_ROW, BENDING_ROW, WIDTH_ROW
+ESTIMATE_ROWS = (
+    Asked("reconstructed from a scan: 95 % intervals that cover the truth", "88 to 99 %"),
+    Asked("the same: error of E", "-"))
 
 
-def scan_row(setting: Setting) -> list[Row]:
+def loop_rows(setting: Setting) -> list[Row]:
     """Measure as many branches as there is time for; sources, views and noises take turns."""
-    source = source_digest(("estimation", "mechanics", "geometry"), __file__,
-                           truth_branch.__file__,
-                           *sorted((Path(__file__).parent / "worlds").glob("*.py")))
-    kept = setting.kept / "truth-scans.jsonl"
-    tasks = [(setting.seed, 3, number) for number in range(setting.at_most(24, 4))]
-    trials = go_on(read_trials(ScanTrial, kept), tasks, lambda each: each.seed,
-                   partial(scan_trial, source=source), source, kept, setting.budget, None,
-                   setting.progress)
+    trials = _loops(setting)
     return [coverage_row(trials), bending_row(trials), width_row(trials)]
 
 
-def coverage_row(trials: list[ScanTrial]) -> Row:
+def estimate_rows(setting: Setting) -> list[Row]:
+    """Of the same branches: intervals by view, and errors over what is stated."""
+    trials = _loops(setting)
+    return [view_row(trials), size_row(trials)]
+
+
+def _loops(setting: Setting) -> list[Trial]:
+    return setting.trials("loops", setting.seeds(24, 4), loop, "estimation", "mechanics",
+                          "geometry", workers=None, catch=LimberError)
+
+
+def scan_of(seed: int) -> tuple[str, str, float]:
+    """Source, view and noise [m] of a branch."""
+    return (PLANTS[seed % len(PLANTS)], *SCANS[seed % len(SCANS)])
+
+
+def coverage_row(trials: list[Trial]) -> Row:
     """Number of intervals that contain the truth, and whether refusals help."""
-    fitted = [each for each in trials if not each.refusal]
-    refused = [each.refusal for each in trials if each.refusal]
+    fitted, refused = sound(trials), [each.failure for each in trials if each.failure]
     mute = [text for text in refused if not any(word in text for word in LACKS)]
-    held = np.concatenate([each.covered for each in fitted]) if fitted else np.zeros(0)
+    held = joined(fitted, "covered")
     share = float(held.mean()) if len(held) else 0.0
-    worst = [float(np.abs(each.errors).max()) for each in fitted]
+    worst = [float(np.abs(each["errors"]).max()) for each in fitted]
     size = f"; median of the worst error {100 * np.median(worst):.0f} %" if worst else ""
     is_met = share_met(share, len(held), 0.88, 0.99) if fitted else True
     return Row(
@@ -136,73 +109,100 @@ def coverage_row(trials: list[ScanTrial]) -> Row:
         False if mute else is_met, len(trials))
 
 
-def bending_row(trials: list[ScanTrial]) -> Row:
+def bending_row(trials: list[Trial]) -> Row:
     """Number of intervals of E I that contain the truth, and their width relative to those of E."""
-    fitted = [each for each in trials if not each.refusal]
+    fitted = sound(trials)
     if not fitted:
         return Row(*BENDING_ROW, "no estimate", False, len(trials))
-    held = np.concatenate([each.bending_covered for each in fitted])
-    width, of_young = (100 * np.median(np.concatenate(parts)) for parts in (
-        [each.bending_widths for each in fitted], [each.widths for each in fitted]))
-    size = 100 * np.median(np.abs(np.concatenate([each.bending_errors for each in fitted])))
+    held = joined(fitted, "bending_covered")
+    width, of_young, size = (100 * np.median(np.abs(joined(fitted, name))) for name in (
+        "bending_widths", "widths", "bending_errors"))
     return Row(*BENDING_ROW, f"{100 * held.mean():.1f} % of {len(held)} (median error "
                f"{size:.0f} %, half width {width:.0f} %, of E {of_young:.0f} %)",
                share_met(float(held.mean()), len(held), 0.88, 0.99), len(trials))
 
 
-def width_row(trials: list[ScanTrial]) -> Row:
+def width_row(trials: list[Trial]) -> Row:
     """Width of the intervals of E I relative to what the pull tells if the shape is known."""
-    fitted = [each for each in trials if not each.refusal]
-    ratios = np.concatenate([np.array(each.bending_widths) / np.array(each.bounds, float)
-                             for each in fitted]) if fitted else np.zeros(0)
-    if not np.isfinite(ratios).any():
+    def ratios(some: list[Trial]) -> np.ndarray:
+        return joined(some, "bending_widths") / joined(some, "bounds")
+
+    fitted = sound(trials)
+    if not np.isfinite(ratios(fitted)).any():
         return Row(*WIDTH_ROW, "no estimate", False, len(trials))
     by_scan = "; ".join(
-        f"{view} {1e3 * noise:.0f} mm {np.nanmedian(np.concatenate(parts)):.2f}"
-        for view, noise in SCANS if (parts := [
-            np.array(each.bending_widths) / np.array(each.bounds, float) for each in fitted
-            if (each.view, each.noise) == (view, noise)]))
-    median = float(np.nanmedian(ratios))
-    return Row(*WIDTH_ROW, f"{median:.2f} (worst {np.nanmax(ratios):.1f}; {by_scan})",
+        f"{view} {1e3 * noise:.0f} mm {np.nanmedian(ratios(own)):.2f}" for view, noise in SCANS
+        if (own := [each for each in fitted if scan_of(each.task)[1:] == (view, noise)]))
+    median = float(np.nanmedian(ratios(fitted)))
+    return Row(*WIDTH_ROW, f"{median:.2f} (worst {np.nanmax(ratios(fitted)):.1f}; {by_scan})",
                median <= 1.5, len(trials))
 
 
-def scan_trial(seed: tuple[int, ...], source: str = "") -> ScanTrial:
-    """Draw a branch, scan it, reconstruct it, pull it in a cell with errors, and estimate."""
-    rng, number = np.random.default_rng(seed), seed[-1]
-    plant, (view, noise) = PLANTS[number % len(PLANTS)], SCANS[number % len(SCANS)]
-    case = branch_case(int(rng.integers(2**31)), plant, view, noise)
-    started = time.perf_counter()
-    found: _Loop | None = None
-    refusal = ""
+def view_row(trials: list[Trial]) -> Row:
+    """Number of intervals that contain the truth; a refusal is not met here."""
+    fitted = sound(trials)
+    held = joined(fitted, "covered")
+    share, failed = float(held.mean()) if len(held) else 0.0, len(trials) - len(fitted)
+    told = ", ".join(f"{view} {100 * joined(own, 'covered').mean():.0f} %"
+                     for view, own in _by_view(fitted))
+    return Row(*ESTIMATE_ROWS[0], f"{100 * share:.1f} % of {len(held)} ({told}; "
+               f"{sum(each['is_poor'] for each in fitted)} of {len(trials)} fits say that they are "
+               f"poor, {failed} failed)",
+               False if failed else share_met(share, len(held), 0.88, 0.99), len(trials))
+
+
+def size_row(trials: list[Trial]) -> Row:
+    """Errors of the moduli, and of what is stated of them."""
+    told = []
+    for view, own in _by_view(sound(trials)):
+        errors = np.log1p(joined(own, "errors"))
+        over = np.median(np.abs(errors / joined(own, "stated"))) / 0.6745
+        parts = np.median([each["parts"] for each in own], axis=0)
+        each = ", ".join(f"{name} {100 * part:.1f} %"
+                         for name, part in zip(PARTS, parts, strict=True))
+        told.append(f"{view}: median {100 * np.median(np.abs(errors)):.1f} %, {over:.2f} of what "
+                    f"is stated ({each})")
+    return Row(*ESTIMATE_ROWS[1], "; ".join(told) or "no estimate", None, len(trials))
+
+
+def _by_view(trials: list[Trial]) -> list[tuple[str, list[Trial]]]:
+    views = {view: [each for each in trials if scan_of(each.task)[1] == view]
+             for view in ("round", "one-sided")}
+    return [(view, own) for view, own in views.items() if own]
+
+
+def loop(seed: int) -> dict[str, Any]:
+    """Draw a branch, scan it, reconstruct it, pull it in a cell with errors, and estimate.
+
+    Returns:
+        Relative errors of E; of E and of E I: whether intervals contain the truth, their half
+        widths in the log; errors of log E I; ``bounds``: half widths of intervals by the
+        Cramer-Rao bound if the shape were known, the same for log E and log E I; what is stated of
+        log E. Each of shape [K].
+    """
+    rng = np.random.default_rng([seed, 3])
+    plant, view, noise = scan_of(seed)
     with tempfile.TemporaryDirectory() as temporary:
-        try:
-            found = _looped(Path(temporary), case, rng)
-        except Cancelled:
-            # Stopped from outside: not a trial.
-            raise
-        except LimberError as error:
-            refusal = str(error)
-    seconds = round(time.perf_counter() - started, 1)
-    if found is None:
-        return ScanTrial(seed, plant, view, noise, (), (), (), (), (), (), (), refusal,
-                         seconds, source)
-    written = found.written
-    errors = np.array(written["young_pa"]) / found.young - 1
-    return ScanTrial(
-        seed, plant, view, noise, tuple(errors.tolist()),
-        *_compared(written["young_interval_pa"], found.young),
-        *_compared(written["bending_stiffness_interval_nm2"], found.bending),
-        tuple(np.log(np.array(written["bending_stiffness_nm2"]) / found.bending).tolist()),
-        tuple(found.bounds.tolist()), "", seconds, source)
+        found = _looped(Path(temporary), branch_case(int(rng.integers(2**31)), plant, view, noise),
+                        rng)
+    written, deviation = found.written, found.written["young_deviation"]
+    covered, widths = _compared(written["young_interval_pa"], found.young)
+    bending_covered, bending_widths = _compared(written["bending_stiffness_interval_nm2"],
+                                                found.bending)
+    return {"errors": np.array(written["young_pa"]) / found.young - 1, "covered": covered,
+            "widths": widths, "bending_covered": bending_covered,
+            "bending_widths": bending_widths,
+            "bending_errors": np.log(np.array(written["bending_stiffness_nm2"]) / found.bending),
+            "bounds": found.bounds, "stated": deviation["total"],
+            "parts": [float(np.median(np.array(deviation[name], float))) for name in PARTS],
+            "is_poor": any("fit is poor" in text for text in written["warnings"])}
 
 
-def _compared(interval: list, truth: np.ndarray) -> tuple[tuple[bool, ...], tuple[float, ...]]:
+def _compared(interval: list, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Whether each interval contains its truth, and their half widths in the log."""
     low, high = np.log(np.array(interval, float)).T
     log_truth = np.log(truth)
-    return (tuple(((low <= log_truth) & (log_truth <= high)).tolist()),
-            tuple(((high - low) / 2).tolist()))
+    return (low <= log_truth) & (log_truth <= high), (high - low) / 2
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class _Loop:
         written: Content of ``estimate.json``.
         young: True E [Pa].
         bending: True E I [N m^2] over the control points' parts.
-        bounds: As :attr:`ScanTrial.bounds`.
+        bounds: Half widths of log E by the bound.
     """
 
     written: dict

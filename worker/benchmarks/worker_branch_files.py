@@ -1,7 +1,11 @@
-"""Readers of the files of a branch folder: each file is put into a copy of one with its checksums
-corrected, as an attacker would do; then every function that shows it or computes with it is called.
+"""Readers of the files of a branch folder and of bags of recordings, for the fuzz.
+
+Each file is put into a copy of a branch folder with its checksums corrected, as an attacker would
+do; then every function that shows it or computes with it is called.
 """
 
+import atexit
+import dataclasses
 import json
 import shutil
 import tempfile
@@ -15,6 +19,8 @@ import numpy as np
 
 from limber.core.files.atomic import file_digest
 from limber.store import Branch
+
+TEMPLATE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,7 @@ class Reader:
     read: Callable[[Path, Path], Any]
     may_lack: bool = False
 
+
 def template_file(name: str, template: Path, folder: Path) -> list[Path]:
     """Copy a file of the template branch."""
     target = folder / Path(name).name
@@ -40,12 +47,9 @@ def template_file(name: str, template: Path, folder: Path) -> list[Path]:
     return [target]
 
 
-
 @cache
 def _work_copy(template: Path) -> Path:
     place = Path(tempfile.mkdtemp(prefix="limber-fuzz-branch-"))
-    import atexit
-
     atexit.register(shutil.rmtree, place, ignore_errors=True)
     return Path(shutil.copytree(template, place / "work.branch"))
 
@@ -232,6 +236,88 @@ def _branch_file(name: str, kind: str, act: Callable[[Branch], Any], make: Any =
                   may_lack)
 
 
+# --- bags as robots record them: MCAP, rosbag2's folder, ROS 1 ----------------------------------
+
+
+def _mcap(template: Path, folder: Path) -> list[Path]:
+    from limber.stages.pulls.export_pull import export_pull
+
+    path = folder / "pull.mcap"
+    export_pull(template, "pull-1", path)
+    return [path]
+
+
+def _bag(_template: Path, path: Path) -> Any:
+    """A bag, up to the pull made from it."""
+    from limber.recordings.bags.bag_pull import pull_of_bag
+    from limber.recordings.bags.bag_reader import read_bag
+    from limber.recordings.settings import ImportSettings
+
+    with tempfile.TemporaryDirectory() as folder:
+        made = pull_of_bag(read_bag(path), Path(folder), ImportSettings())
+    return made.robot, made.seen
+
+
+@cache
+def _recorded_bag(template: Path, kind: str) -> Path:
+    """The template's pull as ROS records it: a folder with SQLite, or the one file of ROS 1."""
+    from rosbags.highlevel import AnyReader
+
+    place = Path(tempfile.mkdtemp(prefix="limber-fuzz-bag-"))
+    atexit.register(shutil.rmtree, place, ignore_errors=True)
+    if kind == "ros1":
+        from rosbags.rosbag1 import Writer
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        types = get_typestore(Stores.ROS1_NOETIC)
+        types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms",
+                                          "tf2_msgs/msg/TFMessage"))
+        writer = Writer(place / "pull.bag")
+    else:
+        from rosbags.rosbag2 import Writer
+
+        writer = Writer(place / "pull", version=9)
+    with AnyReader(_mcap(template, place)) as reader, writer:
+        known = {connection.topic: writer.add_connection(
+            connection.topic, connection.msgtype,
+            typestore=types if kind == "ros1" else reader.typestore)
+            for connection in reader.connections}
+        for connection, logged, raw in reader.messages():
+            if kind == "ros1":
+                message = reader.deserialize(raw, connection.msgtype)
+                raw = types.serialize_ros1(_ros1(message, types), connection.msgtype)
+            writer.write(known[connection.topic], logged, raw)
+    return place / ("pull.bag" if kind == "ros1" else "pull")
+
+
+def _ros1(message: Any, types: Any) -> Any:
+    """A message as in ROS 1: its header counts as well."""
+    parts = {part.name: getattr(message, part.name) for part in dataclasses.fields(message)
+             if part.name != "__msgtype__"}
+    kind = message.__msgtype__
+    if kind == "std_msgs/msg/Header":
+        parts["seq"] = 0
+    made = {name: _ros1(value, types) if dataclasses.is_dataclass(value) else [
+        _ros1(one, types) if dataclasses.is_dataclass(one) else one for one in value]
+        if isinstance(value, list) else value for name, value in parts.items()}
+    return types.types[kind](**made)
+
+
+def _bag_part(name: str, template: Path, folder: Path) -> list[Path]:
+    """One file of a recorded bag: ``pull.bag``, ``metadata.yaml`` or the SQLite file's suffix."""
+    bag = _recorded_bag(template, "ros1" if name == "pull.bag" else "ros2")
+    part = bag if bag.is_file() else next(bag.glob(f"*{name}"))
+    return [Path(shutil.copyfile(part, folder / part.name))]
+
+
+def _bag_with(name: str, template: Path, path: Path) -> Any:
+    """A bag of ROS 2 one of whose files is ``path``."""
+    with tempfile.TemporaryDirectory() as place:
+        bag = Path(shutil.copytree(_recorded_bag(template, "ros2"), Path(place, "pull")))
+        shutil.copyfile(path, next(bag.glob(f"*{name}")))
+        return _bag(template, bag)
+
+
 BRANCH_READERS: dict[str, Reader] = {
     "branch.json": _branch_file("branch.json", "json", _opened),
     "QSM CSV": _branch_file("skeleton.csv", "text", _shown_and_computed),
@@ -257,5 +343,11 @@ BRANCH_READERS: dict[str, Reader] = {
                                    _json_file("vibration.json", _RINGING)),
     "swing.json": _branch_file("swing.json", "json", _swing, _json_file("swing.json", _SWING),
                                may_lack=True),
+    "MCAP": Reader("binary", _mcap, _bag, True),
+    "ROS 1 bag": Reader("binary", partial(_bag_part, "pull.bag"), _bag, True),
+    "rosbag2 SQLite": Reader("binary", partial(_bag_part, ".db3"), partial(_bag_with, ".db3"),
+                             True),
+    "rosbag2 YAML": Reader("text", partial(_bag_part, "metadata.yaml"),
+                           partial(_bag_with, "metadata.yaml"), True),
 }
 """By name."""
