@@ -161,6 +161,7 @@ LAYERS = (
     ("version",),
     ("core",),
     ("geometry",),
+    ("cell",),
     ("mechanics",),
     ("reduced", "recordings"),
     ("perception",),
@@ -181,7 +182,7 @@ PARTS = {"core": ("numerics", "files", "processes"),
          "mechanics": ("materials", "elements", "linear", "statics", "dynamics", "loads"),
          "estimation": ("forward", "fitting", "uncertainty", "online"),
          "planning": ("field", "goals", "constraints", "certificate", "planners"),
-         "robot": ("ur", "urdf", "cell", "motion", "driver", "virtual"),
+         "robot": ("ur", "cell", "motion", "driver", "virtual"),
          "results": ("exports", "scene", "report")}
 
 

@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell, write_cell
+from limber.cell.obstacles import Box
 from limber.core.errors import NoPathError
 from limber.planning.baseline_and_plan import PlanSettings
-from limber.planning.constraints.obstacles import Box
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals.goal import CellPlace, GoalRequest, goal_points, with_near_side
 from limber.planning.goals.goal_kinds import CellGoal, TargetGoal, goal_of
 from limber.planning.goals.regions import Ball
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.plan_file import read_plan
-from limber.robot.cell.cell import Cell, write_cell
 from limber.stages.paths.plan import plan as plan_paths
 from limber.stages.paths.plan_cell import cell_positions, hiding
 from limber.store import Branch

@@ -5,26 +5,20 @@ import shutil
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell, write_cell
+from limber.cell.known_arms import arm_named
+from limber.cell.obstacles import Box
+from limber.cell.reach_and_collision import ArmSurroundings, blocked_by, clearance_in
 from limber.core.errors import InputError, NoPathError
 from limber.core.numerics.rigid import angle_between, pose_vectors
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.baseline_and_plan import PlanSettings
-from limber.planning.constraints.obstacles import Box
 from limber.planning.goals.goal_kinds import View
 from limber.planning.plan_file import read_plan
-from limber.robot.cell.cell import Cell, write_cell
-from limber.robot.known_arms import arm_named
-from limber.stages.paths.arm_surroundings import ArmSurroundings
 from limber.stages.paths.execute import _stated_by_plan
 from limber.stages.paths.execute_path import offsets_along
 from limber.stages.paths.plan import plan as plan_paths
-from limber.stages.paths.plan_cell import (
-    KeptClear,
-    blocked_by,
-    cell_positions,
-    clearance_in,
-    hiding,
-)
+from limber.stages.paths.plan_cell import KeptClear, cell_positions, hiding
 from limber.store import Branch
 
 # No plan made anew because a field of 60 samples is rough.
@@ -81,7 +75,7 @@ def test_the_gripper_lags_behind_where_it_may_not_turn_with_the_branch(copied, m
     def blocked(flange, _joints):
         turned_by = angle_between(*pose_vectors(flange[[0, -1]])[:, 3:])
         return NoPathError("Turned too far.", "", "") if turned_by > 0.7 * turn else None
-    monkeypatch.setattr("limber.stages.paths.plan_cell.blocked_by", lambda *_: blocked)
+    monkeypatch.setattr("limber.cell.reach_and_collision.blocked_by", lambda *_: blocked)
     settings = SETTINGS.model_copy(update={
         "iterations": 100, "inertia": False, "goal": tuple(map(float, there.plan.poses[-1, :3]))})
     path = cell_file(copied)

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, NoPathError
 from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.settings import PlanSettings
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.turning import Turned
 from limber.stages.paths import plan_turning
 from limber.stages.paths.plan import plan

@@ -173,8 +173,8 @@ def test_a_sensors_own_frame_is_turned_by_tf(tmp_path, bare_folder):
 def test_joint_angles_need_the_cell(tmp_path, bare_folder):
     """In any order, with a robot's own names; the base's pose in the branch's frame is the
     cell's."""
+    from limber.cell.cell_file import Cell, write_cell
     from limber.core.numerics.rigid import pose_vectors
-    from limber.robot.cell.cell import Cell, write_cell
 
     names = ["elbow_joint", "shoulder_lift_joint", "shoulder_pan_joint", "wrist_1_joint",
              "wrist_2_joint", "wrist_3_joint"]
@@ -196,8 +196,8 @@ def test_joint_angles_need_the_cell(tmp_path, bare_folder):
 @pytest.mark.slow
 def test_joints_are_called_as_the_cells_arm_calls_them(tmp_path, bare_folder, recorded_data):
     """The arm of a URDF file whose first joint has a name of its own."""
+    from limber.cell.cell_file import read_cell
     from limber.core.numerics.rigid import pose_vectors
-    from limber.robot.cell.cell import read_cell
 
     text = (recorded_data / "ur5_urdf" / "ur5.urdf").read_text(encoding="utf-8")
     (tmp_path / "own.urdf").write_text(text.replace("shoulder_pan_joint", "waist"),
@@ -313,9 +313,9 @@ def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, bare_folder):
+    from limber.cell.cell_file import Cell, write_cell
     from limber.core.progress import Progress
     from limber.recordings.cell_errors import CalibrationEntry
-    from limber.robot.cell.cell import Cell, write_cell
 
     with Written(tmp_path / "theirs.mcap") as bag:
         pulled(bag)

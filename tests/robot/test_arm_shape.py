@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from limber.cell.cell_file import Cell
+from limber.cell.obstacles import Box, cell_obstacles
+from limber.cell.reach_and_collision import blocked_by
+from limber.cell.ur_arms import ARMS
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices
-from limber.planning.constraints.obstacles import Box
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.execution import robot_motion
 from limber.robot.motion.expected_wrench import Predicted
-from limber.robot.ur.arms import ARMS
-from limber.stages.paths.plan_cell import blocked_by, cell_obstacles
 
 
 @pytest.mark.parametrize("name", sorted(ARMS))

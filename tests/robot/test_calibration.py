@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell, read_cell, write_cell
+from limber.cell.ur_arms import ARMS
 from limber.cli.commands.robot import command
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
 from limber.robot.cell.base_calibration import fit_base, touched_point
-from limber.robot.cell.cell import Cell, read_cell, write_cell
 from limber.robot.cell.controller_settings import differences
 from limber.robot.interface import Sample
-from limber.robot.ur.arms import ARMS
 from limber.robot.ur.factory_calibration import (
     PRIMARY_PORT,
     FactoryCalibration,

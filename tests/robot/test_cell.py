@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import tomlkit
 
+from limber.cell.cell_file import Cell, read_cell, write_cell
 from limber.cli.commands.robot import command
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.cell.cell import Cell, read_cell, write_cell
 
 TEXT = """\
 branch = "0d5a"

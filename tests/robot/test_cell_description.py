@@ -5,11 +5,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell
+from limber.cell.ur_arms import ARMS
+from limber.cell.urdf_arm import arm_of_file
 from limber.core.numerics.rigid import matrices
-from limber.robot.cell.cell import Cell
 from limber.robot.ros.cell_description import cell_srdf, cell_urdf, joint_names
-from limber.robot.ur.arms import ARMS
-from limber.robot.urdf.chain_arm import arm_of_file
 
 
 def cell_of(model: str) -> Cell:

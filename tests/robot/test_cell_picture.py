@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
 
+from limber.cell.cell_file import Cell, write_cell
+from limber.cell.obstacles import Box
 from limber.cli.commands.robot import command
 from limber.core.numerics.rigid import matrices
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.planning.constraints.obstacles import Box
 from limber.results.cell_picture import cell_picture
-from limber.robot.cell.cell import Cell, write_cell
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0, 0, 0, 1.2)},
             tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0),

@@ -9,16 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.robot_cells import GRASP_POSE, cell_file, robot_holding, standing_at
 from benchmarks.robot_faults import restored
+from limber.cell.cell_file import ApproachEntry, Cell, check_plan
+from limber.cell.ur_arms import ARMS
 from limber.core.errors import InputError, NoPathError, SafetyStop
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.robot.cell.base_calibration import fit_base
-from limber.robot.cell.cell import ApproachEntry, Cell
-from limber.robot.cell.compatibility import check_plan
 from limber.robot.motion.execution import across, followed, robot_motion
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.pull_plausibility import NUDGE_M
-from limber.robot.ur.arms import ARMS
 from limber.stages.paths import execute_path
 from limber.stages.paths.execute import (
     ExecuteOptions,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from tests.robot.test_start import ARM, POSE, led, line, sample_at
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.followed_path import (
     FollowedPathFile,
     followed_path,

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
+from limber.cell.cell_file import Cell
 from limber.core.numerics.rigid import inverted, matrices
 from limber.geometry.cloud.camera import Camera, depth_to_cloud
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.mechanics.sensitivities import grasp_slopes
-from limber.robot.cell.cell import Cell
 from limber.robot.virtual.branch_solver import BranchSetting, BranchSolver
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.depth_camera import scanned, views_around

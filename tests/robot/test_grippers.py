@@ -5,9 +5,9 @@ import threading
 
 import pytest
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import SafetyStop, WorkError
 from limber.core.progress import SILENT
-from limber.robot.cell.cell import Cell
 from limber.robot.grippers import drive_gripper, holds
 from limber.robot.operator_decisions import _opened_without_driver, grip
 from limber.robot.ur.robotiq import HELD_CLOSING, RobotiqGripper

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from limber.cell.cell_file import LimitsEntry, WorkspaceEntry
+from limber.cell.ur_arms import ARMS
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.cell.cell import LimitsEntry, WorkspaceEntry
 from limber.robot.driver.guard import Guard
 from limber.robot.driver.guard_states import GuardSettings, State, Verdict
 from limber.robot.interface import Sample
-from limber.robot.ur.arms import ARMS
 
 ARM = ARMS["ur5e"]
 JOINTS = np.array([0.1, -1.57, 1.57, -1.57, -1.57, 0.0])

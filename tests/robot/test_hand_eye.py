@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from limber.cell.cell_file import Cell, read_cell, write_cell
 from limber.cli.commands.robot import command
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
-from limber.robot.cell.cell import Cell, read_cell, write_cell
 from limber.robot.cell.hand_eye import base_from_camera, fit_camera
 from limber.store import Branch
 

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from limber.cell.known_arms import arm_named
+from limber.cell.ur_arms import ARMS
 from limber.core.errors import InputError, NoPathError
-from limber.robot.known_arms import arm_named
 from limber.robot.motion.joint_path import follow, joint_path
-from limber.robot.ur.arms import ARMS
 
 
 def random_joints(count: int, seed: int = 11) -> np.ndarray:

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell
+from limber.cell.obstacles import Box
 from limber.core.progress import Progress
-from limber.planning.constraints.obstacles import Box
 from limber.planning.plan_file import PlanPath
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.execution import robot_motion
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.motion.legs import described, legs_of

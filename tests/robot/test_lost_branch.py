@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.robot_stepped import Run, Spring
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.expected_force import ForceErrors, noise_at_rest, not_seen, white_noise
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.trajectory import Trajectory, along, densely

@@ -8,17 +8,17 @@ import pytest
 
 from benchmarks.robot_cells import cell_file, standing_at
 from benchmarks.robot_faults import cell_for, set_off, straight
+from limber.cell.cell_file import Cell, WorkspaceEntry
+from limber.cell.obstacles import Box
+from limber.cell.reach_and_collision import ArmSurroundings
 from limber.cli.commands.robot import command
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.planning.constraints.obstacles import Box
-from limber.robot.cell.cell import Cell, WorkspaceEntry
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.joint_planner import joint_space_path
 from limber.robot.motion.trajectory import along_bounded
 from limber.stages.paths.arm_moves import to_joints
-from limber.stages.paths.arm_surroundings import ArmSurroundings
 from limber.store import Branch
 
 GRASP = (0, 0, 0.15, 0, 0, 0)

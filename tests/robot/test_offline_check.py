@@ -5,8 +5,8 @@ import json
 import pytest
 
 from benchmarks.robot_cells import cell_file, standing_at
+from limber.cell.cell_file import Cell
 from limber.cli.commands.robot import command
-from limber.robot.cell.cell import Cell
 from limber.store import Branch
 
 

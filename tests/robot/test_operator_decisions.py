@@ -6,10 +6,10 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell
 from limber.cli.main import stage_command
 from limber.core.errors import SafetyStop, WorkError
 from limber.core.progress import SILENT
-from limber.robot.cell.cell import Cell
 from limber.robot.operator_decisions import retreat_if_chosen
 
 

@@ -14,12 +14,12 @@ import pytest
 from tests.robot.conftest import Registers
 
 from benchmarks.robot_cells import cell_file, standing_at
+from limber.cell.arm import Rods
+from limber.cell.cell_file import Cell
+from limber.cell.known_arms import arm_named, register_arm
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.controls import control_of, register_control
-from limber.robot.interface import Rods
-from limber.robot.known_arms import arm_named, register_arm
 from limber.robot.motion.joint_path import follow
 from limber.robot.motion.trajectory import densely
 from limber.robot.virtual.controller import Controller
@@ -46,7 +46,7 @@ _TIP = _moved(FLANGE, 0, 0) @ _turned("y", np.array(np.pi / 2))
 
 @dataclass(frozen=True)
 class PieperArm:
-    """As limber.robot.interface.Arm asks for it."""
+    """As limber.cell.arm.Arm asks for it."""
 
     name: str = "pieper-6"
     controller: str = "pieper"
@@ -134,11 +134,11 @@ def test_it_is_known_by_its_name_and_no_other_arm_is():
 
 _PLUGGED = """
 from dataclasses import replace
-from limber.robot.known_arms import register_arm
-from limber.robot.ur.arms import ARMS
+from limber.cell.known_arms import register_arm
+from limber.cell.ur_arms import ARMS
 register_arm(replace(ARMS["ur5"], name="plugged-6"))
 """
-_ASKED = "from limber.robot.known_arms import arm_named; print(arm_named('plugged 6').name)"
+_ASKED = "from limber.cell.known_arms import arm_named; print(arm_named('plugged 6').name)"
 
 
 @pytest.mark.slow

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.pull_plausibility import (
     LOOKED_M,

@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell, write_cell
 from limber.cli.commands.robot import command
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress
 from limber.geometry.io.clouds import read_cloud
-from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.live_view import look
 from limber.robot.realsense import RealSense, camera_differences, seen_points
 from limber.stages.paths.plan_cell import cell_positions

@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from benchmarks.robot_faults import restored
+from limber.cell.cell_file import CameraEntry, Cell
+from limber.cell.known_arms import arm_named
 from limber.cli.main import command_of
 from limber.core.errors import BranchFolderError, InputError, NoPathError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices
@@ -24,8 +26,6 @@ from limber.core.progress import SILENT
 from limber.geometry.cloud.camera import D455
 from limber.perception.observe import observe
 from limber.recordings.recording import read_pull
-from limber.robot.cell.cell import CameraEntry, Cell
-from limber.robot.known_arms import arm_named
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
 from limber.robot.virtual.depth_camera import VirtualCamera
 from limber.stages.pulls.record import (

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.robot_faults import cell_for, new_robot, restored, straight
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, SafetyStop, WorkError
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.link import COLUMNS, RobotLink
 from limber.robot.robot_state import observe, show_before_motion
 

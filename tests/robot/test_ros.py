@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from benchmarks.robot_rosbridge import RosBridge
+from limber.cell.cell_file import Cell, write_cell
 from limber.cli.commands.ros import command
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.trajectory import Trajectory, along, densely

@@ -9,9 +9,9 @@ import pytest
 from tests.robot.test_ros import CELL, HOME, line, robot_at
 
 from benchmarks.robot_rosbridge import ReplayedBridge, RosBridge
+from limber.cell.cell_file import write_cell
 from limber.cli.commands.ros import command
 from limber.core.errors import SafetyStop
-from limber.robot.cell.cell import write_cell
 
 KINDS = {"/joint_states": "sensor_msgs/msg/JointState",
          "/force_torque_sensor_broadcaster/wrench": "geometry_msgs/msg/WrenchStamped"}

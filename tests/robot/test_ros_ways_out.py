@@ -12,9 +12,9 @@ from tests.robot.test_ros import CELL, HOME, ROOT, line, robot_at
 
 from benchmarks import robot_rosbridge
 from benchmarks.robot_rosbridge import STEP, RosBridge, SteppedBridge
+from limber.cell.cell_file import Cell, write_cell
 from limber.cli.commands.ros import command
 from limber.core.errors import Cancelled, InputError, SafetyStop, WorkError
-from limber.robot.cell.cell import Cell, write_cell
 from limber.robot.driver import delays
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.ros import guarded_robot

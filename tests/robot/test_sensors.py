@@ -6,10 +6,10 @@ import threading
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, WorkError
 from limber.core.numerics.rigid import matrices
 from limber.core.numerics.rigid_kernels import turned_wrench, weight_wrench
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.force_sensors import (
     FT300_PORT,
     ControllerSensor,

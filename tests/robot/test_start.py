@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell
+from limber.cell.ur_arms import ARMS
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
-from limber.robot.cell.cell import Cell
 from limber.robot.interface import Sample
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.retreat import RetreatPath
 from limber.robot.motion.start_check import require_start
 from limber.robot.motion.trajectory import Trajectory, along, densely
-from limber.robot.ur.arms import ARMS
 from limber.stages.pulls.record_path import there_and_back
 
 ARM = ARMS["ur5e"]

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import angle_between, pose_vectors, turn_between
 from limber.planning.plan_file import PlanTurning
-from limber.robot.cell.cell import Cell
 from limber.robot.motion import turning
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.motion.turning import TurnCost, turned, turned_motion

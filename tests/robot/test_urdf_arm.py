@@ -8,15 +8,15 @@ from tests.robot.conftest import Registers
 
 from benchmarks.robot_cells import cell_file, standing_at
 from benchmarks.robot_faults import cell_for, straight, tared
+from limber.cell.cell_file import Cell, read_cell, write_cell
+from limber.cell.known_arms import arm_named
+from limber.cell.ur_arms import ARMS
 from limber.core.errors import InputError, NoPathError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.cell.cell import Cell, read_cell, write_cell
 from limber.robot.driver.controls import control_of
 from limber.robot.driver.link import RobotLink
-from limber.robot.known_arms import arm_named
 from limber.robot.motion.joint_path import follow, joint_path
 from limber.robot.motion.trajectory import densely
-from limber.robot.ur.arms import ARMS
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.launch import VirtualRobot
 from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute

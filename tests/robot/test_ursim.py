@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from limber.robot.cell.cell import Cell
+from limber.cell.cell_file import Cell
 from limber.robot.driver.controls import calibration_of
 from limber.robot.ur.ur_control import UrControl
 

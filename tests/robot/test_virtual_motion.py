@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from tests.robot.conftest import Registers
 
+from limber.cell.ur_arms import ARMS
 from limber.core.numerics.rigid import matrices
-from limber.robot.ur.arms import ARMS
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.controller_modes import RuntimeState, SafetyMode
 from limber.robot.virtual.force_sensor import E_SERIES, ForceSensor

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.robot_stepped import Run, Wall
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.contact_speed import contact_speed, speed_within
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.trajectory import Trajectory, along, densely

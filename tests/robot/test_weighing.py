@@ -5,11 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell
+from limber.cell.reach_and_collision import ArmSurroundings
 from limber.cli.robot_commands.moves import log_move
 from limber.cli.robot_commands.weigh import weighed, weightless
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.cell.cell import Cell
 from limber.robot.weighing import (
     require_weighed,
     tilted_joints,
@@ -18,7 +19,6 @@ from limber.robot.weighing import (
     weighed_as,
 )
 from limber.stages.paths.arm_moves import to_joints
-from limber.stages.paths.arm_surroundings import ArmSurroundings
 
 MASS = 0.9
 SWAPPED = np.eye(3)[[1, 2, 0]]

@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from benchmarks.paper_branches import BRANCHES, FRACTIONS, PaperBranch
 from benchmarks.table import Asked, Row
 from benchmarks.trials import Trial, column, sound
+from limber.cell.cell_file import Cell
 from limber.core.errors import LimberError, NoPathError
 from limber.core.numerics.rigid import pose_vectors
 from limber.core.progress import SILENT, Progress
@@ -39,7 +40,6 @@ from limber.planning.make_plan import PlannedMotion, plan_motion
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses, resolve_path
 from limber.planning.path_problem import BlockedError, GentleProblem, random_start
 from limber.planning.settings import PlanSettings
-from limber.robot.cell.cell import Cell
 from limber.stages.paths.plan_cell import cell_positions
 
 ARC_NAMES = tuple(branch.name for branch in BRANCHES)

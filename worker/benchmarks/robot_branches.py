@@ -24,6 +24,7 @@ from benchmarks.machine_stalls import FAILURES, Voided
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from benchmarks.table import Asked, Row, Setting, share_met
 from benchmarks.trials import column, joined, sound
+from limber.cell.cell_file import ApproachEntry
 from limber.cli.closed_loop.comparison import GOAL_TOLERANCE_M, comparison
 from limber.cli.closed_loop.loop import OPEN_FACTOR, ClosedLoop
 from limber.cli.terminal import table_lines
@@ -36,7 +37,6 @@ from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
 from limber.mechanics import solve_static
 from limber.mechanics.materials.materials import young_weights
 from limber.recordings.time_series import read_stream
-from limber.robot.cell.cell import ApproachEntry
 from limber.robot.motion.execution import across
 from limber.robot.virtual.launch import VirtualRobot
 from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.cell.cell_file import Cell, write_cell
+from limber.cell.known_arms import arm_named
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.estimation.simulated_pull import VirtualPullSettings
-from limber.robot.cell.cell import Cell, write_cell
-from limber.robot.known_arms import arm_named
 from limber.robot.motion.execution import across
 from limber.robot.virtual.branch_solver import BranchSetting
 from limber.robot.virtual.launch import VirtualRobot

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.half_open import Cable, Direction
+from limber.cell.cell_file import Cell
+from limber.cell.known_arms import arm_named
 from limber.core.errors import LimberError
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.link import RobotLink
-from limber.robot.known_arms import arm_named
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.trajectory import Trajectory, along, densely
 from limber.robot.virtual.launch import VirtualRobot

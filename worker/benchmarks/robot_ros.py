@@ -13,8 +13,8 @@ import numpy as np
 from benchmarks.machine_stalls import Voided
 from benchmarks.robot_rosbridge import STEP, RosBridge
 from benchmarks.table import Asked, Row, Setting
+from limber.cell.cell_file import Cell
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.real_time import claim_real_time, keep_awake
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path

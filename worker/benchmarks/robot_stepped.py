@@ -7,8 +7,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.numerics.rigid_kernels import crossed
-from limber.robot.cell.cell import Cell
 from limber.robot.driver import control_loop
 from limber.robot.interface import Sample
 from limber.robot.virtual.arm_motions import Braking, Servo, nearest_joints

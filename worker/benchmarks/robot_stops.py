@@ -15,9 +15,9 @@ import numpy as np
 from benchmarks.robot_stepped import Patch, Run, Spring, Wall
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.trials import column, sound
+from limber.cell.cell_file import Cell
 from limber.core.errors import LimberError
 from limber.core.numerics.rigid_kernels import crossed
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.link import COLUMNS
 from limber.robot.interface import Sample
 from limber.robot.motion.contact_speed import speed_within

@@ -302,7 +302,7 @@ def _read_jobs(_template: Path, path: Path) -> Any:
 
 def _cell(_template: Path, folder: Path) -> list[Path]:
     from benchmarks.robot_faults import cell_for
-    from limber.robot.cell.cell import write_cell
+    from limber.cell.cell_file import write_cell
 
     path = folder / "cell.toml"
     write_cell(path, cell_for("127.0.0.71"))
@@ -310,7 +310,7 @@ def _cell(_template: Path, folder: Path) -> list[Path]:
 
 
 def _read_cell(_template: Path, path: Path) -> Any:
-    from limber.robot.cell.cell import read_cell
+    from limber.cell.cell_file import read_cell
 
     return read_cell(path)
 

@@ -32,8 +32,8 @@ def write_pages(folder: Path) -> None:
 
 def pages() -> dict[str, str]:
     """Return the text of each generated page by its path in the guide."""
+    from limber.cell.cell_file import Cell
     from limber.recordings.recording import PullEntry
-    from limber.robot.cell.cell import Cell
 
     return {
         "explanation/accuracy.md": accuracy_page(),

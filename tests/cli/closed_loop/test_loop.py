@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from limber.cell.cell_file import Cell
+from limber.cell.known_arms import arm_named
 from limber.cli import main
 from limber.cli.closed_loop import loop
 from limber.cli.closed_loop.cell_layout import (
@@ -25,8 +27,6 @@ from limber.core.progress import Progress
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.planning.path_problem import UNPROVEN
 from limber.robot.cell.base_calibration import fit_base
-from limber.robot.cell.cell import Cell
-from limber.robot.known_arms import arm_named
 
 TOOL = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 

@@ -463,9 +463,10 @@ def _preview(joints, base, arm):
 
 @pytest.mark.parametrize("away, model", [(0.0, "ur5e"), (0.1, "ur5e"), (0.0, "gone.urdf")])
 def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away, model):
-    """In each frame: foot and links as rods of the arm's own lengths, and a gripper about the
-    grasp, which is in the picture; an arm that is elsewhere, or not known here, is not shown."""
-    from limber.robot.known_arms import arm_named
+    """In each frame: foot and links as rods of the arm's own lengths, and the cell's gripper,
+    which is in the picture; an arm that is elsewhere, or not known here, is not shown."""
+    from limber.cell.known_arms import arm_named
+    from limber.core.numerics.rigid import matrices
 
     arm = arm_named("ur5e")
     steps = np.linspace(0, 1, 41)[:, None]
@@ -479,7 +480,9 @@ def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away, mo
         "frames/p.pc2": _pc2(np.repeat(surface[None], len(points), axis=0))})
     with branch.stage("execute-preview:p", reads=["plans/p.csv"]) as stage:
         stage.path("executions/p-preview.csv").write_text(table)
-        stage.result.update(model=model, base_pose=base)
+        stage.result.update(model=model, base_pose=base, gripper_rods=[
+            [0, 0, 0, 0, 0, 0.1, 0.04], [0, 0.02, 0.1, 0, 0.02, 0.15, 0.01],
+            [0, -0.02, 0.1, 0, -0.02, 0.15, 0.01]])
     data = scene_data(Branch.open(tmp_path / "a.branch"))
     if away or model != "ur5e":
         assert "robot_starts" not in data.arrays
@@ -493,7 +496,8 @@ def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away, mo
     np.testing.assert_allclose(lengths, np.linalg.norm(own.ends - own.starts, axis=2), atol=1e-7)
     np.testing.assert_allclose(data.arrays["robot_radii"][1:-3], own.radii)
     fingers = 0.5 * (ends[:, -2] + ends[:, -1])
-    assert np.linalg.norm(fingers - points, axis=1).max() < 0.03
+    flange = matrices(np.array(base)) @ arm.forward(joints[::10])
+    np.testing.assert_allclose(fingers, (flange @ [0, 0, 0.15, 1])[:, :3], atol=1e-6)
     shown = data.arrays["view_points"]
     assert all((shown == end).all(axis=1).any() for end in ends[0, -3:])
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise, product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from limber.cell.arm import Rods
+from limber.cell.cell_file import Cell
+from limber.cell.known_arms import arm_named
+from limber.cell.obstacles import Box, Obstacle, Solid
+from limber.cell.reach_and_collision import drawn_arm, drawn_gripper
 from limber.core.numerics.rigid import matrices
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.planning.constraints.obstacles import Box, Obstacle, Solid
-from limber.robot.cell.cell import Cell
-from limber.robot.known_arms import arm_named
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,9 +26,6 @@ _CAMERA, _OBSTACLE, _WORKSPACE = "#b03060", "#9a9a9a", "#6a4c93"
 _SHOWN_VIEW_M = 1.0  # of a camera's range that is drawn
 _AXIS_M = 0.15  # length of the drawn axes of a frame
 _ROUND = np.linspace(0.0, np.pi, 13)
-
-Rod = tuple[np.ndarray, np.ndarray, float]
-"""Two ends [m], branch frame, and a radius [m]."""
 
 
 def cell_picture(cell: Cell, joints: np.ndarray, obstacles: Sequence[Obstacle],
@@ -58,12 +57,12 @@ def _draw(axes: Axes, seen: list[int], cell: Cell, joints: np.ndarray,
     base = matrices(np.array(cell.base.pose))
     if cell.second_arm is not None:
         other = arm_named(cell.second_arm.model)
-        _rods(axes, seen, arm_rods(other, matrices(np.array(cell.second_arm.base_pose)),
-                                   np.array(other.home, float)), _SECOND,
+        _rods(axes, seen, drawn_arm(other, np.array([other.home], float),
+                                    matrices(np.array(cell.second_arm.base_pose))), _SECOND,
               f"second arm ({other.name}) at its home")
-    _rods(axes, seen, arm_rods(cell.arm, base, joints), _ARM, f"arm ({cell.arm.name})")
+    _rods(axes, seen, drawn_arm(cell.arm, joints[None], base), _ARM, f"arm ({cell.arm.name})")
     flange = base @ cell.arm.forward(joints)
-    _rods(axes, seen, list(gripper_rods(cell, flange)), _TOOL, "gripper")
+    _rods(axes, seen, drawn_gripper(cell, flange[None]), _TOOL, "gripper")
     if skeleton is not None:
         _branch(axes, seen, skeleton)
     if cell.camera is not None:
@@ -76,32 +75,11 @@ def _draw(axes: Axes, seen: list[int], cell: Cell, joints: np.ndarray,
         _frame(axes, seen, frame, name, side)
 
 
-def arm_rods(arm: Any, base: np.ndarray, joints: np.ndarray) -> list[Rod]:
-    """Return the rods of an arm's foot and links at joint angles [n].
-
-    Args:
-        base: Frame of its base, branch frame, shape [4, 4].
-    """
-    rods = arm.rods(joints[None])
-    starts, ends = (points[0] @ base[:3, :3].T + base[:3, 3] for points in (rods.starts, rods.ends))
-    foot = (base[:3, 3], starts[0], float(rods.radii[0]))
-    return [foot, *zip(starts, ends, map(float, rods.radii), strict=True)]
-
-
-def gripper_rods(cell: Cell, flange: np.ndarray) -> Iterator[Rod]:
-    """Yield the stated shape of the gripper, or a line from the flange to the grasp."""
-    for part in cell.tool.parts:
-        ends = np.array([part.start_m, part.end_m]) @ flange[:3, :3].T + flange[:3, 3]
-        yield ends[0], ends[1], part.radius_m
-    if not cell.tool.parts:
-        yield (flange[:3, 3], (flange @ matrices(np.array(cell.tool.grasp_pose)))[:3, 3],
-               0.5 * cell.arm.link_radius)
-
-
-def _rods(axes: Axes, seen: list[int], rods: Sequence[Rod], colour: str, label: str) -> None:
+def _rods(axes: Axes, seen: list[int], rods: Rods, colour: str, label: str) -> None:
     from matplotlib.collections import PolyCollection
 
-    outlines = [_outline(start[seen], end[seen], radius) for start, end, radius in rods]
+    outlines = [_outline(start[seen], end[seen], radius) for start, end, radius in
+                zip(rods.starts[0], rods.ends[0], rods.radii, strict=True)]
     axes.add_collection(PolyCollection(outlines, facecolors=colour, edgecolors="white",
                                        linewidths=0.6, alpha=0.85, zorder=3, label=label))
     axes.update_datalim(np.concatenate(outlines))

@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from limber.cell.known_arms import arm_named
+from limber.cell.ur_arms import ARMS
 from limber.core.constants import STANDARD_GRAVITY
 from limber.core.errors import InputError
 from limber.planning.constraints.damage import assumed, assumed_strain
-from limber.robot.known_arms import arm_named
-from limber.robot.ur.arms import ARMS
 from limber.store import Branch
 
 ASSUMED = ("This branch was not pulled, so the modulus of the simulated pull is assumed. The "

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, LimberError
 from limber.core.numerics.rigid import inverted, matrices
 from limber.geometry.cloud.camera import Camera, depth_to_cloud, write_camera
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.perception.observe import write_depth
-from limber.robot.cell.cell import Cell
 from limber.robot.realsense import RealSense
 
 _DEPTH_SCALE = 10_000.0  # steps of 0.1 mm

@@ -1,7 +1,7 @@
 """A cell's gripper, driven without a control program: it has to open even if nothing else works."""
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
-from limber.robot.cell.cell import Cell
 from limber.robot.ur.digital_output import switch_output
 from limber.robot.ur.robotiq import HELD_CLOSING, RobotiqGripper
 

@@ -2,7 +2,7 @@
 
 Cell, motion, guard, virtual controller, planning and scenes use a robot only through these. An arm
 that meets :class:`Arm` can be planned with and checked once it has a name
-(:func:`limber.robot.known_arms.register_arm`). It can be moved if a driver of its controller exists
+(:func:`limber.cell.known_arms.register_arm`). It can be moved if a driver of its controller exists
 too (:class:`ArmControl`, :func:`limber.robot.driver.controls.register_control`).
 
 Frames are those of the controller: its base frame and the flange. Joints are revolute; angles are
@@ -18,124 +18,6 @@ import numpy as np
 
 PLAYING = 2
 """A running program, as RTDE reports it."""
-
-
-@dataclass(frozen=True)
-class Rods:
-    """The moving links of an arm in some poses, as capsules, in its base's frame.
-
-    Attributes:
-        names: Names of the links, one per rod.
-        starts, ends: End points of the rods' axes [m], shape [poses, rods, 3].
-        radii: [m], shape [rods].
-    """
-
-    names: tuple[str, ...]
-    starts: np.ndarray
-    ends: np.ndarray
-    radii: np.ndarray
-
-
-class Arm(Protocol):
-    """The description of an arm: kinematics, limits, shape. It never changes.
-
-    Attributes:
-        name: Its name in a cell file (``robot.model``).
-        controller: Kind of its controller, which determines its driver.
-        rate: Steps a second of the controller [Hz].
-        measures_force: Whether the controller itself measures the force at the flange well enough
-            for the guard.
-        payload: Greatest mass at the flange [kg].
-        joint_names: One name per joint, for a person.
-        ros_joints: Parts of the names under which ROS sends the joints.
-        joint_limits: Least and greatest angles [rad], infinite for an endless joint, shape [n, 2].
-        joint_speed: Greatest speeds [rad/s], shape [n].
-        home: Angles far from every singularity and limit [rad], shape [n].
-        shoulder: Centre of the arm's reach, base frame [m], shape [3].
-        reach: Greatest distance of the wrist from there [m].
-        link_radius: Radius of the links in drawings [m].
-        singularity_names: Names of the columns of :meth:`singularity_distance`.
-    """
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def controller(self) -> str: ...
-    @property
-    def rate(self) -> float: ...
-    @property
-    def measures_force(self) -> bool: ...
-    @property
-    def payload(self) -> float: ...
-    @property
-    def joint_names(self) -> tuple[str, ...]: ...
-    @property
-    def ros_joints(self) -> tuple[str, ...]: ...
-    @property
-    def joint_limits(self) -> np.ndarray: ...
-    @property
-    def joint_speed(self) -> Sequence[float] | np.ndarray: ...
-    @property
-    def home(self) -> Sequence[float] | np.ndarray: ...
-    @property
-    def shoulder(self) -> np.ndarray: ...
-    @property
-    def reach(self) -> float: ...
-    @property
-    def link_radius(self) -> float: ...
-    @property
-    def singularity_names(self) -> tuple[str, ...]: ...
-
-    def forward(self, joints: np.ndarray) -> np.ndarray:
-        """Return the flange's frames [..., 4, 4] at joint angles [..., n]."""
-        ...
-
-    def link_frames(self, joints: np.ndarray) -> np.ndarray:
-        """Return the frames [..., m, 4, 4] of the links from the base on, the flange's last, at
-        joint angles [..., n]."""
-        ...
-
-    def jacobian(self, joints: np.ndarray) -> np.ndarray:
-        """Return the flange's velocity [m/s] over its angular velocity [rad/s], base frame, one
-        column per unit joint speed, shape [..., 6, n], at joint angles [..., n].
-        """
-        ...
-
-    def inverse(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """Return joint angles that bring the flange to ``frames``, up to whole turns.
-
-        Args:
-            frames: Frames of the flange, shape [..., 4, 4].
-            near: Angles [..., n] near the requested solution. The nearest solution is among those
-                returned; others may be omitted.
-
-        Returns:
-            One configuration per row, shape [..., k, n] with any k; rows that do not exist are NaN.
-        """
-        ...
-
-    def configurations(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """Return the joint paths through ``frames``: in each the arm keeps its configuration.
-
-        Args:
-            frames: Frames of the flange, in order and close together, shape [poses, 4, 4].
-            near: Angles [n] from which the first is reached, as :meth:`inverse` takes them.
-
-        Returns:
-            Angles [rad] up to whole turns, shape [k, poses, n]; poses that a configuration does
-            not reach are NaN.
-        """
-        ...
-
-    def singularity_distance(self, joints: np.ndarray) -> np.ndarray:
-        """Return the distance of joint angles [..., n] from each kind of singularity, shape [...,
-        s]: 0 in it, at most about 1.
-        """
-        ...
-
-    def rods(self, joints: np.ndarray) -> Rods:
-        """Return the moving links at joint angles [poses, n], for collision checks."""
-        ...
 
 
 @dataclass(frozen=True)

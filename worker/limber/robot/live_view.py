@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import LimberError
 from limber.core.progress import Progress
 from limber.geometry.cloud.camera import Camera, project
-from limber.robot.cell.cell import Cell
 from limber.robot.realsense import RealSense, camera_differences, placed_image
 
 _BRANCH_M = 0.02  # from the branch's nodes at rest: its own points, with their noise

@@ -14,8 +14,8 @@ from limber.robot.grippers import drive_gripper, holds, is_driven
 from limber.robot.robot_state import show_before_motion
 
 if TYPE_CHECKING:
+    from limber.cell.cell_file import Cell
     from limber.core.progress import Progress
-    from limber.robot.cell.cell import Cell
 
 AfterStop = Literal["ask", "hold", "retreat"]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from limber.robot.cell.cell import Cell
+from limber.cell.cell_file import Cell
 
 LOOKED_M = 0.01
 """Travel by which a wrong sensor has been detected."""

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import MissingDependencyError, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.optional import pip_install
 from limber.geometry.cloud.camera import Camera, depth_to_cloud
-from limber.robot.cell.cell import Cell
 
 _FRAMES = 15
 """Frames of one image: their median has less noise, and half of them may miss a pixel."""

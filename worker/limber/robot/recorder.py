@@ -8,11 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import WorkError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, SensorEntry
-from limber.robot.cell.cell import Cell
 
 _FRAMES_FOR_NOISE = 15
 _LEAST_NOISE_M = 1e-4  # a tracker that smooths its points hides their noise

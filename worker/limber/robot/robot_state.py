@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import matrices
-from limber.robot.cell.cell import Cell
 from limber.robot.cell.controller_settings import Difference, differences
 from limber.robot.driver.controls import calibration_of, control_of
 from limber.robot.driver.force_sensors import ForceTorqueSensor, open_sensor

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.core.json_lines import json_objects
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.followed_path import log_path
 
 GRAVITY = 9.81

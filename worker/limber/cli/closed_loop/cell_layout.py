@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import scipy
 
+from limber.cell.arm import Arm
+from limber.cell.cell_file import Cell
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.robot.cell.cell import Cell
-from limber.robot.interface import Arm
 from limber.robot.motion.execution import across
 from limber.robot.motion.joint_path import JointPath, follow
 from limber.robot.motion.trajectory import densely

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell, read_cell, write_cell
+from limber.cell.known_arms import arm_named
 from limber.cli.closed_loop.cell_layout import (
     GRASP_FRACTION,
     base_beside,
@@ -37,8 +39,6 @@ from limber.estimation.simulated_pull import TrueBranch, true_branch
 from limber.geometry.generated import read_truth
 from limber.geometry.io.skeletons import read_swc
 from limber.planning.path_problem import UNPROVEN
-from limber.robot.cell.cell import Cell, read_cell, write_cell
-from limber.robot.known_arms import arm_named
 from limber.robot.virtual.branch_solver import BranchSetting
 from limber.robot.virtual.launch import VirtualRobot
 from limber.robot.virtual.server import MARKER_PORT

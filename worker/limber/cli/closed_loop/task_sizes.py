@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from limber.cell.cell_file import Cell, LimitsEntry
 from limber.estimation.forward.gripper_path import force_for_travel
 from limber.mechanics import solve_static
-from limber.robot.cell.cell import Cell, LimitsEntry
 from limber.store import Branch
 from limber.store.loading import load_grasp_model
 

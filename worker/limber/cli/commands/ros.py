@@ -14,7 +14,7 @@ import numpy as np
 from limber.cli.main import Run, stage_command
 
 if TYPE_CHECKING:
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
     from limber.robot.motion.trajectory import Trajectory
     from limber.stages.pulls.record_nudge import Nudge
 
@@ -40,7 +40,7 @@ def _url(function: Any) -> Any:
 @_url
 def check(run: Run, cell_file: Path, url: str) -> dict[str, Any]:
     """Read joint states, wrenches and the controller's modes, and move nothing."""
-    from limber.robot.cell.cell import read_cell
+    from limber.cell.cell_file import read_cell
     from limber.robot.ros.bridge import Bridge
     from limber.robot.ros.guarded_robot import RosRobot, Topics
     from limber.robot.ros.topics import wrench_topic
@@ -75,8 +75,8 @@ def describe(run: Run, cell_file: Path, output: Path) -> dict[str, Any]:
     robot_state_publisher makes TF of it, MoveIt a planning scene; the launch file of
     scripts/examples/ros2 takes it as urdf:=cell.urdf.
     """
+    from limber.cell.cell_file import read_cell
     from limber.core.files.atomic import write_atomically
-    from limber.robot.cell.cell import read_cell
     from limber.robot.ros.cell_description import cell_srdf, cell_urdf, joint_names
 
     cell = read_cell(cell_file)
@@ -104,9 +104,9 @@ def scan(run: Run, cell_file: Path, topic: str, output: Path, views: int, url: s
     """
     import shlex
 
+    from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError
     from limber.geometry.cloud.cloud import Cloud
-    from limber.robot.cell.cell import read_cell
     from limber.robot.ros.bridge import Bridge
     from limber.robot.ros.cloud_topic import CloudTopic
     from limber.robot.ros.topics import Topics
@@ -157,8 +157,8 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
     safety channel: run the node of scripts/examples/ros2 beside the controller; it also acts on
     silence.
     """
+    from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError, SafetyStop
-    from limber.robot.cell.cell import read_cell
     from limber.robot.ros.bridge import SECONDS
     from limber.robot.ros.topics import wrench_topic
     from limber.robot.weighing import require_weighed
@@ -204,8 +204,8 @@ def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: st
     The path is on disk, so this works after a stop and after a crash. Exit code 4 where the force
     does not fall: open the gripper then.
     """
+    from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError, SafetyStop
-    from limber.robot.cell.cell import read_cell
     from limber.robot.motion.followed_path import followed_path
     from limber.robot.ros.topics import wrench_topic
 
@@ -244,8 +244,8 @@ def serve(run: Run, cell_file: Path, service: str, armed: bool, confirm: str | N
     `ros2 service call /limber/retreat std_srvs/srv/Trigger` then does what `limber ros retreat`
     does, and answers how it ended. A call while the arm moves is refused.
     """
+    from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError, SafetyStop
-    from limber.robot.cell.cell import read_cell
     from limber.robot.ros.bridge import Bridge
     from limber.robot.ros.topics import wrench_topic
     from limber.robot.ros.trigger_service import TriggerService
@@ -303,8 +303,8 @@ def _answered(run: Run, cell: Cell, armed: bool, url: str) -> tuple[bool, str]:
 def gripper(run: Run, cell_file: Path, position: float, effort: float, action: str, armed: bool,
             confirm: str | None, url: str) -> dict[str, Any]:
     """Close or open the gripper by its action in ROS; `stalled` tells that it holds something."""
+    from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError, SafetyStop
-    from limber.robot.cell.cell import read_cell
     from limber.robot.ros.bridge import SECONDS, Bridge
     from limber.robot.ros.gripper_action import drive
 

@@ -17,7 +17,7 @@ def command(what: str, table: bool) -> None:
     add-on's panels and batch jobs are made from them. `limber STAGE --schema` prints one.
     """
     if what == "cell":
-        from limber.robot.cell.cell import Cell
+        from limber.cell.cell_file import Cell
 
         click.echo(json.dumps(Cell.model_json_schema(), indent=1))
         return

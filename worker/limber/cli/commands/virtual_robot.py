@@ -32,9 +32,9 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
     differs from the folder's. Force mode, freedrive and contact detection are not supported: an
     unknown command ends the program and is logged.
     """
-    from limber.robot.cell.cell import read_cell
+    from limber.cell.cell_file import read_cell
+    from limber.cell.known_arms import arm_named
     from limber.robot.driver.real_time import VIRTUAL_ROBOT_PRIORITY, claim_real_time
-    from limber.robot.known_arms import arm_named
     from limber.robot.virtual.controller import Controller
     from limber.robot.virtual.gripped_branch import HeldBranch
     from limber.robot.virtual.launch import serve

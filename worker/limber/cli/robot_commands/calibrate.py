@@ -66,8 +66,8 @@ def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path 
     the camera's pictures by another program (OpenCV's solvePnP gives such poses). The branch's scan
     is in the frame of that camera, so no points need to be touched.
     """
+    from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError
-    from limber.robot.cell.cell import read_cell
     from limber.store import Branch
 
     cell, branch = read_cell(cell_file), Branch.read(branch_folder)
@@ -222,7 +222,7 @@ def _close(run: Run, cell_file: Path, residual: float, sigma: float) -> None:
 def _write_base(cell_file: Path, cell: Any, branch: str, pose: np.ndarray, position_sigma: float,
                 rotation_sigma: float, residual: float) -> None:
     """Write a cell whose base is calibrated for a branch, with the branch's identity."""
-    from limber.robot.cell.cell import BaseEntry, write_cell
+    from limber.cell.cell_file import BaseEntry, write_cell
 
     base = BaseEntry(pose=tuple(map(float, pose)), position_sigma_m=max(position_sigma, 1e-4),
                      rotation_sigma_rad=max(rotation_sigma, 1e-4), residual_m=residual)

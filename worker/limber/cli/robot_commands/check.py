@@ -10,7 +10,7 @@ import click
 from limber.cli.main import Run, stage_command
 
 if TYPE_CHECKING:
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
     from limber.robot.robot_state import Observed
 
 _SECONDS = 1.0
@@ -34,8 +34,8 @@ def check(run: Run, cell_file: Path, offline: bool, folder: Path | None, plan: s
     showing them, and restore them. With --offline only the cell file, its calibration and a plan
     are checked.
     """
+    from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError
-    from limber.robot.cell.cell import read_cell
     from limber.robot.weighing import unweighed
 
     if ((folder or plan) and not offline) or (plan and folder is None):
@@ -53,9 +53,9 @@ def check(run: Run, cell_file: Path, offline: bool, folder: Path | None, plan: s
 def _from_files(run: Run, cell: Cell, cell_file: Path, folder: Path | None, plan: str | None,
                 ) -> dict[str, Any]:
     """Check a cell, its calibration and a plan without a robot."""
-    from limber.robot.cell.compatibility import check_branch
+    from limber.cell.cell_file import check_branch
+    from limber.cell.obstacles import cell_obstacles
     from limber.stages.paths.execute import ExecuteSettings, planned_motion
-    from limber.stages.paths.plan_cell import cell_obstacles
     from limber.store import Branch
 
     obstacles = cell_obstacles(cell, cell_file.parent)

@@ -25,11 +25,11 @@ def draw(run: Run, cell_file: Path, folder: Path | None, output: Path, joints: s
     No robot is needed. Compare it with the bench: a base that is turned, a pose in millimetres or
     an obstacle on the wrong side are seen at once.
     """
+    from limber.cell.cell_file import read_cell
+    from limber.cell.obstacles import cell_obstacles
     from limber.core.errors import InputError
     from limber.core.files.atomic import replacing
     from limber.core.optional import require_extra
-    from limber.robot.cell.cell import read_cell
-    from limber.stages.paths.plan_cell import cell_obstacles
     from limber.store import Branch
     from limber.store.loading import load_skeleton
 

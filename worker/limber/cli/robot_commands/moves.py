@@ -17,7 +17,7 @@ import numpy as np
 from limber.cli.main import Run, stage_command
 
 if TYPE_CHECKING:
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.interface import Sample
     from limber.robot.motion.trajectory import Trajectory
@@ -46,7 +46,7 @@ def move_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.C
 def home(run: Run, cell_file: Path, confirm: str | None, armed: bool, folder: Path | None,
          ) -> dict[str, Any]:
     """Move the empty arm to its home pose, past the cell's obstacles and the branch."""
-    from limber.robot.cell.cell import read_cell
+    from limber.cell.cell_file import read_cell
 
     cell = read_cell(cell_file)
     return _to(run, cell_file, cell, folder, np.array(cell.arm.home), "home", armed, confirm)
@@ -63,7 +63,7 @@ def goto_start(run: Run, cell_file: Path, confirm: str | None, armed: bool, bran
 
     The plan is checked by a dry run of `limber execute` first, which states that start.
     """
-    from limber.robot.cell.cell import read_cell
+    from limber.cell.cell_file import read_cell
     from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute
 
     cell = read_cell(cell_file)
@@ -80,8 +80,8 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
     The path is on disk, so this works after a crash of the program that followed it. Exit code 4 if
     a force over the soft limit remains.
     """
+    from limber.cell.cell_file import read_cell
     from limber.core.errors import SafetyStop
-    from limber.robot.cell.cell import read_cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.motion.followed_path import followed_path
     from limber.robot.motion.retreat import RetreatPath
@@ -115,7 +115,7 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
 @move_command("release")
 def release(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
     """Open the gripper, and retreat from the branch opposite to the approach."""
-    from limber.robot.cell.cell import read_cell
+    from limber.cell.cell_file import read_cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.operator_decisions import grip, require_confirmation
     from limber.stages.paths.arm_moves import away_from_branch
@@ -139,8 +139,8 @@ def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) ->
 
     It works while the robot is stopped: no program is needed on the controller.
     """
+    from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError
-    from limber.robot.cell.cell import read_cell
     from limber.robot.grippers import drive_gripper, is_driven
     from limber.robot.motion.followed_path import FollowedPathFile
 
@@ -167,11 +167,11 @@ def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) ->
 def _to(run: Run, cell_file: Path, cell: Cell, folder: Path | None, goal: np.ndarray, word: str,
         armed: bool, confirm: str | None) -> dict[str, Any]:
     """Plan the path of the empty arm to joint angles ``goal`` [n], and follow it if ``armed``."""
+    from limber.cell.obstacles import cell_obstacles
+    from limber.cell.reach_and_collision import ArmSurroundings
     from limber.robot.driver.link import RobotLink
     from limber.robot.operator_decisions import require_confirmation
     from limber.stages.paths.arm_moves import is_at, to_joints
-    from limber.stages.paths.arm_surroundings import ArmSurroundings
-    from limber.stages.paths.plan_cell import cell_obstacles
     from limber.store import Branch
     from limber.store.loading import load_skeleton
 

@@ -31,12 +31,10 @@ def new_cell(run: Run, cell_file: Path, **given: Any) -> dict[str, Any]:
     Mass and grasp of a gripper have no usual values: the file then says that they are to be filled
     in. An existing file is not overwritten.
     """
+    from limber.cell.cell_file import Cell, SensorEntry, ToolEntry, cell_template, not_stated, slips
+    from limber.cell.known_arms import arm_named
     from limber.core.errors import InputError
     from limber.core.files.atomic import write_atomically
-    from limber.robot.cell.cell import Cell, SensorEntry, ToolEntry
-    from limber.robot.cell.cell_template import cell_template, not_stated
-    from limber.robot.cell.implausible_values import slips
-    from limber.robot.known_arms import arm_named
 
     if cell_file.exists():
         raise InputError(f"{cell_file} exists already.", "A cell file is never overwritten.",

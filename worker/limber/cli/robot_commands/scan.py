@@ -13,7 +13,7 @@ import numpy as np
 from limber.cli.main import Run, stage_command
 
 if TYPE_CHECKING:
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
 
 
 @stage_command("scan")
@@ -39,9 +39,9 @@ def scan(run: Run, address: str, cell_file: Path | None, output: Path,
     is moved from here: guide the arm, and press Enter at each view. Clouds of other cameras are
     recorded with their own program, or come from ROS (`limber ros scan`).
     """
+    from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError
     from limber.geometry.cloud.cloud import Cloud
-    from limber.robot.cell.cell import read_cell
     from limber.robot.virtual.depth_camera import scanned, views_around
 
     count = views or (8 if cell_file is None else 1)

@@ -13,7 +13,7 @@ from limber.cli.main import Run
 from limber.cli.robot_commands.moves import log_move, move_command, require_empty, stands
 
 if TYPE_CHECKING:
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.motion.trajectory import Trajectory
 
@@ -29,14 +29,14 @@ def weigh(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[s
     A sensor of another sign, unit or other axes is named, and so is a mass that is off; exit code
     4. Do this away from the branch, before the first pull.
     """
+    from limber.cell.cell_file import read_cell
+    from limber.cell.obstacles import cell_obstacles
+    from limber.cell.reach_and_collision import ArmSurroundings
     from limber.core.errors import SafetyStop
-    from limber.robot.cell.cell import read_cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.operator_decisions import require_confirmation
     from limber.robot.weighing import require_tilts, tilted_joints, weighed_as
     from limber.stages.paths.arm_moves import to_joints
-    from limber.stages.paths.arm_surroundings import ArmSurroundings
-    from limber.stages.paths.plan_cell import cell_obstacles
 
     cell = read_cell(cell_file)
     require_empty(cell, run)

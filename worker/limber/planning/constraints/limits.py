@@ -10,9 +10,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from limber.cell.obstacles import Obstacle
 from limber.core.errors import InputError
 from limber.mechanics.materials.materials import strain_limit
-from limber.planning.constraints.obstacles import Broken, Constraint, Obstacle, Obstacles
+from limber.planning.constraints.obstacles import Broken, Constraint, Obstacles
 from limber.planning.field.energy_field import UNITS, EnergyField, FieldArrays
 from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.radial import LocalError, slack_of

@@ -5,8 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from limber.geometry.surface.distance import distance_to_surface
-from limber.geometry.surface.surface import Surface
+from limber.cell.obstacles import Obstacle, closest
 
 # Constraints on a plan in addition to the limits on energy, force and loads.
 #
@@ -66,48 +65,6 @@ class Constraint(Protocol):
 
 
 _SCALE = 0.1  # [m] in which closeness falls to a third
-_CHUNK = 2_000_000  # point and face pairs whose solid angles are summed together
-
-
-class Obstacle(Protocol):
-    """A body in the branch frame."""
-
-    name: str
-
-    def clearance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of ``points`` [n, 3] outside it [m], negative inside, shape [n]."""
-        ...
-
-
-@dataclass(frozen=True)
-class Box:
-    """A box of ``half`` edge lengths [m]; ``centre`` [m] and unit rows ``axes`` [3, 3]."""
-
-    name: str
-    half: np.ndarray
-    centre: np.ndarray
-    axes: np.ndarray
-
-    def clearance(self, points: np.ndarray) -> np.ndarray:
-        beyond = np.abs((points - self.centre) @ self.axes.T) - self.half
-        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
-        return outside + np.minimum(beyond.max(axis=1), 0.0)
-
-
-@dataclass(frozen=True)
-class Solid:
-    """The volume enclosed by a closed surface."""
-
-    name: str
-    surface: Surface
-
-    def clearance(self, points: np.ndarray) -> np.ndarray:
-        distance = distance_to_surface(points, self.surface)
-        low, high = self.surface.vertices.min(axis=0), self.surface.vertices.max(axis=0)
-        near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
-        for part in np.array_split(near, 1 + len(near) * len(self.surface.faces) // _CHUNK):
-            distance[part] *= np.where(np.abs(_winding(self.surface, points[part])) > 0.5, -1, 1)
-        return distance
 
 
 @dataclass(frozen=True)
@@ -151,25 +108,3 @@ class Obstacles(Constraint):
         return f"the branch is {1e3 * (depth - kept):.1f} mm inside {name} at ({position}) m"
 
 
-def closest(obstacles: tuple[Obstacle, ...], points: np.ndarray, radius: float = 0.0,
-            ) -> tuple[str, float, np.ndarray] | None:
-    """Return the obstacle that bodies of ``radius`` [m] at ``points`` [n, 3] penetrate deepest, the
-    depth [m] and its position [m]; None if they penetrate none.
-    """
-    worst = None
-    for obstacle in obstacles:
-        depth = radius - obstacle.clearance(points)
-        index = int(depth.argmax())
-        if depth[index] > 0.0 and (worst is None or depth[index] > worst[1]):
-            worst = obstacle.name, float(depth[index]), points[index]
-    return worst
-
-
-def _winding(surface: Surface, points: np.ndarray) -> np.ndarray:
-    """Winding number of a surface around points [n, 3] (Van Oosterom and Strackee 1983), [n]."""
-    a, b, c = (surface.vertices[surface.faces[:, k]][None] - points[:, None] for k in range(3))
-    la, lb, lc = (np.linalg.norm(v, axis=2) for v in (a, b, c))
-    over = np.einsum("nij,nij->ni", a, np.cross(b, c))
-    under = (la * lb * lc + np.einsum("nij,nij->ni", a, b) * lc
-             + np.einsum("nij,nij->ni", b, c) * la + np.einsum("nij,nij->ni", c, a) * lb)
-    return np.arctan2(over, under).sum(axis=1) / (2 * np.pi)

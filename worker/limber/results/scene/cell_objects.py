@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.cell.arm import Rods
+from limber.cell.cell_file import Cell
+from limber.cell.known_arms import arm_named
+from limber.cell.obstacles import Box, Obstacle, Solid
+from limber.cell.reach_and_collision import drawn_arm, drawn_gripper
 from limber.core.numerics.rigid import matrices
-from limber.planning.constraints.obstacles import Box, Obstacle, Solid
-from limber.results.cell_picture import Rod, arm_rods, camera_edges, gripper_rods
+from limber.results.cell_picture import camera_edges
 from limber.results.scene.arrays import SceneData
-from limber.robot.cell.cell import Cell
-from limber.robot.known_arms import arm_named
 
 _SIDES, _RINGS = 16, 5
 _LINE_M = 0.002  # radius of drawn edges
@@ -42,13 +44,13 @@ def add_cell(data: SceneData, cell: Cell, obstacles: Sequence[Obstacle]) -> None
     name = Path(cell.arm.name).stem
     moves = "robot" in data.info
     if not moves:
-        _add(data, "arm", f"Arm {name}", _capsules(arm_rods(cell.arm, base, home)))
-        _add(data, "tool", "Gripper", _capsules(list(gripper_rods(cell, flange))))
+        _add(data, "arm", f"Arm {name}", _capsules(drawn_arm(cell.arm, home[None], base)))
+        _add(data, "tool", "Gripper", _capsules(drawn_gripper(cell, flange[None])))
         _widen_view(data, "arm", "tool")
     if cell.second_arm is not None:
         other = arm_named(cell.second_arm.model)
-        _add(data, "second_arm", f"Second arm {Path(other.name).stem}", _capsules(arm_rods(
-            other, matrices(np.array(cell.second_arm.base_pose)), np.array(other.home, float))))
+        _add(data, "second_arm", f"Second arm {Path(other.name).stem}", _capsules(drawn_arm(
+            other, np.array([other.home], float), matrices(np.array(cell.second_arm.base_pose)))))
     if cell.camera is not None and not (moves and cell.camera.mount == "flange"):
         _add(data, "camera", "Camera's view", _lines(camera_edges(cell, flange)))
     if cell.workspace is not None:
@@ -86,12 +88,13 @@ def _surface(obstacle: Obstacle) -> _Part:
 
 
 def _lines(ends: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[_Part]:
-    return _capsules([(start, end, _LINE_M) for start, end in ends])
+    return [_capsule(start, end, _LINE_M) for start, end in ends]
 
 
-def _capsules(rods: Sequence[Rod]) -> list[_Part]:
-    """Closed surfaces of rods with round ends."""
-    return [_capsule(*rod) for rod in rods]
+def _capsules(rods: Rods) -> list[_Part]:
+    """Closed surfaces of the rods of one pose, with round ends."""
+    return [_capsule(start, end, float(radius)) for start, end, radius in
+            zip(rods.starts[0], rods.ends[0], rods.radii, strict=True)]
 
 
 def _capsule(start: np.ndarray, end: np.ndarray, radius: float) -> _Part:

@@ -4,19 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.cell.arm import Rods
+from limber.cell.known_arms import arm_named
+from limber.cell.reach_and_collision import GRIPPER, drawn_arm
 from limber.core.errors import InputError
 from limber.core.files.reading import read_columns
 from limber.core.numerics.rigid import matrices
 from limber.results.scene.arrays import SceneData
-from limber.robot.interface import Arm
-from limber.robot.known_arms import arm_named
 from limber.store import Branch
 
 _FARTHEST_M = 0.02
 """Distance to the dry run above which a frame's grasp belongs to another motion."""
-_GRIPPER = 0.9  # radius of its body over that of the thinnest link
-_PALM = 0.65  # extent of its body from the flange to the grasp
-_FINGER = 0.3  # radius of a finger over that of the body
 _POSE = ("x_m", "y_m", "z_m")
 
 
@@ -46,49 +44,16 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
     if rows is None:
         return
     base = matrices(np.asarray(entry.result["base_pose"], float))
-    starts, ends, radii = _arm_rods(arm, base, joints[rows])
-    flange = (base @ arm.link_frames(joints[rows]))[:, -1]
-    held = _gripper_rods(flange, positions[rows], _GRIPPER * float(radii.min()))
-    data.arrays["robot_starts"], data.arrays["robot_ends"], data.arrays["robot_radii"] = (
-        np.concatenate(parts, axis=axis) for parts, axis in zip(
-            zip((starts, ends, radii), held, strict=True), (1, 1, 0), strict=True))
-    data.info["robot"] = {"name": Path(arm.name).stem, "gripper_rods": len(held[2])}
-
-
-def _arm_rods(arm: Arm, base: np.ndarray, joints: np.ndarray,
-              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the ends of the rods of foot and links [m], [n, rods, 3], and their radii.
-
-    Args:
-        base: Frame of the arm's base, shape [4, 4].
-        joints: Angles [rad], shape [n, 6].
-    """
-    rods = arm.rods(joints)
-    starts, ends = (points @ base[:3, :3].T + base[:3, 3] for points in (rods.starts, rods.ends))
-    foot = np.broadcast_to(base[:3, 3], (len(joints), 1, 3))
-    return (np.concatenate([foot, starts], axis=1), np.concatenate([starts[:, :1], ends], axis=1),
-            np.r_[rods.radii[0], rods.radii])
-
-
-def _gripper_rods(flange: np.ndarray, grasps: np.ndarray, radius: float,
-                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a body and two fingers between flange and grasp, as :func:`_arm_rods` does.
-
-    Args:
-        flange: Frames of the flange, shape [n, 4, 4].
-        grasps: Middle between the fingers [m], shape [n, 3].
-        radius: Radius of the body [m].
-    """
-    position = flange[:, :3, 3]
-    vector = grasps - position
-    length = np.linalg.norm(vector, axis=1, keepdims=True)
-    axis = vector / np.maximum(length, 1e-9)
-    side = flange[:, :3, 0] - (flange[:, :3, 0] * axis).sum(axis=1, keepdims=True) * axis
-    side *= 0.8 * radius / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-9)
-    palm, tip = position + _PALM * vector, grasps + 0.5 * radius * axis
-    return (np.stack([position, palm - side, palm + side], axis=1),
-            np.stack([palm, tip - side, tip + side], axis=1),
-            radius * np.array([1.0, _FINGER, _FINGER]))
+    # The gripper's rods at each flange: start, end and radius of each in the flange's frame.
+    parts = np.asarray(entry.result["gripper_rods"], float).reshape(-1, 7)
+    flange = (base @ arm.forward(joints[rows]))[:, None]
+    starts, ends = (np.squeeze(flange[..., :3, :3] @ points[:, :, None], -1) + flange[..., :3, 3]
+                    for points in (parts[:, :3], parts[:, 3:6]))
+    shape = drawn_arm(arm, joints[rows], base).joined(
+        Rods((GRIPPER,) * len(parts), starts, ends, parts[:, 6]))
+    data.arrays |= {"robot_starts": shape.starts, "robot_ends": shape.ends,
+                    "robot_radii": shape.radii}
+    data.info["robot"] = {"name": Path(arm.name).stem, "gripper_rods": len(parts)}
 
 
 def _rows(positions: np.ndarray, grasps: np.ndarray) -> np.ndarray | None:

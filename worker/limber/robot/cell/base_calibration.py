@@ -6,9 +6,9 @@ from itertools import combinations
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rigid_fit, spreads
-from limber.robot.cell.cell import Cell
 from limber.robot.cell.controller_settings import in_millimetres, is_tool, tool_in_controller
 from limber.robot.interface import Sample
 

@@ -12,10 +12,10 @@ from typing import Any, Literal
 import numpy as np
 import scipy
 
+from limber.cell.cell_file import CameraEntry
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices
 from limber.core.optional import require_extra
-from limber.robot.cell.cell import CameraEntry
 from limber.robot.cell.hand_eye import CameraFit, CameraOn, fit_camera
 
 _FEWEST_CORNERS = 4

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from limber.cell.arm import Arm
+from limber.cell.cell_file import Cell
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import frame_of, inverse_of, length, pose_of, turn_between
-from limber.robot.cell.cell import Cell
-from limber.robot.interface import Arm, Sample
+from limber.robot.interface import Sample
 from limber.robot.ur.factory_calibration import FactoryCalibration
 
 # A tool that the controller reports is known up to rounding. One computed from nominal joints is

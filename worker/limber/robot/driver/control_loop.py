@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.core.numerics.rigid_kernels import frame_of, pose_of, turn_between
-from limber.robot.cell.cell import Cell
 from limber.robot.cell.controller_settings import require_tool
 from limber.robot.driver.controls import control_of
 from limber.robot.driver.current_motion import Following, UnderWay

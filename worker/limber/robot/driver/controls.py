@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, WorkError
-from limber.robot.cell.cell import Cell
 from limber.robot.interface import ArmControl
 from limber.robot.ur.factory_calibration import FactoryCalibration, read_calibration
 from limber.robot.ur.samples import Dashboard

@@ -14,8 +14,8 @@ import sys
 import threading
 import time
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import LimberError
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.control_loop import Driver, Orders
 from limber.robot.driver.deadline import clear_deadline
 from limber.robot.driver.messages import Words

@@ -8,7 +8,7 @@ import numpy as np
 from limber.core.numerics.rigid_kernels import length
 
 if TYPE_CHECKING:
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
 
 DEVIATIONS = 2.0
 """Standard deviations of a prediction that are allowed."""

@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import SafetyStop, WorkError
 from limber.core.numerics.rigid_kernels import frame_of, pose_of, turn_between
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.current_motion import UnderWay
 from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain

@@ -17,9 +17,9 @@ from typing import Protocol
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, WorkError
 from limber.core.numerics.rigid_kernels import frame_of, inverse_of, turned_wrench, weight_wrench
-from limber.robot.cell.cell import Cell
 from limber.robot.interface import Sample
 from limber.robot.ur.ft300_modbus import Ft300Line
 

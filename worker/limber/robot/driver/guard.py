@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from limber.cell.arm import Arm, within_ratings
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
 from limber.robot.cell.controller_settings import SteadySettings
@@ -35,8 +36,7 @@ from limber.robot.driver.guard_states import (
     State,
     Verdict,
 )
-from limber.robot.interface import Arm, Sample
-from limber.robot.load_ratings import within_ratings
+from limber.robot.interface import Sample
 
 _RUNNING, _NORMAL = 7, 1
 _SAME = 1e-9  # N, N m

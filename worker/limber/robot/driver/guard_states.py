@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.robot.cell.cell import Cell, LimitsEntry, WorkspaceEntry
+from limber.cell.cell_file import Cell, LimitsEntry, WorkspaceEntry
 from limber.robot.driver.expected_force import ForceErrors, kept_share
 
 

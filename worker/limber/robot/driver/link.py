@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.core.processes.child import Child
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.controls import stop_from_outside
 from limber.robot.driver.deadline import CALL_SECONDS, ended_by_deadline
 from limber.robot.motion.trajectory import Trajectory

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
-from limber.robot.cell.cell import Cell
 
 OVER_HARD = 1.1
 """Largest contact force as a multiple of the hard limit."""

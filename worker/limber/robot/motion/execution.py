@@ -1,13 +1,13 @@
 """A planned path as motion of a robot: joints, times, expected wrenches, approach and return."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
+from limber.cell.reach_and_collision import Blocked
 from limber.core.errors import InputError, NoPathError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotated, rotation_vector
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.contact_speed import speed_within
 from limber.robot.motion.expected_wrench import ExpectedWrench, Predicted, interpolated
 from limber.robot.motion.joint_path import JointPath, follow, no_branch
@@ -16,9 +16,6 @@ from limber.robot.motion.trajectory import Trajectory, along, densely
 _WITHIN = 7.815  # chi-squared: 95 % of a vector's draws
 _TURNS = 12  # directions around the branch from which the gripper may come
 _MOST_TRIED = 24  # variants of the path checked against obstacles
-
-Blocked = Callable[[np.ndarray, np.ndarray], NoPathError | None]
-"""Obstacles to flange frames [n, 4, 4] at joint angles [n, joints]; None if there are none."""
 
 
 @dataclass(frozen=True)

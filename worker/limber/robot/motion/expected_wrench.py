@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.numerics.rigid import rotations_at, turn_between
-from limber.robot.cell.cell import Cell
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import platformdirs
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.core.json_lines import json_objects
 from limber.core.json_values import plain
-from limber.robot.cell.cell import Cell
 
 _FORMAT = 1
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from limber.cell.arm import Arm
 from limber.core.errors import InputError, NoPathError
-from limber.robot.interface import Arm
 
 # Between neighbouring poses of a path a joint rotates little; more is a jump to another solution.
 _LARGEST_STEP = 0.35  # rad

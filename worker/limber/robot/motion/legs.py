@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.robot.cell.cell import Cell
+from limber.cell.cell_file import Cell
 from limber.robot.motion.execution import RobotMotion
 from limber.robot.motion.trajectory import Trajectory
 

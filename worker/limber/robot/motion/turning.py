@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import composed
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.execution import RobotMotion, across, robot_motion
 from limber.robot.motion.expected_wrench import Predicted
 

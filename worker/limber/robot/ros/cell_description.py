@@ -1,7 +1,7 @@
 """A cell as ROS describes it: URDF and SRDF, from which its nodes make TF and a planning scene.
 
 The root is the branch's frame. Arms are described by the axes of their joints at angle 0, so any
-arm of :class:`limber.robot.interface.Arm` has a URDF, also one whose dimensions come from a table.
+arm of :class:`limber.cell.arm.Arm` has a URDF, also one whose dimensions come from a table.
 ``base`` and ``tool0`` are those of the controller (REP 199).
 """
 
@@ -11,14 +11,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from limber.cell.arm import Arm
+from limber.cell.cell_file import BoxEntry, Cell
 from limber.core.numerics.rigid import matrices
-from limber.robot.cell.cell import BoxEntry, Cell
-from limber.robot.interface import Arm
 
 _EFFORT = 150.0  # N m; the file has to state one, and Limber limits forces, not torques
 _UPRIGHT = 1e-9  # cosine of a pitch of a right angle
 _STEP, _MOVES = 1e-3, 1e-6  # rad, m: a rod that a joint moves
-_SCALES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _GROUP = "arm"
 Element = ElementTree.Element
 
@@ -49,8 +48,8 @@ def cell_urdf(cell: Cell) -> str:
             _shape(link, np.eye(4), "box", size=_numbers(entry.size_m))
             _fixed(root, "branch", name, matrices(np.array(entry.pose)))
         else:
-            scale = _SCALES[entry.unit]
-            _shape(link, np.eye(4), "mesh", filename=entry.file, scale=_numbers((scale,) * 3))
+            _shape(link, np.eye(4), "mesh", filename=entry.file,
+                   scale=_numbers((entry.scale,) * 3))
             _fixed(root, "branch", name, np.eye(4))
     return _text(root)
 

@@ -4,9 +4,9 @@ import time
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, WorkError
 from limber.core.numerics.rigid import matrices
-from limber.robot.cell.cell import Cell
 from limber.robot.ros.bridge import Bridge
 from limber.robot.ros.messages import CLOUD, JOINT_STATE, JointStates, cloud_of
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import SafetyStop, WorkError
 from limber.core.numerics.rigid import pose_vectors
 from limber.core.numerics.rigid_kernels import frame_of, turn_between, turned_wrench
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.delays import HoldUps
 from limber.robot.driver.force_sensors import Reading, WrenchChain
 from limber.robot.driver.guard import Guard

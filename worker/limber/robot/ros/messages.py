@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.cell.cell import Cell
 from limber.robot.interface import PLAYING, Sample
 from limber.robot.motion.trajectory import Trajectory
 

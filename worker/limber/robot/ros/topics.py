@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.force_sensors import require_sensor
 from limber.robot.ros.messages import WRENCH
 

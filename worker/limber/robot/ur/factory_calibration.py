@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from limber.robot.interface import Arm
-from limber.robot.ur.arms import UrArm
+from limber.cell.arm import Arm
+from limber.cell.ur_arms import UrArm
 
 PRIMARY_PORT = 30001
 ROBOT_STATE, KINEMATICS = 16, 5

@@ -11,7 +11,7 @@ from limber.robot.ur.robotiq import RobotiqGripper
 from limber.robot.ur.samples import Dashboard, SampleStream
 
 if TYPE_CHECKING:
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
 
 _WATCHDOG_HZ = 10.0
 _GAIN = 900.0

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from limber.cell.arm import Arm
 from limber.core.numerics.rigid import inverted, matrices
-from limber.robot.interface import Arm
 from limber.robot.virtual.step_kernels import servo_step
 
 JOINT_ACCELERATION = 40.0

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.arm import Arm
+from limber.cell.known_arms import arm_named
+from limber.cell.ur_arms import UrArm
 from limber.core.errors import InputError
 from limber.core.numerics.rigid_kernels import crossed, frame_of, weight_wrench
-from limber.robot.interface import Arm
-from limber.robot.known_arms import arm_named
-from limber.robot.ur.arms import UrArm
 from limber.robot.ur.factory_calibration import FactoryCalibration, one_arm
 from limber.robot.virtual.arm_motions import STOP_DECELERATION, Braking, Motion
 from limber.robot.virtual.controller_modes import RobotMode, RuntimeState, SafetyMode, SensorFault

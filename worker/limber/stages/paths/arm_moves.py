@@ -4,16 +4,16 @@ from itertools import pairwise
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
+from limber.cell.reach_and_collision import ArmSurroundings
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import length, turn_between
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.contact_speed import speed_within
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.joint_planner import joint_space_path
 from limber.robot.motion.trajectory import Trajectory, along, along_bounded, densely
-from limber.stages.paths.arm_surroundings import ArmSurroundings
 
 _NEAR_M = 0.15  # m from the branch: nearer, the arm is slower
 _SLOWEST = 0.25

@@ -31,7 +31,7 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.driver.live_force import LiveForce
     from limber.robot.motion.execution import RobotMotion
@@ -111,7 +111,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
         SafetyStop: the motion was stopped; the log is nevertheless in the folder.
     """
     if options.arm:
-        from limber.robot.cell.cell import read_cell
+        from limber.cell.cell_file import read_cell
         from limber.robot.weighing import require_weighed
 
         require_weighed(read_cell(cell_file))
@@ -156,9 +156,10 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
     """
     branch, cell, settings, stated = _plan_of_cell(folder, name, cell_file, settings, progress)
     if is_to_move:
-        from limber.robot.cell.compatibility import require_payload
+        from limber.cell.cell_file import require_payload
 
         require_payload(cell)
+    from limber.cell.reach_and_collision import blocked_by
     from limber.robot.motion.execution import robot_motion
     from limber.robot.motion.expected_wrench import Predicted
     from limber.robot.motion.turning import turned
@@ -170,7 +171,7 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
         require_watched,
         require_within_limits,
     )
-    from limber.stages.paths.plan_cell import KeptClear, blocked_by
+    from limber.stages.paths.plan_cell import KeptClear
     from limber.stages.paths.plan_legs import legs_in_cell
     from limber.store.loading import load_grasp_model
 
@@ -205,8 +206,7 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
 def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
                   progress: Progress) -> tuple[Branch, Cell, ExecuteSettings, dict[str, Any]]:
     """Read branch and cell, and the robot data of a plan; refuse those that do not match."""
-    from limber.robot.cell.cell import read_cell
-    from limber.robot.cell.compatibility import check_branch, check_plan
+    from limber.cell.cell_file import check_branch, check_plan, read_cell
 
     branch, cell = Branch.open(folder), read_cell(cell_file)
     if warning := check_branch(cell, branch.uuid, folder):

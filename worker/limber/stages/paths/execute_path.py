@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import Akima1DInterpolator
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, WorkError
 from limber.core.files.reading import csv_records, read_columns
 from limber.core.numerics.rigid import composed, matrices, pose_vectors
@@ -17,7 +18,6 @@ from limber.planning.constraints.chance import YoungUncertainty
 from limber.planning.cost import arc_lengths
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.recordings.recording import POSE_COLUMNS
-from limber.robot.cell.cell import Cell
 from limber.robot.driver.expected_force import not_seen
 from limber.robot.driver.force_sensors import INDEPENDENT_READINGS
 from limber.robot.driver.guard_states import GuardSettings

@@ -11,7 +11,7 @@ from limber.core.settings import Settings
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
     from limber.robot.motion.execution import RobotMotion
     from limber.stages.pulls.record_nudge import Nudge
 
@@ -41,6 +41,7 @@ def execution_summary(cell: Cell, motion: RobotMotion, across: Nudge | None) -> 
 def write_preview(branch: Branch, name: str, settings: Settings, cell: Cell,
                   motion: RobotMotion) -> None:
     """Write the robot's motion for the viewport: poses in the branch's frame, joints, forces."""
+    from limber.cell.reach_and_collision import drawn_gripper
     from limber.core.numerics.rigid import matrices, pose_vectors
 
     base = matrices(np.array(cell.base.pose))
@@ -61,7 +62,10 @@ def write_preview(branch: Branch, name: str, settings: Settings, cell: Cell,
     with branch.stage(f"execute-preview:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
         stage.path(f"executions/{name}-preview.csv").write_text("\n".join(lines) + "\n",
                                                                encoding="utf-8")
-        stage.result.update(model=cell.robot.model, base_pose=list(cell.base.pose))
+        held = drawn_gripper(cell, np.eye(4)[None])
+        stage.result.update(
+            model=cell.robot.model, base_pose=list(cell.base.pose),
+            gripper_rods=np.column_stack([held.starts[0], held.ends[0], held.radii]).tolist())
 
 
 def outcome_line(result: Mapping[str, Any]) -> str:

@@ -27,14 +27,14 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
+    from limber.cell.cell_file import Cell
+    from limber.cell.obstacles import Obstacle
     from limber.planning.constraints.limits import Limits
-    from limber.planning.constraints.obstacles import Obstacle
     from limber.planning.field.grasp_model import GraspModel
     from limber.planning.goals.goal import CellPlace
     from limber.planning.make_plan import PlannedMotion
     from limber.planning.plan_file import PlanPath
     from limber.planning.timing import Pace
-    from limber.robot.cell.cell import Cell
 
 
 _FRAME_RATE = 24.0  # frames per second of the played motion; a pose is a frame
@@ -212,15 +212,10 @@ class _InCell:
     @classmethod
     def of(cls, branch: Branch, path: Path, limits: Limits, progress: Progress,
            settings: PlanSettings, grasp_model: GraspModel) -> _InCell:
+        from limber.cell.obstacles import cell_obstacles
+        from limber.cell.reach_and_collision import clearance_in
         from limber.robot.live_view import look
-        from limber.stages.paths.plan_cell import (
-            cell_for,
-            cell_obstacles,
-            cell_positions,
-            clearance_in,
-            is_fixed,
-            limits_in,
-        )
+        from limber.stages.paths.plan_cell import cell_for, cell_positions, is_fixed, limits_in
 
         cell = cell_for(branch, path, progress)
         obstacles = cell_obstacles(cell, path.parent)
@@ -240,8 +235,9 @@ class _InCell:
             NoPathError: there is no continuous branch of the inverse kinematics, or the gripper
                 meets an obstacle; the message states where.
         """
+        from limber.cell.reach_and_collision import blocked_by
         from limber.robot.motion.execution import robot_motion
-        from limber.stages.paths.plan_cell import blocked_by, predicted_ahead, robot_summary
+        from limber.stages.paths.plan_cell import predicted_ahead, robot_summary
         from limber.stages.paths.plan_legs import legs_in_cell, surface_points
 
         predicted, states, turning = predicted_ahead(motion), found.plan.ahead, None
@@ -275,7 +271,7 @@ class _InCell:
 
     def check_goal(self, settings: PlanSettings) -> None:
         """Raise NoPathError if the given goal is inside an obstacle."""
-        from limber.planning.constraints.obstacles import closest
+        from limber.cell.obstacles import closest
         from limber.planning.goals.goal_kinds import asked_kinds
 
         requested = [getattr(settings, kind.name) for kind in asked_kinds(settings)

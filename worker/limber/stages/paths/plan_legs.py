@@ -4,16 +4,16 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
+from limber.cell.obstacles import Obstacle
+from limber.cell.reach_and_collision import ArmSurroundings
 from limber.core.not_none import present
 from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.planning.constraints.obstacles import Obstacle
 from limber.planning.cost import arc_lengths
 from limber.planning.plan_file import PlanPath
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.execution import RobotMotion
 from limber.robot.motion.legs import HELD, Leg, described, legs_of
-from limber.stages.paths.arm_surroundings import ArmSurroundings
 
 _MOST_POSES = 60  # of a leg whose distances are computed
 _MOST_POINTS = 800  # of the branch's surface

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import NoPathError
 from limber.mechanics import BranchModel, Grasp, StaticResult, follow_poses
 from limber.mechanics.sensitivities import grasp_slopes
@@ -12,7 +13,6 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import arc_lengths
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.path_on_full_model import SolvedPoses
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.expected_wrench import Predicted
 from limber.robot.motion.turning import TurnCost, Turned, turned, turned_motion
 from limber.stages.pulls.record_path import GRASP_RADIUS_M

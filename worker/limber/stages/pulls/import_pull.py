@@ -101,9 +101,9 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
     """The settings with the cell's base, and the cell's data on its robot."""
     if settings.cell is None:
         return settings, None
+    from limber.cell.cell_file import read_cell
     from limber.core.numerics.rigid import matrices, pose_vectors
     from limber.recordings.importing.import_request import RobotKnown
-    from limber.robot.cell.cell import read_cell
     from limber.robot.recorder import known_errors, known_noise
 
     cell = read_cell(settings.cell)

@@ -20,7 +20,7 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
     from limber.robot.driver.link import RobotLink
     from limber.robot.motion.execution import Blocked
     from limber.robot.motion.trajectory import Trajectory
@@ -119,10 +119,10 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
         InputError: cell and branch do not belong together, or the user did not confirm.
         SafetyStop: the guard stopped the pull; the recording so far is nevertheless in the folder.
     """
-    from limber.robot.cell.cell import read_cell
-    from limber.robot.cell.compatibility import check_branch, require_payload
+    from limber.cell.cell_file import check_branch, read_cell, require_payload
+    from limber.cell.obstacles import cell_obstacles
+    from limber.cell.reach_and_collision import blocked_by
     from limber.robot.weighing import require_weighed
-    from limber.stages.paths.plan_cell import blocked_by, cell_obstacles
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise InputError(f"--name {name!r} cannot name a recording.",

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import LimberError, NoPathError, SafetyStop
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.execution import Blocked
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.pull_plausibility import (

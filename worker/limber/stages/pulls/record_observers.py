@@ -14,7 +14,7 @@ from limber.robot.recorder import MarkerStream, PullRecorder
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.robot.cell.cell import Cell
+    from limber.cell.cell_file import Cell
     from limber.robot.depth_recording import DepthRecorder
     from limber.store import Stream
 

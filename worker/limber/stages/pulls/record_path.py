@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, SafetyStop
 from limber.core.files.reading import FileContent, read_columns, read_json_as
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.recordings.recording import POSE_COLUMNS
-from limber.robot.cell.cell import Cell
 from limber.robot.motion.contact_speed import speed_within
 from limber.robot.motion.execution import Blocked
 from limber.robot.motion.joint_path import joint_path

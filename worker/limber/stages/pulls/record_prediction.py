@@ -13,8 +13,8 @@ from limber.stages.pulls.record_path import GRASP_RADIUS_M
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from limber.cell.cell_file import Cell
     from limber.mechanics import BranchModel
-    from limber.robot.cell.cell import Cell
     from limber.robot.motion.trajectory import Trajectory
 
 _SHARES = (0.35, 0.7, 1.0)  # of the travel in which a wrong sensor is noticed

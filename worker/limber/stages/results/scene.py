@@ -75,10 +75,10 @@ def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = 
         InputError: not exactly one of output and data is given, or there is nothing to show.
         WorkError: Blender failed.
     """
+    from limber.cell.cell_file import read_cell
+    from limber.cell.obstacles import cell_obstacles
     from limber.results.scene.cell_objects import add_cell
     from limber.results.scene.contents import scene_data
-    from limber.robot.cell.cell import read_cell
-    from limber.stages.paths.plan_cell import cell_obstacles
     from limber.store.loading import load_targets
 
     if (inputs.output is None) == (inputs.data is None):

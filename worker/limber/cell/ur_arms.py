@@ -16,9 +16,9 @@ from typing import Literal
 
 import numpy as np
 
+from limber.cell import ur_kinematics as kinematics
+from limber.cell.arm import Rods
 from limber.core.numerics.compiled import for_kernels
-from limber.robot.interface import Rods
-from limber.robot.ur import kinematics
 
 Series = Literal["cb3", "e"]
 

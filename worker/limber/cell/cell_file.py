@@ -4,7 +4,9 @@
 angles in radians, masses in kilograms. The branch's frame is that of its folder (z up).
 """
 
+import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,16 +14,14 @@ import numpy as np
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from limber.cell.arm import MOST_SPEED, MOST_TURN_SPEED, Arm, greatest_force, greatest_torque
+from limber.cell.known_arms import arm_named
+from limber.cell.urdf_arm import ENDING
 from limber.core.errors import InputError
 from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_toml
 from limber.core.json_values import plain, validated
 from limber.core.numerics.rigid import inverted, matrices
-from limber.robot.cell.implausible_values import FAR, slips
-from limber.robot.interface import Arm
-from limber.robot.known_arms import arm_named
-from limber.robot.load_ratings import MOST_SPEED, MOST_TURN_SPEED
-from limber.robot.urdf.chain_arm import ENDING
 
 RIGID_N_PER_M = 2e5
 """Stiffness with which a gripper meets a rigid thing: that of the arm and its joints [N/m]."""
@@ -253,8 +253,13 @@ class MeshEntry(_Entry):
     file: str = Field(description="STL, PLY or OBJ, beside the cell file.")
     unit: Literal["m", "cm", "mm"] = "m"
 
+    @property
+    def scale(self) -> float:
+        """Length of the file's unit [m]."""
+        return {"m": 1.0, "cm": 0.01, "mm": 0.001}[self.unit]
 
-Obstacle = Annotated[BoxEntry | MeshEntry, Field(discriminator="kind")]
+
+ObstacleEntry = Annotated[BoxEntry | MeshEntry, Field(discriminator="kind")]
 
 
 class Cell(_Entry):
@@ -273,7 +278,7 @@ class Cell(_Entry):
     camera: CameraEntry | None = None
     second_arm: SecondArmEntry | None = None
     workspace: WorkspaceEntry | None = None
-    obstacles: tuple[Obstacle, ...] = ()
+    obstacles: tuple[ObstacleEntry, ...] = ()
 
     @field_validator("obstacles", mode="before")
     @classmethod
@@ -401,3 +406,318 @@ def _without_none(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_without_none(item) for item in value]
     return value
+
+
+FAR = 20.0
+"""Greatest distance from the branch [m] of any object that an arm works with."""
+_FAR_FROM_ARM = 10.0  # m; distance of the branch's origin beyond the arm's reach
+_AT_FLANGE = 1.0  # m; a tool is nearer to the flange
+_WHOLE_TURN = 2 * math.pi + 1e-6
+_DEGREES = 4 * math.pi  # no joint limit is beyond; in degrees nearly all are
+_LARGEST_RANGE = {"force": 1e4, "torque": 1e3}  # [N], [N m]
+
+
+def slips(cell: "Cell") -> Iterator[str]:
+    """Yield contradictions of a cell with individually valid entries: "limits.hard_force_n is ...".
+    """
+    yield from _joint_slips(cell)
+    yield from _pose_slips(cell)
+    yield from _tool_slips(cell)
+    yield from _limit_slips(cell)
+    if cell.sensor.kind != "none":
+        yield from _sensor_slips(cell.sensor, cell.limits.hard_force_n, cell.limits.hard_torque_nm)
+    yield from _camera_slips(cell)
+    yield from _position_slips(cell)
+
+
+def _joint_slips(cell: "Cell") -> Iterator[str]:
+    own = cell.robot.joint_limits_rad
+    if own is None:
+        return
+    for number, (low, high) in enumerate(own):
+        where = f"robot.joint_limits_rad, row {number + 1},"
+        if max(abs(low), abs(high)) > _DEGREES:
+            yield (f"{where} has {low:g} to {high:g} rad, which is over two turns; was it given in "
+                   "degrees?")
+        elif low >= high:
+            yield f"{where} has {low:g} to {high:g} rad; the lower limit comes first"
+        elif (np.diff(cell.joint_limits[number]) <= 2 * cell.limits.joint_margin_rad).any():
+            yield (f"{where} has {low:g} to {high:g} rad, which leaves the joint no angle within "
+                   f"the arm's own limits and the margin of {cell.limits.joint_margin_rad:g} rad")
+
+
+def _pose_slips(cell: "Cell") -> Iterator[str]:
+    reach = cell.arm.reach + _FAR_FROM_ARM
+    poses: list[tuple[str, Any, float]] = [
+        ("base.pose", cell.base.pose, reach), ("tool.grasp_pose", cell.tool.grasp_pose, _AT_FLANGE),
+        ("sensor.pose", cell.sensor.pose, _AT_FLANGE)]
+    if cell.camera is not None:
+        most = _AT_FLANGE if cell.camera.mount == "flange" else FAR
+        poses.append(("camera.pose", cell.camera.pose, most))
+    if cell.second_arm is not None:
+        poses += [("second_arm.base_pose", cell.second_arm.base_pose, reach),
+                  ("second_arm.grasp_pose", cell.second_arm.grasp_pose, _AT_FLANGE)]
+    poses += [(f"obstacles.{number}.pose", one.pose, FAR)
+              for number, one in enumerate(cell.obstacles) if one.kind == "box"]
+    for name, pose, most in poses:
+        yield from _far(name, pose[:3], most)
+        turn = math.hypot(*pose[3:])
+        if turn > _WHOLE_TURN:
+            yield (f"{name} is turned by {turn:g} rad, more than a whole turn; was the rotation "
+                   "given in degrees?")
+    yield from _far("tool.centre_of_mass_m", cell.tool.centre_of_mass_m, _AT_FLANGE)
+    for number, part in enumerate(cell.tool.parts):
+        for end in ("start_m", "end_m"):
+            yield from _far(f"tool.parts.{number}.{end}", getattr(part, end), _AT_FLANGE)
+
+
+def _tool_slips(cell: "Cell") -> Iterator[str]:
+    """Values of the gripper that are those of a bare flange."""
+    tool = cell.tool
+    is_driven = tool.gripper in ("digital_output", "robotiq")
+    if not any(tool.grasp_pose[:3]) and tool.gripper != "none" and (is_driven or tool.mass_kg):
+        yield (f"tool.grasp_pose is at the flange, where the gripper (tool.gripper = "
+               f'"{tool.gripper}") is screwed on; the flange would go where the fingers should be. '
+               "State where the branch lies between the fingers, in the flange's frame, such as "
+               "[0, 0, 0.15, 0, 0, 0] for fingers 0.15 m before it")
+    if is_driven and tool.mass_kg == 0 and not cell.robot.address.startswith("127."):
+        yield ("tool.mass_kg is 0, the mass of a bare flange, but tool.gripper is "
+               f'"{tool.gripper}"; its weight would be taken for a force on the '
+               "branch. State what the flange carries (`limber robot weigh` compares it)")
+
+
+def _far(name: str, position: Any, most: float) -> Iterator[str]:
+    distance = math.hypot(*position)
+    if distance > most:
+        yield (f"{name} is {distance:g} m away, farther than the {most:g} m that are possible; "
+               f"{distance / 1000:g} m? Was it given in millimetres?")
+
+
+def _limit_slips(cell: "Cell") -> Iterator[str]:
+    limits, arm = cell.limits, cell.arm
+    for name, value, most, unit in (
+            ("hard_force_n", limits.hard_force_n, greatest_force(arm), "N"),
+            ("unexpected_force_n", limits.unexpected_force_n, greatest_force(arm), "N"),
+            ("hard_torque_nm", limits.hard_torque_nm, greatest_torque(arm), "N m")):
+        if value > most:
+            yield (f"limits.{name} is {value:g}, but a {arm.name} may exert at most {most:.3g} "
+                   f"{unit}; {value / 1000:g} {unit}?")
+
+
+def _sensor_slips(sensor: "SensorEntry", hard_force: float, hard_torque: float) -> Iterator[str]:
+    for what, unit, hard, spread, span in (
+            ("force", "n", hard_force, sensor.force_sigma_n, sensor.force_range_n),
+            ("torque", "nm", hard_torque, sensor.torque_sigma_nm, sensor.torque_range_nm)):
+        if hard < spread:
+            yield (f"sensor.{what}_sigma_{unit} is {spread:g}, so that limits.hard_{what}_{unit} "
+                   f"({hard:g}) is within its noise; was one of them given in another unit?")
+        if span <= hard:
+            yield (f"sensor.{what}_range_{unit} is {span:g}, but limits.hard_{what}_{unit} is "
+                   f"{hard:g}: the sensor would be at the end of its range before the motion "
+                   "stops")
+        if span > _LARGEST_RANGE[what]:
+            yield (f"sensor.{what}_range_{unit} is {span:g}, which no sensor at a flange has; "
+                   f"{span / 1000:g}?")
+    if sensor.drift_n_per_minute > sensor.force_range_n:
+        yield (f"sensor.drift_n_per_minute is {sensor.drift_n_per_minute:g}, more than the "
+               f"sensor's range ({sensor.force_range_n:g} N) in a minute")
+
+
+def _camera_slips(cell: "Cell") -> Iterator[str]:
+    camera = cell.camera
+    if camera is None:
+        return
+    near, far = camera.range_m
+    if not 0 <= near < far <= FAR:
+        yield (f"camera.range_m is {near:g} to {far:g} m; it must rise, from 0 to at most {FAR:g} "
+               "m. Was it given in millimetres?")
+    if not all(0.1 * size < focal < 100 * size for focal, size in
+               zip(camera.focal_px, (camera.width, camera.height), strict=True)):
+        yield (f"camera.focal_px is {camera.focal_px}, which is no focal length of an image of "
+               f"{camera.width} x {camera.height} pixels; was it given in millimetres?")
+    if not all(0 <= at <= size for at, size in
+               zip(camera.centre_px, (camera.width, camera.height), strict=True)):
+        yield (f"camera.centre_px is {camera.centre_px}, outside the image of {camera.width} x "
+               f"{camera.height} pixels")
+
+
+def _position_slips(cell: "Cell") -> Iterator[str]:
+    """Distances that the arm is to reach, compared with its reach from the base."""
+    if cell.workspace is None:
+        return
+    low, high = np.array(cell.workspace.low_m), np.array(cell.workspace.high_m)
+    shoulder = matrices(np.array(cell.base.pose)) @ np.r_[cell.arm.shoulder, 1.0]
+    away = float(np.linalg.norm(shoulder[:3] - np.clip(shoulder[:3], low, high)))
+    grasp = math.hypot(*cell.tool.grasp_pose[:3])
+    # The distance from wrist to flange is less than the reach of any arm.
+    most = 1.5 * cell.arm.reach + grasp
+    if away > most:
+        yield (f"workspace is {away:.3g} m from the arm's shoulder, but a {cell.arm.name} reaches "
+               f"{most:.3g} m at most; are base.pose and workspace both in the branch's frame?")
+
+
+_BY_CALIBRATION = ("format_version", "branch", "calibrated")  # by `limber robot calibrate`
+_TEMPLATE_EXAMPLES: dict[str, Any] = {
+    "tool": {"grasp_pose": [0.0, 0.0, 0.15, 0.0, 0.0, 0.0], "mass_kg": 0.9,
+             "parts": [{"start_m": [0.0, 0.0, 0.0], "end_m": [0.0, 0.0, 0.12],
+                        "radius_m": 0.04}]},
+    "robot": {"version": "5.11.6", "joint_limits_rad": [[-3.1, 3.1]] * 6},
+    "base": {"residual_m": 0.001},
+    "sensor": {"file": "forces.csv", "device": "/dev/ttyUSB0",
+               "topic": "/ft300/wrench"},
+    "camera": {"pose": [0.0, -1.0, 0.5, -1.57, 0.0, 0.0]},
+    "second_arm": {"model": "ur5e", "base_pose": [0.6, 0.6, 0.0, 0.0, 0.0, 0.0]},
+    "workspace": {"low_m": [-0.4, -0.4, 0.0], "high_m": [0.4, 0.4, 1.2]},
+    "obstacles": [{"kind": "box", "name": "table", "size_m": [1.0, 1.0, 0.04],
+                   "pose": [0.5, 0.0, -0.02, 0.0, 0.0, 0.0]},
+                  {"kind": "mesh", "name": "pot", "file": "pot.stl", "unit": "mm"}]}
+"""Values that a user has to replace; they are commented out."""
+TO_FILL_IN = ("grasp_pose", "mass_kg")
+"""Keys of [tool] for which no value is usual: without them nothing moves."""
+
+_TEMPLATE_HEAD = """\
+# The cell: which robot stands where beside the branch, what it holds, what it must not exceed.
+# Lengths in metres, angles in radians, masses in kilograms, forces in newtons. Frames: the branch's
+# has z up; the flange's and the base's are those of the controller. Poses are position and rotation
+# vector. Lines behind # show what else there is; take the sign away to use them.
+#
+# Next: limber robot check, then limber robot calibrate, which writes [base].
+"""
+
+
+def cell_template(cell: Cell) -> str:
+    """Return the text of a cell file with all sections: what ``cell`` states, and examples."""
+    parts = [_TEMPLATE_HEAD, "format_version = 1\n"]
+    for name, entry in type(cell).model_fields.items():
+        if name in _BY_CALIBRATION:
+            continue
+        value = getattr(cell, name)
+        if name == "obstacles":
+            parts += [_obstacle(plain(each), False) for each in value]
+            parts += [_obstacle(each, True) for each in _TEMPLATE_EXAMPLES[name]]
+            continue
+        kind = _model_of(entry.annotation)
+        stated = plain(value) if value is not None else {}
+        if name == "tool":
+            stated = {key: stated[key] for key in stated if key not in not_stated(cell)}
+        lines = "\n".join(_template_lines(kind, stated, _TEMPLATE_EXAMPLES.get(name, {}),
+                                          value is None))
+        mark = "# " if value is None else ""
+        parts.append(f"# {_first_line(kind)}\n{mark}[{name}]\n{lines}\n")
+    return "\n".join(parts)
+
+
+def not_stated(cell: Cell) -> list[str]:
+    """Return the keys of [tool] that a cell with a gripper still has to state."""
+    return [] if cell.tool.gripper == "none" else [
+        name for name in TO_FILL_IN if getattr(cell.tool, name) == getattr(ToolEntry(), name)]
+
+
+def _template_lines(kind: type[BaseModel], stated: dict[str, Any], examples: dict[str, Any],
+           is_example: bool) -> Iterator[str]:
+    """The keys of a section; those that are not stated are examples, commented out."""
+    for name, entry in kind.model_fields.items():
+        value, mark = stated.get(name), ""
+        if value is None or value == [] or is_example:
+            value, mark = examples.get(name, entry.default), "# "
+        if entry.description:
+            yield f"# {entry.description}"
+        if mark and kind is ToolEntry and name in TO_FILL_IN:
+            yield "# TO FILL IN, measured at your gripper; the next line is only an example."
+        yield f"{mark}{name} = {_written(value)}"
+
+
+def _obstacle(entry: dict[str, Any], is_example: bool) -> str:
+    mark = "# " if is_example else ""
+    lines = [f"{mark}{name} = {_written(value)}" for name, value in entry.items()]
+    comment = "A box in the way." if entry["kind"] == "box" else "A closed surface in the way."
+    return "\n".join([f"# {comment}", f"{mark}[[obstacles]]", *lines]) + "\n"
+
+
+def _written(value: Any) -> str:
+    return tomlkit.item(plain(value), _sort_keys=False).as_string() if not isinstance(
+        value, list | tuple) or not any(isinstance(each, dict) for each in value) else (
+        "[" + ", ".join(_inline(each) for each in value) + "]")
+
+
+def _inline(entry: dict[str, Any]) -> str:
+    return "{" + ", ".join(f"{key} = {_written(value)}" for key, value in entry.items()) + "}"
+
+
+def _model_of(annotation: Any) -> type[BaseModel]:
+    """The model of a section, also of an optional one."""
+    for each in (annotation, *getattr(annotation, "__args__", ())):
+        if isinstance(each, type) and issubclass(each, BaseModel):
+            return each
+    raise TypeError(f"{annotation} is no section")
+
+
+def _first_line(kind: type[BaseModel]) -> str:
+    return (kind.__doc__ or "").strip().split("\n")[0]
+
+
+_SAME_M, _SAME_RAD = 1e-3, 5e-3
+
+
+def require_payload(cell: Cell) -> None:
+    """Refuse to move an arm whose payload is not stated.
+
+    Raises:
+        InputError: the cell does not state the gripper's mass.
+    """
+    if cell.tool.mass_kg is None:
+        raise InputError("The cell file does not state tool.mass_kg, so the payload is not set.",
+                         "The controller and the guard would interpret the gripper's weight as a "
+                         "force on it.", "Weigh the gripper and state its mass; 0 for a "
+                                                "bare flange.")
+
+
+def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
+    """Return a warning if a plan was made without a robot's cell.
+
+    Args:
+        made_for: What the plan's file states about its robot.
+
+    Raises:
+        InputError: it was made for another robot, another branch or another pose of the base.
+    """
+    if not made_for:
+        return ("The plan was made without a cell (`limber plan --cell`), so obstacles and the "
+                "gripper's shape were not checked.")
+    if made_for.get("model") != cell.arm.name:
+        raise InputError(f"The plan was made for a {made_for.get('model')}, but the cell has a "
+                         f"{cell.arm.name}.", "The two arms differ in reach.",
+                         "Plan again with this cell.")
+    if made_for.get("branch") not in (None, cell.branch):
+        raise InputError(f"The plan was made with a cell of branch {made_for['branch']}, but this "
+                         "cell belongs to branch "
+                         f"{cell.branch}.", "The robot would move to the position of another "
+                         "branch.", "Plan again with this cell.")
+    base = made_for.get("base_pose")
+    if base is not None:
+        off = np.abs(np.array(base, float) - np.array(cell.base.pose))
+        if off[:3].max() > _SAME_M or off[3:].max() > _SAME_RAD:
+            raise InputError(
+                f"The plan was made with the robot's base {1e3 * off[:3].max():.1f} mm and "
+                f"{np.degrees(off[3:].max()):.2f} degrees away from its pose in the cell file.",
+                "The cell was calibrated again after planning, so reach and obstacles have "
+                "changed.",
+                "Plan again with this cell.")
+    return None
+
+
+def check_branch(cell: Cell, uuid: str, folder: object) -> str | None:
+    """Return a warning if the cell names no branch.
+
+    Raises:
+        InputError: the cell was calibrated for another branch.
+    """
+    if cell.branch is None:
+        return ("The cell file names no branch, so it is assumed that base.pose was calibrated "
+                "for this one. `limber robot calibrate` writes the name.")
+    if cell.branch != uuid:
+        raise InputError(f"The cell was calibrated for branch {cell.branch}, but {folder} is "
+                         f"branch {uuid}.",
+                         "The robot would move to the position of another branch.",
+                         "Calibrate it for this branch: limber robot calibrate.")
+    return None

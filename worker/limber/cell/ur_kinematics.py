@@ -2,7 +2,7 @@
 
 Frames are the controller's: the base frame that its pendant shows (not ROS's ``base_link``, which
 is rotated by 180 degrees about z) and the flange, as homogeneous matrices. All kernels take many
-poses; :class:`limber.robot.ur.arms.UrArm` calls them.
+poses; :class:`limber.cell.ur_arms.UrArm` calls them.
 """
 
 import math

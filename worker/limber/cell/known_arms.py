@@ -3,10 +3,10 @@
 import functools
 from importlib.metadata import entry_points
 
+from limber.cell.arm import Arm
+from limber.cell.ur_arms import ARMS
+from limber.cell.urdf_arm import ENDING, arm_of_file
 from limber.core.errors import InputError
-from limber.robot.interface import Arm
-from limber.robot.ur.arms import ARMS
-from limber.robot.urdf.chain_arm import ENDING, arm_of_file
 
 _ARMS: dict[str, Arm] = dict(ARMS)
 

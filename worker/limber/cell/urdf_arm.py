@@ -1,0 +1,565 @@
+"""An arm of a URDF file: like any other, with iterative inverse kinematics.
+
+Of the file only the chain of revolute joints from base to flange and the links' simple shapes are
+needed, so Limber needs no robot parser. A document type is refused, and with it every entity.
+
+In the kernels ``origins`` [n + 1, 4, 4] are the joints' frames at angle 0, each in that of the
+previous joint, and the flange's in the last one's; ``axes`` [n, 3] are the joint axes.
+"""
+
+import functools
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from limber.cell.arm import Rods
+from limber.core.errors import InputError
+from limber.core.files.reading import read_text
+from limber.core.numerics.compiled import compiled, for_kernels
+from limber.core.numerics.rigid_kernels import inverse_of, rotation_vector
+
+_BASE = "base"
+_FLANGES = ("tool0", "flange")
+"""Names of links in ROS-Industrial (REP 199): the controller's base frame and its flange."""
+_FEWEST = 6
+Element = ElementTree.Element
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A revolute joint.
+
+    Attributes:
+        name: Name in the file.
+        origin: Its frame at angle 0 in that of the previous joint, shape [4, 4].
+        axis: Axis of rotation, its frame, unit length, shape [3].
+        limits: Least and greatest angle [rad], infinite for an endless joint.
+        speed: Greatest [rad/s].
+    """
+
+    name: str
+    origin: np.ndarray
+    axis: np.ndarray
+    limits: tuple[float, float]
+    speed: float
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A capsule around a link's simple shape, in the frame of joint number ``joint`` [m]."""
+
+    joint: int
+    name: str
+    start: np.ndarray
+    end: np.ndarray
+    radius: float
+
+
+@dataclass(frozen=True)
+class Chain:
+    """An arm as its file describes it.
+
+    Attributes:
+        joints: Joints from the base on.
+        flange: Its frame in the last joint's, shape [4, 4].
+        rods: Shapes of the moving links, as far as the file has cylinders, spheres and boxes.
+    """
+
+    joints: tuple[Joint, ...]
+    flange: np.ndarray
+    rods: tuple[Rod, ...]
+
+
+class _WithoutDoctype(ElementTree.TreeBuilder):
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise ElementTree.ParseError("it declares a document type, which is not allowed because "
+                                     "it can define entities")
+
+
+def read_chain(path: Path) -> Chain:
+    """Read the arm of a URDF file.
+
+    It runs from the link ``base`` (else the root) to ``tool0``, ``flange``, or else the end of the
+    only chain with six or more joints.
+
+    Raises:
+        InputError: the file cannot be read, or is not an arm of six or more revolute joints.
+    """
+    try:
+        # Entities need a document type, which is refused.
+        root = ElementTree.XML(read_text(path, "the description of an arm (URDF)"),
+                               ElementTree.XMLParser(target=_WithoutDoctype()))  # noqa: S314
+        return _Robot(root).chain()
+    except (ElementTree.ParseError, ValueError) as error:
+        raise InputError(f"Robot {str(path)!r} does not describe a supported arm: {error}.",
+                         "Limber supports serial arms with six or more revolute joints.",
+                         "Correct the URDF file. If it is a xacro file, convert it with xacro "
+                         "first.") from error
+
+
+class _Robot:
+    """The tree of a URDF file. Its methods raise ValueError if it does not describe an arm."""
+
+    def __init__(self, root: Element):
+        if root.tag != "robot":
+            raise ValueError(f"its root is <{root.tag}>, not <robot>")
+        self._links = {_said(link, "name"): link for link in root.findall("link")}
+        self._above = {_said(_part(joint, "child"), "link"): joint
+                       for joint in root.findall("joint")}
+
+    def chain(self) -> Chain:
+        """The joints from the base to the flange."""
+        base = self._joints_to(_BASE) if _BASE in self._links else []
+        if any(_turns(joint) for joint in base):
+            raise ValueError(f"its link {_BASE!r} is not fixed to the root")
+        frame = np.eye(4)
+        for joint in base:
+            frame = frame @ _origin(joint)
+        frame = inverse_of(frame)
+        joints: list[Joint] = []
+        rods: list[Rod] = []
+        for element in self._joints_to(self._flange()):
+            frame = frame @ _origin(element)
+            if _turns(element):
+                joints.append(_joint(element, frame))
+                frame = np.eye(4)
+            if joints:
+                link = _said(_part(element, "child"), "link")
+                rods += _rods(self._links[link], link, frame, len(joints) - 1)
+        if len(joints) < _FEWEST:
+            raise ValueError(f"it has only {len(joints)} revolute joints between base and flange")
+        return Chain(tuple(joints), frame, tuple(rods))
+
+    def _flange(self) -> str:
+        for name in _FLANGES:
+            if name in self._links:
+                return name
+        parents = {_said(_part(joint, "parent"), "link") for joint in self._above.values()}
+        ends = [name for name in self._links if name not in parents
+                and sum(map(_turns, self._joints_to(name))) >= _FEWEST]
+        if len(ends) != 1:
+            raise ValueError(f"it has no link {' or '.join(map(repr, _FLANGES))}, and {len(ends)} "
+                             f"chains of {_FEWEST} or more revolute joints")
+        return ends[0]
+
+    def _joints_to(self, link: str) -> list[Element]:
+        """The joints from the root to a link."""
+        found: list[Element] = []
+        while link in self._above:
+            found.append(self._above[link])
+            link = _said(_part(found[-1], "parent"), "link")
+            if len(found) > len(self._above):
+                raise ValueError(f"its links form a loop at {link!r}")
+        if link not in self._links:
+            raise ValueError(f"a joint refers to the link {link!r}, which does not exist")
+        return found[::-1]
+
+
+def _turns(joint: Element) -> bool:
+    kind = _said(joint, "type")
+    if kind == "fixed":
+        return False
+    if kind not in ("revolute", "continuous") or joint.find("mimic") is not None:
+        raise ValueError(f"its joint {joint.get('name')!r} has type {kind!r} or mimics another "
+                         "joint; only revolute, continuous and fixed joints are supported")
+    return True
+
+
+def _joint(element: Element, origin: np.ndarray) -> Joint:
+    name, limit = _said(element, "name"), element.find("limit")
+    speed = None if limit is None else limit.get("velocity")
+    if limit is None or speed is None or not float(speed) > 0.0:
+        raise ValueError(f"its joint {name!r} states no velocity limit")
+    limits = (-np.inf, np.inf)
+    if _said(element, "type") == "revolute":
+        limits = float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0))
+        if not limits[0] < limits[1]:
+            raise ValueError(f"the lower limit of its joint {name!r} is not below the upper limit")
+    element_axis = element.find("axis")
+    axis = _vector((1.0, 0.0, 0.0) if element_axis is None else _said(element_axis, "xyz").split())
+    if not np.linalg.norm(axis) > 0.0:
+        raise ValueError(f"the axis of its joint {name!r} is zero")
+    return Joint(name, origin, axis / np.linalg.norm(axis), limits, float(speed))
+
+
+def _rods(link: Element, name: str, frame: np.ndarray, joint: int) -> list[Rod]:
+    """The simple shapes of a link, each enclosed in a rod; meshes are omitted."""
+    found = []
+    for collision in link.findall("collision"):
+        shape = _part(_part(collision, "geometry"), "*")
+        along, radius = _axis_and_radius(shape)
+        if radius > 0.0:
+            transform = frame @ _origin(collision)
+            half = transform[:3, :3] @ (0.5 * along)
+            found.append(Rod(joint, name, transform[:3, 3] - half, transform[:3, 3] + half, radius))
+    return found
+
+
+def _axis_and_radius(shape: Element) -> tuple[np.ndarray, float]:
+    """A shape's longest axis [m, 3] and its greatest distance from it [m]; 0 for a mesh."""
+    if shape.tag == "sphere":
+        return np.zeros(3), float(_said(shape, "radius"))
+    if shape.tag == "cylinder":
+        return np.array([0.0, 0.0, float(_said(shape, "length"))]), float(_said(shape, "radius"))
+    if shape.tag == "box":
+        size = _vector(_said(shape, "size").split())
+        longest = np.eye(3)[int(size.argmax())]
+        return size * longest, 0.5 * float(np.linalg.norm(size * (1.0 - longest)))
+    return np.zeros(3), 0.0
+
+
+def _origin(element: Element) -> np.ndarray:
+    """The frame of an element in its parent's: roll, pitch and yaw about fixed axes."""
+    from scipy.spatial.transform import Rotation
+
+    frame, origin = np.eye(4), element.find("origin")
+    if origin is not None:
+        frame[:3, :3] = Rotation.from_euler(
+            "xyz", _vector(origin.get("rpy", "0 0 0").split())).as_matrix()
+        frame[:3, 3] = _vector(origin.get("xyz", "0 0 0").split())
+    return frame
+
+
+def _vector(parts: object) -> np.ndarray:
+    vector = np.array(parts, float)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{parts} is not a list of three finite numbers")
+    return vector
+
+
+def _part(element: Element, tag: str) -> Element:
+    part = element.find(tag)
+    if part is None:
+        raise ValueError(f"its <{element.tag}> {element.get('name', '')!r} has no <{tag}>")
+    return part
+
+
+def _said(element: Element, key: str) -> str:
+    value = element.get(key)
+    if value is None:
+        raise ValueError(f"one of its <{element.tag}> elements has no attribute {key!r}")
+    return value
+
+
+_MOST_STEPS = 60
+_CLOSE = 1e-11  # m and rad: a solution
+_LARGEST_STEP = 0.5  # rad
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e3
+
+
+@compiled
+def _chained(origins: np.ndarray, axes: np.ndarray, joints: np.ndarray, frames: np.ndarray,
+             ) -> None:
+    """Fill the frames [n + 1, 4, 4] of the joints and the flange at one pose [n]."""
+    turned, turn = np.eye(4), np.eye(3)
+    for k in range(len(origins)):
+        if k < len(joints):
+            c, s = math.cos(joints[k]), math.sin(joints[k])
+            x, y, z = axes[k]
+            v = 1.0 - c
+            # Rodrigues.
+            turn[0, 0], turn[0, 1], turn[0, 2] = c + x * x * v, x * y * v - z * s, x * z * v + y * s
+            turn[1, 0], turn[1, 1], turn[1, 2] = y * x * v + z * s, c + y * y * v, y * z * v - x * s
+            turn[2, 0], turn[2, 1], turn[2, 2] = z * x * v - y * s, z * y * v + x * s, c + z * z * v
+        origin, before = origins[k], frames[max(k - 1, 0)]
+        for i in range(3):
+            for j in range(3):
+                turned[i, j] = origin[i, j] if k == len(joints) else (
+                    origin[i, 0] * turn[0, j] + origin[i, 1] * turn[1, j]
+                    + origin[i, 2] * turn[2, j])
+            turned[i, 3] = origin[i, 3]
+        if k == 0:
+            frames[0] = turned
+            continue
+        for i in range(3):
+            for j in range(4):
+                frames[k, i, j] = (before[i, 0] * turned[0, j] + before[i, 1] * turned[1, j]
+                                   + before[i, 2] * turned[2, j] + before[i, 3] * turned[3, j])
+        frames[k, 3] = turned[3]
+
+
+@compiled
+def _slopes(axes: np.ndarray, frames: np.ndarray, slopes: np.ndarray) -> None:
+    """Fill the flange's Jacobian [6, n] from the frames [n + 1, 4, 4] of one pose."""
+    count = len(axes)
+    for k in range(count):
+        for i in range(3):
+            slopes[3 + i, k] = (frames[k, i, 0] * axes[k, 0] + frames[k, i, 1] * axes[k, 1]
+                                + frames[k, i, 2] * axes[k, 2])
+        axis, lever = slopes[3:, k], frames[count, :3, 3] - frames[k, :3, 3]
+        slopes[0, k] = axis[1] * lever[2] - axis[2] * lever[1]
+        slopes[1, k] = axis[2] * lever[0] - axis[0] * lever[2]
+        slopes[2, k] = axis[0] * lever[1] - axis[1] * lever[0]
+
+
+@compiled
+def _off(frame: np.ndarray, flange: np.ndarray, off: np.ndarray) -> None:
+    """Fill the translation [m] and rotation [rad] from the flange to its target, shape [6]."""
+    off[:3] = frame[:3, 3] - flange[:3, 3]
+    off[3:] = rotation_vector(frame @ inverse_of(flange))
+
+
+@compiled
+def chain_frames(origins: np.ndarray, axes: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """Return the frames of the joints and the flange in the base's, shape [poses, n + 1, 4, 4]."""
+    frames = np.empty((len(joints), len(origins), 4, 4))
+    for pose in range(len(joints)):
+        _chained(origins, axes, joints[pose], frames[pose])
+    return frames
+
+
+@compiled
+def chain_jacobian(axes: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Return Jacobians of the flange [poses, 6, n] from frames [poses, n + 1, 4, 4]."""
+    slopes = np.empty((len(frames), 6, len(axes)))
+    for pose in range(len(frames)):
+        _slopes(axes, frames[pose], slopes[pose])
+    return slopes
+
+
+@compiled
+def solved(origins: np.ndarray, axes: np.ndarray, frames: np.ndarray, starts: np.ndarray,
+           is_path: bool) -> np.ndarray:
+    """Return the angles that bring the flange to ``frames`` [k, 4, 4], shape [k, n].
+
+    Gauss-Newton steps with Levenberg-Marquardt damping; NaN if they do not converge.
+
+    Args:
+        starts: Start angles of each search, shape [k, n].
+        is_path: Search each but the first from the one before; NaN from the first unreached one on.
+    """
+    count = len(axes)
+    found = np.full((len(frames), count), np.nan)
+    chain, tried = np.empty((count + 1, 4, 4)), np.empty((count + 1, 4, 4))
+    slopes, off, off_tried = np.empty((6, count)), np.empty(6), np.empty(6)
+    for number in range(len(frames)):
+        is_later = is_path and number > 0
+        guess = found[number - 1].copy() if is_later else starts[number].copy()
+        if np.isnan(guess[0]):
+            continue
+        joints, damping, least = guess, 1e-3, np.inf
+        for _ in range(_MOST_STEPS):
+            _chained(origins, axes, guess, tried)
+            _off(frames[number], tried[count], off_tried)
+            square = (off_tried * off_tried).sum()
+            if square < least:
+                joints, least = guess, square
+                chain[:], off[:] = tried, off_tried
+                damping = max(0.1 * damping, _LEAST_DAMPING)
+                _slopes(axes, chain, slopes)
+            else:
+                damping *= 10.0
+            if not np.abs(off).max() > _CLOSE:
+                found[number] = joints
+                break
+            if not damping < _MOST_DAMPING:
+                break
+            step = slopes.T @ np.linalg.solve(slopes @ slopes.T + damping * np.eye(6), off)
+            guess = joints + step * min(1.0, _LARGEST_STEP / max(np.abs(step).max(), 1e-12))
+    return found
+
+
+ENDING = ".urdf"
+_STARTS = 96
+_MOST = 8  # stored configurations
+_APART = 0.2  # rad between two configurations
+_THICK = 0.07  # radius of a link without a simple shape over the arm's reach, rounded up
+_DRAWN = 0.05  # the same for drawn links
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfArm:
+    """A chain of revolute joints; see :class:`limber.cell.arm.Arm`.
+
+    A URDF does not describe the controller: only the virtual robot can move the arm until a driver
+    is registered with an arm of its own. It states no payload either: none is refused.
+    """
+
+    name: str
+    chain: Chain
+
+    controller = "virtual"
+    rate = 500.0
+    measures_force = True
+    payload = math.inf
+    singularity_names = ("nearest",)
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(joint.name for joint in self.chain.joints)
+
+    @property
+    def ros_joints(self) -> tuple[str, ...]:
+        return self.joint_names
+
+    @cached_property
+    def joint_limits(self) -> np.ndarray:
+        return np.array([joint.limits for joint in self.chain.joints])
+
+    @cached_property
+    def joint_speed(self) -> np.ndarray:
+        return np.array([joint.speed for joint in self.chain.joints])
+
+    @cached_property
+    def home(self) -> np.ndarray:
+        return self._starts[int(self._conditions(self._starts).argmax())]
+
+    @cached_property
+    def shoulder(self) -> np.ndarray:
+        """On the first joint's axis, at the height of the second joint."""
+        first, second = self.link_frames(np.zeros(len(self.chain.joints)))[:2]
+        axis = first[:3, :3] @ self.chain.joints[0].axis
+        return first[:3, 3] + axis * (axis @ (second[:3, 3] - first[:3, 3]))
+
+    @cached_property
+    def reach(self) -> float:
+        """Upper bound: the distance of the last joint from the shoulder with all links in line."""
+        positions = self.link_frames(np.zeros(len(self.chain.joints)))[1:-1, :3, 3]
+        return float(np.linalg.norm(positions[0] - self.shoulder)
+                     + np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+    @property
+    def link_radius(self) -> float:
+        return _DRAWN * self.reach
+
+    def forward(self, joints: np.ndarray) -> np.ndarray:
+        return self.link_frames(joints)[..., -1, :, :]
+
+    def link_frames(self, joints: np.ndarray) -> np.ndarray:
+        """Return the frames of all joints and of the flange, shape [..., n + 1, 4, 4]."""
+        joints = np.asarray(joints, float)
+        count = joints.shape[-1]
+        frames = chain_frames(self._origins, self._axes, for_kernels(joints.reshape(-1, count)))
+        return frames.reshape(*joints.shape[:-1], count + 1, 4, 4)
+
+    def jacobian(self, joints: np.ndarray) -> np.ndarray:
+        frames = self.link_frames(joints)
+        slopes = chain_jacobian(self._axes, for_kernels(frames.reshape(-1, *frames.shape[-3:])))
+        return slopes.reshape(*frames.shape[:-3], 6, len(self._axes))
+
+    def inverse(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+        """Return up to eight configurations for each of ``frames`` [..., 4, 4], or the one found
+        from ``near`` [..., n]; see :class:`limber.cell.arm.Arm`.
+        """
+        frames = np.asarray(frames, float)
+        count = len(self._axes)
+        flat = for_kernels(frames.reshape(-1, 4, 4))
+        begun = None if near is None else np.broadcast_to(
+            np.asarray(near, float), (*frames.shape[:-2], count)).reshape(-1, count)
+        found = np.full((len(flat), _MOST, count), np.nan)
+        if begun is not None:
+            found[:, 0] = self._solved(flat, begun)
+        for number in np.flatnonzero(np.isnan(found[:, 0, 0])):
+            kept = self._apart(self._solved(np.repeat(flat[number:number + 1], _STARTS, axis=0),
+                                            self._starts))
+            found[number, :len(kept)] = kept
+        return found.reshape(*frames.shape[:-2], _MOST, count)
+
+    def configurations(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+        frames = np.asarray(frames, float)
+        return np.array([self._solved(frames, start[None], is_path=True)
+                         for start in self.inverse(frames[0], near)])
+
+    def _solved(self, frames: np.ndarray, starts: np.ndarray, *, is_path: bool = False,
+                ) -> np.ndarray:
+        return solved(self._origins, self._axes, for_kernels(frames), for_kernels(starts), is_path)
+
+    def singularity_distance(self, joints: np.ndarray) -> np.ndarray:
+        """Return the ratio of the Jacobian's least to greatest singular value, lengths in reaches
+        of the arm, as a fraction of its value in the arm's best pose, shape [..., 1].
+        """
+        return self._conditions(joints) / self._best_condition
+
+    def _conditions(self, joints: np.ndarray) -> np.ndarray:
+        slopes = self.jacobian(joints)
+        slopes[..., :3, :] /= self.reach
+        values = np.linalg.svd(slopes, compute_uv=False)
+        return values[..., -1:] / values[..., :1]
+
+    def rods(self, joints: np.ndarray) -> Rods:
+        """Return the moving links: their simple shapes, or else thick lines between the joints.
+
+        The link that moves with the first joint alone is omitted if it is such a line: it begins in
+        the base's foot, and touches the mount.
+        """
+        frames = self.link_frames(joints)
+        names: list[str] = []
+        starts, ends, radii = [], [], []
+        for number, name in enumerate(self.joint_names):
+            own = [rod for rod in self.chain.rods if rod.joint == number]
+            turn, position = frames[:, number, :3, :3], frames[:, number, :3, 3]
+            for rod in own:
+                names.append(rod.name)
+                starts.append(turn @ rod.start + position)
+                ends.append(turn @ rod.end + position)
+                radii.append(rod.radius)
+            if not own and number > 0:
+                names.append(f"link behind {name}")
+                starts.append(position)
+                ends.append(frames[:, number + 1, :3, 3])
+                radii.append(_THICK * self.reach)
+        return Rods(tuple(names), np.stack(starts, axis=1), np.stack(ends, axis=1),
+                    np.array(radii))
+
+    @cached_property
+    def _best_condition(self) -> float:
+        return float(self._conditions(self.home)[0])
+
+    @cached_property
+    def _origins(self) -> np.ndarray:
+        return np.array([*(joint.origin for joint in self.chain.joints), self.chain.flange])
+
+    @cached_property
+    def _axes(self) -> np.ndarray:
+        return np.array([joint.axis for joint in self.chain.joints])
+
+    @cached_property
+    def _starts(self) -> np.ndarray:
+        """Start angles of the search for configurations, always the same, shape [starts, n]."""
+        low, high = np.clip(self.joint_limits, -np.pi, np.pi).T
+        return np.random.default_rng(0).uniform(low, high, (_STARTS, len(low)))
+
+    def _apart(self, found: np.ndarray) -> np.ndarray:
+        """Return the solutions [k, n] that are different configurations, the best first: within the
+        limits, and far from singularities.
+        """
+        found = found[np.isfinite(found).all(axis=1)]
+        if not len(found):
+            return found
+        found = (found + np.pi) % (2 * np.pi) - np.pi
+        low, high = self.joint_limits.T
+        inside = ((found > low) & (found < high)).all(axis=1)
+        best = np.lexsort((-self.singularity_distance(found)[:, 0], ~inside))
+        kept: list[np.ndarray] = []
+        for joints in found[best]:
+            off = [np.abs((joints - other + np.pi) % (2 * np.pi) - np.pi).max() for other in kept]
+            if min(off, default=np.inf) > _APART and len(kept) < _MOST:
+                kept.append(joints)
+        return np.array(kept)
+
+
+def arm_of_file(name: str) -> UrdfArm:
+    """Return the arm of a URDF file; its name is the file's.
+
+    Raises:
+        InputError: the file cannot be read, or does not describe a supported arm.
+    """
+    path = Path(name)
+    try:
+        stamp = path.stat()
+    except OSError as error:
+        raise InputError(f"Robot {name!r} cannot be read from its file ({error.strerror}).",
+                         "It must describe the arm's links and "
+                         "joints.", "Give the path of its URDF.",
+                         ) from error
+    return _read(name, stamp.st_mtime_ns, stamp.st_size)
+
+
+@functools.lru_cache(maxsize=16)
+def _read(name: str, _changed: int, _size: int) -> UrdfArm:
+    """The arm of a file in its present state: a cell asks for its arm many times a second."""
+    return UrdfArm(name, read_chain(Path(name)))

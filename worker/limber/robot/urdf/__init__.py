@@ -1,1 +1,0 @@
-"""Arms that a URDF file describes: any chain of six or more revolute joints."""
