@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, LimberError
 from limber.core.json_values import plain
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.loads.load_effects import load_effects
 from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
-from limber.stages.motion.load import LoadSettings, _inputs, load
+from limber.stages.motion.load import Load, LoadSettings, _inputs, load
+from limber.stages.results.report import page_of
 from limber.store import Branch
 from limber.store.loading import load_branch, load_skeleton
 
@@ -104,18 +105,16 @@ def test_gusts_that_make_no_sense(tmp_path, content, settings, told):
 @pytest.mark.slow
 def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     """Its table and picture on the page, its frames in the scene; a damaged file is named."""
-    from limber.results.report.loads_section import read_load
-    from limber.results.report.page import draw_page
     from limber.results.scene.contents import scene_data
 
     folder = Path(shutil.copytree(EXAMPLE, tmp_path / "a.branch"))
     result = load(folder, LoadSettings(wind=(6.0, 0.0, 0.0), gust=0.2, name="gale"))
     branch = Branch.open(folder, verify=True)
     assert branch.manifest.stages["load:gale"].result["sag_m"] == result["sag_m"]
-    section = next(one for one in draw_page(branch)[1] if one.title == "Load: gale")
+    section = next(one for one in page_of(branch)[1] if one.title == "Load: gale")
     told = dict(row[:2] for row in section.tables[0][1])
     assert told["peak load of the gusts over the mean load"] == f"{result['gusts']['factor']:.2f}"
-    assert len(section.pictures) == 1 and not section.text
+    assert len(section.pictures) == 2 and not section.text
     data = scene_data(branch, motion="load-gale")
     assert data.info["frames"]["name"] == "load-gale" and "frame_scalar:strain" in data.arrays
     assert len(data.arrays["frame_strain"]) == 2
@@ -129,7 +128,7 @@ def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     assert not branch.is_current("load:gale", branch.manifest.stages["load:gale"].settings,
                                  **_inputs(branch, LoadSettings()))
     (folder / "loads" / "gale.json").write_text('{"sag_m": 1e999}')
-    with pytest.raises(InputError, match=r"gale\.json"):
-        read_load(folder / "loads" / "gale.json")
+    with pytest.raises(LimberError, match=r"gale\.json"):
+        Load.content(branch, "load:gale", {})
     with pytest.raises(ValueError, match="pattern"):
         LoadSettings(name="../out")

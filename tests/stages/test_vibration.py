@@ -10,8 +10,8 @@ import pytest
 from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.mechanics.dynamics.modes import lowest_modes
-from limber.results.report.ringing_section import vibration_rows
 from limber.stages.moduli.vibration import VibrationSettings, vibration
+from limber.stages.registry import result_of
 from limber.store import Branch
 from limber.store.loading import load_branch, load_mesh
 
@@ -49,12 +49,12 @@ def test_a_stiffer_branch_rings_faster(branch, tmp_path):
     now = Branch.open(branch.folder, verify=True)
     assert load_mesh(now).cell_data["young"].mean() == pytest.approx(told["young_pa"])
     assert vibration(branch.folder, record, VibrationSettings()) == told, "kept"
-    modulus, vibrations = vibration_rows(now.path("vibration.json"))
+    section = result_of(now, "vibration", told).section(now, "vibration")
+    (_, modulus), (_, vibrations) = section.tables
     assert modulus[1][1] == f"{told['young_pa'] / 1e6:.4g}" and len(vibrations) == 1 + len(
         told["frequencies_hz"])
-    now.path("vibration.json").write_text('{"young_pa": -1}')
-    with pytest.raises(InputError, match=r"vibration\.json"):
-        vibration_rows(now.path("vibration.json"))
+    with pytest.raises(InputError, match=r"branch\.json: young_interval"):
+        result_of(now, "vibration", told | {"young_interval_pa": [1.0]})
 
 
 @pytest.mark.slow

@@ -191,25 +191,21 @@ def _searched(branch: Branch) -> Any:
 
 
 def _load(branch: Branch) -> Any:
-    from limber.results.report.loads_section import load_rows, read_load
+    from limber.stages.motion.load import Load
 
-    return load_rows(read_load(branch.path("loads/gale.json")))
-
-
-def _ringing(branch: Branch) -> Any:
-    from limber.results.report.ringing_section import vibration_rows
-
-    return vibration_rows(branch.path("vibration.json"))
+    return Load.read(branch, "load:gale", {}).rows()
 
 
 def _swing(branch: Branch) -> Any:
-    from limber.results.report.swing_section import along_path, read_swing, swing_rows
+    from limber.results.report.swing_section import along_path
+    from limber.stages.moduli.swing import Swing
 
-    swing = read_swing(branch.path("swing.json"))
-    return swing_rows(swing), along_path(swing)
+    swing = Swing.read(branch, "swing", _SWING)
+    return along_path(swing.seen, swing.simulated)
 
 
-_LOAD = {"tip_displacement_m": [0.01, 0, -0.02], "sag_m": 0.02, "sag_interval_m": [0.01, 0.03],
+_LOAD = {"along": [{"from_m": 0.0, "to_m": 0.3, "strain": 0.001}],
+         "tip_displacement_m": [0.01, 0, -0.02], "sag_m": 0.02, "sag_interval_m": [0.01, 0.03],
          "greatest_strain": 0.001, "greatest_strain_interval": [0.0008, 0.0012],
          "strain_over_limit": 0.1, "frequencies_hz": [2.0], "frequencies_before_hz": [2.5, 3.1],
          "first_frequency_interval_hz": [1.9, 2.1], "wind_force_n": [1, 0, 0], "added_mass_kg": 0.1,
@@ -217,11 +213,6 @@ _LOAD = {"tip_displacement_m": [0.01, 0, -0.02], "sag_m": 0.02, "sag_interval_m"
          "held_by": "strain", "gusts": {
              "factor": 1.5, "peak_factor": 3.2, "dynamic": 1.1, "damping": 0.03,
              "mean_speed_m_s": 5.0, "mean_tip_displacement_m": [0.01, 0, 0]}}
-_RINGING = {"young_pa": 1e9, "young_interval_pa": [8e8, 1.2e9], "frequencies_hz": [2.0, 4.0],
-            "frequency_deviations_hz": [0.01, 0.02], "damping_ratios": [0.02, 0.03],
-            "damping_ratio_deviations": [0.001, 0.002],
-            "damping_ratio_intervals": [[0.01, 0.02], [0.02, 0.03]],
-            "model_frequencies_hz": [2.0, 4.1], "left_over": 0.05}
 _TRACK = (0.02 * np.cos(np.linspace(0, 6, 12))[:, None, None] * [[[0, 0, 0.1], [0, 0.5, 1.0]]])
 _SWING = {"pull": "let-go", "young_pa": 2.5e6, "young_interval_pa": [2.4e6, 2.7e6],
           "damping_ratio": 0.05, "damping_ratio_interval": [0.04, 0.06], "release_s": 0.4,
@@ -339,8 +330,6 @@ BRANCH_READERS: dict[str, Reader] = {
     "plan JSON": _branch_file("plans/to-goal.json", "json", _planned),
     "plan CSV": _branch_file("plans/to-goal.csv", "text", _planned),
     "loads JSON": _branch_file("loads/gale.json", "json", _load, _json_file("gale.json", _LOAD)),
-    "vibration.json": _branch_file("vibration.json", "json", _ringing,
-                                   _json_file("vibration.json", _RINGING)),
     "swing.json": _branch_file("swing.json", "json", _swing, _json_file("swing.json", _SWING),
                                may_lack=True),
     "MCAP": Reader("binary", _mcap, _bag, True),

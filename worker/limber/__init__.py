@@ -23,37 +23,37 @@ from limber.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from limber.api.branch import Branch as Branch
-    from limber.api.motion_results import Load as Load
-    from limber.api.motion_results import Simulation as Simulation
-    from limber.api.path_results import EnergyField as EnergyField
-    from limber.api.path_results import Execution as Execution
-    from limber.api.path_results import Plan as Plan
-    from limber.api.path_results import Written as Written
-    from limber.api.pull_results import Estimate as Estimate
-    from limber.api.pull_results import Generated as Generated
-    from limber.api.pull_results import Pull as Pull
-    from limber.api.result import Result as Result
     from limber.api.settings_table import settings as settings
     from limber.api.verbs import generate as generate
     from limber.api.verbs import mesh as mesh
     from limber.api.verbs import open as open
     from limber.api.verbs import reconstruct as reconstruct
+    from limber.stages.moduli.estimate import Estimate as Estimate
+    from limber.stages.motion.load import Load as Load
+    from limber.stages.motion.simulate import Simulation as Simulation
+    from limber.stages.paths.energy import EnergyField as EnergyField
+    from limber.stages.paths.execute import Execution as Execution
+    from limber.stages.paths.plan import Plan as Plan
+    from limber.stages.pulls.import_pull import Pull as Pull
+    from limber.stages.result import Result as Result
+    from limber.stages.result import Written as Written
+    from limber.stages.shape.generate import Generated as Generated
 
 # Before any module of Limber loads a library, in each process: no result may depend on threads.
 _same_digits()
 
 _PLACES = {
     "Branch": "api.branch",
-    "EnergyField": "api.path_results",
-    "Estimate": "api.pull_results",
-    "Execution": "api.path_results",
-    "Generated": "api.pull_results",
-    "Load": "api.motion_results",
-    "Plan": "api.path_results",
-    "Pull": "api.pull_results",
-    "Result": "api.result",
-    "Simulation": "api.motion_results",
-    "Written": "api.path_results",
+    "EnergyField": "stages.paths.energy",
+    "Estimate": "stages.moduli.estimate",
+    "Execution": "stages.paths.execute",
+    "Generated": "stages.shape.generate",
+    "Load": "stages.motion.load",
+    "Plan": "stages.paths.plan",
+    "Pull": "stages.pulls.import_pull",
+    "Result": "stages.result",
+    "Simulation": "stages.motion.simulate",
+    "Written": "stages.result",
     "generate": "api.verbs",
     "mesh": "api.verbs",
     "open": "api.verbs",

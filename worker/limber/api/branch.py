@@ -4,19 +4,15 @@ import html
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from limber.api.by_name import ByName
-from limber.api.motion_results import Load, Simulation
-from limber.api.path_results import EnergyField, Execution, Plan, Written
-from limber.api.pull_results import Estimate, Pull
-from limber.api.result import Result, drawn
 from limber.api.running import in_python_words, run_stage, stage_of
 from limber.api.settings_table import known_stage
-from limber.api.typed_results import read_result
 from limber.core.errors import InputError
 from limber.core.settings import checked_settings, nearest
+from limber.stages.registry import result_of, stage_description
+from limber.stages.result import Result, Written, drawn
 from limber.store import Branch as Folder
 
 if TYPE_CHECKING:
@@ -26,6 +22,13 @@ if TYPE_CHECKING:
     from limber.geometry.skeleton.skeleton import Skeleton
     from limber.geometry.tets.tet_mesh import TetMesh
     from limber.session.client import InteractiveSession
+    from limber.stages.moduli.estimate import Estimate
+    from limber.stages.motion.load import Load
+    from limber.stages.motion.simulate import Simulation
+    from limber.stages.paths.energy import EnergyField
+    from limber.stages.paths.execute import Execution
+    from limber.stages.paths.plan import Plan
+    from limber.stages.pulls.import_pull import Pull
 
 PathLike = str | os.PathLike[str]
 
@@ -105,7 +108,7 @@ class Branch:
         return from_entries(made.result.get("alternatives") or [] if made else [])
 
     @property
-    def pulls(self) -> Mapping[str, Pull]:
+    def pulls(self) -> "Mapping[str, Pull]":
         """The recordings by name.
 
         >>> limber.open("a.branch").pulls["pull-1"].times[0]
@@ -115,9 +118,9 @@ class Branch:
 
         branch = self._read()
         entries = branch.manifest.stages
-        return ByName(known_pulls(branch), lambda name: Pull.read(
+        return ByName(known_pulls(branch), lambda name: cast("Pull", result_of(
             branch, f"pull:{name}",
-            entries[f"pull:{name}"].result if f"pull:{name}" in entries else {}))
+            entries[f"pull:{name}"].result if f"pull:{name}" in entries else {})))
 
     @property
     def results(self) -> Mapping[str, Result]:
@@ -128,7 +131,7 @@ class Branch:
         """
         branch = self._read()
         entries = branch.manifest.stages
-        return ByName(sorted(entries), lambda key: read_result(branch, key, entries[key].result))
+        return ByName(sorted(entries), lambda key: result_of(branch, key, entries[key].result))
 
     def plot(self) -> "Figure":
         """Draw the scan and its skeleton from the front and from the side.
@@ -142,7 +145,7 @@ class Branch:
         return drawn(lambda: scan_and_skeleton(branch, []))
 
     def add_pull(self, source: PathLike, name: str, *, quiet: bool = False,
-                 **settings: Any) -> Pull:
+                 **settings: Any) -> "Pull":
         """Import a recording of a pull into the branch folder.
 
         Args:
@@ -160,9 +163,9 @@ class Branch:
         ...                                  robot=f"{folder}/robot.csv").poses.shape
         (24, 6)
         """
-        return cast(Pull, self._run("add_pull", quiet, settings, source=source, name=name))
+        return cast("Pull", self._run("add_pull", quiet, settings, source=source, name=name))
 
-    def virtual_pull(self, *, quiet: bool = False, **settings: Any) -> Pull:
+    def virtual_pull(self, *, quiet: bool = False, **settings: Any) -> "Pull":
         """Simulate a pull of the branch with a known Young's modulus and the noise of sensors.
 
         Args:
@@ -177,9 +180,9 @@ class Branch:
         >>> limber.open("a.branch").virtual_pull(name="short", frames=4, seed=1).forces.shape
         (4, 3)
         """
-        return cast(Pull, self._run("virtual_pull", quiet, settings))
+        return cast("Pull", self._run("virtual_pull", quiet, settings))
 
-    def estimate(self, *, quiet: bool = False, **settings: Any) -> Estimate:
+    def estimate(self, *, quiet: bool = False, **settings: Any) -> "Estimate":
         """Estimate Young's modulus along the branch from its pulls, and enter it in the mesh.
 
         Args:
@@ -199,9 +202,9 @@ class Branch:
             raise InputError("follow was given.", "It estimates while a pull is recorded, and "
                              "returns another result.",
                              "Use branch.run(\"estimate\", follow=True).")
-        return cast(Estimate, self._run("estimate", quiet, settings))
+        return cast("Estimate", self._run("estimate", quiet, settings))
 
-    def simulate(self, *, quiet: bool = False, **settings: Any) -> Simulation:
+    def simulate(self, *, quiet: bool = False, **settings: Any) -> "Simulation":
         """Pull the branch by a pose or a force.
 
         Args:
@@ -220,11 +223,9 @@ class Branch:
         >>> bent.forces.shape, bool(bent.strains.max() < 0.02)
         ((7, 3), True)
         """
-        replayed = settings.get("pull")
-        return cast(Simulation, self._run(
-            "simulate", quiet, settings, key=f"replay:{replayed}" if replayed else None))
+        return cast("Simulation", self._run("simulate", quiet, settings))
 
-    def load(self, *, quiet: bool = False, **settings: Any) -> Load:
+    def load(self, *, quiet: bool = False, **settings: Any) -> "Load":
         """Put the branch under wind, snow, fruit or a cut.
 
         Args:
@@ -241,9 +242,9 @@ class Branch:
         >>> bool(gale.greatest_strain > calm.greatest_strain)
         True
         """
-        return cast(Load, self._run("load", quiet, settings))
+        return cast("Load", self._run("load", quiet, settings))
 
-    def energy_field(self, *, quiet: bool = False, **settings: Any) -> EnergyField:
+    def energy_field(self, *, quiet: bool = False, **settings: Any) -> "EnergyField":
         """Sample grasp poses and fit the deformation energy over them.
 
         Args:
@@ -257,9 +258,9 @@ class Branch:
         >>> field = limber.open("a.branch").energy_field(samples=40)  # doctest: +SKIP
         >>> field.energy([[0.02, 0.0, 0.25]])                         # doctest: +SKIP
         """
-        return cast(EnergyField, self._run("energy_field", quiet, settings))
+        return cast("EnergyField", self._run("energy_field", quiet, settings))
 
-    def plan(self, *, quiet: bool = False, **settings: Any) -> Plan:
+    def plan(self, *, quiet: bool = False, **settings: Any) -> "Plan":
         """Plan a gentle path of the grasp on the energy field; the shortest one for comparison.
 
         Args:
@@ -275,9 +276,9 @@ class Branch:
         >>> soft = limber.open("a.branch").plan(max_strain=0.02, name="soft")  # doctest: +SKIP
         >>> soft.strains.max() <= 0.02                                        # doctest: +SKIP
         """
-        return cast(Plan, self._run("plan", quiet, settings))
+        return cast("Plan", self._run("plan", quiet, settings))
 
-    def execute(self, cell: PathLike, *, quiet: bool = False, **settings: Any) -> Execution:
+    def execute(self, cell: PathLike, *, quiet: bool = False, **settings: Any) -> "Execution":
         """Check a plan for a robot; with ``arm=True`` and ``confirm=NAME`` follow it.
 
         Args:
@@ -293,7 +294,7 @@ class Branch:
 
         >>> limber.open("a.branch").execute("cell.toml", name="to-goal")  # doctest: +SKIP
         """
-        return cast(Execution, self._run("execute", quiet, settings, cell=cell))
+        return cast("Execution", self._run("execute", quiet, settings, cell=cell))
 
     def report(self, *, quiet: bool = False, **settings: Any) -> Written:
         """Write one HTML page with figures and tables of all results.
@@ -305,8 +306,7 @@ class Branch:
         >>> limber.open("a.branch").report().path.name
         'report.html'
         """
-        _, values = self._values("report", quiet, settings)
-        return Written(MappingProxyType(values), Path(values["report"]))
+        return cast(Written, self._run("report", quiet, settings))
 
     def scene(self, output: PathLike, *, quiet: bool = False, **settings: Any) -> Written:
         """Write a Blender scene with the branch, its motion and paths.
@@ -322,8 +322,7 @@ class Branch:
 
         >>> limber.open("a.branch").scene("a.blend", render="a.png")  # doctest: +SKIP
         """
-        _, values = self._values("scene", quiet, settings, output=output)
-        return Written(MappingProxyType(values), Path(output))
+        return cast(Written, self._run("scene", quiet, settings, output=output))
 
     def export(self, output: PathLike, *, quiet: bool = False, **settings: Any) -> Written:
         """Write the branch for another program.
@@ -340,8 +339,7 @@ class Branch:
         >>> limber.open("a.branch").export("a.xml").path.name
         'a.xml'
         """
-        _, values = self._values("export", quiet, settings, output=output)
-        return Written(MappingProxyType(values), Path(output))
+        return cast(Written, self._run("export", quiet, settings, output=output))
 
     def run(self, stage: str, *, quiet: bool = False, **settings: Any) -> Result:
         """Run a stage without a verb, such as ``predict``, ``swing`` or ``target``.
@@ -359,8 +357,7 @@ class Branch:
         """
         if known_stage(stage) in ("generate", "reconstruct", "mesh"):
             raise InputError(f"{stage} makes a new branch.", "", f"Call limber.{stage}.")
-        _, values = self._values(stage, quiet, settings)
-        return Result(MappingProxyType(values))
+        return self._run(stage, quiet, settings)
 
     def session(self, *, mode: str = "rigid", **settings: Any) -> "InteractiveSession":
         """Start a process in which the branch follows its grasps, many times a second.
@@ -409,12 +406,12 @@ class Branch:
     def _read(self) -> Folder:
         return Folder.read(self.folder)
 
-    def _values(self, verb: str, quiet: bool, settings: dict[str, Any], **needed: Any,
-                ) -> tuple[str, dict[str, Any]]:
-        return run_stage(stage_of(verb), {**settings, **needed, "branch_folder": self.folder},
-                         quiet=quiet)
-
-    def _run(self, verb: str, quiet: bool, settings: dict[str, Any], *, key: str | None = None,
-             **needed: Any) -> Result:
-        entry, values = self._values(verb, quiet, settings, **needed)
-        return read_result(self._read(), key or entry, values)
+    def _run(self, verb: str, quiet: bool, settings: dict[str, Any], **needed: Any) -> Result:
+        name = stage_of(verb)
+        key, values = run_stage(name, {**settings, **needed, "branch_folder": self.folder},
+                                quiet=quiet)
+        if replayed := settings.get("pull") if name == "simulate" else None:
+            key = f"replay:{replayed}"
+        if settings.get("follow") or not key:
+            return (stage_description(name).result or Result).read(None, name, values)
+        return result_of(self._read(), key, values)

@@ -11,17 +11,19 @@ import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from limber.api.branch import Branch, PathLike
-from limber.api.pull_results import Generated
 from limber.api.running import run_stage
 from limber.core.errors import InputError
 
+if TYPE_CHECKING:
+    from limber.stages.shape.generate import Generated
 
-def generate(folder: PathLike, *, quiet: bool = False, **settings: Any) -> Generated:
+
+def generate(folder: PathLike, *, quiet: bool = False, **settings: Any) -> "Generated":
     """Make a branch with known truth, and scan it as a scanner would.
 
     Args:
@@ -34,8 +36,10 @@ def generate(folder: PathLike, *, quiet: bool = False, **settings: Any) -> Gener
     >>> scan.cloud.name, scan.young.shape
     ('cloud.ply', (4,))
     """
+    from limber.stages.shape.generate import Generated
+
     _, values = run_stage("generate", {**settings, "folder": folder}, quiet=quiet)
-    return Generated.read(None, "", values)
+    return Generated.read(None, "generate", values)
 
 
 def reconstruct(cloud: "PathLike | np.ndarray | Mapping[str, Any]", folder: PathLike, *,

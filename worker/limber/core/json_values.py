@@ -38,14 +38,14 @@ def plain(value: Any) -> Any:
     return value
 
 
-def number_array(values: Any) -> np.ndarray:
-    """Return nested lists of numbers as an array of floats.
+def number_array(values: Any, *, gaps: bool = False) -> np.ndarray:
+    """Return nested lists of numbers as an array of floats; with ``gaps`` None becomes NaN.
 
     Raises:
         ValueError: they are ragged, or there is anything else among them: a text, a Boolean, None.
     """
     held = np.array(values, object)
-    if not {type(value) for value in held.ravel().tolist()} <= {int, float}:
+    if not {type(value) for value in held.ravel().tolist()} <= {int, float, *[type(None)] * gaps}:
         raise ValueError("a value that is not a number")
     return held.astype(float)
 

@@ -22,6 +22,8 @@ from limber.core.progress import Progress
 
 if TYPE_CHECKING:
     from limber.core.settings import Settings
+    from limber.stages.result import Result
+    from limber.store import Branch
 
 FORMAT = 1
 """Format version of the schemas that :func:`all_schemas` returns."""
@@ -38,6 +40,7 @@ class StageDescription:
         inputs: Files, folders and names: source and target.
         settings: What the result depends on beside the inputs; the manifest records them.
         options: Options of the run, which do not change the result.
+        result: What it returns; None: values without labels.
         key: Key of its entry in the manifest; ``{name}`` is replaced by that input or setting.
             Empty: it makes none.
         reads: Names of the branch folder's files that it reads; ``{name}`` as in ``key``.
@@ -57,6 +60,7 @@ class StageDescription:
     inputs: "type[Settings]"
     settings: "type[Settings]"
     options: "type[Settings]"
+    result: "type[Result] | None" = None
     key: str = ""
     reads: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
@@ -170,6 +174,29 @@ def stage_description(name: str) -> StageDescription:
     if name not in stage_summaries():
         raise KeyError(name)
     return stage_module(name).STAGE
+
+
+def result_of(branch: "Branch", key: str, values: Mapping[str, Any]) -> "Result":
+    """Return the typed result of an entry of a branch's manifest.
+
+    Args:
+        key: The entry's name, such as ``plan:to-light``.
+        values: The stage's result.
+
+    Raises:
+        InputError: the values, or a file that belongs to them, are damaged.
+    """
+    from limber.stages.result import Result
+
+    return (result_kinds().get(key.partition(":")[0]) or Result).read(branch, key, values)
+
+
+@cache
+def result_kinds() -> "dict[str, type[Result]]":
+    """Return the results' models by the first words of the manifest's entries."""
+    stages = map(stage_description, stage_summaries())
+    kinds = {stage.key.partition(":")[0]: stage.result for stage in stages if stage.result}
+    return kinds | ({"replay": kinds["simulate"]} if "simulate" in kinds else {})
 
 
 def stage_schema(name: str) -> dict[str, Any]:

@@ -1,8 +1,7 @@
-"""The execution of a plan by a robot: the measured force against the predicted one."""
+"""The figure of an execution by a robot: the measured force against the predicted one."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,27 +16,6 @@ _MOST_POINTS = 1500
 _GAP_SECONDS = 0.5
 _NAMES = [*(f"{kind}_f{axis}_n" for kind in ("smooth", "expected") for axis in "xyz"),
           *(f"expected_{entry}_n2" for entry in ("xx", "yy", "zz"))]
-
-
-def execution_rows(result: Mapping[str, Any]) -> list[list[str]]:
-    """Return the rows of an execution's result, as its stage returns it."""
-    ended = ("the end of the path, then returned" if result.get("reached")
-             else f"a stop: {result.get('stop_reason')}")
-    rows = [["item", "value"], ["ended at", ended]]
-    for key, label, scale, form in [
-            ("predicted_peak_force_n", "predicted peak force [N]", 1, "{:.2f}"),
-            ("peak_force_n", "measured peak force [N]", 1, "{:.2f}"),
-            ("force_within_share",
-             "force within 5 % of the peak, or within the interval [% of the path]",
-             100, "{:.1f}"),
-            ("force_error_of_peak",
-             "force difference not exceeded on 95 % of the path [% of the peak]", 100,
-             "{:.1f}"),
-            ("path_error_m", "largest distance from the path [mm]", 1000, "{:.2f}")]:
-        value = result.get(key)
-        if value is not None and np.isfinite(value):
-            rows.append([label, form.format(scale * value)])
-    return rows
 
 
 def force_along_path(path: Path) -> "Figure":

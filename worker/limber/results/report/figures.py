@@ -133,18 +133,16 @@ def pull(recording: Any) -> "Figure":
     return figure
 
 
-def motion(frames: Mapping[str, Any]) -> "Figure":
-    """Energies and grasp force of a simulated motion over time."""
+def motion(time: np.ndarray, energies: np.ndarray, kinetic: np.ndarray, force: np.ndarray,
+           ) -> "Figure":
+    """Energies [J] and grasp force [N] [n, 3] of a simulated motion over time [s]."""
     import matplotlib.pyplot as plt
 
-    time = frames["times_s"]
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.8), layout="constrained")
-    left.plot(time, 1e3 * np.array(frames["energies_j"]), color=SIMULATED, label="strain")
-    kinetic = 1e3 * np.array(frames["kinetic_energies_j"])
+    left.plot(time, 1e3 * energies, color=SIMULATED, label="strain")
     if kinetic.any():
-        left.plot(time, kinetic, "--", color=SIMULATED, label="kinetic")
+        left.plot(time, 1e3 * kinetic, "--", color=SIMULATED, label="kinetic")
     left.set(xlabel="time [s]", ylabel="energy [mJ]")
-    force = np.array(frames["grasp_forces_n"])
     for (name, line), column in zip(AXIS_LINES.items(), force.T, strict=True):
         right.plot(time, column, line, color=SIMULATED, label=name)
     right.set(xlabel="time [s]", ylabel="force on the grasp [N]")
@@ -154,16 +152,15 @@ def motion(frames: Mapping[str, Any]) -> "Figure":
     return figure
 
 
-def energy_samples(data: Mapping[str, np.ndarray]) -> "Figure":
-    """Energy and force of the sampled grasp poses over their distance from rest."""
+def energy_samples(positions: np.ndarray, energies: np.ndarray, forces: np.ndarray) -> "Figure":
+    """Energy [J] and force [N] of the sampled grasps over their distance from rest, the first."""
     import matplotlib.pyplot as plt
 
-    rest = data["rest_pose"][:3] if "rest_pose" in data else data["poses"][:, :3].mean(axis=0)
-    distance = 1e3 * np.linalg.norm(data["poses"][:, :3] - rest, axis=1)
+    distance = 1e3 * np.linalg.norm(positions - positions[0], axis=1)
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.8))
-    left.scatter(distance, 1e3 * data["energies_j"], s=9, color=SIMULATED)
+    left.scatter(distance, 1e3 * energies, s=9, color=SIMULATED)
     left.set(xlabel="displacement of the grasp [mm]", ylabel="strain energy [mJ]")
-    force = np.linalg.norm(data["forces_n"], axis=1)
+    force = np.linalg.norm(forces, axis=1)
     right.scatter(distance, force, s=9, color=SIMULATED)
     right.set(xlabel="displacement of the grasp [mm]", ylabel="force [N]")
     for axis in (left, right):

@@ -1,107 +1,17 @@
-"""The report's section on wind, snow, fruit and cuts that act on a branch."""
+"""Figures of wind, snow, fruit and cuts that act on a branch."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import Field
 
-from limber.core.files.reading import FileContent, read_arrays, read_json_as, require_shapes
+from limber.core.files.reading import read_arrays, require_shapes
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.results.findings import failure_sentence
 from limber.results.motion_files import read_pc2
 from limber.results.report.charts import draw_faces, two_views
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-_Interval = tuple[float, float]
-_Way = tuple[float, float, float]
-
-
-class Gusts(FileContent):
-    """Gusts in ``loads/NAME.json``: effects beyond those of the mean wind."""
-
-    factor: float
-    peak_factor: float
-    dynamic: float
-    damping: float
-    mean_speed_m_s: float
-    mean_tip_displacement_m: _Way
-
-
-class LoadFile(FileContent):
-    """Content of ``loads/NAME.json`` that is shown."""
-
-    tip_displacement_m: _Way
-    sag_m: float
-    sag_interval_m: _Interval | None = None
-    greatest_strain: float
-    greatest_strain_interval: _Interval | None = None
-    strain_over_limit: float
-    frequencies_hz: list[float] = Field(min_length=1)
-    frequencies_before_hz: list[float] = Field(min_length=1)
-    first_frequency_interval_hz: _Interval | None = None
-    wind_force_n: _Way
-    added_mass_kg: float
-    cut_mass_kg: float
-    bears_times: float | None = None
-    bears_times_interval: _Interval | None = None
-    held_by: str | None = None
-    gusts: Gusts | None = None
-
-
-def read_load(path: Path) -> LoadFile:
-    """Read the output of ``limber load --name``.
-
-    Raises:
-        InputError: it cannot be read, or has other content.
-    """
-    return read_json_as(path, LoadFile, "the result of a load")
-
-
-def load_rows(load: LoadFile) -> list[list[str]]:
-    """Return the effects of the loads on the branch, each with its interval if known."""
-    tip = 1e3 * float(np.linalg.norm(load.tip_displacement_m))
-    rows = [["quantity", "value", "95 % interval"],
-            ["force of the wind [N]", f"{np.linalg.norm(load.wind_force_n):.3g}", ""],
-            ["added mass [kg]", f"{load.added_mass_kg:.4g}", ""],
-            ["mass cut off [kg]", f"{load.cut_mass_kg:.4g}", ""],
-            ["displacement of the tip [mm]", f"{tip:.1f}", ""],
-            ["downward part of it [mm]", f"{1e3 * load.sag_m:.1f}",
-             _between(load.sag_interval_m, 1e3, 1)],
-            ["largest strain", f"{load.greatest_strain:.5f}",
-             _between(load.greatest_strain_interval, 1.0, 5)],
-            ["largest strain over the failure strain of the wood",
-             f"{100 * load.strain_over_limit:.0f} %",
-             failure_sentence(load.strain_over_limit)],
-            ["first frequency [Hz]", f"{load.frequencies_hz[0]:.3f}",
-             _between(load.first_frequency_interval_hz, 1.0, 3)],
-            ["first frequency before [Hz]", f"{load.frequencies_before_hz[0]:.3f}", ""]]
-    if load.bears_times is not None:
-        ended = {"strain": "then the wood fails", "equilibrium": "then it has no equilibrium"}.get(
-            load.held_by or "", "larger loads were not tried")
-        rows.append([f"factor on these loads that the branch bears ({ended})",
-                     f"{load.bears_times:.2f}",
-                     _between(load.bears_times_interval, 1.0, 2)])
-    if load.gusts is not None:
-        mean = 1e3 * float(np.linalg.norm(load.gusts.mean_tip_displacement_m))
-        rows += [["mean wind [m/s]", f"{load.gusts.mean_speed_m_s:.2f}", ""],
-                 ["displacement of the tip in the mean wind [mm]", f"{mean:.1f}", ""],
-                 ["peak load of the gusts over the mean load", f"{load.gusts.factor:.2f}", ""],
-                 ["dynamic amplification of the sway (1: quasi-static)",
-                  f"{load.gusts.dynamic:.2f}", ""],
-                 ["damping of the first mode, including the air",
-                  f"{100 * load.gusts.damping:.1f} %",
-                  ""]]
-    return [row for row in rows if row[1] not in ("0", "0.0")]
-
-
-def _between(interval: _Interval | None, factor: float, digits: int) -> str:
-    if interval is None:
-        return "not known"
-    return " to ".join(f"{factor * value:.{digits}f}" for value in interval)
-
 
 def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
     """Draw the branch as scanned (grey) and under the loads, coloured by its largest strain.
@@ -137,15 +47,15 @@ def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
     return figure
 
 
-def strain_along_path(from_m: np.ndarray, to_m: np.ndarray, strain: np.ndarray) -> "Figure":
+def strain_along_path(along: np.ndarray) -> "Figure":
     """Draw the largest strain of each piece of the main path.
 
     Args:
-        from_m, to_m: Ends of the pieces, from the root [m], shape [n].
-        strain: Largest principal strain in each, shape [n].
+        along: Ends of the pieces from the root [m] and the largest principal strain, [n, 3].
     """
     from matplotlib.figure import Figure
 
+    from_m, to_m, strain = along.T
     figure = Figure(figsize=(6.0, 3.2), layout="constrained")
     axes = figure.add_subplot()
     axes.bar(from_m, 100 * strain, to_m - from_m, align="edge", edgecolor="white")

@@ -1,18 +1,14 @@
 """``report.html``: figures and tables of all results of a branch, in one file."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from typing import Any
 
-import numpy as np
-
-from limber.core.errors import InputError
 from limber.core.optional import require_extra
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimate_file import read_estimate
 from limber.geometry.skeleton.qsm_tables import Caliper
-from limber.geometry.tets.tet_mesh import TetMesh
 from limber.results.findings import (
     ASSUMED,
     ASSUMED_PULL,
@@ -20,12 +16,8 @@ from limber.results.findings import (
     certificate_sentence,
     modulus_sentence,
     path_sentence,
-    peaks_line,
     simulated_pull,
 )
-from limber.results.motion_files import read_frames_file
-from limber.results.report import figures, loads_section, swing_section
-from limber.results.report.path_sections import energy_section, execution_section, plan_section
 from limber.results.report.report_tables import (
     action_rows,
     cause_rows,
@@ -36,7 +28,6 @@ from limber.results.report.report_tables import (
     pull_rows,
     rigidity_rows,
 )
-from limber.results.report.ringing_section import vibration_rows
 from limber.results.report.section import Section, inline_png
 from limber.results.report.shape_sections import (
     cylinders_section,
@@ -50,11 +41,14 @@ _SOURCE_LABELS = {"file": "source", "unit": "unit of length", "sha256": "sha256 
                   "truth": "known truth"}
 
 
-def draw_page(branch: Branch, *, calipers: Sequence[Caliper] = (), progress: Progress = SILENT,
+def draw_page(branch: Branch,
+              results: Sequence[Callable[[Branch], Section | None]], *,
+              calipers: Sequence[Caliper] = (), progress: Progress = SILENT,
               ) -> tuple[str, list[Section]]:
     """Return the page for the stages that have been run, as HTML, and its sections.
 
     Args:
+        results: Builders of the sections of the stages' results.
         calipers: Caliper diameters to compare with the scan's.
 
     Raises:
@@ -63,31 +57,14 @@ def draw_page(branch: Branch, *, calipers: Sequence[Caliper] = (), progress: Pro
     """
     require_extra("report", ("matplotlib", "jinja2"), "The report")
     page = [_found(branch), *_held_back(branch), _summary(branch)]
-    loads = [name.removesuffix(".json") for name in branch.names("loads")
-             if name.endswith(".json")]
-    motions = [key for key in branch.manifest.stages if key.split(":")[0] == "simulate"]
-    builders: list[Callable[[Branch], Section]] = [
+    builders: list[Callable[[Branch], Section | None]] = [
         scan_section, partial(cylinders_section, calipers=calipers), mesh_section,
-        *_each(_pull, branch.names("pulls"), "Pulls", "limber import-pull or virtual-pull"),
-        _estimate, *([_swing] if branch.has("swing.json") else []),
-        *([_vibration] if branch.has("vibration.json") else []),
-        *_each(_simulation, motions, "Simulated motion",
-               "limber simulate NAME.branch"),
-        *_each(_load, loads), energy_section,
-        *_each(plan_section, _names(branch, "plan"), "Paths",
-               "limber plan NAME.branch"),
-        *_each(execution_section, _names(branch, "execute")), _provenance]
+        *results, _provenance]
     for number, build in enumerate(builders):
         progress(number / len(builders), "drawing")
-        page.append(build(branch))
+        if section := build(branch):
+            page.append(section)
     return _render(branch, page), page
-
-
-def _each(build: Callable[..., Section], names: Iterable[str], title: str = "",
-          missing: str = "") -> list[Callable[[Branch], Section]]:
-    """Return a builder for each name's section; without names, one for a missing section."""
-    found: list[Callable[[Branch], Section]] = [partial(build, name=name) for name in names]
-    return found or ([lambda _branch: Section(title, missing=missing)] if title else [])
 
 
 def _names(branch: Branch, stage: str) -> list[str]:
@@ -167,28 +144,10 @@ def _summary(branch: Branch) -> Section:
     return section
 
 
-def _pull(branch: Branch, name: str) -> Section:
-    from limber.recordings.recording import read_pull
-
-    section = Section(f"Pull {name}")
-    pull = read_pull(branch.path(f"pulls/{name}"))
-    if _is_virtual(branch, name):
-        section.title += " (simulated)"
-        section.text.append(
-            "This pull was simulated on a separate, finer mesh, with "
-            f"{'a known' if _has_truth(branch) else 'an assumed'} Young's modulus and sensor "
-            "noise. There is no robot recording of this branch.")
-    section.draw(figures.pull(pull), "Force on the branch and displacement of the grasp over time.")
-    return section
-
-
-def _estimate(branch: Branch) -> Section:
-    section = Section("Young's modulus along the branch")
-    if not branch.has("estimate.json"):
-        section.missing = "limber estimate NAME.branch"
-        return section
+def estimate_section(branch: Branch) -> Section:
     from limber.results.report import estimate_figures
 
+    section = Section("Young's modulus along the branch")
     estimate = read_estimate(branch.path("estimate.json"))
     virtual = simulated_pull(branch)
     section.tables.append((
@@ -216,58 +175,6 @@ def _estimate(branch: Branch) -> Section:
     return section
 
 
-def _swing(branch: Branch) -> Section:
-    swing = swing_section.read_swing(branch.path("swing.json"))
-    section = Section(f"Swing {swing.pull}", text=swing.warnings,
-                      tables=[("", swing_section.swing_rows(swing))])
-    section.draw(swing_section.swing_over_time(swing),
-                 "Displacement of the marker that swings most, along its path: observed (dots) "
-                 "and simulated.")
-    return section
-
-
-def _vibration(branch: Branch) -> Section:
-    modulus, vibrations = vibration_rows(branch.path("vibration.json"))
-    return Section("Ringing", tables=[("", modulus), ("Vibrations in the recording", vibrations)])
-
-
-def _simulation(branch: Branch, name: str) -> Section:
-    entry = branch.manifest.stages[name]
-    section = Section(f"Simulated motion: {entry.settings['name']}")
-    frames = read_frames_file(branch.path(f"frames/{entry.settings['name']}.json")).model_dump()
-    section.draw(figures.motion(frames), "Strain and kinetic energy, and the force on the grasp, "
-                                         "over time.")
-    if not entry.result["converged"]:
-        section.text.append("The simulation did not converge to the end; the frames stop at the "
-                            "last converged state.")
-    tip = np.linalg.norm(entry.result["tip_displacement_m"])
-    section.text.append(
-        f"{entry.result['frame_count']} frames. At the end the tip has moved by {1e3 * tip:.1f} "
-        f"mm and the branch stores {entry.result['energy_j']:.4g} J. The smallest det F is "
-        f"{min(frames['min_det_f']):.3f}.")
-    if frames["largest_principal_strains"]:
-        forces = np.linalg.norm(frames["grasp_forces_n"] or [[0.0]], axis=1)
-        section.text.append(peaks_line({"young_median_pa": entry.result.get("young_median_pa"),
-                                        "peak_strain": max(frames["largest_principal_strains"]),
-                                        "peak_force_n": float(forces.max())}))
-    return section
-
-
-def _load(branch: Branch, name: str) -> Section:
-    section = Section(f"Load: {name}", tables=[
-        ("", loads_section.load_rows(loads_section.read_load(branch.path(f"loads/{name}.json"))))])
-    frames = f"frames/load-{name}.pc2"
-    if branch.has(frames) and branch.has(f"frames/load-{name}.npz"):
-        try:
-            section.draw(loads_section.bent_branch(TetMesh.read(branch.path("mesh.vtu")),
-                                           branch.path(frames)),
-                         "The branch as scanned (grey) and at rest under the loads, from the "
-                         "front and from the side.")
-        except InputError as error:
-            section.text.append(f"The bent branch cannot be drawn: {error}")
-    return section
-
-
 def _provenance(branch: Branch) -> Section:
     section = Section("How it was made")
     rows = [["stage", "finished", "settings"]]
@@ -288,16 +195,6 @@ def _setting(value: Any) -> str:
     if isinstance(value, list):
         return "(" + ", ".join(map(_setting, value)) + ")"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _is_virtual(branch: Branch, name: str) -> bool:
-    entry = branch.manifest.stages.get(f"pull:{name}")
-    return entry is not None and entry.result.get("young_true_pa") is not None
-
-
-def _has_truth(branch: Branch) -> bool:
-    """Whether the branch was generated; the true modulus of any other scan is unknown."""
-    return branch.has("truth/truth.json")
 
 
 def _render(branch: Branch, page: list[Section]) -> str:

@@ -1,32 +1,9 @@
-"""The report's sections on the energy field, on paths, and on their execution by a robot."""
+"""The report's section on paths."""
 
-from limber.core.errors import InputError
-from limber.core.files.reading import read_arrays
-from limber.planning.field.energy_field import EnergyField
 from limber.results.findings import beyond_sentence, certificate_sentence
-from limber.results.report import execution_section as execution
-from limber.results.report import figures
 from limber.results.report.report_tables import comparison_rows, leg_rows
 from limber.results.report.section import Section
 from limber.store import Branch
-
-
-def energy_section(branch: Branch) -> Section:
-    section = Section("Energy over grasp poses")
-    if not branch.has("energy.npz"):
-        section.missing = "limber energy NAME.branch"
-        return section
-    EnergyField.read(branch.path("energy.npz"))  # checks what is shown
-    data = read_arrays(branch.path("energy.npz"), "an energy field")
-    section.draw(figures.energy_samples(data), "Strain energy of the sampled grasp poses "
-                                               "against the distance from rest, and the force.")
-    error = {key: float(data[key]) for key in ("energy_error", "force_error") if key in data}
-    result = branch.manifest.stages["energy"].result
-    section.text.append(
-        f"{result['sample_count']} poses solved, {result['rejected_count']} rejected. Held-out "
-        f"error of the radial basis functions: energy {100 * error.get('energy_error', 0):.2g} %, "
-        f"force {100 * error.get('force_error', 0):.2g} %.")
-    return section
 
 
 def plan_section(branch: Branch, name: str) -> Section:
@@ -57,17 +34,4 @@ def plan_section(branch: Branch, name: str) -> Section:
         section.text.append(beyond)
     for figure, caption in plan_figures.report_figures(branch, name):
         section.draw(figure, caption)
-    return section
-
-
-def execution_section(branch: Branch, name: str) -> Section:
-    section = Section(f"Executed by the robot: {name}", tables=[
-        ("", execution.execution_rows(branch.manifest.stages[f"execute:{name}"].result))])
-    try:
-        section.draw(execution.force_along_path(
-            branch.path(f"executions/{name}/samples.csv")),
-            "Force of the gripper on the branch: measured (smoothed), and predicted at the "
-            "gripper's measured position. The robot moves to the goal, waits and returns.")
-    except InputError as error:
-        section.text.append(f"The forces cannot be drawn: {error}")
     return section

@@ -19,13 +19,15 @@ from limber.core.settings import Groups
 from limber.estimation.settings import EstimateSettings
 from limber.stages.inputs import BranchInputs, RunOptions
 from limber.stages.registry import StageDescription
+from limber.stages.result import Numbers, Picture, Result, frozen, of_files, shown
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from limber.estimation import fit_assessment
     from limber.estimation.estimated_branch import Subject
-    from limber.estimation.fit_assessment import Estimate
     from limber.estimation.fitting.objective import EvaluationLog
     from limber.recordings.recording import Pull
+    from limber.results.report.section import Section
 
 
 EVALUATIONS = ".estimate-evaluations.jsonl"
@@ -52,6 +54,58 @@ class EstimateOptions(RunOptions):
         False, description="Estimate frame by frame while a pull is recorded, or replay one.",
         json_schema_extra={"switch": True})
     pace: float = Field(1.0, ge=0, description="Speed of a replay; 0: as fast as possible.")
+
+
+class Estimate(Result):
+    """Young's modulus along the branch.
+
+    >>> found = limber.open("a.branch").results["estimate"]
+    >>> found.young.shape, found.interval.shape, found.converged
+    ((4,), (4, 2), True)
+    """
+
+    heading = "Young's modulus along the branch"
+    missing = "limber estimate NAME.branch"
+    pictures = (Picture("estimate_figures.young_along_branch", "", ("file",)),)
+    columns: ClassVar = {
+        "fractions": "fraction", "young": "young_pa", "interval": "low_pa high_pa",
+        "bending_stiffness": "ei_nm2", "bending_interval": "ei_low_nm2 ei_high_nm2"}
+
+    young: Numbers = shown("Young's modulus", ".4g MPa", interval="interval",
+                           meaning="at the control points [Pa], shape [K]")
+    poisson: float = shown("Poisson's ratio", ".3f")
+    loss: float = shown("loss", ".3g m2", meaning="the paper's loss J [m^2]")
+    converged: bool = shown("converged", meaning="whether the fit ended at a solution")
+    interval: np.ndarray = of_files("its 95 % interval [Pa], shape [K, 2]; NaN if an end is open")
+    bending_stiffness: np.ndarray = of_files(
+        "E times the second moment of area [N m^2], the latter a mean over each control point's "
+        "section by strain energy, shape [K]; NaN in a folder of an earlier version")
+    bending_interval: np.ndarray = of_files(
+        "its 95 % interval [N m^2], shape [K, 2]: narrower than that of E if the scan leaves the "
+        "radius uncertain")
+    fractions: np.ndarray = of_files("positions of the control points on the main path, 0 base to "
+                                     "1 tip, shape [K]")
+    control_points: np.ndarray = of_files("[m], branch frame, shape [K, 3]")
+    file: Any = of_files("content of ``estimate.json``")
+
+    def of_folder(self, branch: Branch, key: str) -> dict[str, Any]:
+        from limber.estimation.estimate_file import read_estimate
+
+        file = read_estimate(branch.path("estimate.json"))
+        count = len(file["young_pa"])
+        return {"file": file, "young": frozen(file["young_pa"]), "poisson": file["poisson"],
+                "loss": float(frozen(file["loss_m2"])), "converged": file["converged"],
+                "interval": frozen(file["young_interval_pa"]),
+                "bending_stiffness": frozen(file.get("bending_stiffness_nm2") or [np.nan] * count),
+                "bending_interval": frozen(file.get("bending_stiffness_interval_nm2")
+                                           or [[np.nan] * 2] * count),
+                "fractions": frozen(file["fractions"]),
+                "control_points": frozen(file["control_points_m"])}
+
+    def section(self, branch: Branch, key: str) -> Section:
+        from limber.results.report.page import estimate_section
+
+        return estimate_section(branch)
 
 
 def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = False,
@@ -161,7 +215,7 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
 def _with_supported_points(
         branch: Branch, pulls: list[Pull], subject: Subject, settings: EstimateSettings,
         log: EvaluationLog, progress: Progress,
-        ) -> tuple[Estimate, EstimateSettings, Subject, dict[int, float] | None]:
+        ) -> tuple[fit_assessment.Estimate, EstimateSettings, Subject, dict[int, float] | None]:
     """Fit with as many control points as the pulls support, starting from a fit with four.
 
     Returns:
@@ -276,8 +330,9 @@ def _cloud(branch: Branch) -> np.ndarray | None:
     return cloud.points[cloud.attributes.get("leaf", np.zeros(len(cloud))) == 0]
 
 
-def _score_unused_pulls(branch: Branch, names: list[str], subject: Subject, found: Estimate,
-                        settings: EstimateSettings, initial: Subject, progress: Progress) -> None:
+def _score_unused_pulls(branch: Branch, names: list[str], subject: Subject,
+                        found: fit_assessment.Estimate, settings: EstimateSettings,
+                        initial: Subject, progress: Progress) -> None:
     """Score the branch's pulls that this estimate did not use.
 
     ``initial``: the branch with the control points where markers without a position are.
@@ -355,6 +410,7 @@ def _moduli_line(values: Mapping[str, Any]) -> str:
 
 STAGE = StageDescription(
     "estimate", 70, run, BranchInputs, EstimateSettings, EstimateOptions, key="estimate",
+    result=Estimate,
     reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("estimate.json", "mesh.vtu"),
     tables=_tables, found=(
         _moduli_line, "Main cause of the uncertainty: {causes[0][cause]} "

@@ -9,17 +9,65 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from limber.core.errors import InputError, WorkError
-from limber.core.json_values import plain
+from limber.core.files.reading import read_json
+from limber.core.json_values import number_array, plain
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings, SwingSettings
 from limber.stages.inputs import BranchInputs, RunOptions, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import Interval, Picture, Result, frozen, kept, of_files, shown
 from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.estimation.vibration.free_swing import SwingFit
     from limber.recordings.recording import Pull
+    from limber.results.report.section import Section
+
+
+class Swing(Result):
+    """Young's modulus and damping of a branch by a free swing."""
+
+    heading = "Swing"
+    pictures = (Picture("swing_section.swing_over_time", "Displacement of the marker that swings "
+                        "most, along its path: observed (dots) and simulated.",
+                        ("times", "seen", "simulated")),)
+
+    young: float = shown("Young's modulus, mean", ".4g MPa")
+    young_interval: Interval = kept("its 95 % interval [Pa]")
+    damping_ratio: float = shown("damping ratio of the first vibration", ".3g")
+    damping_ratio_interval: Interval = kept("its 95 % interval, a ratio")
+    release: float = shown("time of release", ".4g s")
+    release_deviation: float = shown("its standard deviation", ".2g s")
+    frequency: float = shown("first frequency", ".4g Hz")
+    relative_residual: float = shown("residual relative to the largest displacement", ".2g %")
+    times: np.ndarray = of_files("[s], shape [n]")
+    seen: np.ndarray = of_files("displacements of the markers [m], shape [n, markers, 3]; NaN "
+                                "where not observed")
+    simulated: np.ndarray = of_files("those of the fit [m], shape [n, markers, 3]")
+
+    def of_folder(self, branch: Branch, key: str) -> dict[str, Any]:
+        path = branch.path("swing.json")
+        content = read_json(path, "the result of a swing")
+        try:
+            found = {name: number_array(content[f"{name}_{unit}"], gaps=name == "seen")
+                     for name, unit in (("times", "s"), ("seen", "m"), ("simulated", "m"))}
+        except (LookupError, TypeError, ValueError) as error:
+            raise InputError(f"{path} has no tracks of markers.", *_DAMAGED) from error
+        shape = found["simulated"].shape
+        if (len(shape) != 3 or shape[2] != 3 or not shape[1] or found["seen"].shape != shape
+                or found["times"].shape != shape[:1] or len(found["times"]) < 2):
+            raise InputError(f"{path}: the observed and simulated tracks do not have the same "
+                             "markers and times.", *_DAMAGED)
+        return {name: frozen(values) for name, values in found.items()}
+
+    def illustrate(self, section: Section, branch: Branch, key: str) -> None:
+        section.title += f" {self.values.get('pull', '')}"
+        section.text += self.warnings
+        super().illustrate(section, branch, key)
+
+
+_DAMAGED = "The result of a swing was expected.", "The file is damaged. Run `limber swing` again."
 
 
 def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
@@ -122,6 +170,7 @@ def _summary(found: SwingFit, young: np.ndarray, pull: Pull, warnings: list[str]
 
 STAGE = StageDescription(
     "swing", 75, by_name(swing), BranchInputs, SwingSettings, RunOptions, key="swing",
+    result=Swing,
     reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("swing.json", "mesh.vtu"),
     found=("Young's modulus, mean of the branch: {young_pa:Pa} ({young_interval_pa[0]:Pa} to "
            "{young_interval_pa[1]:Pa}); damping ratio {damping_ratio:.3g}.",),

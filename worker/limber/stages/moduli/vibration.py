@@ -9,6 +9,7 @@ the branch is kept.
 from __future__ import annotations
 
 import json
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -22,11 +23,13 @@ from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.stages.inputs import BranchInputs, RunOptions, argument, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import Interval, Numbers, Result, kept, shown
 from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.estimation.vibration.ringing import Ringing
     from limber.mechanics.model import BranchModel
+    from limber.results.report.section import Section
 
 _MESH_DEVIATION = 0.02
 """Largest error of Young's modulus due to the mesh: quadratic tetrahedra are too stiff."""
@@ -63,6 +66,30 @@ class VibrationSettings(Settings):
                                  "wood's density.")
     radius_sigma: float = Field(0.02, ge=0, le=1, description="Relative standard deviation of the "
                                 "scan's radii as a whole.")
+
+
+class Vibration(Result):
+    """Young's modulus and damping of a branch by the ringing in a recording."""
+
+    heading = "Ringing"
+
+    young: float = shown("Young's modulus, mean of the branch", ".4g MPa")
+    young_interval: Interval = kept("its 95 % interval [Pa]")
+    left_over: float = shown("unexplained part of the recording", ".0f %")
+    frequencies: Numbers = kept("of the vibrations in the recording [Hz]")
+    frequency_deviations: Numbers = kept("their standard deviations [Hz]")
+    damping_ratios: Numbers = kept("their damping ratios")
+    damping_ratio_intervals: list[Interval] | None = kept("the 95 % intervals of those ratios")
+
+    def illustrate(self, section: Section, branch: Branch, key: str) -> None:
+        rows = [["frequency [Hz]", "+-", "damping", "95 % interval"]]
+        intervals = [*map("{0[0]:.2f} to {0[1]:.2f} %".format,
+                          (100 * ends for ends in self.damping_ratio_intervals or ()))]
+        for frequency, spread, ratio, ends in zip(
+                self.frequencies, self.frequency_deviations, self.damping_ratios,
+                intervals or repeat(""), strict=False):
+            rows.append([f"{frequency:.4g}", f"{spread:.2g}", f"{100 * ratio:.2f} %", ends])
+        section.tables.append(("Vibrations in the recording", rows))
 
 
 def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
@@ -187,7 +214,7 @@ def _summary(seen: Ringing, fitted: dict[str, Any], level: float) -> dict[str, A
 
 STAGE = StageDescription(
     "vibration", 76, by_name(vibration), VibrationInputs, VibrationSettings, RunOptions,
-    key="vibration", reads=("mesh.vtu",), writes=("vibration.json", "mesh.vtu"),
+    key="vibration", result=Vibration, reads=("mesh.vtu",), writes=("vibration.json", "mesh.vtu"),
     found=("Young's modulus, mean of the branch: {young_pa:Pa} ({young_interval_pa[0]:Pa} to "
            "{young_interval_pa[1]:Pa}), from a ringing at {frequencies_hz[0]:Hz}.",),
     then="limber energy {branch_folder}", step="estimate", label="Fit Natural Frequencies")

@@ -5,26 +5,39 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import BeforeValidator, Field, field_validator
 
 from limber.core.constants import STANDARD_GRAVITY
 from limber.core.errors import InputError
 from limber.core.files.atomic import file_digest
 from limber.core.files.reading import read_json
+from limber.core.json_values import number_array
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings, possible_force
 from limber.stages.inputs import BranchInputs, RunOptions, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import (
+    Interval,
+    Numbers,
+    Picture,
+    Result,
+    Vector,
+    frozen,
+    kept,
+    shown,
+)
 from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.mechanics.loads.load_effects import Gusts
     from limber.mechanics.loads.outdoor import Bent
     from limber.mechanics.model import BranchModel
+    from limber.results.report.section import Section
 
 _FASTEST_WIND = 150.0  # m/s; more than tornadoes have
 _MOST_MULTIPLE = 50.0  # of the loads, up to which a limit load is sought
@@ -88,6 +101,88 @@ class LoadSettings(Settings):
     def _possible_fruit(cls, values: tuple[_Fruit, ...]) -> tuple[_Fruit, ...]:
         possible_force(tuple(fruit[3] * STANDARD_GRAVITY for fruit in values))
         return values
+
+
+def _pieces(rows: Any) -> np.ndarray:
+    try:
+        return frozen(number_array([[row[name] for name in ("from_m", "to_m", "strain")]
+                                    for row in rows]))
+    except (LookupError, TypeError) as error:
+        raise ValueError("a piece of the main path lacks from_m, to_m or strain") from error
+
+
+_Pieces = Annotated[np.ndarray, BeforeValidator(_pieces)]
+
+
+class GustEffects(Result):
+    """Effects of gusts beyond those of the mean wind."""
+
+    mean_speed: float = shown("mean wind", ".2f m/s")
+    mean_tip_displacement: Vector = shown("displacement of the tip in the mean wind", ".1f mm",
+                                          of=np.linalg.norm)
+    factor: float = shown("peak load of the gusts over the mean load", ".2f")
+    dynamic: float = shown("dynamic amplification of the sway (1: quasi-static)", ".2f")
+    damping: float = shown("damping of the first mode, including the air", ".1f %")
+
+
+class Load(Result):
+    """Effects of wind, snow, fruit or a cut on the branch.
+
+    >>> found = limber.open("a.branch").load(snow=2.0)
+    >>> bool(found.frequencies[0] < found.frequencies_before[0]), found.bears_times is None
+    (True, True)
+    """
+
+    heading = "Load: {name}"
+    pictures = (Picture("loads_section.strain_along_path", "Largest strain of each piece of the "
+                        "main path.", ("along",)),)
+    columns: ClassVar = {"along": "from_m to_m strain"}
+
+    sag: float = shown("sag of the tip", ".1f mm")
+    sag_interval: Interval | None = kept("its 95 % interval [m]; None if the uncertainty of E is "
+                                         "unknown")
+    greatest_strain: float = shown("largest principal strain", ".5f")
+    greatest_strain_interval: Interval | None = kept("its 95 % interval, a strain")
+    strain_over_limit: float = shown("largest strain over the failure strain of the wood", ".0f %")
+    frequencies: Numbers = shown(
+        "first frequency", ".3f Hz", interval="first_frequency_interval", of=itemgetter(0),
+        meaning="lowest natural frequencies under the loads [Hz]")
+    first_frequency_interval: Interval | None = kept("95 % interval of the first [Hz]")
+    frequencies_before: Numbers = shown("first frequency before", ".3f Hz", of=itemgetter(0),
+                                        meaning="those without the loads [Hz]")
+    tip_displacement: Vector = shown("displacement of the tip", ".1f mm", of=np.linalg.norm)
+    wind_force: Vector = shown("force of the wind on the whole branch", ".3g N",
+                               of=np.linalg.norm, unless_zero=True)
+    added_mass: float = shown("added mass", ".4g kg", unless_zero=True)
+    cut_mass: float = shown("mass cut off", ".4g kg", unless_zero=True)
+    bears_times: float | None = shown("factor on these loads that the branch bears", ".2f")
+    bears_times_interval: Interval | None = kept("its 95 % interval, a factor")
+    held_by: str | None = shown("what limits it")
+    gusts: GustEffects | None = kept("the effects of gusts")
+    along: _Pieces = kept("pieces of the main path: from and to in metres, largest strain")
+
+    @classmethod
+    def content(cls, branch: Branch, key: str, values: Mapping[str, Any],
+                ) -> tuple[Path, Mapping[str, Any]]:
+        if "along" in values:
+            return super().content(branch, key, values)
+        path = branch.path(f"loads/{key.partition(':')[2]}.json")
+        return path, read_json(path, "the effects of loads")
+
+    def illustrate(self, section: Section, branch: Branch, key: str) -> None:
+        from limber.results.report.loads_section import bent_branch
+        from limber.store.loading import load_mesh
+
+        super().illustrate(section, branch, key)
+        section.text += filter(None, [_failure_line(self.values)])
+        frames = f"frames/load-{key.partition(':')[2]}"
+        if branch.has(f"{frames}.pc2") and branch.has(f"{frames}.npz"):
+            try:
+                section.draw(bent_branch(load_mesh(branch), branch.path(f"{frames}.pc2")),
+                             "The branch as scanned (grey) and at rest under the loads, from the "
+                             "front and from the side.")
+            except InputError as error:
+                section.text.append(f"The bent branch cannot be drawn: {error}")
 
 
 def load(folder: Path, settings: LoadSettings, *, force: bool = False,
@@ -220,12 +315,12 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
 def _failure_line(result: Mapping[str, Any]) -> str:
     from limber.results.findings import failure_sentence
 
-    return failure_sentence(result["strain_over_limit"])
+    return failure_sentence(result.get("strain_over_limit", 0.0))
 
 
 STAGE = StageDescription(
     "load", 45, by_name(load, folder="branch_folder"), BranchInputs, LoadSettings, RunOptions,
-    key="load:{name}", reads=("mesh.vtu", "skeleton.swc"),
+    key="load:{name}", result=Load, reads=("mesh.vtu", "skeleton.swc"),
     writes=("loads/{name}.json", "frames/load-{name}.pc2", "frames/load-{name}.json"),
     tables=_tables,
     found=("Under the loads the tip sags by {sag_m:m}; greatest strain {greatest_strain:share}, "

@@ -17,12 +17,14 @@ from limber.core.settings import Groups
 from limber.mechanics.settings import SimulateSettings
 from limber.stages.inputs import BranchInputs, RunOptions
 from limber.stages.registry import StageDescription
+from limber.stages.result import FORCE, Picture, Result, Vector, frozen, of_files, shown
 from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
     from limber.mechanics.dynamics.drive import PoseTable
     from limber.mechanics.model import BranchModel
     from limber.mechanics.pull_simulation import SimulatedMotion
+    from limber.results.report.section import Section
 
 
 KEY = "simulate"
@@ -43,6 +45,62 @@ class SimulateInputs(BranchInputs):
         None, description="Replay this recording: the grasp, the motion and the result's name are "
         "those of the recording. The measured motion can then be compared frame by frame.",
         json_schema_extra={"metavar": "NAME", "panel": False})
+
+
+class Simulation(Result):
+    """A simulated motion, frame by frame.
+
+    >>> bent = limber.open("a.branch").simulate(move=(0.005, 0, 0), kind="static", duration=0.1)
+    >>> bent.positions.shape[::2] == (len(bent.times), 3)
+    True
+    """
+
+    heading = "Simulated motion: {name}"
+    missing = "limber simulate NAME.branch"
+    pictures = (Picture("figures.motion", "Strain and kinetic energy, and the force on the grasp, "
+                        "over time.", ("times", "energies", "kinetic_energies", "forces")),)
+    columns: ClassVar = {"times": "time_s", "energies": "energy_j", "forces": FORCE,
+                         "kinetic_energies": "kinetic_energy_j", "strains": "strain"}
+
+    name: str = shown("name", meaning="name of its files")
+    frame_count: int = shown("frames", ",")
+    energy: float = shown("final energy", ".4g J")
+    grasp_force: Vector = shown("final force", ".4g N", of=np.linalg.norm,
+                          meaning="final force of the gripper on the branch [N], shape [3]")
+    tip_displacement: Vector = shown("final displacement of the tip", ".1f mm", of=np.linalg.norm)
+    peak_strain: float = shown("largest strain", ".4g")
+    min_det_f: float = shown("smallest det F", ".3f", meaning="smallest det F, a volume ratio")
+    converged: bool = shown("converged", meaning="whether the branch followed to the end")
+    times: np.ndarray = of_files("[s], shape [n]")
+    energies: np.ndarray = of_files("strain energy [J], shape [n]")
+    kinetic_energies: np.ndarray = of_files("[J], shape [n]")
+    forces: np.ndarray = of_files("forces of the gripper on the branch [N], shape [n, 3]")
+    strains: np.ndarray = of_files("largest principal strain in the branch, shape [n]")
+    positions: np.ndarray = of_files("positions of the surface's vertices [m], shape [n, vertices, "
+                                     "3], single precision")
+
+    def of_folder(self, branch: Branch, key: str) -> dict[str, Any]:
+        from limber.results.motion_files import read_frames_file, read_pc2
+
+        name = branch.manifest.stages[key].settings["name"]
+        frames = read_frames_file(branch.path(f"frames/{name}.json"))
+        return {"name": name, "times": frozen(frames.times_s),
+                "energies": frozen(frames.energies_j),
+                "kinetic_energies": frozen(frames.kinetic_energies_j),
+                "forces": frozen(frames.grasp_forces_n),
+                "strains": frozen(frames.largest_principal_strains),
+                "positions": read_pc2(branch.path(f"frames/{name}.pc2"))[0]}
+
+    def illustrate(self, section: Section, branch: Branch, key: str) -> None:
+        section.title = self.heading.format(name=self.name)
+        super().illustrate(section, branch, key)
+        if not self.converged:
+            section.text.append("The simulation did not converge to the end; the frames stop at "
+                                "the last converged state.")
+        section.text.append(_peaks_line({
+            "young_median_pa": self.values.get("young_median_pa"),
+            "peak_strain": float(self.strains.max()),
+            "peak_force_n": float(np.linalg.norm(self.forces, axis=1).max())}))
 
 
 def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
@@ -235,8 +293,8 @@ def _peaks_line(result: Mapping[str, Any]) -> str:
 
 
 STAGE = StageDescription(
-    "simulate", 40, run, SimulateInputs, SimulateSettings, RunOptions, key=KEY, reads=("mesh.vtu",),
-    writes=("frames/{name}.pc2", "frames/{name}.json"),
+    "simulate", 40, run, SimulateInputs, SimulateSettings, RunOptions, key=KEY,
+    result=Simulation, reads=("mesh.vtu",), writes=("frames/{name}.pc2", "frames/{name}.json"),
     found=("{frame_count} frames. At the end the tip has moved by {tip_displacement_m:|m}, the "
            "force on the grasp is {grasp_force_n:|N} and the branch stores {energy_j:J}.",
            _peaks_line),

@@ -1,7 +1,7 @@
 """Sample the deformation energy over grasp poses, and fit a field to it."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -10,9 +10,56 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.settings import EnergySettings
 from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import FORCE, Picture, Result, frozen, of_files, shown
 from limber.store import Branch
 
 _MOST_TIMES = 4  # multiple of the requested samples that --field-error may take
+
+
+class EnergyField(Result):
+    """Deformation energy over the position of the grasp.
+
+    >>> field = limber.open("a.branch").results["energy"]
+    >>> field.energy(field.positions[:2]).shape, bool(field.energy_error < 0.1)
+    ((2,), True)
+    """
+
+    heading = "Energy over grasp poses"
+    missing = "limber energy NAME.branch"
+    pictures = (Picture("figures.energy_samples", "Strain energy of the sampled grasp poses "
+                        "against the distance from rest, and the force.",
+                        ("positions", "energies", "forces")),)
+    columns: ClassVar = {"positions": "x_m y_m z_m", "energies": "energy_j", "forces": FORCE}
+
+    sample_count: int = shown("samples", ",")
+    rejected_count: int = shown("rejected", ",")
+    max_energy: float = shown("largest energy", ".4g J")
+    max_force: float = shown("largest force", ".4g N")
+    energy_error: float = shown("error of the energy", ".2g %", meaning=(
+        "root mean square error over that of the energy, for samples outside the fit"))
+    force_error: float = shown("error of the force", ".2g %", meaning="likewise of the force")
+    positions: np.ndarray = of_files("sampled positions of the grasp [m], shape [m, 3]; the first "
+                                     "is at rest")
+    energies: np.ndarray = of_files("potential of strain and weight above the rest shape there "
+                                    "[J], shape [m]")
+    forces: np.ndarray = of_files("forces of the gripper on the branch there [N], shape [m, 3]")
+    field: Any = of_files("the fit, an :class:`limber.planning.field.energy_field.EnergyField`")
+
+    def of_folder(self, branch: Branch, key: str) -> dict[str, Any]:
+        from limber.planning.field import energy_field
+
+        field = energy_field.EnergyField.read(branch.path("energy.npz"))
+        samples = field.samples
+        return {"field": field, "positions": frozen(samples.positions),
+                "energies": frozen(samples.energies), "forces": frozen(samples.forces)}
+
+    def energy(self, points: np.ndarray) -> np.ndarray:
+        """Return the energy [J] with the grasp at ``points`` [m], shape [n, 3]; shape [n]."""
+        return self.field.energy(np.asarray(points, float))
+
+    def force(self, points: np.ndarray) -> np.ndarray:
+        """Return the gripper's force [N] with the grasp at ``points`` [m], both [n, 3]."""
+        return self.field.force(np.asarray(points, float))
 
 
 def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int | None = None,
@@ -82,8 +129,8 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
 
 STAGE = StageDescription(
     "energy", 90, by_name(sample_energy_field, folder="branch_folder"), BranchInputs,
-    EnergySettings, ParallelOptions, key="energy", reads=("mesh.vtu", "skeleton.swc"),
-    writes=("energy.npz",),
+    EnergySettings, ParallelOptions, key="energy", result=EnergyField,
+    reads=("mesh.vtu", "skeleton.swc"), writes=("energy.npz",),
     found=("{sample_count} poses solved, {rejected_count} rejected.",
            "Error of the field: energy {energy_error:share}, force {force_error:share}."),
     then="limber plan {branch_folder}", step="plan", label="Sample the Energy")

@@ -26,6 +26,7 @@ from limber.stages.paths.execute_summary import (
     write_preview,
 )
 from limber.stages.registry import StageDescription
+from limber.stages.result import Picture, Result, of_files, shown
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -123,6 +124,39 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
                                  "after_stop": None, "peak_force_n": None, "path_error_m": None}
     require_confirmation(name, options.confirm, planned.cell, progress)
     return _armed(planned, name, options, progress)
+
+
+class Execution(Result):
+    """The execution of a plan by a robot, or the results of the dry run.
+
+    >>> limber.open("a.branch").execute("cell.toml", name="to-goal").reached  # doctest: +SKIP
+    False
+    """
+
+    heading = "Executed by the robot: {name}"
+    pictures = (Picture("execution_section.force_along_path", "Force of the gripper on the branch: "
+                        "measured (smoothed), and predicted at the gripper's measured position. "
+                        "The robot moves to the goal, waits and returns.", ("log",)),)
+
+    name: str = shown("plan")
+    armed: bool = shown("armed", meaning="whether the robot moved; otherwise it was a dry run")
+    reached: bool | None = shown("reached", meaning="whether it reached the path's end and "
+                                                    "returned; None in a dry run")
+    stop_reason: str | None = shown("stopped", meaning="reason for the stop; None without one")
+    predicted_peak_force: float | None = shown("predicted peak force", ".2f N")
+    peak_force: float | None = shown("measured peak force", ".2f N")
+    force_within_share: float | None = shown(
+        "path with the force within 5 % of the peak, or within the interval", ".1f %",
+        meaning="fraction of the path with the force within 5 % of the peak, or the interval")
+    force_error_of_peak: float | None = shown(
+        "force difference not exceeded on 95 % of the path, of the peak", ".1f %",
+        meaning="force difference not exceeded on 95 % of the path, a fraction of the peak")
+    path_error: float | None = shown("largest distance from the path", ".2f mm")
+    log: Any = of_files("the samples of the robot, a path")
+
+    def of_folder(self, branch: Branch, key: str) -> dict[str, Any]:
+        name = key.partition(":")[2]
+        return {"name": name, "log": branch.path(f"executions/{name}/samples.csv")}
 
 
 @dataclass(frozen=True)
@@ -402,7 +436,7 @@ def _followed_to_its_end(link: RobotLink, trajectory: Trajectory) -> dict[str, A
 
 STAGE = StageDescription(
     "execute", 110, by_name(execute, folder="branch_folder", cell_file="cell"), ExecuteInputs,
-    ExecuteSettings, ExecuteOptions, key="execute:{name}",
+    ExecuteSettings, ExecuteOptions, key="execute:{name}", result=Execution,
     reads=("plans/{name}.csv", "mesh.vtu", "skeleton.swc"),
     writes=("executions/{name}/samples.csv", "executions/{name}/report.json"),
     found=(outcome_line, "Predicted peak force {predicted_peak_force_n:N}, measured "

@@ -24,9 +24,12 @@ from limber.core.settings import Groups
 from limber.planning.settings import PlanSettings
 from limber.stages.inputs import ParallelOptions, PlacedInputs, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import FORCE, POSE, Picture, Result, drawn, frozen, of_files, shown
 from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from limber.cell.cell_file import Cell
     from limber.cell.obstacles import Obstacle
     from limber.planning.constraints.limits import Limits
@@ -35,6 +38,7 @@ if TYPE_CHECKING:
     from limber.planning.make_plan import PlannedMotion
     from limber.planning.plan_file import PlanPath
     from limber.planning.timing import Pace
+    from limber.results.report.section import Section
 
 
 _FRAME_RATE = 24.0  # frames per second of the played motion; a pose is a frame
@@ -53,6 +57,89 @@ class PlanInputs(PlacedInputs):
         "CSV of break tests on shoots of the same plant: a column strain_at_break (0.05 is 5 %). "
         "They state the branch's strength."))
     name: str = Field("path", description="Name of the plan's files.")
+
+
+class Plan(Result):
+    """A gentle path of the grasp and the shortest one, both computed with the full model.
+
+    >>> plan = limber.open("a.branch").results["plan:to-goal"]
+    >>> plan.path.shape[1], plan.bound <= plan.cost
+    (6, True)
+    """
+
+    heading = "Paths: {name}"
+    missing = "limber plan NAME.branch"
+    pictures = (Picture("plan_figures.paths_over_slice", "", ("field", "file")),)
+    columns: ClassVar = {"times": "time_s", "path": POSE, "energies": "energy_j", "forces": FORCE,
+                         "strains": "strain"}
+
+    name: str = shown("name", meaning="name of its files")
+    length: float = shown("length", ".1f mm")
+    energy: float = shown("energy", ".3g J m", meaning="energy integrated along the gentle path "
+                                                       "[J m]")
+    energy_saved: float | None = shown("saved", ".1f percent",
+                                       meaning="energy saved relative to the shortest path [%]")
+    peak_force: float = shown("peak force", ".3g N")
+    gap: float | None = shown(
+        "cost above the best path, at most", ".2g percent", meaning="largest cost of the gentle "
+        "path above that of the best one [%]; None if unknown")
+    cost: float = of_files(
+        "cost of the gentle path on the energy field, dimensionless: the planner weighs energy and "
+        "length, each over its scale. With a ``max_detour``: the energy along it [J m]")
+    bound: float = of_files("lower bound of the cost of any path, dimensionless or [J m] as the "
+                            "cost: the certificate")
+    path: np.ndarray = of_files("poses along the gentle path: position [m], rotation vector [rad], "
+                                "shape [n, 6]")
+    times: np.ndarray = of_files("[s], shape [n]")
+    energies: np.ndarray = of_files("above the rest shape [J], shape [n]")
+    forces: np.ndarray = of_files("forces of the gripper on the branch [N], shape [n, 3]")
+    strains: np.ndarray = of_files("largest strain in the branch, shape [n]")
+    shortest_path: np.ndarray = of_files("poses along the shortest path [m, rad], shape [k, 6]")
+    file: Any = of_files("the plan's file, a :class:`limber.planning.plan_file.PlanFile`")
+    field: Any = of_files("the fitted energy field")
+    damage: Any = of_files("the strains along the branch; None in a folder of an older version")
+
+    def of_folder(self, branch: Branch, key: str) -> dict[str, Any]:
+        from limber.planning.constraints.damage import DamageAlong
+        from limber.planning.field.energy_field import EnergyField
+        from limber.planning.plan_file import read_plan
+
+        name = key.partition(":")[2]
+        damage = f"plans/{name}-damage.csv"
+        found = read_plan(branch.path(f"plans/{name}.json"))
+        path, gentle, proof = found.plan, self.values["plan"], self.values["certificate"]
+        return {"name": name, "length": gentle["length_m"], "energy": gentle["energy_integral_jm"],
+                "peak_force": gentle["peak_force_n"], "gap": proof["gap_percent"],
+                "cost": float(frozen(proof["upper_bound"])), "bound": proof["lower_bound"],
+                "path": frozen(path.poses), "times": frozen(path.times),
+                "energies": frozen(path.energies), "forces": frozen(path.forces),
+                "strains": frozen(path.strains), "shortest_path": frozen(found.baseline.poses),
+                "file": found, "field": EnergyField.read(branch.path("energy.npz")),
+                "damage": DamageAlong.read(branch.path(damage)) if branch.has(damage) else None}
+
+    def plot_damage(self) -> Figure:
+        """Draw where along the branch the gentle path would damage it, and how probably.
+
+        Raises:
+            InputError: the plan is of a version that did not compute it.
+        """
+        from limber.results.report.damage_figure import damage_along_branch
+
+        if self.damage is None:
+            raise InputError(f"The plan {self.name} has no strains along the branch.",
+                             "An older version of Limber made it.", "Plan again with force=True.")
+        return drawn(lambda: damage_along_branch(self.damage))
+
+    def plot_along(self) -> Figure:
+        """Draw energy, force and strain over the length of both paths."""
+        from limber.results.report.plan_figures import along_paths
+
+        return drawn(lambda: along_paths(self.file))
+
+    def section(self, branch: Branch, key: str) -> Section:
+        from limber.results.report.path_sections import plan_section
+
+        return plan_section(branch, self.name)
 
 
 def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
@@ -364,7 +451,7 @@ def _found_lines(values: Mapping[str, Any]) -> str:
 
 STAGE = StageDescription(
     "plan", 100, by_name(plan, folder="branch_folder", cell_file="cell"), PlanInputs, PlanSettings,
-    ParallelOptions, key="plan:{name}", reads=("mesh.vtu", "energy.npz"),
+    ParallelOptions, key="plan:{name}", result=Plan, reads=("mesh.vtu", "energy.npz"),
     writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
             "plans/{name}-motion.csv", "plans/{name}-setpoints.csv", "plans/{name}-trees.csv",
             "plans/{name}-damage.csv", "plans/{name}-bound.npz", "frames/{name}.pc2",

@@ -19,10 +19,12 @@ from limber.recordings.importing.recording_formats import RECORDINGS, recording_
 from limber.recordings.settings import ImportSettings
 from limber.stages.inputs import BranchInputs, RunOptions, argument, required
 from limber.stages.registry import StageDescription
+from limber.stages.result import FORCE, POSE, Picture, Result, frozen, of_files, shown
 from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.recordings.importing.import_request import BranchFrame, RobotKnown
+    from limber.results.report.section import Section
 
 
 class ImportInputs(BranchInputs):
@@ -38,6 +40,64 @@ class ImportInputs(BranchInputs):
         "--load become a pull for `limber swing`. Other records (accelerometer, strain gauge, "
         "video track, markers of a plucked branch) are evaluated by `limber vibration`.",
         json_schema_extra={"switch": True})
+
+
+class Pull(Result):
+    """A recording of force and motion.
+
+    >>> pull = limber.open("a.branch").pulls["pull-1"]
+    >>> pull.table()["fx_n"].shape == pull.times.shape
+    True
+    """
+
+    heading = "Pull: {name}"
+    missing = "limber import-pull or virtual-pull"
+    pictures = (Picture("figures.pull", "Force on the branch and displacement of the grasp over "
+                        "time.", ("recording",)),)
+    columns: ClassVar = {"times": "time_s", "poses": POSE, "forces": FORCE,
+                         "torques": "tx_nm ty_nm tz_nm"}
+
+    name: str = shown("name")
+    frame_count: int = shown("frames", ",")
+    duration: float = shown("duration", ".3g s")
+    way: float = shown("way", ".3g mm", meaning="largest distance of the grasp from its first "
+                                                "position [m]")
+    peak_force: float | None = shown("peak force", ".3g N")
+    times: np.ndarray = of_files("[s], shape [n]")
+    poses: np.ndarray = of_files("poses of the grasp: position [m], rotation vector [rad], shape "
+                                 "[n, 6]")
+    forces: np.ndarray = of_files("forces of the gripper on the branch [N], shape [n, 3]; NaN if "
+                                  "not measured")
+    torques: np.ndarray = of_files("likewise [N m], shape [n, 3]")
+    marker_times: np.ndarray = of_files("[s], shape [k]; empty if there are no markers")
+    markers: np.ndarray = of_files("positions of the observed points [m], shape [k, points, 3]; "
+                                   "NaN if not observed")
+    recording: Any = of_files("what was read, a :class:`limber.recordings.recording.Pull`")
+
+    def of_folder(self, branch: Branch, key: str) -> dict[str, Any]:
+        from limber.recordings.recording import read_pull
+
+        found = read_pull(branch.path(f"pulls/{key.partition(':')[2]}"))
+        seen, forces = found.observations, found.wrenches[:, :3]
+        size = np.linalg.norm(forces, axis=1)
+        return {"recording": found, "name": found.name, "frame_count": len(found.times),
+                "duration": float(np.ptp(found.times)), "way": float(np.linalg.norm(
+                    found.poses[:, :3] - found.poses[0, :3], axis=1).max()),
+                "peak_force": float(np.nanmax(size)) if np.isfinite(size).any() else None,
+                "times": frozen(found.times), "poses": frozen(found.poses),
+                "forces": frozen(forces), "torques": frozen(found.wrenches[:, 3:]),
+                "marker_times": frozen([] if seen is None else seen.times),
+                "markers": frozen(np.empty((0, 0, 3)) if seen is None else seen.positions)}
+
+    def illustrate(self, section: Section, branch: Branch, key: str) -> None:
+        if self.values.get("young_true_pa") is not None:
+            # The true modulus of a branch that was not generated is unknown.
+            known = "a known" if branch.has("truth/truth.json") else "an assumed"
+            section.title += " (simulated)"
+            section.text.append("This pull was simulated on a separate, finer mesh, with "
+                                f"{known} Young's modulus and sensor noise. There is no robot "
+                                "recording of this branch.")
+        super().illustrate(section, branch, key)
 
 
 def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSettings, *,
@@ -179,6 +239,7 @@ def _moved(values: Mapping[str, Any]) -> str | None:
 
 STAGE = StageDescription(
     "import-pull", 50, run, ImportInputs, ImportSettings, RunOptions, key="pull:{name}",
+    result=Pull,
     writes=("pulls/{name}/",),
     found=("Pull {pull} ({kind}): {frame_count} frames of {point_count} points.",
            _moved,

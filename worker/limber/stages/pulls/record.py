@@ -16,6 +16,7 @@ from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
 from limber.stages.inputs import NOT_KEPT, BranchInputs, by_name, required
+from limber.stages.pulls.import_pull import Pull
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -380,8 +381,8 @@ def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str
 
 STAGE = StageDescription(
     "record", 55, by_name(record, folder="branch_folder", cell_file="cell"), RecordInputs,
-    RecordSettings, RecordOptions, key="record:{name}", reads=("skeleton.swc",),
-    writes=("pulls/{name}/",),
+    RecordSettings, RecordOptions, key="record:{name}", result=Pull,
+    reads=("skeleton.swc",), writes=("pulls/{name}/",),
     found=("Pull {pull}: {sample_count:count} samples in {seconds:s}, {marker_frames} marker "
            "frames, peak force {peak_force_n:N}; ended: {ended}.",
            "{depth_images} depth images."),

@@ -14,6 +14,7 @@ from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.estimation.settings import VirtualPullSettings
 from limber.stages.inputs import BranchInputs, RunOptions, by_name
+from limber.stages.pulls.import_pull import Pull
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -116,7 +117,7 @@ def _assumed_line(result: Mapping[str, Any]) -> str | None:
 
 STAGE = StageDescription(
     "virtual-pull", 52, by_name(virtual_pull), VirtualPullInputs, VirtualPullSettings, RunOptions,
-    key="pull:{name}", reads=("skeleton.swc",), writes=("pulls/{name}/",),
+    key="pull:{name}", result=Pull, reads=("skeleton.swc",), writes=("pulls/{name}/",),
     found=("Simulated pull {pull}: {travel_m:m} of travel, peak force {peak_force_n:N}, "
            "{frame_count} frames.", _assumed_line),
     then="limber estimate {branch_folder}", step="pulls", label="Simulate a Pull")

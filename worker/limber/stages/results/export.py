@@ -20,6 +20,7 @@ from limber.geometry.io.formats import Format, Registry, listed, unknown_suffix
 from limber.geometry.io.skeletons import SKELETONS
 from limber.stages.inputs import BranchInputs, NoOptions, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import Written
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -187,7 +188,7 @@ class ExportInputs(BranchInputs):
 
 STAGE = StageDescription(
     "export", 125, by_name(export, folder="branch_folder"), ExportInputs, ExportSettings, NoOptions,
-    reads=("mesh.vtu", "skeleton.swc"),
+    result=Written, reads=("mesh.vtu", "skeleton.swc"),
     found=("{link_count} links on springs, {mass_kg:kg}.",
            "{tet_count:count} tetrahedra, {node_count:count} nodes.",
            "{cylinder_count:count} cylinders."),

@@ -14,6 +14,7 @@ from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.stages.inputs import BranchInputs, NoOptions, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import Written
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -160,7 +161,8 @@ def _writable(path: Path) -> Path:
 
 
 STAGE = StageDescription(
-    "scene", 120, by_name(scene), SceneInputs, SceneSettings, NoOptions, reads=("mesh.vtu",),
+    "scene", 120, by_name(scene), SceneInputs, SceneSettings, NoOptions,
+    result=Written, reads=("mesh.vtu",),
     found=("{object_count} objects and {frame_count} frames, made by Blender {blender}.",
            "Data of {vertex_count:count} vertices.", "Picture {picture}.",
            "Turntable {turntable}."))

@@ -16,6 +16,7 @@ from limber.core.settings import Groups, Settings
 from limber.geometry.settings import BranchSpec
 from limber.stages.inputs import NoOptions, argument
 from limber.stages.registry import StageDescription
+from limber.stages.result import Numbers, Result, kept, shown
 
 if TYPE_CHECKING:
     from limber.geometry.generated import GeneratedBranch
@@ -36,6 +37,20 @@ class GenerateSettings(BranchSpec):
     common = ("seed",)
 
     seed: int = Field(0, description="Seed of everything random.")
+
+
+class Generated(Result):
+    """A branch with known truth, and its scan.
+
+    >>> limber.generate("made", length=0.3, fork_count=0, seed=1).young.shape
+    (4,)
+    """
+
+    point_count: int = shown("points", ",")
+    length: float = shown("length", ".3f m")
+    branch_count: int = shown("branches")
+    cloud: Path = shown("scan", meaning="the scan, for :func:`limber.reconstruct`")
+    young: Numbers = kept("true Young's modulus at the control points [Pa], shape [K]")
 
 
 def generate(folder: Path, settings: BranchSpec, *, seed: int = 0,
@@ -85,6 +100,7 @@ def run(inputs: GenerateInputs, settings: GenerateSettings, _options: NoOptions,
 
 STAGE = StageDescription(
     "generate", 10, run, GenerateInputs, GenerateSettings, NoOptions,
+    result=Generated,
     found=("A branch with known truth: {length_m:m} in {branch_count:#branch/branches}, scanned as "
            "{point_count:count} points.",),
     then="limber reconstruct {cloud} -o {folder}.branch")
