@@ -16,9 +16,7 @@ from limber.core.files import reading
 from limber.core.files.atomic import file_digest, replacing, require_file
 from limber.core.files.reading import (
     MOST_TOML_BYTES,
-    csv_records,
     read_arrays,
-    read_columns,
     read_json,
     read_json_as,
     read_text,
@@ -26,6 +24,7 @@ from limber.core.files.reading import (
     require_shapes,
     toml_content,
 )
+from limber.core.files.tables import csv_records, read_columns
 from limber.core.machine_errors import machine_error
 
 

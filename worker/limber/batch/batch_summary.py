@@ -1,8 +1,6 @@
 """The summary of a batch: a table with one row per branch, and an HTML page."""
 
-import csv
 import html
-import io
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +21,7 @@ from limber.batch.batch_progress import (
 from limber.batch.jobs.branch_jobs import BranchJob, JobFile
 from limber.batch.pictures import pictures
 from limber.core.files.atomic import write_atomically
+from limber.core.files.tables import table_text
 from limber.version import VERSION
 
 _COLORS = {DONE: "#2d7a3a", KEPT: "#6c9a74", FAILED: "#b3261e", RUNNING: "#1f5fa8",
@@ -58,11 +57,8 @@ def write_table(jobs: JobFile, records: Records) -> None:
     """Write the CSV: one row per branch, with the results of its stages side by side."""
     rows = [_row(branch, records) for branch in jobs.branches]
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, columns, restval="")
-    writer.writeheader()
-    writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
-    write_atomically(path_of_table(jobs), text.getvalue())
+    write_atomically(path_of_table(jobs), table_text(
+        columns, ([_cell(row.get(key)) for key in columns] for row in rows)))
 
 
 def _row(branch: BranchJob, records: Records) -> dict[str, Any]:
@@ -77,11 +73,11 @@ def _row(branch: BranchJob, records: Records) -> dict[str, Any]:
     return row | {"error": " ".join(filter(None, reasons))}
 
 
-def _cell(value: Any) -> Any:
-    """Return a value that no spreadsheet interprets as a formula."""
-    if value is None:
-        return ""
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+def _cell(value: Any) -> str:
+    """Return a value, with all its digits, that no spreadsheet interprets as a formula."""
+    if isinstance(value, str) and value.startswith(_FORMULA):
+        return f"'{value}"
+    return "" if value is None else str(value)
 
 
 def write_page(jobs: JobFile, records: Records) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from limber.core.alignment import Alignment
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError, MeshingError
-from limber.core.files.reading import csv_records
+from limber.core.files.tables import csv_records
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.preparation import size_doubts
 from limber.geometry.io.formats import Format, known_format

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import BranchFolderError
-from limber.core.files.reading import csv_records, read_arrays, require_shapes
+from limber.core.files.reading import read_arrays, require_shapes
+from limber.core.files.tables import csv_records
 
 _POSITION = ("x_m", "y_m", "z_m")
 _WHAT = "the bound of a plan"

@@ -10,6 +10,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.files.reading import read_text
+from limber.core.files.tables import write_table
 
 MAD_TO_SIGMA = 1.4826
 """Ratio of standard deviation to median absolute deviation of a normal variable."""
@@ -73,11 +74,8 @@ def read_stream(path: str | Path) -> Stream:
 
 def write_stream(path: str | Path, stream: Stream) -> None:
     """Write a CSV file that :func:`read_stream` reads; NaN becomes an empty field."""
-    lines = [",".join(("t_s", *stream.columns))]
-    for time, row in zip(stream.times, stream.values, strict=True):
-        fields = ["" if np.isnan(value) else f"{value:.9g}" for value in row]
-        lines.append(",".join([f"{time:.6f}", *fields]))
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_table(path, ("t_s", *stream.columns), (
+        (f"{time:.6f}", *row) for time, row in zip(stream.times, stream.values, strict=True)))
 
 
 def gaps(times: np.ndarray, factor: float = 5.0) -> np.ndarray:

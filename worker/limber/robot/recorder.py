@@ -10,13 +10,13 @@ import numpy as np
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import WorkError
+from limber.core.files.tables import table_line
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.recordings.cell_errors import CalibrationEntry
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, SensorEntry
 
 _FRAMES_FOR_NOISE = 15
 _LEAST_NOISE_M = 1e-4  # a tracker that smooths its points hides their noise
-HEADER = ",".join(("t_s", *POSE_COLUMNS, *WRENCH_COLUMNS))
 
 
 class Lines(Protocol):
@@ -48,7 +48,7 @@ class PullRecorder:
         self.first: float | None = None
         self.count, self.peak_force = 0, 0.0
         self.last: np.ndarray | None = None
-        lines.append(HEADER)
+        lines.append(table_line(("t_s", *POSE_COLUMNS, *WRENCH_COLUMNS)))
 
     def close_gripper(self) -> None:
         """The gripper has closed at the last sample's pose: rows begin."""
@@ -72,7 +72,7 @@ class PullRecorder:
         wrench[:, 3:] += np.cross(samples[:, 1:4] - pieces[:, :3, 3], wrench[:, :3])
         rows = np.column_stack([samples[:, 0] - self.first, pose_vectors(pieces), wrench])
         for row in rows:
-            self._lines.append(",".join("" if np.isnan(x) else f"{x:.7g}" for x in row))
+            self._lines.append(table_line(row, digits=7))
         self.count += len(rows)
         self.peak_force = max(self.peak_force,
                               float(np.nanmax(np.linalg.norm(wrench[:, :3], axis=1))))

@@ -8,8 +8,10 @@ import scipy
 from limber.cell.arm import Arm
 from limber.cell.cell_file import Cell
 from limber.core.errors import NoPathError
+from limber.core.files.tables import write_table
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.recordings.recording import POSE_COLUMNS
 from limber.robot.motion.execution import across
 from limber.robot.motion.joint_path import JointPath, follow
 from limber.robot.motion.trajectory import densely
@@ -115,12 +117,11 @@ def write_touched(path: Path, base: np.ndarray, moved: np.ndarray, axis_points: 
     touched = np.tile(np.zeros(6), (len(points), 1))
     touched[:, :3] = points @ matrices(base)[:3, :3] + inverted(matrices(base))[:3, 3]
     touched[:, :3] += sigma * rng.standard_normal((len(points), 3))
-    lines = ["name,x_m,y_m,z_m,robot_x_m,robot_y_m,robot_z_m,robot_rx_rad,robot_ry_rad,"
-             "robot_rz_rad"]
-    for number, (point, pose) in enumerate(zip(points + moved, touched, strict=True)):
-        name = f"rim-{number + 1}" if number < _MARKS else f"branch-{number + 1 - _MARKS}"
-        lines.append(",".join([name, *(f"{value:.7g}" for value in (*point, *pose))]))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    names = [f"rim-{number + 1}" if number < _MARKS else f"branch-{number + 1 - _MARKS}"
+             for number in range(len(points))]
+    rows = zip(names, points + moved, touched, strict=True)
+    write_table(path, ("name", "x_m", "y_m", "z_m", *(f"robot_{name}" for name in POSE_COLUMNS)),
+                ((name, *point, *pose) for name, point, pose in rows), digits=7)
 
 
 def grasp_of(skeleton: Skeleton, fraction: float = GRASP_FRACTION,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import shlex
 import sys
 from datetime import UTC, datetime
@@ -89,7 +88,7 @@ def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path 
 def _views_of(views_file: Path, camera_on: CameraSide, largest_residual: float,
               ) -> tuple[CameraFit, dict[str, Any]]:
     """Fit the camera to a table of board poses that another program has found."""
-    from limber.core.files.reading import read_columns
+    from limber.core.files.tables import read_columns
     from limber.recordings.recording import POSE_COLUMNS
     from limber.robot.cell.hand_eye import fit_camera
 
@@ -137,11 +136,11 @@ def _pictures_of(run: Run, cell: Any, images_file: Path | None, camera_on: Camer
 def _pictures(path: Path) -> tuple[list[str], np.ndarray]:
     """Names and poses [n, 6] of a table of pictures."""
     from limber.core.errors import InputError
-    from limber.core.files.reading import read_text
+    from limber.core.files.tables import csv_records
     from limber.recordings.recording import POSE_COLUMNS
 
     columns = [f"robot_{name}" for name in POSE_COLUMNS]
-    rows = list(csv.DictReader(read_text(path, "a table of pictures").splitlines()))
+    rows = csv_records(path, "a table of pictures")
     try:
         names = [row["image"] for row in rows]
         poses = np.array([[float(row[name]) for name in columns] for row in rows])
@@ -233,15 +232,15 @@ def _write_base(cell_file: Path, cell: Any, branch: str, pose: np.ndarray, posit
 
 def _points(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
     from limber.core.errors import InputError
+    from limber.core.files.tables import csv_rows
 
     try:
-        with open(path, newline="", encoding="utf-8-sig") as stream:
-            rows = [row for row in csv.reader(stream) if row]
+        rows = csv_rows(path, "a table of points")
         if rows and not _is_number(rows[0][1]):
             rows = rows[1:]
         names = [row[0] for row in rows]
         numbers = np.array([[float(part) for part in row[1:]] for row in rows])
-    except (OSError, ValueError, IndexError) as error:
+    except (ValueError, IndexError) as error:
         raise InputError(f"{path} cannot be read as points ({error}).",
                          "A line has name,x_m,y_m,z_m.", "Correct the file.") from error
     if not np.isfinite(numbers).all():

@@ -1,4 +1,4 @@
-"""Checked reading of files of other programs and of branch folders: JSON, TOML, CSV, arrays.
+"""Checked reading of files of other programs and of branch folders: JSON, TOML, arrays.
 
 Such files may be truncated, corrupt or malicious. Therefore numbers must be finite and at most
 ``LARGEST_NUMBER``, declared sizes are compared with the file's size before memory is allocated,
@@ -7,7 +7,6 @@ file.
 """
 
 import contextlib
-import csv
 import json
 import math
 import os
@@ -61,7 +60,7 @@ def read_text(path: str | os.PathLike, what: str) -> str:
     try:
         return Path(path).read_text(encoding="utf-8-sig")
     except (OSError, ValueError) as error:
-        raise _unreadable(path, what, error) from error
+        raise unreadable(path, what, error) from error
 
 
 def _require_modest_text(path: str | os.PathLike, most_bytes: int, what: str) -> None:
@@ -92,7 +91,7 @@ def json_content(text: str, path: str | os.PathLike, what: str) -> Any:
     try:
         return json.loads(text, parse_constant=_refused, parse_float=_finite, parse_int=_integer)
     except (ValueError, RecursionError) as error:
-        raise _unreadable(path, what, error) from error
+        raise unreadable(path, what, error) from error
 
 
 def read_json_as(path: str | os.PathLike, kind: type[Content], what: str) -> Content:
@@ -156,7 +155,7 @@ def toml_content(text: str, path: str | os.PathLike, what: str, *, finite: bool 
                              f"than {_MOST_KEY_PARTS} parts")
         return tomllib.loads(text, parse_float=_finite if finite else float)
     except (ValueError, RecursionError) as error:
-        raise _unreadable(path, what, error) from error
+        raise unreadable(path, what, error) from error
 
 
 def read_arrays(path: str | os.PathLike, what: str) -> dict[str, np.ndarray]:
@@ -184,60 +183,7 @@ def read_arrays(path: str | os.PathLike, what: str) -> dict[str, np.ndarray]:
     except (OSError, ValueError, EOFError, SyntaxError, TypeError, OverflowError, RuntimeError,
             NotImplementedError, RecursionError, tokenize.TokenError, zipfile.BadZipFile,
             zlib.error) as error:
-        raise _unreadable(path, what, error) from error
-
-
-def csv_rows(path: str | os.PathLike, what: str) -> list[list[str]]:
-    """Return the fields of each line of a CSV file, including empty lines.
-
-    Raises:
-        InputError: it cannot be read, or a field has more than 131,072 characters.
-    """
-    try:
-        return list(csv.reader(read_text(path, what).splitlines()))
-    except csv.Error as error:
-        raise _unreadable(path, what, error) from error
-
-
-def csv_records(path: str | os.PathLike, what: str, comment: str = "") -> list[dict[str, Any]]:
-    """Return the fields of each line of a CSV file, keyed by the titles in its first line.
-
-    A missing field is None; fields beyond the titles are listed under None.
-
-    Args:
-        comment: Lines that begin with this are skipped.
-
-    Raises:
-        InputError: as :func:`csv_rows`.
-    """
-    lines = [line for line in read_text(path, what).splitlines()
-             if not (comment and line.startswith(comment))]
-    try:
-        return list(csv.DictReader(lines))
-    except csv.Error as error:
-        raise _unreadable(path, what, error) from error
-
-
-def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
-                 ) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV file with a header that contain only finite numbers.
-
-    Raises:
-        InputError: it cannot be read, has no rows, or one of ``needed`` is not among them.
-    """
-    rows = [row for row in csv_rows(path, what) if row]
-    columns = {}
-    for name, *values in zip(*rows, strict=False):
-        with contextlib.suppress(ValueError):
-            numbers = np.array([float(value) for value in values])
-            if _are_moderate(numbers):
-                columns[name.strip()] = numbers
-    missing = [name for name in needed if not len(columns.get(name, ()))]
-    if missing:
-        raise InputError(f"{path} has no column {missing[0]} of finite numbers.",
-                         f"{what[0].upper()}{what[1:]} was expected.",
-                         "It is damaged, or was written by another program. Make it again.")
-    return columns
+        raise unreadable(path, what, error) from error
 
 
 def require_finite(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], what: str) -> None:
@@ -247,7 +193,7 @@ def require_finite(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], wh
         InputError: there is such an array; the message names it.
     """
     for name, values in arrays.items():
-        if not _are_moderate(values):
+        if not are_moderate(values):
             raise InputError(f"{path}: {name} has values that are not finite, or beyond "
                              f"{LARGEST_NUMBER:g}.", f"{what[0].upper()}{what[1:]} holds numbers.",
                              "It is damaged. Make it again.")
@@ -325,7 +271,7 @@ def _require_modest(expanded: float, size: float) -> None:
         raise ValueError(f"its {size} bytes would expand to {expanded:.3g} bytes")
 
 
-def _are_moderate(values: np.ndarray) -> bool:
+def are_moderate(values: np.ndarray) -> bool:
     """Whether all numbers are finite and at most ``LARGEST_NUMBER``."""
     return values.dtype.kind not in "fc" or bool((np.abs(values) <= LARGEST_NUMBER).all())
 
@@ -348,7 +294,7 @@ def _refused(text: str) -> NoReturn:
     raise ValueError(f"{text} is not a finite number")
 
 
-def _unreadable(path: str | os.PathLike, what: str, error: Exception) -> InputError:
+def unreadable(path: str | os.PathLike, what: str, error: Exception) -> InputError:
     reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
     return InputError(f"{path} cannot be read ({reason[:300] or type(error).__name__}).",
                       f"{what[0].upper()}{what[1:]} was expected.",

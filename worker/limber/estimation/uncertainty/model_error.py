@@ -14,7 +14,7 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from limber.core.files.reading import read_columns
+from limber.core.files.tables import read_columns
 from limber.core.numerics.rigid import composed, rotated
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.estimation.fitting.objective import Evaluation, Objective

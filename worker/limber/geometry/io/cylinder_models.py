@@ -11,15 +11,14 @@
 ======================  ===========================================================================
 """
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.files.atomic import write_lines
 from limber.core.files.reading import HARMLESS_BYTES, LARGEST_EXPANSION
+from limber.core.files.tables import write_table
 from limber.core.optional import require_extra
 from limber.geometry.io.isolated_readers import read_apart
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -250,28 +249,22 @@ def write_treeqsm(skeleton: Skeleton, path: Path) -> None:
 def write_rtwig(skeleton: Skeleton, path: Path) -> None:
     """Write rTwig's minimal table [m]: what its ``reconstruct_qsm`` needs, with branch and order.
     """
-    lines = ["id,parent,start_x,start_y,start_z,end_x,end_y,end_z,radius,branch,branch_order"]
-    for node in range(1, skeleton.node_count):
-        up = int(skeleton.parent[node])
-        numbers = (*skeleton.nodes[up], *skeleton.nodes[node], skeleton.radius[node])
-        lines.append(_row(node, up, numbers, skeleton.branch[node] + 1, skeleton.order[node]))
-    write_lines(path, lines)
+    titles = ("id parent start_x start_y start_z end_x end_y end_z radius branch "
+              "branch_order").split()
+    write_table(path, titles, (
+        (node, up, *skeleton.nodes[up], *skeleton.nodes[node], skeleton.radius[node],
+         skeleton.branch[node] + 1, skeleton.order[node])
+        for node, up in enumerate(skeleton.parent[1:], start=1)))
 
 
 def write_simpleforest(skeleton: Skeleton, path: Path) -> None:
     """Write a table with SimpleForest's names [m]."""
-    lines = ["ID,parentID,startX,startY,startZ,endX,endY,endZ,axisX,axisY,axisZ,radius,length,"
-             "branchID,branchOrder"]
-    for node in range(1, skeleton.node_count):
-        up = int(skeleton.parent[node])
+    titles = ("ID parentID startX startY startZ endX endY endZ axisX axisY axisZ radius length "
+              "branchID branchOrder").split()
+    rows = []
+    for node, up in enumerate(skeleton.parent[1:], start=1):
         start, end = skeleton.nodes[up], skeleton.nodes[node]
         length = float(np.linalg.norm(end - start))
-        numbers = (*start, *end, *((end - start) / max(length, 1e-300)), skeleton.radius[node],
-                   length)
-        lines.append(_row(node - 1, up - 1, numbers, skeleton.branch[node], skeleton.order[node]))
-    write_lines(path, lines)
-
-
-def _row(number: int, parent: int, numbers: Iterable[float], branch: int, order: int) -> str:
-    cells = (number, parent, *(f"{value:.9g}" for value in numbers), branch, order)
-    return ",".join(map(str, cells))
+        rows.append((node - 1, up - 1, *start, *end, *((end - start) / max(length, 1e-300)),
+                     skeleton.radius[node], length, skeleton.branch[node], skeleton.order[node]))
+    write_table(path, titles, rows)

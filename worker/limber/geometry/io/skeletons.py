@@ -1,6 +1,5 @@
 """Skeletons of other programs and the registry of their formats; SWC, cylinder models as CSV."""
 
-import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,7 +10,8 @@ import numpy as np
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
 from limber.core.files.atomic import write_lines
-from limber.core.files.reading import csv_records, read_text, require_finite
+from limber.core.files.reading import read_text, require_finite
+from limber.core.files.tables import csv_records, write_table
 from limber.geometry.io.cylinder_models import (
     read_treeqsm,
     write_rtwig,
@@ -403,19 +403,14 @@ def write_cylinders(skeleton: Skeleton, path: Path) -> None:
     start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
     length = np.linalg.norm(end - start, axis=1)
     axis = (end - start) / np.maximum(length, 1e-300)[:, None]
-    with open(path, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream)
-        writer.writerow("id parent sx sy sz ex ey ez radius length ax ay az branch order "
-                        "radius_sigma radius_state probability start_radius".split())
-        for i in range(len(end)):
-            node = i + 1
-            numbers = [*start[i], *end[i], skeleton.radius[node], length[i], *axis[i]]
-            up = skeleton.parent[node] - 1
-            writer.writerow([i, up, *(f"{v:.15g}" for v in numbers), skeleton.branch[node],
-                             skeleton.order[node], f"{skeleton.radius_sigma[node]:.3g}",
-                             skeleton.radius_state[node],
-                             f"{skeleton.probability[node]:.3f}",
-                             f"{skeleton.radius[skeleton.parent[node]]:.12g}"])
+    titles = ("id parent sx sy sz ex ey ez radius length ax ay az branch order radius_sigma "
+              "radius_state probability start_radius").split()
+    rows = ((node - 1, up - 1, *start[node - 1], *end[node - 1], skeleton.radius[node],
+             length[node - 1], *axis[node - 1], skeleton.branch[node], skeleton.order[node],
+             f"{skeleton.radius_sigma[node]:.3g}", skeleton.radius_state[node],
+             f"{skeleton.probability[node]:.3f}", f"{skeleton.radius[up]:.12g}")
+            for node, up in enumerate(skeleton.parent[1:], start=1))
+    write_table(path, titles, rows, digits=15, line_end="\r\n")
 
 
 def _require_whole(path: Path, numbers: np.ndarray) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.files.reading import csv_records
+from limber.core.files.tables import csv_records
 from limber.geometry.skeleton.skeleton import Skeleton
 
 HEIGHTS = (0.02, 0.1, 0.3, 0.5, 0.7, 0.9)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError, WorkError
-from limber.core.files.reading import read_columns
+from limber.core.files.tables import read_columns
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.loads.outdoor import Bent, LoadedOutdoors, recorded, turbulent
 from limber.mechanics.materials.materials import RayleighDamping

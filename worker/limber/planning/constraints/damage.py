@@ -11,7 +11,6 @@ The gripper prescribes the pose: the strain there hardly depends on the stiffnes
 the branch's radius.
 """
 
-import csv
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ import scipy
 from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
-from limber.core.files.reading import read_columns
+from limber.core.files.tables import csv_records, read_columns, table_text
 from limber.core.numerics.compiled import compiled
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.materials.materials import LEAST_YOUNG, SPECIES, STRENGTH_OVER_YOUNG
@@ -134,12 +133,7 @@ def read_break_tests(path: Path) -> np.ndarray:
     Raises:
         InputError: there is no such file or column, or a value is not a strain.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} cannot be read ({error}).", "It holds the break tests.",
-                         "Give a CSV file.") from error
+    rows = csv_records(path, "a CSV file of break tests")
     if not rows or _COLUMN not in rows[0]:
         raise InputError(f"{path} has no column {_COLUMN}.",
                          "It states the largest strain of each shoot when it broke (0.05 is 5 %).",
@@ -228,13 +222,11 @@ class DamageAlong:
 
     def write(self, stream: TextIO) -> None:
         """Write it as CSV, one row per node."""
-        writer = csv.writer(stream, lineterminator="\n")
-        known = [] if self.probabilities is None else [self.probabilities]
-        writer.writerow((*_COLUMNS, *([_PROBABILITY] if known else ())))
-        for x, y, z, parent, *values in np.column_stack(
-                [self.nodes, self.parents, self.strains, *known]):
-            writer.writerow((*(f"{one:.6g}" for one in (x, y, z)), int(parent),
-                             *(f"{one:.6g}" for one in values)))
+        known = {} if self.probabilities is None else {_PROBABILITY: self.probabilities}
+        rows = np.column_stack([self.nodes, self.strains, *known.values()])
+        stream.write(table_text((*_COLUMNS, *known), (
+            (*row[:3], parent, *row[3:]) for row, parent in zip(rows, self.parents, strict=True)),
+            digits=6))
 
     @classmethod
     def read(cls, path: Path) -> "DamageAlong":

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.files.tables import write_table
 from limber.recordings.cell_errors import calibration_of
 from limber.recordings.force_slope import WHY_NO_MODULUS, ForceTable, force_slope
 from limber.recordings.importing.import_request import (
@@ -87,9 +88,8 @@ def _import_force(read: ForceTable, request: ImportRequest) -> dict[str, Any]:
     for message in found.warnings:
         request.progress.warn(message)
     request.progress.warn(f"{request.source.name} does not give a modulus. {WHY_NO_MODULUS}")
-    table = np.column_stack([displacement, force])
-    np.savetxt(request.folder / "force.csv", table, "%.9g", ",", header="displacement_m,force_n",
-               comments="")
+    write_table(request.folder / "force.csv", ("displacement_m", "force_n"),
+                zip(displacement, force, strict=True))
     return {"slope_n_per_m": found.slope, "slope_interval_n_per_m": list(found.interval),
             "contact_m": found.contact, "contact_seen": found.contact_seen,
             "baseline_n": found.baseline, "stiffening": found.stiffening,

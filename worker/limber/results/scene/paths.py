@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.files.reading import read_columns
+from limber.core.files.tables import read_columns
 from limber.planning.plan_file import read_plan_summary
 from limber.planning.search_files import read_trees
 from limber.results.findings import PATH_NAMES, SAME, remarks_on

@@ -8,7 +8,7 @@ from limber.cell.arm import Rods
 from limber.cell.known_arms import arm_named
 from limber.cell.reach_and_collision import GRIPPER, drawn_arm
 from limber.core.errors import InputError
-from limber.core.files.reading import read_columns
+from limber.core.files.tables import read_columns
 from limber.core.numerics.rigid import matrices
 from limber.results.scene.arrays import SceneData
 from limber.store import Branch

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -12,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from limber.core.errors import InputError, NoPathError
+from limber.core.files.tables import table_text
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import POSITION, Groups, Settings
 from limber.planning.settings import PlanSettings
@@ -112,14 +111,9 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
 def _rows(trials: Sequence[ComparedTrial]) -> str:
     from limber.planning.compared_planners import COMPARED
 
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    for trial in trials:
-        for path, score in trial.scores.items():
-            writer.writerow([trial.number + 1, COMPARED[path],
-                             *(f"{getattr(score, column):.9g}" for column in _COLUMNS[2:])])
-    return text.getvalue()
+    return table_text(_COLUMNS, (
+        (trial.number + 1, COMPARED[path], *(getattr(score, column) for column in _COLUMNS[2:]))
+        for trial in trials for path, score in trial.scores.items()))
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:

@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from limber.core.errors import InputError, SafetyStop
+from limber.core.files.tables import table_line
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
@@ -314,14 +315,14 @@ def _armed(planned: PlannedMotion, name: str, options: ExecuteOptions, progress:
         batches: list[np.ndarray] = []
         judging: list[PullPlausibility] = []
         try:
-            stream.append(",".join(COLUMNS))
+            stream.append(table_line(COLUMNS))
 
             live = LiveForce(branch.folder, f"Following {name}", cell.limits.soft_force_n)
 
             def take(rows: np.ndarray) -> None:
                 batches.append(rows)
                 for row in rows:
-                    stream.append(",".join("" if np.isnan(x) else f"{x:.7g}" for x in row))
+                    stream.append(table_line(row, digits=7))
                 live.take(rows)
                 if judging and judging[-1].reason is None and judging[-1].take(rows):
                     link.stop()

@@ -9,7 +9,7 @@ from scipy.interpolate import Akima1DInterpolator
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, WorkError
-from limber.core.files.reading import csv_records, read_columns
+from limber.core.files.tables import csv_records, read_columns
 from limber.core.numerics.rigid import composed, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.mechanics import BranchModel, Grasp, StaticResult, follow_poses

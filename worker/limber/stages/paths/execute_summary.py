@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from limber.core.files.tables import write_table
 from limber.core.settings import Settings
 from limber.store import Branch
 
@@ -58,10 +59,8 @@ def write_preview(branch: Branch, name: str, settings: Settings, cell: Cell,
     header = ["t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
               *(f"q{number + 1}_rad" for number in range(motion.joints.joints.shape[1])),
               "fx_n", "fy_n", "fz_n"]
-    lines = [",".join(header), *(",".join(f"{x:.7g}" for x in row) for row in np.vstack(rows))]
     with branch.stage(f"execute-preview:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
-        stage.path(f"executions/{name}-preview.csv").write_text("\n".join(lines) + "\n",
-                                                               encoding="utf-8")
+        write_table(stage.path(f"executions/{name}-preview.csv"), header, np.vstack(rows), digits=7)
         held = drawn_gripper(cell, np.eye(4)[None])
         stage.result.update(
             model=cell.robot.model, base_pose=list(cell.base.pose),

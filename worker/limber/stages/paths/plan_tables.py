@@ -1,11 +1,10 @@
 """The CSV tables of a plan: paths, motion, set-points and search trees."""
 
-import csv
-import io
 from collections.abc import Mapping
 
 import numpy as np
 
+from limber.core.files.tables import table_text
 from limber.core.not_none import present
 from limber.planning.cost import arc_lengths
 from limber.planning.plan_file import PlanPath
@@ -23,7 +22,7 @@ _MOTION_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "fx
 def path_table(path: PlanPath) -> str:
     """Return a path, one row per pose."""
     along = arc_lengths(path.poses[:, :3])
-    return _csv(_COLUMNS, np.column_stack(
+    return table_text(_COLUMNS, np.column_stack(
         [along, path.poses, path.energies, path.force_sizes, path.strains]))
 
 
@@ -35,7 +34,9 @@ def motion_table(motion: PlanPath) -> str:
     torques = present(motion.torques, "torque of the motion")
     rows = np.column_stack([times, motion.poses, forces, torques,
                             motion.energies, motion.strains, *motion.targets.values()])
-    return _csv((*_MOTION_COLUMNS, *targets), rows, motion.phases)
+    phases = present(motion.phases, "phase of the motion")
+    return table_text((*_MOTION_COLUMNS, *targets, "phase"), (
+        (*row, phase) for row, phase in zip(rows, phases, strict=True)))
 
 
 def setpoints(motion: PlanPath, pace: Pace, rate: float) -> str:
@@ -44,26 +45,14 @@ def setpoints(motion: PlanPath, pace: Pace, rate: float) -> str:
     end = phases.count("approach") + phases.count("path") - 1
     law = time_law(motion.poses[:, :3], pace, (end,))
     instants = np.arange(int(np.ceil(law.duration * rate)) + 1) / rate
-    return _csv(_MOTION_COLUMNS[:7], np.column_stack(
+    return table_text(_MOTION_COLUMNS[:7], np.column_stack(
         [instants, poses_at(motion.poses, law, instants, (end,))]))
 
 
 def trees_table(trees: Mapping[str, SearchTree]) -> str:
     """One row per node: its tree, its position, and the row of its parent in that tree (-1: none).
     """
-    lines = ["planner,x_m,y_m,z_m,parent"]
-    for planner, tree in trees.items():
-        small = tree.pruned(_MOST_NODES)
-        lines += [f"{planner},{x:.6g},{y:.6g},{z:.6g},{parent}"
-                  for (x, y, z), parent in zip(small.nodes, small.parents, strict=True)]
-    return "\n".join(lines) + "\n"
-
-
-def _csv(columns: tuple[str, ...], rows: np.ndarray, phases: tuple[str, ...] | None = None) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((*columns, *(() if phases is None else ("phase",))))
-    for number, row in enumerate(rows):
-        writer.writerow([*(f"{value:.9g}" for value in row),
-                         *(() if phases is None else (phases[number],))])
-    return text.getvalue()
+    pruned = {planner: tree.pruned(_MOST_NODES) for planner, tree in trees.items()}
+    return table_text(("planner", "x_m", "y_m", "z_m", "parent"), (
+        (planner, *node, parent) for planner, tree in pruned.items()
+        for node, parent in zip(tree.nodes, tree.parents, strict=True)), digits=6)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from limber.core.errors import InputError
+from limber.core.files.tables import table_line
 from limber.core.progress import Progress
 from limber.robot.recorder import MarkerStream, PullRecorder
 from limber.store import Branch
@@ -86,7 +87,7 @@ class Observers:
             return None, None
         points, noise = self._tracker.at_rest()
         names = (f"m{k}_{axis}_m" for k in range(len(points)) for axis in "xyz")
-        self.lines.append(",".join(("t_s", *names)))
+        self.lines.append(table_line(("t_s", *names)))
         return tuple(tuple(map(float, point)) for point in points), noise
 
     def heard(self, rows: np.ndarray) -> None:
@@ -105,8 +106,8 @@ class Observers:
             return
         for clock, points in self._tracker.read():
             if clock >= recorder.first:
-                self.lines.append(",".join([f"{clock - recorder.first:.6f}",
-                                            *(f"{value:.6g}" for value in points.ravel())]))
+                self.lines.append(table_line(
+                    (f"{clock - recorder.first:.6f}", *points.ravel()), digits=6))
 
     def end(self, recorder: PullRecorder, progress: Progress) -> None:
         """Write the last observations, and warn of what is missing."""

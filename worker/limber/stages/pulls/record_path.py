@@ -8,7 +8,8 @@ from pydantic import Field
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, SafetyStop
-from limber.core.files.reading import FileContent, read_columns, read_json_as
+from limber.core.files.reading import FileContent, read_json_as
+from limber.core.files.tables import read_columns
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.recordings.recording import POSE_COLUMNS
