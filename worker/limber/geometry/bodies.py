@@ -149,8 +149,8 @@ def _section(surface: Surface, axis: np.ndarray, at: float) -> tuple[float, np.n
         ends.append((point, up))
     if len(cut) == 0:
         return 0.0, np.zeros(3)
-    start = sum(np.where(used[:, None], point, 0.0) for point, used in starts)
-    end = sum(np.where(used[:, None], point, 0.0) for point, used in ends)
+    start = np.sum([np.where(used[:, None], point, 0.0) for point, used in starts], axis=0)
+    end = np.sum([np.where(used[:, None], point, 0.0) for point, used in ends], axis=0)
     origin = start.mean(axis=0)
     p, q = start - origin, end - origin
     twice = np.cross(p, q) @ axis

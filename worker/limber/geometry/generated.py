@@ -87,7 +87,7 @@ def _true_skeleton(rng: np.random.Generator, spec: BranchSpec) -> Skeleton:
     share = np.linspace(0, 1, len(main))
     radius = [spec.radius_root + (spec.radius_tip - spec.radius_root) * share**1.2]
     turn = rng.uniform(0, 2 * np.pi)
-    positions = np.linspace(0.18, 0.78, spec.fork_count + 2)[1:-1] if spec.fork_count else []
+    positions = np.linspace(0.18, 0.78, spec.fork_count + 2)[1:-1]
     count = len(main)
     for position in positions:
         at = int(np.clip((position + rng.uniform(-0.03, 0.03)) * len(main), 2, len(main) - 3))

@@ -110,7 +110,8 @@ def touching_runs(skeleton: Skeleton) -> list[dict[str, Any]]:
     start = np.array([members[0] for members in skeleton.runs()])
     found: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
     for pair in np.flatnonzero((one != other) & (overlap > 0)):
-        key = tuple(sorted((int(one[pair]), int(other[pair]))))
+        low, high = sorted((int(one[pair]), int(other[pair])))
+        key = low, high
         at = skeleton.nodes[pairs[pair]].mean(axis=0)
         # They overlap as expected around the fork that joins them, or from which both start.
         own = 3 * float(skeleton.radius[start[list(key)]].max())

@@ -11,6 +11,7 @@ from limber.core.alignment import Alignment
 from limber.core.constants import STANDARD_GRAVITY, UNIT_METRES
 from limber.core.errors import InputError
 from limber.core.lazy import loaded
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf
@@ -429,7 +430,8 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared) -> tuple[SkeletonRe
         found: The skeleton of the cloud.
         prepared: The cloud, and the view from which it was seen.
     """
-    skeleton, dropped = without_hidden_twigs(found.skeleton, prepared.view, _SILHOUETTE_REACH)
+    view = present(prepared.view, "view")
+    skeleton, dropped = without_hidden_twigs(found.skeleton, view, _SILHOUETTE_REACH)
     node, residual = nearest_cylinders(skeleton, prepared.cloud.points)
     text = ""
     if dropped:

@@ -8,7 +8,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.not_none import present
-from limber.core.numerics.rigid import composed
+from limber.core.numerics.rigid import any_normal, composed
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.dynamics.drive import PoseTable
@@ -179,8 +179,7 @@ def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
     branch, whose length is fixed; under a force it moves where it can.
     """
     axis = grasp.centre - model.mesh.nodes[model.fixed].mean(axis=0)
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across /= np.linalg.norm(across)
+    across = any_normal(axis)
     weightless = model.with_parameters(gravity=(0.0, 0.0, 0.0))
     probe = solve_static(weightless, grasp=grasp, grasp_force=_PROBE * across).require()
     moved = np.linalg.norm(grasp.weights @ probe.displacement[grasp.nodes])

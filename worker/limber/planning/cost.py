@@ -17,6 +17,7 @@ import numpy as np
 import scipy
 
 from limber.core.numerics.compiled import compiled
+from limber.geometry.skeleton.sweep import arc_lengths
 from limber.planning.field.energy_field import EnergyField, allowed_at, energy_at
 
 STEP = 0.005
@@ -95,11 +96,6 @@ def measure_path(positions: np.ndarray, energies: np.ndarray, forces: np.ndarray
         energy_sum_nmm=float(np.interp(spots, along, energies).sum() * 1e3),
         peak_energy_j=float(energies.max()), peak_force_n=float(forces.max()),
         positive_work_j=float(np.maximum(np.diff(energies), 0.0).sum()))
-
-
-def arc_lengths(path: np.ndarray) -> np.ndarray:
-    """Return the distance along a polyline [n, 3] of each of its points [m], shape [n]."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
 
 
 def resample(path: np.ndarray, spacing: float) -> np.ndarray:

@@ -238,7 +238,8 @@ class _Rounds:
                 self.field, self.grasp_model, self.start, self.aim, self.planned_limits,
                 ahead.part(0.3, 1.0))
             if found is None:
-                return self._closed(none, is_last, ahead.part(0.3, 1.0))
+                self._closed(none, is_last, ahead.part(0.3, 1.0))
+                return None
             self.passages.append(found)
             self.progress.warn(
                 f"{none.seen} The energy field's error makes this uncertain, so poses are added: "
@@ -342,7 +343,7 @@ class _Rounds:
             broken += self._unfit_end(plan)
         if self.uncertainty is not None and not broken:
             risk = self.uncertainty.risk(
-                self.grasp_model, plan, self.limits, self.settings.confidence
+                self.grasp_model, plan, self.limits, present(self.settings.confidence, "confidence")
             )
             self.risks.append(risk)
             broken = risk.exceeded_limits()

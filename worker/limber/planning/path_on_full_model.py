@@ -144,7 +144,9 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
                  progress: Progress = SILENT) -> ResolvedPath:
     """Solve the branch along ``path`` [n, 3], coming from rest along ``approach`` [k, 3]."""
     before, unsolved, reasons = [grasp_model.rest], [], []
-    good, last, state = [], None, grasp_model.rest.displacement
+    good: list[bool] = []
+    last: np.ndarray | None = None
+    state = grasp_model.rest.displacement
     ahead = resample(approach, _APPROACH_STEP)[1:-1]
     is_whole = True
     for number, point in enumerate(np.concatenate([ahead, path])):

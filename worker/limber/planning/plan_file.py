@@ -38,6 +38,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from limber.core.errors import InputError
 from limber.core.files.reading import checked_as, read_json
 from limber.core.json_values import number_array, plain
+from limber.core.not_none import present
 from limber.planning.baseline_and_plan import PathPair
 from limber.planning.certificate.lower_bound import COST
 from limber.planning.constraints.limits import Limits, with_unit
@@ -290,7 +291,7 @@ def limits_of_motion(motion: PlanPath, limits: Limits) -> dict[str, dict[str, fl
     """Return value, peak along the motion and margin of each requested limit."""
     peaks = {"energy": motion.energies, "force": motion.force_sizes, "strain": motion.strains,
              "stress": motion.stresses, "axial_force": motion.axial_forces,
-             "torque": np.linalg.norm(motion.torques, axis=1)}
+             "torque": np.linalg.norm(present(motion.torques, "torque"), axis=1)}
     found = {}
     for name, limit in limits.asked().items():
         if name not in peaks:
@@ -367,7 +368,8 @@ def _path_from(content: dict[str, Any]) -> PlanPath:
     targets = {name: number_array(positions)
                for name, positions in content.get("targets_m", {}).items()}
     phases = tuple(content["phases"]) if "phases" in content else None
-    columns = [*values.values(), forces, *targets.values(), *([] if phases is None else [phases])]
+    columns: list[Any] = [*values.values(), forces, *targets.values(),
+                          *([] if phases is None else [phases])]
     if values["poses"].shape != (count, 6) or any(len(column) != count for column in columns):
         raise ValueError("columns of unequal length")
     if forces.shape != (count, 3):

@@ -9,7 +9,7 @@ from limber.cell.arm import Arm
 from limber.cell.cell_file import Cell
 from limber.core.errors import NoPathError
 from limber.core.files.tables import write_table
-from limber.core.numerics.rigid import inverted, matrices, pose_vectors
+from limber.core.numerics.rigid import any_normal, inverted, matrices, pose_vectors
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.recordings.recording import POSE_COLUMNS
 from limber.robot.motion.execution import across
@@ -135,6 +135,5 @@ def grasp_of(skeleton: Skeleton, fraction: float = GRASP_FRACTION,
 def sideways(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two directions across the line from the root, the origin, to ``point`` [3]."""
     axis = point / np.linalg.norm(point)
-    first = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
-    first /= np.linalg.norm(first)
+    first = any_normal(axis)
     return first, np.cross(axis, first)

@@ -14,6 +14,12 @@ def _rotations(vectors: np.ndarray) -> "scipy.spatial.transform.Rotation":
     return scipy.spatial.transform.Rotation.from_rotvec(np.array(vectors, float))
 
 
+def any_normal(directions: np.ndarray) -> np.ndarray:
+    """Return a unit vector orthogonal to each direction [..., 3], the same for the same one."""
+    normal = np.cross(directions, np.eye(3)[np.abs(directions).argmin(axis=-1)])
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
 def rotation_matrix(vectors: np.ndarray) -> np.ndarray:
     """Return the matrices of rotation vectors [rad], shape [3] or [n, 3]."""
     return _rotations(vectors).as_matrix()

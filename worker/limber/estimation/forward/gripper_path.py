@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from limber.core.errors import WorkError
-from limber.core.numerics.rigid import rotation_matrix
+from limber.core.numerics.rigid import any_normal, rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.forward_model import compliance
 from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
@@ -206,8 +206,7 @@ def sideways_forces(axis: np.ndarray, frame_count: int, *, turn: float, phase: f
         phase: Initial direction [rad].
     """
     axis = axis / np.linalg.norm(axis)
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    first /= np.linalg.norm(first)
+    first = any_normal(axis)
     second = np.cross(axis, first)
     share = np.linspace(0.0, 1.0, frame_count)
     # Speed ramps up and down as a robot's does.

@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from limber.core.files.tables import read_columns
-from limber.core.numerics.rigid import composed, rotated
+from limber.core.numerics.rigid import any_normal, composed, rotated
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.forward_model import Forward
@@ -237,8 +237,7 @@ def _nodal(model: BranchModel, grasp: Grasp, load: SmallLoad) -> np.ndarray:
 def _across(grasp: Grasp, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors perpendicular to the line from base to grasp."""
     axis = grasp.centre - base.mean(axis=0)
-    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    first /= np.linalg.norm(first)
+    first = any_normal(axis)
     return first, np.cross(axis, first) / np.linalg.norm(axis)
 
 

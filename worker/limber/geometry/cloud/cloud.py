@@ -251,8 +251,8 @@ class OwnFrame:
         offset = points[order] - middle
         axes = own_axes(offset)
         coordinates = offset @ axes
-        step = 2.0**np.floor(np.log2(max(_STEP * np.linalg.norm(np.ptp(coordinates, axis=0)),
-                                         1e-300)))
+        size = float(np.linalg.norm(np.ptp(coordinates, axis=0)))
+        step = 2.0**np.floor(np.log2(max(_STEP * size, 1e-300)))
         return cls(np.round(coordinates / step) * step, order, middle, axes)
 
     def inside(self, points: np.ndarray) -> np.ndarray:

@@ -170,7 +170,8 @@ def _enough_digits(points: np.ndarray) -> None:
 def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
                     eye: np.ndarray | None, counts: dict[str, int]) -> tuple[Cloud, View | None]:
     """Drop flying pixels if one depth camera saw the cloud; also return its position."""
-    eye = settings.camera_at if eye is None else eye
+    if eye is None and settings.camera_at is not None:
+        eye = np.asarray(settings.camera_at)
     if eye is None:
         scanner, sight = _own_sight(cloud.points * scale)
     else:

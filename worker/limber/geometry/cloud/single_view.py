@@ -13,6 +13,8 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from limber.core.numerics.rigid import any_normal
+
 _BESIDE = 1.6  # pixels: the eight around a pixel
 _REGULAR = 0.6  # 5 % quantile over median of the distances to the nearest pixel; 0.27 at random
 _AXIS = np.cos(np.radians(35.0))  # largest angle at which the camera frame's own axis is used
@@ -90,8 +92,7 @@ def find_sight(points: np.ndarray, eye: np.ndarray | None = None,
     if forward is None or (ray @ forward).min() < np.cos(_WIDEST):
         return None
     depth = offset @ forward
-    right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
-    right /= np.linalg.norm(right)
+    right = any_normal(forward)
     image = np.stack([offset @ right, offset @ np.cross(forward, right)], axis=1) / depth[:, None]
     spacing = cKDTree(image).query(image, k=2)[0][:, 1]
     pitch = float(np.median(spacing))
@@ -232,7 +233,7 @@ def _common_line(normals: np.ndarray, offsets: np.ndarray, weight: np.ndarray, e
     the line that most other planes pass through is taken.
     """
     rng = np.random.default_rng(0)
-    best, least, miss = None, np.inf, None
+    best, least, miss = None, np.inf, np.zeros(0)
     for one, other in rng.integers(len(normals), size=(_TRIED, 2)):
         along = np.cross(normals[one], normals[other])
         size = float(np.linalg.norm(along))

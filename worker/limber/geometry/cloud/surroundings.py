@@ -404,18 +404,18 @@ def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
                 spreads.append(values[0])
     if len(centres) < max(10, 0.5 * least / len(points) * len(sample)):
         return None
-    centres, normals = np.array(centres), np.array(normals)
+    middles, across = np.array(centres), np.array(normals)
     thick = 4 * float(np.sqrt(np.median(spreads))) + 1e-4 * diagonal
-    best, share = None, 0
-    for start in rng.permutation(len(centres))[:_TRIES]:
-        on = np.abs((centres - centres[start]) @ normals[start]) < 2 * thick
-        on &= np.abs(normals @ normals[start]) > 0.9
+    best, share = np.zeros(len(middles), bool), 0
+    for start in rng.permutation(len(middles))[:_TRIES]:
+        on = np.abs((middles - middles[start]) @ across[start]) < 2 * thick
+        on &= np.abs(across @ across[start]) > 0.9
         if on.sum() > share:
             best, share = on, int(on.sum())
     if share < _IN_PLANE:
         return None
-    middle = centres[best].mean(axis=0)
-    axes = principal_axes(centres[best])
+    middle = middles[best].mean(axis=0)
+    axes = principal_axes(middles[best])
     offset = (points - middle) @ axes.T
     on = np.abs(offset[:, 2]) < thick
     if on.sum() < least or not _is_broad(offset[on][:, :2], diagonal):

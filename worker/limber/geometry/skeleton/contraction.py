@@ -308,8 +308,7 @@ def level_graph(points: np.ndarray, source: np.ndarray, *, gap_factor: float,
     same = links[level[links[:, 0]] == level[links[:, 1]]]
     owner = labels(len(points), same)
     support = np.bincount(owner)
-    nodes = np.stack([np.bincount(owner, points[:, k]) for k in range(3)], axis=1)
-    nodes /= support[:, None]
+    nodes = np.stack([np.bincount(owner, points[:, k]) / support for k in range(3)], axis=1)
     parent = _parents(owner, before)
     thickness = np.maximum(_thickness(points, owner, nodes, parent, support), 0.3 * spacing)
     below = np.flatnonzero(parent >= 0)

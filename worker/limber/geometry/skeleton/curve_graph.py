@@ -1,6 +1,7 @@
 """From contracted points to a tree of nodes: cover, connect, bridge gaps, root, prune."""
 
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from scipy.sparse.csgraph import (
@@ -50,7 +51,7 @@ class CurveGraph:
     bridges: list[dict] = field(default_factory=list)
     split_off: list[dict] = field(default_factory=list)
     loops: list[float] = field(default_factory=list)
-    owner: np.ndarray = field(default=None)
+    owner: np.ndarray = field(default=cast(np.ndarray, None))
     plants: list[dict] = field(default_factory=list)
 
 

@@ -11,7 +11,7 @@ file, as `limber skeleton` lists them::
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -157,9 +157,10 @@ def edited(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str] | None 
     Raises:
         InputError: a position is not on an axis, or the result would not be a tree.
     """
-    doing = {"add": _added, "move": _moved, "delete": _deleted, "merge": _merged,
-             "bridge": _bridged, "split": _split, "root": _rooted, "radius": _with_radius,
-             "confirm": _confirmed}
+    doing: dict[str, Callable[[Skeleton, Any], Skeleton]] = {
+        "add": _added, "move": _moved, "delete": _deleted, "merge": _merged,
+        "bridge": _bridged, "split": _split, "root": _rooted, "radius": _with_radius,
+        "confirm": _confirmed}
     for number, edit in enumerate(edits, start=1):
         try:
             skeleton = doing[edit.do](skeleton, edit)

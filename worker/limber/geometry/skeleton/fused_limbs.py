@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.sweep import any_normal, stretches
+from limber.geometry.skeleton.sweep import stretches
 
 # Feet of side branches: their axes are followed down while the points show two limbs, not one.
 #

@@ -59,14 +59,15 @@ def untied(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> np.nd
         if len(near[a]) != 2 or len(near[b]) != 2:
             continue
         thick = max(thickness[a], thickness[b])
-        arms = [_arm(nodes, near, one, other, thick) for one, other in ((a, b), (b, a))]
-        if any(arm is None for arm in arms):
+        arm, opposite = (_arm(nodes, near, one, other, thick) for one, other in ((a, b), (b, a)))
+        if arm is None or opposite is None:
             continue
-        cosine = float(arms[0] @ arms[1])
+        cosine = float(arm @ opposite)
         if cosine > -np.cos(_TURN):
             turning.append((float(np.linalg.norm(nodes[a] - nodes[b])) / thick, k))
     # Of the edges around one turn, the longest is removed: nothing was scanned beside it.
-    keep, cut = np.ones(len(edges), bool), []
+    keep = np.ones(len(edges), bool)
+    cut: list[np.ndarray] = []
     for _, k in sorted(turning, reverse=True):
         middle, thick = nodes[edges[k]].mean(axis=0), float(thickness[edges[k]].max())
         if all(np.linalg.norm(middle - other) > _ARM * thick for other in cut):

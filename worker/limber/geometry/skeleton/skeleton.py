@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from limber.core.alignment import Alignment
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.sweep import tangents
 
 MEASURED, LIMITED, INTERPOLATED, UNRESOLVED, BRIDGED = 0, 1, 2, 3, 4
@@ -37,11 +39,11 @@ class Skeleton:
     nodes: np.ndarray
     parent: np.ndarray
     radius: np.ndarray
-    radius_sigma: np.ndarray = field(default=None)
-    branch: np.ndarray = field(default=None)
-    order: np.ndarray = field(default=None)
-    radius_state: np.ndarray = field(default=None)
-    probability: np.ndarray = field(default=None)
+    radius_sigma: np.ndarray = field(default=cast(np.ndarray, None))
+    branch: np.ndarray = field(default=cast(np.ndarray, None))
+    order: np.ndarray = field(default=cast(np.ndarray, None))
+    radius_state: np.ndarray = field(default=cast(np.ndarray, None))
+    probability: np.ndarray = field(default=cast(np.ndarray, None))
 
     def __post_init__(self) -> None:
         count = len(self.nodes)
@@ -229,13 +231,13 @@ def _check_tree(nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray) -> No
         raise InputError(f"The skeleton has {len(roots)} roots (nodes {names}).",
                          "A branch has exactly one root.", fix)
     if (parent >= len(nodes)).any():
-        bad = int(np.flatnonzero(parent >= len(nodes))[0])
-        raise InputError(f"Skeleton node {bad + 1} has a parent that does not exist in the file.",
+        lost = int(np.flatnonzero(parent >= len(nodes))[0])
+        raise InputError(f"Skeleton node {lost + 1} has a parent that does not exist in the file.",
                          "Each node except the root must have another node as its parent.", fix)
     depth = _depths(parent)
     if (depth < 0).any():
-        bad = int(np.flatnonzero(depth < 0)[0])
-        raise InputError(f"Skeleton node {bad + 1} is on a cycle, or is attached to one.",
+        lost = int(np.flatnonzero(depth < 0)[0])
+        raise InputError(f"Skeleton node {lost + 1} is on a cycle, or is attached to one.",
                          "The skeleton of a branch must be a tree.", fix)
 
 
@@ -350,6 +352,5 @@ def shortest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     if sine < 1e-12:
         if cosine > 0:
             return np.eye(3)
-        side = np.cross(start, np.eye(3)[int(np.argmin(np.abs(start)))])
-        return Rotation.from_rotvec(np.pi * side / np.linalg.norm(side)).as_matrix()
+        return Rotation.from_rotvec(np.pi * any_normal(start)).as_matrix()
     return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()

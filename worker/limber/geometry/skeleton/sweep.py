@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from limber.core.numerics.rigid import any_normal
+
 _SAME = 1e-13  # fraction of the coordinates; closer nodes coincide
 
 
@@ -22,14 +24,6 @@ def tangents(points: np.ndarray) -> np.ndarray:
     step /= np.maximum(np.linalg.norm(step, axis=1), 1e-300)[:, None]
     tangent = np.vstack([step[:1], step[:-1] + step[1:], step[-1:]])
     return tangent / np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
-
-
-def any_normal(direction: np.ndarray) -> np.ndarray:
-    """A unit vector orthogonal to ``direction`` [3]; the same for the same direction."""
-    axis = np.zeros(3)
-    axis[int(np.argmin(np.abs(direction)))] = 1.0
-    normal = np.cross(direction, axis)
-    return normal / np.linalg.norm(normal)
 
 
 def frames(points: np.ndarray, tangent: np.ndarray, normal: np.ndarray | None = None,

@@ -38,7 +38,7 @@ def level_surface(level: Callable[[np.ndarray], np.ndarray], low: np.ndarray, hi
     grid = value.reshape(count)
     for axis in range(3):  # the box closes cut surfaces
         for end in (0, -1):
-            face = [slice(None)] * 3
+            face: list[slice | int] = [slice(None)] * 3
             face[axis] = end
             grid[tuple(face)] = np.maximum(grid[tuple(face)], _NEAR * step)
     surface = _march(points, grid)

@@ -7,11 +7,13 @@ import importlib.util
 import sys
 import tempfile
 import types
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from limber.core.errors import MeshingError, MissingDependencyError, WorkError
+from limber.core.not_none import present
 from limber.core.processes.child import run_module
 from limber.core.processes.end_with_parent import end_by_kernel
 from limber.core.processes.process_limits import Limits
@@ -69,11 +71,11 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
             return result["nodes"], result["tets"]
 
 
-def _load_tetrahedralize():
+def _load_tetrahedralize() -> Callable:
     """Import pytetwild's numpy interface without pyvista, which only its package file needs."""
-    folders = importlib.util.find_spec("pytetwild").submodule_search_locations
+    found = importlib.util.find_spec("pytetwild")
     package = types.ModuleType("pytetwild")
-    package.__path__ = list(folders)
+    package.__path__ = list(present(found, "package pytetwild").submodule_search_locations or [])
     sys.modules["pytetwild"] = package
     from pytetwild.pytetwild import tetrahedralize
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError, MeshingError
+from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import (
     arc_lengths,
@@ -289,7 +290,7 @@ def _matched(corner: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.nd
         Whether the corners must be reversed to run counter-clockwise, shape [j]; normals, shape [j,
         3].
     """
-    first = _unit(np.cross(tangent, np.eye(3)[np.argmin(np.abs(tangent), axis=1)]))
+    first = any_normal(tangent)
     second = np.cross(tangent, first)
     flat = corner - corner.mean(axis=0)
     angle = np.arctan2(second @ flat.T, first @ flat.T)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from limber.core.numerics.rigid import any_normal
 from limber.planning.certificate.subsolution import (
     CURVATURE_FACTOR,
     RIM,
@@ -98,8 +99,7 @@ def _axes(start: np.ndarray, goal: np.ndarray, chart: Chart) -> np.ndarray:
         along, normal = direction, np.zeros(3)
     first = along / np.linalg.norm(along)
     if not normal.any():
-        normal = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
-        normal /= np.linalg.norm(normal)
+        normal = any_normal(first)
     return np.stack([first, np.cross(normal, first), normal])
 
 

@@ -138,11 +138,12 @@ class Limits:
         values, inner = sampled_sizes(known.samples), ~known.region.is_face()
         found = dict.fromkeys(UNITS, 0.0)
         for name, limit in self.asked().items():
-            if values.get(name) is None:
+            value = values.get(name)
+            if value is None:
                 raise InputError(f"The energy field contains no {name.replace('_', ' ')}.",
                                  "An older version of Limber sampled it.",
                                  "Run `limber energy` again with --force.")
-            size = np.abs(values[name])
+            size = np.abs(value)
             near = inner & (size > _NEAR[0] * limit) & (size < _NEAR[1] * limit)
             near = near if near.sum() >= _FEWEST else inner
             off = np.quantile(np.abs(missed[name][near]), _COVERED)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.core.numerics.compiled import compiled
+from limber.core.numerics.rigid import any_normal
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,7 @@ class Chart:
         if radius <= 0.0 or not np.linalg.norm(arm) > 0.0:
             return cls(np.zeros(3), 0.0, np.eye(3))
         outward = arm / np.linalg.norm(arm)
-        first = np.cross(outward, np.eye(3)[np.argmin(np.abs(outward))])
-        first /= np.linalg.norm(first)
+        first = any_normal(outward)
         return cls(np.asarray(pivot, float), float(radius),
                    np.stack([first, np.cross(outward, first), outward]))
 

@@ -14,6 +14,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.mechanics import StaticResult
 from limber.planning.field.grasp_model import GraspModel, Guess
@@ -93,7 +94,7 @@ class LearntGraspModel(GraspModel):
     def tangents(self, displacement: np.ndarray) -> np.ndarray:
         known = self._last.get("result")
         if known is not None and known.displacement is displacement:
-            return known.tangents
+            return present(known.tangents, "tangent")
         return super().tangents(displacement)
 
     def _corrected(self, state: ReducedState) -> CorrectedResult | None:

@@ -212,7 +212,9 @@ def _apart(pairs: list[tuple[int, int, np.ndarray]], known: Sequence[Solved], bi
     with two shapes is nearer than any known one.
     """
     flat = chart.map(np.array([one.pose[:3] for one in known]))
-    positions, used, chosen = np.array([one.pose[:3] for one in known]), set(), []
+    positions = np.array([one.pose[:3] for one in known])
+    used: set[int] = set()
+    chosen = []
     for first, second, about in pairs:
         if not used.isdisjoint(about.tolist()):
             continue
@@ -332,7 +334,7 @@ def walk_energy_surface(solvers: SolverPool, count: int, *, deflection: float, s
 def _walk(grasp_model: GraspModel, across: np.ndarray, outward: float,
           progress: Progress = SILENT) -> list[tuple[Solved | None, Solved | None]]:
     """Return the states under each force [n, 3], also drawn ``outward`` [N]."""
-    pairs = []
+    pairs: list[tuple[Solved | None, Solved | None]] = []
     for number, force in enumerate(across):
         progress(number / len(across), "finding the low-energy surface")
         slack = _under(grasp_model, force, grasp_model.rest) if force.any() else grasp_model.rest
@@ -537,8 +539,8 @@ def _asked(bad: list[Solved], targets: np.ndarray) -> np.ndarray:
 
 
 def _counted(bad: list[Solved]) -> dict[str, int]:
-    reasons = [one.trouble for one in bad]
-    return {str(reason): reasons.count(reason) for reason in sorted(set(reasons))}
+    reasons = [str(one.trouble) for one in bad]
+    return {reason: reasons.count(reason) for reason in sorted(set(reasons))}
 
 
 def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,

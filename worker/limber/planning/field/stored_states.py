@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -103,7 +104,7 @@ def samples_of(good: Sequence[Solved], rejected: np.ndarray) -> GraspSamples:
 _STATES = 6  # states around a position that are used
 _SURE = 0.02  # fraction of the length by which they may differ from the nearest state
 _DISTINCT_STATES = 0.002  # fraction of the length by which two states differ
-_KERNEL = {"kernel": "cubic", "smoothing": 1e-9}
+_KERNEL: dict[str, Any] = {"kernel": "cubic", "smoothing": 1e-9}
 _STRAIGHT = 0.9  # cosine of a path's turn below which it is not continued
 _STRAIN_DIFFERENCE = 1e-4  # fraction of a state's change by which its strain's change is measured
 
@@ -124,7 +125,8 @@ def guess_of(grasp_model: GraspModel, known: Sequence[Solved], positions: np.nda
     """
     if not grasp_model.needs_guess:
         return Guess()
-    length, states = grasp_model.reach.arc_length, []
+    length = grasp_model.reach.arc_length
+    states: list[Solved] = []
     for k in np.argsort(np.linalg.norm(positions - position, axis=1), kind="stable")[:2 * _STATES]:
         gaps = [np.linalg.norm(one.pose[:3] - positions[k]) for one in states]
         if known[k].has_tangents and min(gaps, default=np.inf) > _DISTINCT_STATES * length:
@@ -187,7 +189,8 @@ def blended(grasp_model: GraspModel, shares: Sequence[Share]) -> Guess:
     """
     if not grasp_model.needs_guess:
         return Guess()
-    strains, strain = grasp_model.model.strains, 0.0
+    strains = grasp_model.model.strains
+    strain: Any = 0.0
     for weight, displacement, change in shares:
         own = strains(displacement)
         near = strains(displacement + _STRAIN_DIFFERENCE * change)

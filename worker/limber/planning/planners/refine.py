@@ -14,6 +14,8 @@ to the branch's stiffness: chords in space leave the valley between their ends.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
 import scipy
@@ -111,7 +113,8 @@ def smooth_cost(path: np.ndarray, energy_field: EnergyField, weights: EdgeWeight
     edges = np.diff(path, axis=0)
     lengths = np.sqrt((edges**2).sum(axis=1) + _MIN_GAP**2)
     direction = edges / lengths[:, None]
-    energy = slope = 0.0
+    energy: Any = 0.0
+    slope: Any = 0.0
     rate = np.full(len(edges), weights.length)
     gradient = np.zeros_like(path)
     if weights.energy > 0.0:
@@ -265,6 +268,16 @@ class _Excess:
     weight: float = _WEIGHTS[0]
 
 
+def _along(outward: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda push: push[:, None] * outward
+
+
+def _load_slope(known: EnergyField, name: str, load: np.ndarray, points: np.ndarray,
+                active: np.ndarray) -> np.ndarray:
+    """Slope of a load's size at the points with the indices ``active``, shape [k, 3]."""
+    return np.sign(load[active])[:, None] * known.load_gradient(points[active], name)
+
+
 @dataclass
 class Limited:
     """The limits on a path's points [n, 3] and their multipliers.
@@ -340,7 +353,7 @@ class Limited:
                 if np.isfinite(bound):
                     outward = side * np.eye(3)[axis] / scale
                     yield _Excess((side * (points[:, axis] - bound) + self.margin) / scale,
-                                  lambda push, outward=outward: push[:, None] * outward)
+                                  _along(outward))
         inside = min(_INSIDE * problem.goal.tolerance, self.margin)
         outside = (problem.goal_excess(points[-1]) + inside) / scale
         yield _Excess(np.array([outside]), lambda push: self._at_end(points, push))
@@ -367,9 +380,8 @@ class Limited:
         for row, (name, limit) in enumerate(zip(known.load_names, limits.max_loads, strict=True)):
             if limit < np.inf:
                 load = known.load(points, name)
-                yield excess(np.abs(load), limit, 2 + row, lambda active, load=load, name=name:
-                             np.sign(load[active])[:, None]
-                             * known.load_gradient(points[active], name))
+                yield excess(np.abs(load), limit, 2 + row,
+                             partial(_load_slope, known, name, load, points))
         if limits.max_force < np.inf:
             force = known.force(points)
             size = np.linalg.norm(force, axis=1)

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import HungTwig
@@ -280,9 +281,7 @@ def _section(offset: np.ndarray, segment: _Segment, volume: np.ndarray, young: n
              shear: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Principal axes (rows, the tangent last), E I about them [N m^2] and G J of a segment."""
     tangent = segment.tangent
-    helper = np.eye(3)[np.abs(tangent).argmin()]
-    first = np.cross(tangent, helper)
-    first /= np.linalg.norm(first)
+    first = any_normal(tangent)
     second = np.cross(tangent, first)
     flat = offset @ np.stack([first, second], axis=1)
     weight = volume * young

@@ -11,7 +11,7 @@ from limber.cell.cell_file import Cell
 from limber.cell.known_arms import arm_named
 from limber.cell.obstacles import Box, Obstacle, Solid
 from limber.cell.reach_and_collision import drawn_arm, drawn_gripper
-from limber.core.numerics.rigid import matrices
+from limber.core.numerics.rigid import any_normal, matrices
 from limber.results.cell_picture import camera_edges
 from limber.results.scene.arrays import SceneData
 
@@ -101,8 +101,7 @@ def _capsule(start: np.ndarray, end: np.ndarray, radius: float) -> _Part:
     vector = end - start
     length = float(np.linalg.norm(vector))
     axis = vector / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
-    first = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
-    first /= np.linalg.norm(first)
+    first = any_normal(axis)
     around = 2 * np.pi * np.arange(_SIDES) / _SIDES
     circle = np.outer(np.cos(around), first) + np.outer(np.sin(around), np.cross(axis, first))
     round_end = np.linspace(0.0, 0.5 * np.pi, _RINGS + 1)[:-1]

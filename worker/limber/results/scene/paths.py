@@ -72,8 +72,10 @@ def _add_path(data: SceneData, key: str, table: dict[str, np.ndarray]) -> None:
 
 
 def _add_trees(data: SceneData, branch: Branch, plan: str) -> None:
-    """Add the search trees."""
+    """Add the search trees; a user may have deleted their file, which is large."""
     data.info["trees"] = {}
+    if not branch.has(f"plans/{plan}-trees.csv"):
+        return
     trees = read_trees(branch.path(f"plans/{plan}-trees.csv"))
     for planner, key in _TREES.items():
         if planner in trees:

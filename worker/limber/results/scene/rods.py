@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.core.numerics.rigid import any_normal
 from limber.results.scene.arrays import SceneData
 from limber.results.scene.colours import colours_of
 
@@ -70,10 +71,7 @@ def rods(points: np.ndarray, lines: np.ndarray, radius: float | np.ndarray,
     vector = points[lines[:, 1]] - points[lines[:, 0]]
     length = np.linalg.norm(vector, axis=1)
     lines, vector = lines[length > 0], vector[length > 0] / length[length > 0, None]
-    # Perpendicular to a line: built from the axis least along it.
-    least = np.eye(3)[np.abs(vector).argmin(axis=1)]
-    first = np.cross(vector, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    first = any_normal(vector)
     second = np.cross(vector, first)
     angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
     ring = (first[:, None] * np.cos(angle)[:, None] + second[:, None] * np.sin(angle)[:, None])

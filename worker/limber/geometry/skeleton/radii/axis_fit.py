@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import SuperLU, splu
 
+from limber.core.numerics.rigid import any_normal
 from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.radii.fit_kernels import (
     Match,
@@ -38,7 +39,6 @@ from limber.geometry.skeleton.radii.visible_sides import (
     side_uncertainty,
 )
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
-from limber.geometry.skeleton.sweep import any_normal
 
 # Smoothness of axes and radii: second differences along each run, by their bandwidth.
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import i0e
 
+from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.radii.fit_kernels import Match, reach_on_circle
 from limber.geometry.skeleton.skeleton import Skeleton
 
@@ -202,7 +203,7 @@ def fit_seen_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weig
         turns = np.linalg.solve(information[:2, :2] + prior, score[:2])
         turns *= min(1.0, _TURN / max(float(np.linalg.norm(turns)), 1e-300))
         view = view + _across(view) @ turns
-        view /= np.linalg.norm(view)
+        view = view / np.linalg.norm(view)
     if not limit_free:
         return _one_side(view, first.limit, first.limit_sigma)
     score, information = _score_and_information(out, axis, sharpness, bessel, weight, view,
@@ -234,8 +235,7 @@ def _score_and_information(out: np.ndarray, axis: np.ndarray, sharpness: np.ndar
 
 def _across(view: np.ndarray) -> np.ndarray:
     """Two unit vectors orthogonal to the view and to each other, shape [3, 2]."""
-    other = np.cross(view, np.eye(3)[np.argmin(np.abs(view))])
-    other /= np.linalg.norm(other)
+    other = any_normal(view)
     return np.stack([other, np.cross(view, other)], axis=1)
 
 
@@ -286,8 +286,8 @@ def evenly_seen(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match
         step = np.linalg.norm(nodes[own] - nodes[np.maximum(skeleton.parent[own], 0)], axis=1)
         along, total = np.cumsum(step), np.vstack([np.zeros(3), np.cumsum(sums[own], axis=0)])
         reach = _WINDOW * np.maximum(radius[own], _NOISY_WINDOW * noise)
-        first, last = (np.searchsorted(along, along + offset, side) for offset, side in (
-            (-reach, "left"), (reach, "right")))
+        first = np.searchsorted(along, along - reach, "left")
+        last = np.searchsorted(along, along + reach, "right")
         count, mean, square = (total[last] - total[first]).T
         even[own] = (count > _TELLING) & (np.abs(mean) < _ASKEW * count) & (
             square > _NARROW * count)
