@@ -9,6 +9,7 @@ import pytest
 from benchmarks import table
 from benchmarks.table import Asked, Part, Row, Setting, allowance, rows_of, share_met
 from benchmarks.trials import Budget, go_on, parsed_seconds, side_by_side
+from benchmarks.worker_fuzz import LINE_READERS, READERS, TEMPLATE, outcome
 from limber.core.errors import InputError
 from limber.core.progress import SILENT
 
@@ -219,3 +220,11 @@ def test_every_bench_is_a_table_of_parts(name):
     rows = [asked for part in parts.values() if not part.alone for asked in part.gives]
     assert len(set(rows)) == len(rows) > 5
     assert all(part.gives and 0 < part.seconds < 900 for part in parts.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(READERS.keys() - LINE_READERS.keys()))
+def test_a_reader_of_the_fuzz_reads_its_own_files(name, tmp_path):
+    """Before anything is mutated: else the fuzz would only try what refuses."""
+    made = READERS[name].make(TEMPLATE, tmp_path)
+    assert made and {outcome(READERS[name], path) for path in made} == {("read", "")}

@@ -206,7 +206,7 @@ def cell_trial(task: tuple[int, int, int], calibration: CalibrationEntry, pull_c
 def _estimated(pulls: list[Pull], subject: Subject) -> Estimate:
     """Result of `limber estimate`, its mesh's stiffness corrected, or its refusal."""
     found = fit_branch(pulls, subject, SETTINGS, log=EvaluationLog(None, ""))
-    require_result(found)
+    require_result(found, subject.skeleton)
     judge_model(found, subject, pulls[0].entry.grasp, SETTINGS, axes=None, cloud=None)
     return found
 

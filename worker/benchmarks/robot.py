@@ -1,4 +1,4 @@
-"""The robot's table: kinematics, stop times, faults, the stream, paths; all on the virtual robot.
+"""The robot's table: stop times, faults, the stream, paths; all on the virtual robot.
 
 No real robot was measured. Times are those of this computer under its load at the moment; the
 virtual controller and the driver share it.
@@ -49,11 +49,6 @@ from limber.robot.virtual.launch import VirtualRobot
 _ADDRESS = "127.0.0.71"
 
 
-_KINEMATICS = (
-    Asked("kinematics: position of every inverse solution, 10,000 poses, 7 arms", "1e-9 m"),
-    Asked("kinematics: poses whose own joints are not among the solutions", "0"),
-    Asked("kinematics against an independent library: position", "1e-9 m"),
-    Asked("poses with another number of inverse solutions than the library's", "0"))
 _STOP_SECONDS = {125: 0.012, 500: 0.006}
 """Required time [s], by the controller's rate [Hz]."""
 _FAULT_RUNS, _NAMED_SHARE = 5, 0.95
@@ -69,41 +64,6 @@ def _stop_asked(rate: int) -> tuple[Asked, ...]:
 def _faults_asked(told: str) -> tuple[Asked, ...]:
     return (Asked(f"{told} while moving: standstill and a report", "every one"),
             Asked(f"{told} while moving: the report names the fault", "95 %"))
-
-
-def _kinematics(setting: Setting) -> list[Row]:
-    rng = np.random.default_rng(setting.seed)
-    worst, missing, count = 0.0, 0, 10_000 // len(ARMS) + 1
-    for arm in ARMS.values():
-        joints = rng.uniform(-np.pi, np.pi, (count, 6))
-        frames = arm.forward(joints)
-        solutions = arm.inverse(frames)
-        exist = np.isfinite(solutions).all(axis=-1)
-        again = arm.forward(np.nan_to_num(solutions))
-        worst = max(worst, float(np.linalg.norm(
-            (again - frames[:, None])[..., :3, 3], axis=-1)[exist].max()))
-        apart = np.abs((solutions - joints[:, None] + np.pi) % (2 * np.pi) - np.pi).max(axis=-1)
-        missing += int(np.sum(~(np.nanmin(apart, axis=1) < 1e-6)))
-    total = count * len(ARMS)
-    found = [Row(*_KINEMATICS[0], f"{worst:.1e} m", worst < 1e-9, total),
-             Row(*_KINEMATICS[1], str(missing), missing == 0, total)]
-    try:
-        import ur_analytic_ik
-    except ImportError:
-        return [*found, *(Row(*asked, "library not installed", None, 0)
-                          for asked in _KINEMATICS[2:])]
-    off, lacking = 0.0, 0
-    for name, arm in ARMS.items():
-        library = getattr(ur_analytic_ik, name)
-        joints = rng.uniform(-np.pi, np.pi, (count, 6))
-        frames = arm.forward(joints)
-        theirs = np.array([library.forward_kinematics(*row) for row in joints])
-        off = max(off, float(np.abs(frames - theirs)[:, :3, 3].max()))
-        ours = np.isfinite(arm.inverse(frames)).all(axis=-1).sum(axis=1)
-        lacking += sum(len(library.inverse_kinematics(frame)) != number
-                       for frame, number in zip(frames, ours, strict=True))
-    return [*found, Row(*_KINEMATICS[2], f"{off:.1e} m", off < 1e-9, total),
-            Row(*_KINEMATICS[3], str(lacking), lacking == 0, total)]
 
 
 @dataclass(frozen=True)
@@ -270,7 +230,6 @@ def _watched(run: Callable[[Setting, Voided], list[Row]]) -> Callable[[Setting],
 
 
 PARTS = {
-    "kinematics": Part(_kinematics, 10, _KINEMATICS),
     "stop-500": Part(_watched(partial(_stop_time, model="ur5e")), 15, _stop_asked(500),
                      grows=True),
     "stop-125": Part(_watched(partial(_stop_time, model="ur5")), 15, _stop_asked(125), grows=True),

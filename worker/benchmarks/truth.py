@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks import bad_recordings, drawn_branches, estimation, scan_loops, silicone_beam
+from benchmarks import drawn_branches, estimation, scan_loops, silicone_beam
 from benchmarks import mechanics_reduced as reduced
 from benchmarks.drawn_branches import (
     FIRST_PULL,
@@ -221,7 +221,7 @@ def _followed(action: str, pulls: list[Pull], truth: Truth, cell: CellErrors,
 
 def _fitted(pulls: list[Pull], subject: Subject) -> Estimate:
     found = fit_branch(pulls, subject, _SETTINGS, log=EvaluationLog(None, ""))
-    require_result(found)
+    require_result(found, subject.skeleton)
     return found
 
 
@@ -267,7 +267,6 @@ PARTS = {
     "starts": Part(_start_row, 20, (_START,), grows=True),
     "advice": Part(_advice_row, 30, (_ADVICE,), grows=True),
     "paper": Part(_paper_row, 60, (_PAPER,)),
-    "bad-recordings": Part(bad_recordings.refused_row, 80, (bad_recordings.ROW,), grows=True),
     "beam": Part(silicone_beam.beam_rows, 60, silicone_beam.BEAM_ROWS),
     "real-beam": Part(silicone_beam.real_row, 60, (silicone_beam.REAL_ROW,)),
     "sag": Part(silicone_beam.sag_row, 20, (silicone_beam.SAG_ROW,), grows=True),

@@ -22,13 +22,11 @@ import numpy as np
 
 import limber
 from benchmarks import worker_batches as batches
-from benchmarks import worker_exports as exports
 from benchmarks import worker_fuzz
 from benchmarks.estimation import RINGING, ringing_row
 from benchmarks.table import Asked, Part, Row, Setting, last_json, limber_command
 from benchmarks.worker_branch_files import TEMPLATE
 from benchmarks.worker_hostile import HOSTILE_ROWS, hostile
-from benchmarks.worker_reports import REPORT_ROWS, reported
 from limber.core.errors import LimberError
 from limber.core.numerics.compiled import KernelCache, cache_folder
 from limber.geometry.cloud import preparation
@@ -410,10 +408,8 @@ def _own_names() -> set[str]:
 PARTS = {
     "hostile": Part(hostile, 60, HOSTILE_ROWS, grows=True),
     **worker_fuzz.PARTS,
-    "readers": Part(reported, 120, REPORT_ROWS),
     "kernel-cache": Part(kernels, 60, (KERNELS_ROW,), grows=True),
     "start-up": Part(_start_up, 15, tuple(_START_UP.values())),
-    "exports": Part(exports.exported, 60, exports.EXPORT_ROWS, grows=True),
     "ringing": Part(ringing_row, 30, (RINGING,), grows=True),
     "demo": Part(run_demo, 90, DEMO_ROWS),
     "readme": Part(run_readme, 60, (README_ROW,), grows=True),

@@ -173,7 +173,8 @@ def _search_file(template: Path, folder: Path) -> list[Path]:
     found = result_of_skeleton(read_skeleton(template / "skeleton.csv"),
                                read_points(template / "cloud.ply").points[::10])
     place = np.array([0.1, 0.2, 0.3])
-    found = replace(found, loops=[0.1], second_base=place, other_root=place, bridges=[
+    found = replace(found, loops=[0.1], second_base=place, root_ends=[
+        {"at": at, "probability": 0.5} for at in (place, 2 * place)], bridges=[
         {"from": place, "to": 2 * place, "length": 0.1, "price": 1.5}], split_off=[
         {"points": 3, "distance": 0.1, "at": place}], unlikely=[
         {"length": 0.01, "at": place, "probability": 0.2}])

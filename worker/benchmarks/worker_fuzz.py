@@ -543,7 +543,8 @@ class _Child:
             self._process.wait()
 
 
-def _outcome(reader: Reader, template: Path, file: Path) -> tuple[str, str]:
+def outcome(reader: Reader, file: Path, template: Path = TEMPLATE) -> tuple[str, str]:
+    """What a reader makes of a file: a word, and the message."""
     try:
         result = reader.read(template, file)
     except LimberError as error:
@@ -595,7 +596,7 @@ def _main(template: Path) -> None:
     print("ready", flush=True)
     for line in sys.stdin:
         name, file = line.rstrip("\n").split("\t")
-        word, told = _outcome(READERS[name], template, Path(file))
+        word, told = outcome(READERS[name], Path(file), template)
         assert word in _WORDS
         print("\n" + json.dumps({"word": word, "told": told[:400]}), flush=True)
 
