@@ -13,8 +13,7 @@ from limber.geometry.tets.tet_mesh import mark
 from limber.geometry.tets.tree_sweep import curved_beam
 from limber.mechanics.pull_simulation import load_case_of, motion_of
 from limber.mechanics.settings import SimulateSettings
-from limber.recordings.recorded_grasp import grasp_on
-from limber.recordings.recording import GraspEntry, PullEntry
+from limber.recordings.recording import GraspEntry, PullEntry, grasp_on
 from limber.recordings.synchronisation import frames_of
 from limber.store import Branch
 from limber.store.loading import load_branch, load_grasp_model, load_subject

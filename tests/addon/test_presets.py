@@ -4,7 +4,7 @@ import importlib
 
 import pytest
 
-from limber.recordings.sensor_presets import SENSORS
+from limber.recordings.sensor_checks import SENSORS
 from limber.stages.registry import stage_description
 
 

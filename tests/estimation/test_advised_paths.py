@@ -17,7 +17,7 @@ from limber.estimation.fitting.objective import EvaluationLog
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.simulated_pull import marked_points
 from limber.estimation.uncertainty.model_error import total_interval
-from limber.recordings.cell_errors import CalibrationEntry
+from limber.recordings.recording import CalibrationEntry
 
 OFF_M = 11e-3
 

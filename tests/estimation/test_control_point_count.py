@@ -14,7 +14,7 @@ from limber.estimation.fit import fit_branch
 from limber.estimation.fitting.objective import EvaluationLog
 from limber.estimation.settings import EstimateSettings
 from limber.geometry.skeleton.skeleton import FRACTIONS
-from limber.recordings.cell_errors import EXACT
+from limber.recordings.recording import EXACT
 
 QUICK = EstimateSettings(key_frames=6, hold_out=False, mesh_check=False, gravity=False,
                          poisson=0.35)

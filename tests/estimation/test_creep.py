@@ -10,8 +10,7 @@ from tests.estimation.test_nuisances import SETTINGS, objective_of
 from benchmarks.paper_branches import exact_pull, measured
 from limber.estimation.fit import fit_pulls
 from limber.estimation.fitting.nuisances import relaxed
-from limber.recordings.cell_errors import CalibrationEntry
-from limber.recordings.recording import Observations
+from limber.recordings.recording import CalibrationEntry, Observations
 
 SHARE, SECONDS = 0.12, 1.2
 CELL = CalibrationEntry(force_bias_sigma_n=0.1, force_drift_sigma_n=0.1, pose_sigma_m=2e-4,

@@ -11,8 +11,7 @@ import pytest
 from limber.core.progress import Progress
 from limber.estimation.online import follow
 from limber.estimation.online.filter import OnlineState
-from limber.recordings.cell_errors import EXACT, CalibrationEntry
-from limber.recordings.recording import write_pull
+from limber.recordings.recording import EXACT, CalibrationEntry, write_pull
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull
 from limber.estimation.uncertainty.shape_error import grip_error
 from limber.geometry.skeleton.skeleton import control_points
-from limber.recordings.cell_errors import EXACT
+from limber.recordings.recording import EXACT
 
 SETTINGS = EstimateSettings(hold_out=False, poisson=0.36, key_frames=4)
 SIGMA, STEP = 1e-3, 5e-4

@@ -14,9 +14,8 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.hung_load import settled
-from limber.recordings.importing.markers_under_load import against_load
-from limber.recordings.recorded_grasp import grasp_on
-from limber.recordings.recording import GraspEntry, Observations, read_pull
+from limber.recordings.markers_under_load import against_load
+from limber.recordings.recording import GraspEntry, Observations, grasp_on, read_pull
 from limber.recordings.registration import read_nominal, register
 
 BEAM = Path(__file__).parents[1] / "data" / "silicone_beam"

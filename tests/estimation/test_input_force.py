@@ -17,8 +17,7 @@ from limber.estimation.settings import EstimateSettings
 from limber.estimation.simulated_pull import VirtualPullSettings, simulate_pull
 from limber.mechanics.dynamics.integration import simulate_dynamics
 from limber.mechanics.points import point_operator
-from limber.recordings.recorded_grasp import grasp_on
-from limber.recordings.recording import GraspEntry
+from limber.recordings.recording import GraspEntry, grasp_on
 from limber.recordings.synchronisation import frames_of
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])

@@ -27,8 +27,7 @@ from limber.geometry.io.skeletons import write_cylinders
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
-from limber.recordings.recorded_grasp import grasp_on
-from limber.recordings.recording import GraspEntry
+from limber.recordings.recording import GraspEntry, grasp_on
 
 YOUNG = np.array([40e6, 22e6, 12e6, 3e6])
 

@@ -18,7 +18,7 @@ from limber.estimation.uncertainty.next_actions import (
     TORQUE_SIGMA_NM,
     Prospects,
 )
-from limber.recordings.cell_errors import CalibrationEntry
+from limber.recordings.recording import CalibrationEntry
 from limber.recordings.synchronisation import frames_of
 
 CELL = CalibrationEntry(force_bias_sigma_n=0.5, force_drift_sigma_n=0.5, repeat_sigma=0.03)

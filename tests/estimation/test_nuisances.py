@@ -36,8 +36,15 @@ from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.simulated_pull import CellErrors, marked_points, simulate_pull
 from limber.estimation.uncertainty.covariance import ADVICE, largest, variance_parts
 from limber.estimation.uncertainty.model_error import path_error, path_prescribed
-from limber.recordings.cell_errors import EXACT, CalibrationEntry, calibration_of
-from limber.recordings.recording import Observations, PullEntry, read_entry, write_entry
+from limber.recordings.recording import (
+    EXACT,
+    CalibrationEntry,
+    Observations,
+    PullEntry,
+    calibration_of,
+    read_entry,
+    write_entry,
+)
 from limber.recordings.synchronisation import frames_of
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])

@@ -23,7 +23,7 @@ from limber.estimation.uncertainty.shape_error import (
 )
 from limber.mechanics.added_masses import HungTwig
 from limber.mechanics.model import BranchModel
-from limber.recordings.cell_errors import CalibrationEntry
+from limber.recordings.recording import CalibrationEntry
 
 SETTINGS = EstimateSettings(hold_out=False, poisson=0.36)
 QUANTILE = 2.306 / 1.960  # Student's with 8 shapes over the normal one

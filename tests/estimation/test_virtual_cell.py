@@ -8,8 +8,15 @@ from limber.core.errors import InputError
 from limber.core.numerics.rigid import rotated
 from limber.estimation.settings import VirtualPullSettings
 from limber.estimation.simulated_pull import CellErrors
-from limber.recordings.cell_errors import EXACT, CalibrationEntry
-from limber.recordings.recording import GraspEntry, Observations, Pull, PullEntry, read_pull
+from limber.recordings.recording import (
+    EXACT,
+    CalibrationEntry,
+    GraspEntry,
+    Observations,
+    Pull,
+    PullEntry,
+    read_pull,
+)
 from limber.stages.pulls.virtual_pull import virtual_pull
 
 POINT = (0.0, 0.0, 0.3)

@@ -17,7 +17,7 @@ from limber.estimation.simulated_pull import TrueBranch, simulate_pull
 from limber.geometry.tets.tet_mesh import mark
 from limber.geometry.tets.tree_sweep import curved_beam
 from limber.mechanics.added_masses import PointMass
-from limber.recordings.cell_errors import CalibrationEntry
+from limber.recordings.recording import CalibrationEntry
 from limber.stages.pulls.virtual_pull import virtual_pull
 from limber.stages.shape.mesh import mesh_surface
 from limber.store import Branch

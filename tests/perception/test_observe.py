@@ -8,7 +8,7 @@ from limber.core.errors import InputError
 from limber.geometry.cloud.camera import depth_to_cloud, write_camera
 from limber.geometry.cloud.cloud import Cloud
 from limber.perception.observe import list_frames, observe, write_depth
-from limber.recordings.masks import segment_by_depth
+from limber.recordings.image_folders import segment_by_depth
 from limber.recordings.recording import GraspEntry, Pull, PullEntry
 
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)

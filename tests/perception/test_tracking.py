@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from limber.geometry.cloud.camera import SeenCloud, depth_to_cloud
 from limber.perception.curve import RestCurve
 from limber.perception.tracking import Anchor, CurveTracker, rest_offset
-from limber.recordings.masks import segment_by_depth
+from limber.recordings.image_folders import segment_by_depth
 
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)
 BENDS = np.linspace(0.0, 1.1, 12)

@@ -20,8 +20,7 @@ from limber.estimation.next_pull import (
 )
 from limber.estimation.settings import EstimateSettings
 from limber.planning.constraints.chance import Exposure, Surface
-from limber.recordings.cell_errors import EXACT
-from limber.recordings.recording import SensorEntry
+from limber.recordings.recording import EXACT, SensorEntry
 from limber.stages.pulls.suggest_pull import SuggestPullSettings, suggest_pull, verdict
 from limber.store import Branch
 from limber.store.loading import load_subject

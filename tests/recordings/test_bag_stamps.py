@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
-from limber.recordings.bags.bag_pull import pull_of_bag
-from limber.recordings.bags.bag_reader import Bag, Topic, read_bag
-from limber.recordings.bags.stamps import stamped
+from limber.recordings.bag_pull import pull_of_bag
+from limber.recordings.bag_reader import Bag, Topic, read_bag, stamped
 from limber.recordings.settings import ImportSettings
 
 REPORTED = (Path(__file__).parents[3] / "shared" / "data" / "reports" / "13-mcap-zero-stamps"

@@ -11,8 +11,8 @@ from limber.core.progress import SILENT
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.geometry.io.depth_images import depth_metres
 from limber.perception.observe import write_depth
-from limber.recordings.bags.bag_reader import read_bag
-from limber.recordings.bags.bag_writer import _Messages, write_mcap
+from limber.recordings.bag_pull import _Messages, write_mcap
+from limber.recordings.bag_reader import read_bag
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.settings import ImportSettings
 from limber.stages.pulls.export_pull import export_pull
@@ -315,7 +315,7 @@ def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
 def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, bare_folder):
     from limber.cell.cell_file import Cell, write_cell
     from limber.core.progress import Progress
-    from limber.recordings.cell_errors import CalibrationEntry
+    from limber.recordings.recording import CalibrationEntry
 
     with Written(tmp_path / "theirs.mcap") as bag:
         pulled(bag)
@@ -343,9 +343,9 @@ def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, ba
 def test_a_broken_description_in_a_bag_costs_only_itself(mcap, tmp_path, bare_folder, plain_pull,
                                                           monkeypatch):
     from limber.core.progress import Progress
-    from limber.recordings.bags import bag_writer
+    from limber.recordings import bag_pull
 
-    monkeypatch.setattr(bag_writer, "entry_text", lambda entry: "grasp = {radius_m = -1}")
+    monkeypatch.setattr(bag_pull, "entry_text", lambda entry: "grasp = {radius_m = -1}")
     write_mcap(tmp_path / "odd.mcap", tmp_path / "spring", plain_pull)
     said: list[str] = []
     import_pull(bare_folder, tmp_path / "odd.mcap", "odd", ImportSettings(),

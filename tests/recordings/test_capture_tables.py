@@ -7,8 +7,8 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.recordings.robot_tables import is_robot_table, robot_stream
-from limber.recordings.table_parts.clocks import clock_seconds
 from limber.recordings.tables import marker_stream, read_table, split_title, time_stream
+from limber.recordings.time_series import clock_seconds
 
 MOTIVE = (Path(__file__).parents[3] / "shared" / "data" / "reports" / "17-motive-csv"
           / "motive.csv")

@@ -10,8 +10,7 @@ from limber.core.errors import InputError
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.force_slope import read_force_displacement
-from limber.recordings.recorded_grasp import grasp_on
-from limber.recordings.recording import GraspEntry, read_pull
+from limber.recordings.recording import GraspEntry, grasp_on, read_pull
 from limber.store import Branch
 from limber.store.loading import load_mesh, load_skeleton
 

@@ -13,14 +13,14 @@ from limber.core.errors import InputError
 from limber.geometry.cloud.camera import D455, read_camera, read_mask, write_camera
 from limber.geometry.io.depth_images import depth_metres
 from limber.perception.observe import list_frames, write_depth
-from limber.recordings.importing.import_request import ImportRequest
-from limber.recordings.importing.recording_formats import RECORDINGS
+from limber.recordings.import_request import ImportRequest
 from limber.recordings.recording import (
     POSE_COLUMNS,
     WRENCH_COLUMNS,
     read_pull,
     write_pull,
 )
+from limber.recordings.recording_formats import RECORDINGS
 from limber.recordings.settings import ImportSettings
 from limber.recordings.time_series import Stream, read_stream, write_stream
 from limber.stages.pulls.import_pull import import_pull

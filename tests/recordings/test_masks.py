@@ -9,7 +9,7 @@ from PIL import Image
 
 from limber.core.errors import InputError, MissingDependencyError
 from limber.geometry.cloud.camera import read_mask
-from limber.recordings.masks import YoloSegmenter, segment_by_depth
+from limber.recordings.image_folders import YoloSegmenter, segment_by_depth
 
 
 def test_depth_range_and_small_pieces():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from limber.cli.main import call
-from limber.recordings.importing.recording_formats import RECORDINGS, RecordingFormat
 from limber.recordings.recording import read_pull, write_pull
+from limber.recordings.recording_formats import RECORDINGS, RecordingFormat
 from limber.recordings.time_series import Stream
 from limber.stages.registry import stage_description
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
-from limber.recordings.importing.import_request import BranchFrame, require_on_branch
+from limber.recordings.import_request import BranchFrame, require_on_branch
 from limber.recordings.recording import GraspEntry
 from limber.recordings.registration import register
 

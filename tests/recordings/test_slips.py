@@ -7,7 +7,7 @@ import pytest
 
 from limber.core.alignment import Alignment
 from limber.core.errors import InputError
-from limber.recordings.importing.slips import likely_slip, require_no_slip
+from limber.recordings.import_request import likely_slip, require_no_slip
 from limber.recordings.recording import Observations
 
 

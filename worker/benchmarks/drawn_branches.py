@@ -36,14 +36,14 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.materials.materials import young_weights
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
-from limber.recordings.cell_errors import CalibrationEntry
-from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import (
+    CalibrationEntry,
     GraspEntry,
     Observations,
     Pull,
     PullEntry,
     SensorEntry,
+    grasp_on,
 )
 from limber.stages.pulls.suggest_pull import SuggestPullSettings
 

@@ -40,7 +40,6 @@ from benchmarks.robot_ros import LEAST_ROS_S, ROS_ROWS, ros_door
 from benchmarks.robot_stops import RETREAT_ROW, STATES_ROW, retreats, wrong_states
 from benchmarks.table import Asked, Part, Row, Setting
 from benchmarks.trials import Trial, column, sound
-from limber.cell.ur_arms import ARMS
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.trajectory import Trajectory, along, densely

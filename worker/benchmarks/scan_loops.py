@@ -30,8 +30,7 @@ from limber.geometry.reconstruction import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
 from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, control_points
-from limber.recordings.cell_errors import CalibrationEntry
-from limber.recordings.recording import Pull, write_pull
+from limber.recordings.recording import CalibrationEntry, Pull, write_pull
 from limber.recordings.settings import ImportSettings
 from limber.stages.moduli.estimate import estimate
 from limber.stages.pulls.import_pull import import_pull

@@ -33,8 +33,7 @@ from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.simulated_pull import CellErrors
 from limber.estimation.uncertainty.next_actions import ANOTHER_PULL
-from limber.recordings.cell_errors import CalibrationEntry
-from limber.recordings.recording import Pull
+from limber.recordings.recording import CalibrationEntry, Pull
 
 _CALIBRATED = CalibrationEntry(pose_sigma_m=2e-4, pose_sigma_rad=3.5e-3)
 

@@ -241,8 +241,8 @@ def _mcap(template: Path, folder: Path) -> list[Path]:
 
 def _bag(_template: Path, path: Path) -> Any:
     """A bag, up to the pull made from it."""
-    from limber.recordings.bags.bag_pull import pull_of_bag
-    from limber.recordings.bags.bag_reader import read_bag
+    from limber.recordings.bag_pull import pull_of_bag
+    from limber.recordings.bag_reader import read_bag
     from limber.recordings.settings import ImportSettings
 
     with tempfile.TemporaryDirectory() as folder:

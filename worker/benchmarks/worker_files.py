@@ -195,8 +195,8 @@ def _c3d(_template: Path, folder: Path) -> list[Path]:
 
 
 def _read_c3d(_template: Path, path: Path) -> Any:
-    from limber.recordings.importing.import_request import ImportRequest
-    from limber.recordings.importing.recording_formats import RECORDINGS
+    from limber.recordings.import_request import ImportRequest
+    from limber.recordings.recording_formats import RECORDINGS
 
     return RECORDINGS.read(path, request=ImportRequest(path))
 

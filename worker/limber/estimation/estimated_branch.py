@@ -20,8 +20,7 @@ from limber.mechanics.added_masses import PointMass
 from limber.mechanics.loads.loaded_branch import is_stable
 from limber.mechanics.materials.materials import LayeredSection, RayleighDamping, young_weights
 from limber.mechanics.model import BranchModel
-from limber.recordings.cell_errors import CalibrationEntry, calibration_of
-from limber.recordings.recording import Pull, PullEntry
+from limber.recordings.recording import CalibrationEntry, Pull, PullEntry, calibration_of
 from limber.recordings.synchronisation import Frames, frames_of
 
 

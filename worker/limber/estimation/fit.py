@@ -65,8 +65,7 @@ from limber.estimation.uncertainty.identifiability import (
     require_own_frame,
     require_scale,
 )
-from limber.recordings.cell_errors import calibration_of
-from limber.recordings.recording import Pull
+from limber.recordings.recording import Pull, calibration_of
 from limber.recordings.sensor_checks import force_unit_suspicion
 
 FAR_FROM_FOLDING = 0.25

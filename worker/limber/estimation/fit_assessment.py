@@ -46,9 +46,7 @@ from limber.estimation.uncertainty.shape_error import (
 )
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.materials.materials import LayeredSection
-from limber.recordings.cell_errors import calibration_of
-from limber.recordings.recorded_grasp import grasp_on
-from limber.recordings.recording import GraspEntry, Pull
+from limber.recordings.recording import GraspEntry, Pull, calibration_of, grasp_on
 from limber.recordings.sensor_checks import PLAUSIBLE_YOUNG_PA
 
 MISFIT_FACTOR = 4.0

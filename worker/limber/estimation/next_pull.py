@@ -26,14 +26,15 @@ from limber.estimation.settings import EstimateSettings
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.strain import strain_state
-from limber.recordings.cell_errors import CalibrationEntry, calibration_of
-from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import (
+    CalibrationEntry,
     GraspEntry,
     Observations,
     Pull,
     PullEntry,
     SensorEntry,
+    calibration_of,
+    grasp_on,
 )
 
 UNKNOWN_SCALE = 1.15

@@ -16,7 +16,7 @@ from limber.core.settings import (
 if TYPE_CHECKING:
     import numpy as np
 
-    from limber.recordings.cell_errors import CalibrationEntry
+    from limber.recordings.recording import CalibrationEntry
 
 
 class EstimateSettings(Settings):
@@ -249,7 +249,7 @@ class VirtualPullSettings(Settings):
     @property
     def calibration(self) -> "CalibrationEntry":
         """Standard deviations of the cell's errors; those not requested are exact."""
-        from limber.recordings.cell_errors import EXACT, CalibrationEntry
+        from limber.recordings.recording import EXACT, CalibrationEntry
 
         begun = CalibrationEntry() if self.cell_errors == "realistic" else EXACT
         sigmas = {"pose_sigma_m": self.pose_sigma, "pose_sigma_rad": self.pose_turn_sigma,

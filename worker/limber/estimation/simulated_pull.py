@@ -33,14 +33,15 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.perception.observe import write_depth
 from limber.perception.simulated_camera import render_depth, with_noise
-from limber.recordings.cell_errors import EXACT, CalibrationEntry
-from limber.recordings.recorded_grasp import grasp_on
 from limber.recordings.recording import (
+    EXACT,
+    CalibrationEntry,
     GraspEntry,
     Observations,
     Pull,
     PullEntry,
     SensorEntry,
+    grasp_on,
 )
 
 # Simulated errors of a cell: drawn once, then applied to its recordings.

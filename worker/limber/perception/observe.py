@@ -13,7 +13,7 @@ from limber.geometry.cloud.camera import Camera, SeenCloud, depth_to_cloud, read
 from limber.geometry.io.depth_images import depth_metres
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.perception.tracking import Anchor, CurveTracker, rest_offset
-from limber.recordings.masks import segment_by_depth
+from limber.recordings.image_folders import segment_by_depth
 from limber.recordings.recording import Observations, Pull
 
 CAMERA_OFFSET_M = 4e-3

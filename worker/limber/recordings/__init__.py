@@ -20,7 +20,7 @@ _PLACES = {
     "clean": "sensor_checks",
     "force_slope": "force_slope",
     "frames_of": "synchronisation",
-    "import_recording": "importing.pulls",
+    "import_recording": "importing",
     "read_pull": "recording",
     "read_table": "tables",
     "write_pull": "recording",

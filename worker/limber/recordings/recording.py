@@ -16,9 +16,84 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from limber.core.errors import InputError
 from limber.core.files.reading import read_toml, toml_content
 from limber.core.json_values import plain, validated
+from limber.core.numerics.rigid import rotation_matrix
 from limber.core.settings import possible_time
-from limber.recordings.cell_errors import CalibrationEntry
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.grasp import Grasp
 from limber.recordings.time_series import Stream, read_stream, write_stream
+
+# Calibration errors of a cell: standard deviations of errors constant over a recording.
+#
+# Noise averages out over frames; an error of a millimetre in the gripper's frame does not. A fit
+# treats these errors as unknowns, with the deviations given here as their prior.
+
+
+class CalibrationEntry(BaseModel):
+    """Standard deviations, under ``[calibration]`` of ``pull.toml``; 0: known exactly.
+
+    The defaults are those of a carefully set up cell without later measurement: a hand-eye
+    calibration accurate to a millimetre and a degree, a force sensor within 2 % whose zero drifts
+    by a newton (makers' sheets allow more; see the note on field errors), a camera accurate to a
+    millimetre.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    pose_sigma_m: float = Field(
+        1e-3, ge=0,
+        description="Position of the gripper's frame in the branch's frame, each axis.")
+    pose_sigma_rad: float = Field(
+        0.0175, ge=0,
+        description="Rotation of the gripper's frame in the branch's frame, each axis.")
+    pose_noise_m: float = Field(
+        1e-4, gt=0, description="Error of a single pose: the robot's repeatability.")
+    force_gain_sigma: float = Field(0.02, ge=0, description="Relative error of the force.")
+    force_bias_sigma_n: float = Field(
+        1.0, ge=0, description="Zero offset of the force, each axis.")
+    force_drift_sigma_n: float = Field(
+        1.0, ge=0, description="Drift of the force's zero over the recording, each axis.")
+    torque_bias_sigma_nm: float = Field(
+        0.05, ge=0, description="Zero offset of the torque, each axis.")
+    camera_sigma_m: float = Field(
+        1e-3, ge=0,
+        description="Position of the observer's frame in the branch's frame, each axis.")
+    camera_sigma_rad: float = Field(
+        1e-3, ge=0, description="Rotation of the observer's frame about the branch, each axis.")
+    point_sigma_m: float = Field(
+        5e-3, ge=0, description="Position of each observed point along the branch, relative to "
+        "its place on the scanned one, and across it unless rest_points_m states it. Scanned tips "
+        "were up to 16 mm short.")
+    clock_sigma_s: float = Field(
+        2e-3, ge=0,
+        description="Offset of the observer's clock from the robot's that remains after alignment.")
+    slip_sigma_m: float = Field(
+        5e-4, ge=0, description="Slip of the grasp along the branch from beginning to end.")
+    held_length_sigma_m: float = Field(
+        1e-3, ge=0, description="Half the length of the piece that a clamping gripper holds.")
+    repeat_sigma: float = Field(
+        0.02, ge=0, description="Relative variation of the stiffness of one branch between "
+        "recordings: creep, temperature, how it is held.")
+
+
+EXACT = CalibrationEntry(
+    pose_sigma_m=0.0, pose_sigma_rad=0.0, force_gain_sigma=0.0, force_bias_sigma_n=0.0,
+    force_drift_sigma_n=0.0, torque_bias_sigma_nm=0.0, camera_sigma_m=0.0, camera_sigma_rad=0.0,
+    point_sigma_m=0.0, clock_sigma_s=0.0, slip_sigma_m=0.0, held_length_sigma_m=0.0,
+    repeat_sigma=0.0)
+"""Calibration of a simulated cell without errors."""
+WITHOUT_GRIPPER = CalibrationEntry(
+    pose_sigma_m=0.0, pose_sigma_rad=0.0, force_gain_sigma=0.0, force_bias_sigma_n=0.0,
+    force_drift_sigma_n=0.0, torque_bias_sigma_nm=0.0, camera_sigma_m=0.0, camera_sigma_rad=1e-3,
+    point_sigma_m=0.0, clock_sigma_s=0.0, slip_sigma_m=0.0, held_length_sigma_m=0.0)
+"""Calibration for a stated load and markers registered to the branch at rest. The remaining error
+is the rotation of that registration.
+"""
+
+
+def calibration_of(entry: "PullEntry") -> CalibrationEntry:
+    """Return the calibration of a pull's cell; the defaults if its recording does not state it."""
+    return entry.calibration or CalibrationEntry()
+
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 WRENCH_COLUMNS = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
@@ -285,3 +360,43 @@ def _marker_observations(path: Path, stream: Stream) -> Observations:
     partly = np.isfinite(positions).any(axis=2) & ~np.isfinite(positions).all(axis=2)
     positions = np.where(partly[..., None], np.nan, positions)
     return Observations(stream.times, positions)
+
+
+# The recorded grasp on any mesh that simulates it.
+
+LEAST_NODES = 6
+"""Fewest nodes of a patch; a smaller one is widened."""
+
+
+def grasp_on(mesh: TetMesh, entry: GraspEntry) -> Grasp:
+    """Return the recorded grasp as a patch of a mesh.
+
+    Its centre is the recorded point. A patch of under 6 nodes is widened; the recorded length held
+    by a clamping gripper is kept.
+
+    Raises:
+        InputError: the point is not on the branch, or is in its fixed base.
+    """
+    point = np.array(entry.point_m)
+    distance = np.sort(np.linalg.norm(mesh.nodes - point, axis=1))
+    if entry.mode == "rigid":
+        is_off = distance[0] > 3 * entry.radius_m
+        return Grasp.gripping(mesh, point, entry.radius_m, 1 if is_off else LEAST_NODES)
+    if distance[0] > 3 * entry.radius_m:
+        return Grasp.at(mesh, point, entry.radius_m, entry.mode)
+    radius = max(entry.radius_m, distance[min(LEAST_NODES, len(distance)) - 1] * (1 + 1e-9))
+    return Grasp.at(mesh, point, radius, entry.mode)
+
+
+def pose_on(grasp: Grasp, entry: GraspEntry, pose: np.ndarray) -> np.ndarray:
+    """Return the pose [m, rad] of a mesh's patch for a recorded pose of the grasp point."""
+    arm = grasp.centre - np.array(entry.point_m)
+    turn = rotation_matrix(pose[3:]) if grasp.mode == "rigid" else np.eye(3)
+    return np.concatenate([pose[:3] + turn @ arm, pose[3:]])
+
+
+def point_of(grasp: Grasp, entry: GraspEntry, pose: np.ndarray) -> np.ndarray:
+    """Return the recorded grasp point [m], shape [3], for a pose of a mesh's patch [m, rad]."""
+    arm = np.array(entry.point_m) - grasp.centre
+    turn = rotation_matrix(pose[3:]) if grasp.mode == "rigid" else np.eye(3)
+    return pose[:3] + turn @ arm

@@ -14,7 +14,7 @@ from limber.core.settings import (
     possible_force,
     possible_time,
 )
-from limber.recordings.importing.recording_formats import kind_names
+from limber.recordings.recording_formats import kind_names
 
 
 class ImportSettings(Settings):

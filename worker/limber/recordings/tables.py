@@ -6,6 +6,7 @@ and count it in milliseconds. Here they are converted to streams in SI units on 
 """
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,25 +17,326 @@ from limber.core.constants import FORCE_UNITS_N, UNIT_METRES
 from limber.core.errors import InputError
 from limber.core.files import text_columns
 from limber.core.files.text_columns import LENGTHS, plain
-from limber.recordings.table_parts.capture_titles import capture_preamble
-from limber.recordings.table_parts.clocks import (
+from limber.recordings.time_series import (
     TIME_UNITS_S,
+    Stream,
+    clock_seconds,
+    in_order,
     in_seconds,
     is_time,
     unit_in_name,
 )
-from limber.recordings.table_parts.rows import (
-    fields_of,
-    first_numbers,
-    is_clock,
-    number_of,
-    section_of,
-    separator_of,
-    text_of,
-    words_in,
-)
-from limber.recordings.table_parts.serial_log import without_arrows
-from limber.recordings.time_series import Stream, in_order
+
+# The lines of a table as text, split into fields, and the start of its numbers.
+
+_COLUMN = 20
+"""Rows that make single numbers a column."""
+_EMPTY = ("", "nan", "na", "n/a", "null", "none", "-")
+
+
+def section_of(lines: list[str]) -> list[str]:
+    """Return the lines that are not empty; of a Vicon file only its trajectories, of a LabVIEW file
+    those below its headers.
+    """
+    ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")]
+    if ends:
+        return [line for line in lines[ends[-1] + 1:] if line.strip()]
+    begin = next((k for k, line in enumerate(lines)
+                  if line.strip('",;\t \ufeff').lower() == "trajectories"), None)
+    if begin is None:
+        return [line for line in lines if line.strip()]
+    end = next((k for k in range(begin, len(lines)) if not lines[k].strip(",;\t ")), len(lines))
+    return lines[begin:end]
+
+
+def is_clock(part: str) -> bool:
+    """Return whether a field is a date or a time of day."""
+    try:
+        float(part.replace(",", "."))
+    except ValueError:
+        return clock_seconds(part) is not None
+    return False
+
+
+def text_of(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises:
+        InputError: it cannot be read, or is not text.
+    """
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
+                         "Check the path and the file.") from error
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return raw.decode("utf-16", errors="replace")
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = raw.decode("latin-1")
+    if "\x00" in text:
+        raise InputError(f"{path} is not a text file.", "A table of numbers was expected.",
+                         "Export it as CSV.")
+    return text
+
+
+def separator_of(lines: list[str]) -> str | None:
+    """Return the separator of the fields; None is white space."""
+    sample = lines[-20:]
+    for sign in ("\t", ";", ","):
+        counts = [line.count(sign) for line in sample]
+        # The last line may be truncated.
+        if counts and np.median(counts) >= 1 and (
+                np.mean(np.array(counts[:-1] or counts) == np.median(counts)) > 0.6):
+            return sign
+    return None
+
+
+def fields_of(line: str, separator: str | None) -> list[str]:
+    """Return the fields of a line without quotes."""
+    # A unit in brackets belongs to the title before it.
+    parts = line.split(separator) if separator else re.sub(r"\s+(?=[\[(])", "", line).split()
+    return [part.strip().strip('"').strip() for part in parts]
+
+
+def number_of(text: str, comma: bool) -> float | None:
+    """Return a number, a date or time of day in seconds, NaN for an empty field, None for a word.
+
+    Args:
+        text: The field.
+        comma: Whether decimals may be commas.
+    """
+    if text.lower() in _EMPTY:
+        return np.nan
+    try:
+        number = float(text.replace(",", ".") if comma else text)
+    except ValueError:
+        return clock_seconds(text)
+    return None if np.isinf(number) else number
+
+
+def first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:
+    """Return the index of the first row of numbers, and the number of its fields.
+
+    Raises:
+        InputError: there is none.
+    """
+    for index, row in enumerate(rows):
+        words = words_in(row)
+        known = [part for part in row if part.lower() not in _EMPTY]
+        follows = rows[index + 1] if index + 1 < len(rows) else row
+        # A preamble (NO_OF_FRAMES 600) also has numbers, but never two consecutive rows of several
+        # numbers, nor words at the same positions twice.
+        if (len(row) > 1 or _is_column(rows[index:index + _COLUMN])) and (
+                len(known) - len(words) > len(row) // 2) and (
+                not words or (words == words_in(follows) and len(words) <= len(row) // 3)) and (
+                len(follows) == len(row) or index + 2 >= len(rows)):
+            return index, len(row)
+    raise InputError(f"{path} has no row of numbers." if rows else f"{path} is empty.",
+                     "A header and rows of numbers were expected.",
+                     "Check the file, or export it again.")
+
+
+def _is_column(rows: list[list[str]]) -> bool:
+    """Whether these are readings alone: a preamble has fewer single numbers below each other."""
+    return len(rows) == _COLUMN and all(len(row) == 1 and not words_in(row) for row in rows)
+
+
+def words_in(row: list[str]) -> list[int]:
+    """Return which fields are neither numbers nor empty."""
+    return [k for k, part in enumerate(row) if number_of(part, True) is None]
+
+
+# Motion capture titles in several rows: Motive, Vicon Nexus, Qualisys, OpenSim's TRC.
+#
+# One row has the letters of the axes, a row above it the markers' names, and in some formats a row
+# below it the units. The quantity and the rate are in a preamble.
+
+_RATES = ("exportframerate", "framerate", "captureframerate", "frequency", "datarate",
+          "camerarate", "samplerate", "samplingrate", "samplefrequency", "samplingfrequency")
+_UNIT_KEYS = ("lengthunits", "units")
+_KINDS = ("position", "rotation", "markerquality", "meanmarkererror", "quality", "error")
+_TYPES = ("marker", "rigid body marker", "bone marker", "rigid body", "bone")
+"""Motive's types that count as markers; the first one present is used."""
+
+
+@dataclass(frozen=True)
+class Preamble:
+    """Content of the rows above the numbers of a capture.
+
+    Attributes:
+        titles: Titles of the columns; those of markers are ``NAME:X``, with a unit if rows have it.
+            None if they do not span several rows.
+        rate_hz: Frames per second, if stated.
+        unit: Unit of length, if the preamble states one, as spelled in the file.
+    """
+
+    titles: list[str] | None
+    rate_hz: float | None
+    unit: str | None
+
+
+def capture_preamble(above: Sequence[Sequence[str]], width: int,
+                     comments: Sequence[str] = ()) -> Preamble:
+    """Return what the rows above the numbers state about a capture.
+
+    Args:
+        above: Cells of these rows.
+        width: Number of columns of numbers.
+        comments: Lines of comments, without their marks.
+    """
+    rows = [[*row[:width], *[""] * (width - len(row))] for row in above]
+    at = next((k for k in reversed(range(len(rows))) if len(above[k]) <= width + 1
+               and sum(_axis(cell) is not None for cell in rows[k]) >= 3), None)
+    titles = _without_axes(above, width) if at is None or at == 0 else _titled(rows, at)
+    is_qualisys = any(row and _letters(row[0]) == "markernames" for row in above)
+    rate = _stated(above, _RATES) or _stated(
+        [_pair(line) for line in (*comments, *map(" ".join, above))], _RATES)
+    if rate is None and titles is not None:
+        # Vicon writes the rate alone in a row.
+        rate = next((row[0] for row in above if row and _is_plain_number(row[0])
+                     and not any(row[1:])), None)
+    unit = _stated(above, _UNIT_KEYS)
+    has_rate = rate and _is_plain_number(rate) and float(rate)
+    return Preamble(titles, float(rate) if rate and has_rate else None,
+                    unit or ("mm" if is_qualisys else None))
+
+
+def _titled(rows: list[list[str]], at: int) -> list[str] | None:
+    axes = [_axis(cell) for cell in rows[at]]
+    columns = [k for k, axis in enumerate(axes) if axis]
+    named = next((row for row in rows[:at] if "name" in (_letters(row[0]), _letters(row[1]))),
+                 None) or next((row for row in reversed(rows[:at]) if row[columns[0]]
+                                and not _is_kind(row)), None)
+    if named is None:
+        return None
+    labels = _filled(named, columns)
+    kinds = _filled(next((row for row in rows[:at] if _is_kind(row)), []), columns)
+    types = _filled(next((row for row in rows[:at] if "type" in (_letters(row[0]),
+                                                               _letters(row[1]))), []), columns)
+    present = {kind.lower() for kind in types.values()}
+    chosen = next((kind for kind in _TYPES if kind in present), None)
+    units = rows[at + 1] if at + 1 < len(rows) else []
+    titles = []
+    for k, axis in enumerate(axes):
+        if axis is None:
+            own = rows[at][k] or (named[k] if k < min(columns) else "")
+            titles.append(own or f"column {k + 1}")
+        elif kinds.get(k, "position").lower() != "position" or (
+                chosen is not None and types.get(k, "").lower() != chosen):
+            titles.append(f"{labels.get(k, '')} {axis} of {types.get(k, '')} {kinds.get(k, '')} "
+                          "rotation, not used")
+        else:
+            unit = f" ({units[k].strip('()[] ')})" if k < len(units) and units[k] else ""
+            titles.append(f"{labels.get(k, 'm0')}:{axis}{unit}")
+    return titles
+
+
+def _without_axes(above: Sequence[Sequence[str]], width: int) -> list[str] | None:
+    """Qualisys names its markers only in the preamble."""
+    names = next(([cell for cell in row[1:] if cell] for row in above
+                  if row and _letters(row[0]) == "markernames"), None)
+    if names is None or width - 3 * len(names) not in (0, 1, 2):
+        return None
+    if any(len(row) == width and _letters(row[0]) in ("frame", "time") for row in above):
+        return None
+    return [*("Frame", "Time (s)")[:width - 3 * len(names)],
+            *(f"{name}:{axis}" for name in names for axis in "XYZ")]
+
+
+def _filled(row: Sequence[str], columns: Sequence[int]) -> dict[int, str]:
+    """A row's cells at columns; an empty one takes the value to its left."""
+    found, last = {}, ""
+    for k in columns:
+        last = (row[k] if k < len(row) else "") or last
+        if last:
+            found[k] = last
+    return found
+
+
+def _is_kind(row: Sequence[str]) -> bool:
+    words = {_letters(cell) for cell in row if cell}
+    return "position" in words and words <= set(_KINDS)
+
+
+def _stated(above: Sequence[Sequence[str]], keys: Sequence[str]) -> str | None:
+    """The value after one of the keys, or below it."""
+    for key in keys:
+        for row, below in zip(above, [*above[1:], []], strict=False):
+            at = next((k for k, cell in enumerate(row) if _letters(cell) == key), None)
+            if at is None:
+                continue
+            for value in (row[at + 1:at + 2], below[at:at + 1]):
+                if value and value[0] and (keys is not _RATES or _is_plain_number(value[0])) and (
+                        _letters(value[0]) not in (*_RATES, *_UNIT_KEYS, "origdatarate")):
+                    return value[0]
+    return None
+
+
+def _pair(line: str) -> list[str]:
+    """``Sampling rate [Hz]: 200`` or ``Sample Rate = 200 Hz``, as cells of a row."""
+    found = re.fullmatch(r"\W*([a-z ]+?)\s*[(\[]?(?:hz)?[)\]]?\s*[:=\s]\s*([\d.]+)\s*(?:hz)?\W*",
+                         line.lower())
+    return list(found.groups()) if found else []
+
+
+def _axis(cell: str) -> str | None:
+    found = re.fullmatch(r"([XYZxyz])\d*", cell)
+    return found.group(1).upper() if found else None
+
+
+def _letters(cell: str) -> str:
+    return re.sub(r"[^a-z]", "", cell.lower())
+
+
+def _is_plain_number(text: str) -> bool:
+    return re.fullmatch(r"\d+(\.\d*)?", text) is not None
+
+
+# Logs of the Arduino IDE's serial monitor: ``14:03:05.123 -> 0.25,1.5``.
+
+_LINE = re.compile(r"\s*(\d{1,2}:\d{2}:\d{2}(?:[.,]\d+)?)\s*->\s?(.*)")
+_PAIR = re.compile(r"([^\W\d][^:=]*)[:=]([-+.\d].*)")
+"""A reading as the serial plotter takes it: ``force:2.5``."""
+
+
+def without_arrows(lines: list[str]) -> list[str]:
+    """Return the lines of such a log as a table with titles; other lines as they are.
+
+    What the board prints before its first reading is left out, but for the titles right above.
+    """
+    found = [_LINE.fullmatch(line) for line in lines]
+    if 2 * sum(one is not None for one in found) <= len(lines):
+        return lines
+    stamped = [(one[1], re.sub(r"\s*([:=])\s*", r"\1", one[2])) for one in found if one is not None]
+    separator = separator_of([rest for _, rest in stamped])
+    rows = [(stamp, fields_of(rest, separator)) for stamp, rest in stamped]
+    pairs = [[_PAIR.fullmatch(part) for part in row] for _, row in rows]
+    titles = next(([pair[1] for pair in row if pair] for row in pairs if row and all(row)), [])
+    if titles:
+        rows = [(stamp, [pair[2] if pair else part for pair, part in zip(row, own, strict=True)])
+                for (stamp, own), row in zip(rows, pairs, strict=True)]
+    widths = Counter(len(row) for _, row in rows if _are_numbers(row))
+    # The first line of a log is often a part of one.
+    width = widths.most_common(1)[0][0] if widths else 0
+    first = next((k for k, (_, row) in enumerate(rows)
+                  if len(row) == width and _are_numbers(row)), len(rows))
+    above = rows[first - 1][1] if first else []
+    if len(titles) != width:
+        named = len(above) == width and not any(map(_is_reading, above))
+        titles = above if named else [f"reading_{k + 1}" for k in range(width)]
+    return ["\t".join(("time", *titles)),
+            *("\t".join((stamp, *row)) for stamp, row in rows[first:])]
+
+
+def _are_numbers(row: list[str]) -> bool:
+    return all(map(_is_reading, row))
+
+
+def _is_reading(part: str) -> bool:
+    return part != "" and number_of(part, True) is not None
+
 
 LENGTH_UNITS_M = {spelt: UNIT_METRES[unit] for spelt, unit in LENGTHS.items()}
 FORCE_NAMES_N = FORCE_UNITS_N | {

@@ -12,8 +12,7 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import WorkError
 from limber.core.files.tables import table_line
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
-from limber.recordings.cell_errors import CalibrationEntry
-from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, SensorEntry
+from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, CalibrationEntry, SensorEntry
 
 _FRAMES_FOR_NOISE = 15
 _LEAST_NOISE_M = 1e-4  # a tracker that smooths its points hides their noise

@@ -222,7 +222,7 @@ def all_schemas() -> dict[str, Any]:
     """
     from limber.geometry.cloud.preparation import LONGEST
     from limber.mechanics.materials.materials import SOURCE, SPECIES
-    from limber.recordings.sensor_presets import SENSORS
+    from limber.recordings.sensor_checks import SENSORS
 
     return {"format": FORMAT,
             "species": {"source": SOURCE,

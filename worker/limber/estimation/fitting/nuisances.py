@@ -17,8 +17,7 @@ from scipy.linalg import solve_triangular
 
 from limber.core.not_none import present
 from limber.estimation.forward.forward_model import Forward
-from limber.recordings.cell_errors import CalibrationEntry, calibration_of
-from limber.recordings.recording import PullEntry
+from limber.recordings.recording import CalibrationEntry, PullEntry, calibration_of
 from limber.recordings.synchronisation import Frames
 
 AXES = "xyz"

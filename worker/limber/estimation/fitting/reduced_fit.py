@@ -26,7 +26,7 @@ from limber.estimation.forward.forward_model import Forward, key_frames, travel
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.forward.reduced_pull import CorrectedForward, ReducedForward
 from limber.estimation.parameters import Values
-from limber.recordings.recorded_grasp import pose_on
+from limber.recordings.recording import pose_on
 from limber.reduced.model_cache import read_model, reduce_snapshots, write_model
 from limber.reduced.reduced_model import ReducedModel, ReducedSettings
 from limber.reduced.training import Trainer, TrainingSettings, sample_poses, sample_young

@@ -23,8 +23,7 @@ from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet
-from limber.recordings.recorded_grasp import grasp_on, pose_on
-from limber.recordings.recording import PullEntry
+from limber.recordings.recording import PullEntry, grasp_on, pose_on
 from limber.recordings.synchronisation import Frames
 
 

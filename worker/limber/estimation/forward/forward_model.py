@@ -18,8 +18,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import refined_solve
 from limber.mechanics.statics.solve import StaticSettings, solve_static
-from limber.recordings.cell_errors import calibration_of
-from limber.recordings.recording import GraspEntry, PullEntry
+from limber.recordings.recording import GraspEntry, PullEntry, calibration_of
 from limber.recordings.synchronisation import Frames
 
 # Direction of the branch at its observed points, at rest and in a deformed state.

@@ -33,8 +33,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces, static_sensitivities
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
-from limber.recordings.recorded_grasp import grasp_on, point_of, pose_on
-from limber.recordings.recording import PullEntry
+from limber.recordings.recording import PullEntry, grasp_on, point_of, pose_on
 from limber.recordings.synchronisation import Frames
 
 # The torque of a clamping gripper: whether it counts, and its derivatives.

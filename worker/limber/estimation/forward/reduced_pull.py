@@ -11,8 +11,7 @@ from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torq
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.points import point_operator
-from limber.recordings.recorded_grasp import pose_on
-from limber.recordings.recording import PullEntry
+from limber.recordings.recording import PullEntry, pose_on
 from limber.recordings.synchronisation import Frames
 from limber.reduced.reduced_model import ReducedModel, ReducedSensitivities, ReducedState
 

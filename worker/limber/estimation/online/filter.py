@@ -22,8 +22,7 @@ from limber.estimation.online.full_model import Beside, ExactFrame, Here
 from limber.estimation.parameters import YOUNG_BOUNDS_PA
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.points import point_operator
-from limber.recordings.recorded_grasp import pose_on
-from limber.recordings.recording import GraspEntry
+from limber.recordings.recording import GraspEntry, pose_on
 from limber.reduced.reduced_model import ReducedModel, ReducedState, ReducedStaticSettings
 
 # Information of the frames of a pull on the moduli: linearised and summed.

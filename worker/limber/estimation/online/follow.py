@@ -21,9 +21,7 @@ from limber.estimation.online.full_model import Beside, FullBranch, Here
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty.model_error import ModelError, geometry_error, total_interval
-from limber.recordings.cell_errors import calibration_of
-from limber.recordings.recorded_grasp import grasp_on
-from limber.recordings.recording import Observations, Pull, read_pull
+from limber.recordings.recording import Observations, Pull, calibration_of, grasp_on, read_pull
 from limber.recordings.sensor_checks import clean
 from limber.recordings.synchronisation import frames_of
 from limber.reduced.model_cache import build_reduced

@@ -17,8 +17,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import static_sensitivities
 from limber.mechanics.statics.solve import solve_static
-from limber.recordings.recorded_grasp import grasp_on, pose_on
-from limber.recordings.recording import GraspEntry
+from limber.recordings.recording import GraspEntry, grasp_on, pose_on
 from limber.reduced.model_cache import reduce_snapshots
 from limber.reduced.reduced_model import ReducedModel, ReducedSettings
 from limber.reduced.training import Trainer, sample_young

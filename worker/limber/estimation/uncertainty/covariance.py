@@ -14,7 +14,7 @@ from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.interpolation_prior import YoungField
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace
 from limber.estimation.uncertainty.drift import scale_steps
-from limber.recordings.cell_errors import calibration_of
+from limber.recordings.recording import calibration_of
 
 OUTLIER = 4.5
 """Standardised residual (RMS over axes) above which a measurement is reported as an outlier.

@@ -12,7 +12,7 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.forward_model import Forward
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.recordings.cell_errors import calibration_of
+from limber.recordings.recording import calibration_of
 
 # Why a measured force does not determine the scale of Young's modulus.
 

@@ -24,7 +24,7 @@ from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces
-from limber.recordings.cell_errors import CalibrationEntry, calibration_of
+from limber.recordings.recording import CalibrationEntry, calibration_of
 
 RADIUS_POWER = 4.0
 """Bending stiffness is Young's modulus times the radius to the fourth power."""

@@ -31,7 +31,7 @@ from limber.mechanics.materials.materials import LayeredSection
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import reactions
-from limber.recordings.cell_errors import calibration_of
+from limber.recordings.recording import calibration_of
 
 # First-order effect of shape and mass, which the fit assumes known, on pulls and moduli.
 #

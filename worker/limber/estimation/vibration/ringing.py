@@ -17,8 +17,8 @@ import scipy
 
 from limber.core.errors import InputError
 from limber.core.not_none import present
-from limber.recordings.importing.import_request import ImportRequest
-from limber.recordings.importing.recording_formats import RECORDINGS
+from limber.recordings.import_request import ImportRequest
+from limber.recordings.recording_formats import RECORDINGS
 from limber.recordings.tables import at_rate, read_table, split_title, time_stream
 from limber.recordings.time_series import MAD_TO_SIGMA, Stream, in_order
 

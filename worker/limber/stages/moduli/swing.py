@@ -83,7 +83,7 @@ def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
     """
     from limber.estimation.forward.forward_model import under_its_weight
     from limber.estimation.vibration.free_swing import SwingSeen, fit_swing
-    from limber.recordings.recorded_grasp import grasp_on
+    from limber.recordings.recording import grasp_on
     from limber.store.loading import load_subject, pulls_digest
 
     branch = Branch.open(branch_folder)

@@ -33,7 +33,7 @@ def export_pull(folder: Path, name: str, output: Path, *, progress: Progress = S
     Raises:
         InputError: there is no such pull, or the file cannot be written.
     """
-    from limber.recordings.bags.bag_writer import write_mcap
+    from limber.recordings.bag_pull import write_mcap
     from limber.recordings.recording import read_pull
 
     branch = Branch.read(folder)

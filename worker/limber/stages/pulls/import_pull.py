@@ -15,7 +15,7 @@ from limber.core.files.atomic import file_digest
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.geometry.io.formats import listed
-from limber.recordings.importing.recording_formats import RECORDINGS, recording_format
+from limber.recordings.recording_formats import RECORDINGS, recording_format
 from limber.recordings.settings import ImportSettings
 from limber.stages.inputs import BranchInputs, RunOptions, argument, required
 from limber.stages.registry import StageDescription
@@ -23,7 +23,7 @@ from limber.stages.result import FORCE, POSE, Picture, Result, frozen, of_files,
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.recordings.importing.import_request import BranchFrame, RobotKnown
+    from limber.recordings.import_request import BranchFrame, RobotKnown
     from limber.results.report.section import Section
 
 
@@ -110,8 +110,8 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
     Raises:
         InputError: SOURCE cannot be read as the stated kind.
     """
-    from limber.recordings.importing.import_request import BranchFrame, ImportRequest
-    from limber.recordings.importing.pulls import import_recording
+    from limber.recordings.import_request import BranchFrame, ImportRequest
+    from limber.recordings.importing import import_recording
 
     source = Path(source)
     if not source.exists():
@@ -163,7 +163,7 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
         return settings, None
     from limber.cell.cell_file import read_cell
     from limber.core.numerics.rigid import matrices, pose_vectors
-    from limber.recordings.importing.import_request import RobotKnown
+    from limber.recordings.import_request import RobotKnown
     from limber.robot.recorder import known_errors, known_noise
 
     cell = read_cell(settings.cell)
@@ -186,7 +186,7 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | Non
 
 
 def _frame(branch: Branch, settings: ImportSettings) -> BranchFrame:
-    from limber.recordings.importing.import_request import BranchFrame
+    from limber.recordings.import_request import BranchFrame
     from limber.store.loading import load_mesh, load_skeleton
 
     loaded = settings.weight is not None or settings.load is not None

@@ -8,16 +8,22 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.not_none import present
-from limber.recordings.cell_errors import WITHOUT_GRIPPER, CalibrationEntry
 from limber.recordings.force_slope import ForceTable
 from limber.recordings.hung_load import settled, swung
-from limber.recordings.importing.import_request import (
+from limber.recordings.import_request import (
     ImportRequest,
     require_near,
     require_on_branch,
 )
-from limber.recordings.importing.recording_formats import RecordingFormat
-from limber.recordings.recording import Observations, Pull, SwingEntry, write_pull
+from limber.recordings.recording import (
+    WITHOUT_GRIPPER,
+    CalibrationEntry,
+    Observations,
+    Pull,
+    SwingEntry,
+    write_pull,
+)
+from limber.recordings.recording_formats import RecordingFormat
 from limber.recordings.time_series import Stream
 
 UNLOADED = 0.01

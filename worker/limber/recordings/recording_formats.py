@@ -7,8 +7,7 @@ from typing import Literal
 from limber.geometry.io.formats import Format, Registry
 
 _TABLES = (".csv", ".tsv", ".txt", ".trc")
-_HERE = "limber.recordings.importing"
-_READERS = f"{_HERE}.readers"
+_READERS = "limber.recordings.importing"
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class RecordingFormat(Format):
 
 
 RECORDINGS = Registry("recording", "limber.recordings", [
-    RecordingFormat("bag", (".mcap", ".db3", ".bag"), f"{_HERE}.bag_import:read_bag_pull",
+    RecordingFormat("bag", (".mcap", ".db3", ".bag"), f"{_READERS}:read_bag_pull",
                     recognises=lambda path: (path / "metadata.yaml").is_file(), holds="pull",
                     about="ROS bag, file or folder"),
     RecordingFormat("pull", (), f"{_READERS}:read_folder", holds="pull", about="Limber pull",
@@ -35,15 +34,15 @@ RECORDINGS = Registry("recording", "limber.recordings", [
                     recognises=lambda path: (path / "depth").is_dir()),
     RecordingFormat("clouds", (), f"{_READERS}:read_clouds", holds="clouds",
                     recognises=Path.is_dir, about="folder of clouds"),
-    RecordingFormat("c3d", (".c3d",), f"{_HERE}.c3d:c3d_arrays", isolated=True, about="markers"),
+    RecordingFormat("c3d", (".c3d",), f"{_READERS}:c3d_arrays", isolated=True, about="markers"),
     RecordingFormat("force-displacement", _TABLES, f"{_READERS}:read_force_table",
                     recognises=f"{_READERS}:is_force_table", holds="force", about="force table"),
     RecordingFormat("robot", _TABLES, f"{_READERS}:read_robot", holds="robot", about="RTDE log",
                     recognises=f"{_READERS}:is_robot_log"),
     RecordingFormat("markers", _TABLES, f"{_READERS}:read_markers", about="markers",
                     recognises=Path.is_file),
-], of_arrays=f"{_HERE}.c3d:markers_of_arrays")
-"""Arrays read by a format are markers, as :func:`.c3d.c3d_arrays` gives them."""
+], of_arrays=f"{_READERS}:markers_of_arrays")
+"""Arrays read by a format are markers, as :func:`.importing.c3d_arrays` gives them."""
 
 
 def kind_names() -> tuple[str, ...]:

@@ -1,1 +1,0 @@
-"""Further parts of other programs' tables: clocks, and titles of several rows."""
