@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.foreign_files import CAPTURES, COUNT, M1, M2
 from limber.core.errors import InputError
 from limber.recordings.robot_tables import is_robot_table, robot_stream
 from limber.recordings.tables import marker_stream, read_table, split_title, time_stream
@@ -12,60 +13,12 @@ from limber.recordings.time_series import clock_seconds
 
 MOTIVE = (Path(__file__).parents[3] / "shared" / "data" / "reports" / "17-motive-csv"
           / "motive.csv")
-M1, M2 = np.array([0.1, 0.2, 0.3]), np.array([0.15, 0.22, 0.5])
-COUNT = 20
 
 
-def rows(first, scale, separator=",", more=()):
-    """Rows of two markers that move in x by 1 mm a frame."""
-    found = []
-    for k in range(COUNT):
-        values = np.r_[M1 + [1e-3 * k, 0, 0], M2 + [1e-3 * k, 0, 0]] * scale
-        found.append(separator.join([*first(k), *(f"{value:.6f}" for value in values), *more]))
-    return "\n".join(found) + "\n"
-
-
-def motive(unit, scale, rigid=False):
-    """Two markers; with ``rigid`` after a rigid body of a rotation, a position and an error."""
-    kinds, names = ["Marker"] * 6, ["M1"] * 3 + ["M2"] * 3
-    parts, axes = ["Position"] * 6, [*"XYZXYZ"]
-    if rigid:
-        kinds, names = ["Rigid Body"] * 8 + kinds, ["Branch"] * 8 + names
-        parts = ["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"] + parts
-        axes = [*"XYZWXYZ", "", *axes]
-    head = [f"Format Version,1.23,Export Frame Rate,100.0,Length Units,{unit}", ""]
-    head += [",".join(["", word, *cells]) for word, cells in (
-        ("Type", kinds), ("Name", names), ("ID", ["A1"] * len(names)), ("", parts))]
-    head.append(",".join(["Frame", "Time (Seconds)", *axes]))
-
-    def first(k):
-        return [str(k), f"{k / 100:.6f}", *(["0.5"] * 8 if rigid else [])]
-    return "\n".join(head) + "\n" + rows(first, scale)
-
-
-VICON = ("Trajectories\n100\n,,Beam:M1,,,Beam:M2,,\nFrame,Sub Frame,X,Y,Z,X,Y,Z\n"
-         ",,mm,mm,mm,mm,mm,mm\n" + rows(lambda k: [str(k + 1), "0"], 1e3))
-FILES = {
-    "motive.csv": motive("Millimeters", 1e3), "motive_m.csv": motive("Meters", 1),
-    "motive_rigid.csv": motive("Centimeters", 100, rigid=True), "vicon.csv": VICON,
-    "vicon_devices.csv": "Devices\n1000\n,,Force,,\nFrame,Sub Frame,Fx,Fy,Fz\n,,N,N,N\n"
-                         + "".join(f"{k},0,1,2,3\n" for k in range(90)) + "\n" + VICON,
-    "qualisys.tsv": "NO_OF_FRAMES\t20\nFREQUENCY\t100\nMARKER_NAMES\tM1\tM2\n"
-                    + rows(lambda k: [], 1e3, "\t"),
-    "qualisys_header.tsv": "NO_OF_FRAMES\t20\nFREQUENCY\t100\nMARKER_NAMES\tM1\tM2\nFrame\tTime\t"
-                           "M1 X\tM1 Y\tM1 Z\tM2 X\tM2 Y\tM2 Z\n"
-                           + rows(lambda k: [str(k + 1), f"{k / 100:.5f}"], 1e3, "\t"),
-    "opensim.trc": "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tCameraRate\tNumFrames\tNumMarkers\t"
-                   "Units\tOrigDataRate\n100.0\t100.0\t20\t2\tmm\t100.0\nFrame#\tTime\tM1\t\t\tM2"
-                   "\t\t\n\t\tX1\tY1\tZ1\tX2\tY2\tZ2\n\n"
-                   + rows(lambda k: [str(k + 1), f"{k / 100:.5f}"], 1e3, "\t"),
-}
-
-
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", CAPTURES)
 def test_markers_of_motion_capture(tmp_path, name):
     """Both markers, in metres, at 100 frames a second, in every program's layout."""
-    (tmp_path / name).write_text(FILES[name])
+    (tmp_path / name).write_text(CAPTURES[name])
     stream, labels = marker_stream(tmp_path / name)
     assert [label.rpartition(":")[2] for label in labels] == ["M1", "M2"]
     np.testing.assert_allclose(stream.values[0], np.r_[M1, M2], atol=1e-9)
@@ -77,7 +30,7 @@ def test_markers_of_motion_capture(tmp_path, name):
 @pytest.mark.parametrize("name", ["vicon.csv", "qualisys.tsv", "opensim.trc"])
 def test_a_capture_of_one_frame_is_refused(tmp_path, name):
     """Its last line may be cut short, and then there is none."""
-    text = FILES[name]
+    text = CAPTURES[name]
     (tmp_path / name).write_text(text[:text.index("0.150000" if name == "qualisys_header.tsv"
                                                   else "150.000000")])
     with pytest.raises(InputError):

@@ -1,35 +1,26 @@
 """Clouds as laser scanners write them: PTX and E57, several scans, each with its own pose."""
 
-import struct
-
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
+from benchmarks.foreign_files import (
+    FLOATS,
+    POINTS,
+    SCALED,
+    SHIFT,
+    SPHERES,
+    TURN,
+    WIDE,
+    e57,
+    packed,
+    ptx,
+)
 from limber.core.errors import InputError
 from limber.geometry.cloud.preparation import gathered
 from limber.geometry.io import clouds as clouds_module
 from limber.geometry.io import e57 as e57_module
 from limber.geometry.io.clouds import read_points
 from limber.geometry.io.e57 import checksums
-
-RNG = np.random.default_rng(5)
-POINTS = RNG.uniform(-2, 2, (50, 3)).round(4)
-TURN, SHIFT = Rotation.from_rotvec([0.2, -0.4, 1.1]), np.array([10.0, -4.0, 1.5])
-
-
-def ptx(path, *, colour, silent=0, cut=0):
-    """Two scans, the second turned and moved, with pixels that saw nothing."""
-    lines = []
-    for turn, shift in ((Rotation.identity(), np.zeros(3)), (TURN, SHIFT)):
-        own = turn.inv().apply(POINTS - shift)
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[3, :3] = turn.as_matrix().T, shift
-        rows = [" ".join(f"{v:.9f}" for v in point) + " 0.25" + (" 9 8 7" if colour else "")
-                for point in own] + ["0 0 0 0.5" + (" 0 0 0" if colour else "")] * silent
-        lines += [str(len(rows)), "1", "0 0 0", "1 0 0", "0 1 0", "0 0 1",
-                  *(" ".join(f"{v:.12f}" for v in row) for row in matrix), *rows]
-    path.write_text("\n".join(lines[:len(lines) - cut]) + "\n")
 
 
 @pytest.mark.parametrize(("colour", "silent"), [(False, 0), (True, 0), (True, 7)])
@@ -68,48 +59,6 @@ def test_ptx_that_is_none(tmp_path, text):
         (tmp_path / "a.ptx").write_text(text)
     with pytest.raises(InputError, match=r"cut short|header of a scan"):
         read_points(tmp_path / "a.ptx")
-
-
-def packed(values, bits):
-    """Whole numbers as E57 packs them: the lowest bit first."""
-    held = sum(int(value) << (bits * k) for k, value in enumerate(values))
-    return held.to_bytes((bits * len(values) + 7) // 8, "little")
-
-
-FLOATS = ("".join(f'<cartesian{a} type="Float"/>' for a in "XYZ"),
-          [POINTS[:, k].astype("<f8").tobytes() for k in range(3)])
-SCALED = ("".join(f'<cartesian{a} type="ScaledInteger" minimum="-20000" maximum="20000" '
-                  'scale="1e-4"/>' for a in "XYZ"),
-          [packed(np.round(POINTS[:, k] * 1e4).astype(int) + 20000, 16) for k in range(3)])
-WIDE = ("".join(f'<cartesian{a} type="ScaledInteger" minimum="{-2**60}" maximum="{2**60}" '
-                'scale="1e-4"/>' for a in "XYZ"),
-        [packed([int(v) + 2**60 for v in np.round(POINTS[:, k] * 1e4)], 62) for k in range(3)])
-SPHERES = ("".join(f'<spherical{a} type="Float"/>' for a in ("Range", "Azimuth", "Elevation")),
-           [column.astype("<f8").tobytes() for column in (
-               np.linalg.norm(POINTS, axis=1), np.arctan2(POINTS[:, 1], POINTS[:, 0]),
-               np.arcsin(POINTS[:, 2] / np.linalg.norm(POINTS, axis=1)))])
-
-
-def e57(path, columns, extra=("", ()), pose=""):
-    """One scan, its points in two packets that part each column's bytes anywhere."""
-    prototype, streams = columns[0] + extra[0], [*columns[1], *extra[1]]
-    body = b""
-    for half in (0, 1):
-        parts = [s[:len(s) // 3] if half == 0 else s[len(s) // 3:] for s in streams]
-        packet = struct.pack(f"<H{len(parts)}H", len(parts), *map(len, parts)) + b"".join(parts)
-        packet += bytes(-(len(packet) + 4) % 4)
-        body += struct.pack("<BBH", 1, 0, len(packet) + 3) + packet
-    section = struct.pack("<BxxxxxxxQQQ", 1, 32 + len(body), 48 + 32, 0) + body
-    xml = ('<?xml version="1.0"?><e57Root type="Structure" xmlns="urn:e57"><data3D type="Vector">'
-           f'<vectorChild type="Structure">{pose}<points type="CompressedVector" fileOffset="48" '
-           f'recordCount="{len(POINTS)}"><prototype type="Structure">{prototype}</prototype>'
-           '<codecs type="Vector"/></points></vectorChild></data3D></e57Root>').encode()
-    logical = 48 + len(section)
-    content = struct.pack("<8sIIQQQQ", b"ASTM-E57", 1, 0, 0, logical // 1020 * 1024
-                          + logical % 1020, len(xml), 1024) + section + xml
-    pages = np.frombuffer(content + bytes(-len(content) % 1020), np.uint8).reshape(-1, 1020)
-    path.write_bytes(np.hstack([pages, checksums(pages).astype(">u4")[:, None].view(np.uint8)]
-                               ).tobytes())
 
 
 def test_checksums_are_those_of_the_standard():
