@@ -5,8 +5,10 @@ import struct
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.io.e57 import checksums
 
+CLOUD = np.random.default_rng(0).normal(size=(200, 3)).round(5)
 POINTS = np.random.default_rng(5).uniform(-2, 2, (50, 3)).round(4)
 TURN, SHIFT = Rotation.from_rotvec([0.2, -0.4, 1.1]), np.array([10.0, -4.0, 1.5])
 
@@ -119,4 +121,67 @@ CAPTURES = {
                    "Units\tOrigDataRate\n100.0\t100.0\t20\t2\tmm\t100.0\nFrame#\tTime\tM1\t\t\tM2"
                    "\t\t\n\t\tX1\tY1\tZ1\tX2\tY2\tZ2\n\n"
                    + rows(lambda k: [str(k + 1), f"{k / 100:.5f}"], 1e3, "\t"),
+}
+
+
+def _write_pcd(path, kind):
+    header = ("# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\n"
+              f"COUNT 1 1 1 1\nWIDTH 200\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 200\n"
+              f"DATA {kind}\n")
+    table = np.column_stack([CLOUD, np.arange(200)]).astype(np.float32)
+    body = table.tobytes() if kind == "binary" else "\n".join(
+        " ".join(map(str, row)) for row in table).encode()
+    path.write_bytes(header.encode() + body)
+
+
+def _write_compressed_pcd(path):
+    from pypcd4 import Encoding, PointCloud
+
+    PointCloud.from_xyz_points(CLOUD.astype(np.float32)).save(
+        path, encoding=Encoding.BINARY_COMPRESSED)
+
+
+def write_ascii_ply(path):
+    rows = "\n".join(f"{x} {y} {z} 0 0 1 200 10 20" for x, y, z in CLOUD)
+    names = "".join(f"property float {n}\n" for n in ("x", "y", "z", "nx", "ny", "nz"))
+    names += "".join(f"property uchar {n}\n" for n in ("red", "green", "blue"))
+    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 200\n{names}end_header\n{rows}\n")
+
+
+def _write_las(path, point_format=3):
+    import laspy
+
+    content = laspy.create(point_format=point_format)
+    content.header.scales, content.header.offsets = [1e-5] * 3, [0, 0, 0]
+    content.x, content.y, content.z = CLOUD.T
+    content.intensity = np.arange(200)
+    content.write(path)
+
+
+def _write_faces(path):
+    from plyfile import PlyData, PlyElement
+
+    table = np.core.records.fromarrays(CLOUD.T.astype(np.float32), names="x,y,z")
+    face = np.zeros(4, [("vertex_indices", "i4", (3,))])
+    PlyData([PlyElement.describe(table, "vertex"), PlyElement.describe(face, "face")]).write(
+        str(path))
+
+
+CLOUDS = {
+    "a.xyz": lambda p: np.savetxt(p, CLOUD),
+    "a.csv": lambda p: np.savetxt(p, CLOUD, delimiter=",", header="x,y,z", comments=""),
+    "semicolon.txt": lambda p: np.savetxt(p, CLOUD, delimiter=";"),
+    "double.ply": lambda p: Cloud(CLOUD).write_ply(p),
+    "ascii.ply": write_ascii_ply,
+    "a.pcd": lambda p: _write_pcd(p, "ascii"),
+    "b.pcd": lambda p: _write_pcd(p, "binary"),
+    "c.pcd": _write_compressed_pcd,
+    "a.las": _write_las,
+    "a.laz": _write_las,
+    "b.las": lambda p: _write_las(p, 6),
+    "b.laz": lambda p: _write_las(p, 6),
+    "faces.ply": _write_faces,
+    "a.npy": lambda p: np.save(p, CLOUD),
+    "a.npz": lambda p: np.savez(p, points=CLOUD, intensity=np.arange(200)),
+    "a.obj": lambda p: p.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in CLOUD)),
 }

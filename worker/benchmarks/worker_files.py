@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.foreign_files import CAPTURES, FLOATS, SCALED, e57, ptx, sealed
+from benchmarks.foreign_files import CAPTURES, CLOUDS, FLOATS, SCALED, e57, ptx, sealed
 from benchmarks.worker_branch_files import Reader, template_file
 from limber.core.errors import InputError
 from limber.geometry.io.formats import Registry
@@ -23,56 +23,12 @@ from limber.store import Branch
 _PAGE = 1024
 
 
-def _points() -> np.ndarray:
-    rng = np.random.default_rng(5)
-    return np.column_stack([rng.normal(0, 0.01, (60, 2)), np.linspace(0, 0.5, 60)])
-
-
-def _ply(_template: Path, folder: Path) -> list[Path]:
-    from plyfile import PlyData, PlyElement
-
-    table = np.zeros(60, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1")])
-    for axis, values in zip("xyz", _points().T, strict=True):
-        table[axis] = values
-    face = np.zeros(4, [("vertex_indices", "i4", (3,))])
-    files = []
-    for name, is_text in (("binary.ply", False), ("text.ply", True)):
-        files.append(folder / name)
-        PlyData([PlyElement.describe(table, "vertex"), PlyElement.describe(face, "face")],
-                text=is_text).write(str(files[-1]))
+def _clouds(suffixes: str, _template: Path, folder: Path) -> list[Path]:
+    """Clouds in each form that these suffixes have."""
+    files = [folder / name for name in CLOUDS if Path(name).suffix in suffixes.split()]
+    for path in files:
+        CLOUDS[path.name](path)
     return files
-
-
-def _pcd(_template: Path, folder: Path) -> list[Path]:
-    from pypcd4 import Encoding, PointCloud
-
-    cloud = PointCloud.from_xyz_points(_points().astype(np.float32))
-    files = []
-    for encoding in (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED):
-        files.append(folder / f"{encoding.value}.pcd")
-        cloud.save(files[-1], encoding=encoding)
-    return files
-
-
-def _las(suffix: str, _template: Path, folder: Path) -> list[Path]:
-    import laspy
-
-    files = []
-    for version, form in (("1.2", 3), ("1.4", 6)):
-        header = laspy.LasHeader(point_format=form, version=version)
-        header.scales = np.full(3, 1e-4)
-        content = laspy.LasData(header)
-        content.x, content.y, content.z = _points().T
-        files.append(folder / f"{form}{suffix}")
-        content.write(str(files[-1]))
-    return files
-
-
-def _texts(_template: Path, folder: Path) -> list[Path]:
-    plain, headed = folder / "a.xyz", folder / "b.csv"
-    np.savetxt(plain, _points(), "%.5f")
-    np.savetxt(headed, _points(), "%.5f", ",", header="x,y,z", comments="")
-    return [plain, headed]
 
 
 def _meshes(suffix: str, _template: Path, folder: Path) -> list[Path]:
@@ -80,15 +36,6 @@ def _meshes(suffix: str, _template: Path, folder: Path) -> list[Path]:
 
     path = folder / f"ball{suffix}"
     trimesh.creation.icosphere(subdivisions=3, radius=0.1).export(path)
-    return [path]
-
-
-def _arrays(suffix: str, _template: Path, folder: Path) -> list[Path]:
-    path = folder / f"cloud{suffix}"
-    if suffix == ".npy":
-        np.save(path, _points())
-    else:
-        np.savez_compressed(path, points=_points(), intensity=np.ones(60))
     return [path]
 
 
@@ -456,15 +403,16 @@ def _markers(_template: Path, path: Path) -> Any:
 
 
 FILE_READERS: dict[str, Reader] = {
-    "PLY": Reader("binary", _ply, _cloud), "PCD": Reader("binary", _pcd, _cloud),
-    "XYZ": Reader("text", _texts, _cloud),
-    "LAS": Reader("binary", partial(_las, ".las"), _cloud),
-    "LAZ": Reader("binary", partial(_las, ".laz"), _cloud),
+    "PLY": Reader("binary", partial(_clouds, ".ply"), _cloud),
+    "PCD": Reader("binary", partial(_clouds, ".pcd"), _cloud),
+    "XYZ": Reader("text", partial(_clouds, ".xyz .csv"), _cloud),
+    "LAS": Reader("binary", partial(_clouds, ".las"), _cloud),
+    "LAZ": Reader("binary", partial(_clouds, ".laz"), _cloud),
     "OBJ": Reader("text", partial(_meshes, ".obj"), _cloud),
     "STL": Reader("binary", partial(_meshes, ".stl"), _cloud),
     "OFF": Reader("text", partial(_meshes, ".off"), _cloud),
-    "NPZ": Reader("npz", partial(_arrays, ".npz"), _cloud),
-    "NPY": Reader("binary", partial(_arrays, ".npy"), _cloud),
+    "NPZ": Reader("npz", partial(_clouds, ".npz"), _cloud),
+    "NPY": Reader("binary", partial(_clouds, ".npy"), _cloud),
     "PNG depth": Reader("binary", _pixels, _depth), "PNG mask": Reader("binary", _pixels, _mask),
     "camera TOML": Reader("text", _camera_file, _camera),
     "intrinsics JSON": Reader("json", _intrinsics, partial(_rgbd, "camera_intrinsic.json")),
@@ -481,9 +429,8 @@ FILE_READERS: dict[str, Reader] = {
     "ring CSV": Reader("text", partial(_decay, "ring.csv", "a_m_s2"), _ring),
     "wind CSV": Reader("text", partial(_decay, "wind.csv", "speed_m_s"), _wind),
     "MTG": Reader("text", partial(_cylinder_models, ".mtg"), partial(_read, SKELETONS)),
-    "add-on clouds": Reader("binary", lambda template, folder: [
-        *_ply(template, folder), *_texts(template, folder)],
-        partial(_addon_read, "clouds", "read_points")),
+    "add-on clouds": Reader("binary", partial(_clouds, ".ply .xyz .csv"),
+                            partial(_addon_read, "clouds", "read_points")),
     "add-on scene data": Reader("npz", _scene_file, partial(
         _addon_read, "scene_data", "read_scene_data"), True),
     "SWC": Reader("text", partial(template_file, "skeleton.swc"), partial(_read, SKELETONS)),

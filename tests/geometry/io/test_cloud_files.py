@@ -3,76 +3,25 @@
 import numpy as np
 import pytest
 
+from benchmarks.foreign_files import CLOUD as POINTS
+from benchmarks.foreign_files import CLOUDS, write_ascii_ply
 from limber.core.errors import InputError
-from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.io.clouds import read_cloud, read_points
 from limber.geometry.io.depth_images import read_depth
 
-POINTS = np.random.default_rng(0).normal(size=(200, 3)).round(5)
 
-
-def _write_pcd(path, kind):
-    header = ("# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\n"
-              f"COUNT 1 1 1 1\nWIDTH 200\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 200\n"
-              f"DATA {kind}\n")
-    table = np.column_stack([POINTS, np.arange(200)]).astype(np.float32)
-    body = table.tobytes() if kind == "binary" else "\n".join(
-        " ".join(map(str, row)) for row in table).encode()
-    path.write_bytes(header.encode() + body)
-
-
-def _write_compressed_pcd(path):
-    from pypcd4 import Encoding, PointCloud
-
-    PointCloud.from_xyz_points(POINTS.astype(np.float32)).save(
-        path, encoding=Encoding.BINARY_COMPRESSED)
-
-
-def _write_ascii_ply(path):
-    rows = "\n".join(f"{x} {y} {z} 0 0 1 200 10 20" for x, y, z in POINTS)
-    names = "".join(f"property float {n}\n" for n in ("x", "y", "z", "nx", "ny", "nz"))
-    names += "".join(f"property uchar {n}\n" for n in ("red", "green", "blue"))
-    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 200\n{names}end_header\n{rows}\n")
-
-
-def _write_las(path):
-    import laspy
-
-    content = laspy.create(point_format=3)
-    content.header.scales, content.header.offsets = [1e-5] * 3, [0, 0, 0]
-    content.x, content.y, content.z = POINTS.T
-    content.intensity = np.arange(200)
-    content.write(path)
-
-
-WRITERS = {
-    "a.xyz": lambda p: np.savetxt(p, POINTS),
-    "a.csv": lambda p: np.savetxt(p, POINTS, delimiter=",", header="x,y,z", comments=""),
-    "semicolon.txt": lambda p: np.savetxt(p, POINTS, delimiter=";"),
-    "double.ply": lambda p: Cloud(POINTS).write_ply(p),
-    "ascii.ply": _write_ascii_ply,
-    "a.pcd": lambda p: _write_pcd(p, "ascii"),
-    "b.pcd": lambda p: _write_pcd(p, "binary"),
-    "c.pcd": _write_compressed_pcd,
-    "a.las": _write_las,
-    "a.laz": _write_las,
-    "a.npz": lambda p: np.savez(p, points=POINTS, intensity=np.arange(200)),
-    "a.obj": lambda p: p.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in POINTS)),
-}
-
-
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("name", CLOUDS)
 def test_each_format_gives_the_points(tmp_path, name):
     """Positions agree to the precision of the format's own numbers."""
     path = tmp_path / name
-    WRITERS[name](path)
+    CLOUDS[name](path)
     np.testing.assert_allclose(read_points(path).points, POINTS, atol=2e-5)
 
 
 def test_attributes_are_kept(tmp_path):
     """Normals, colours and scalars survive reading and writing."""
     path = tmp_path / "a.ply"
-    _write_ascii_ply(path)
+    write_ascii_ply(path)
     cloud = read_points(path)
     cloud.write_ply(tmp_path / "b.ply")
     again = read_points(tmp_path / "b.ply")
