@@ -25,19 +25,6 @@ from limber.store import Branch
 
 _SCREEN = (1280, 800)
 _ROOT = Path(__file__).parents[2]
-_FRAME = Asked("frame write of 50,000 vertices", "0.5 ms")
-_GRAB = (Asked("grab loop on Blender's side, median / 95 %", "1 / 2 ms"),
-         Asked("pose to drawn mesh (without drawing), median / 95 %", "under 33 ms"),
-         Asked("memory over grabs", "flat"))
-_WINDOW = (Asked("grab in a window, frames per second", "30"),
-           Asked("grab in a window, mouse to drawn frame, median / 95 %", "95 %: 60 ms"))
-_IMPORT = (Asked("import of 1,000,000 points", "3 s"),
-           Asked("the interface stands while it is read / shown", "50 / 250 ms"))
-_REGISTER = Asked("registering", "100 ms")
-_JOBS = Asked("memory over job runs", "flat")
-_UNDO = Asked("undo and redo, random sequences", "state consistent, no crash")
-
-
 def _probed(setting: Setting, part: str) -> dict[str, Any]:
     """Results of one part of the probe, by measure; empty if Blender did not start."""
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
@@ -125,80 +112,66 @@ def _said(command: list[str], environment: dict[str, str]) -> dict[str, Any]:
     return found
 
 
-def _frame_rows(setting: Setting) -> list[Row]:
-    return [_row(_probed(setting, "frame write"), "frame write", _FRAME, "frames",
-                 lambda m: (f"{m['median_ms']:.2f} ms (95 %: {m['high_ms']:.2f})",
-                            m["median_ms"] <= 0.5))]
+Judged = Callable[[dict[str, Any]], tuple[str, bool]]
 
 
-def _grab_rows(setting: Setting) -> list[Row]:
-    found = _probed(setting, "grab")
-    return [
-        _row(found, "grab", _GRAB[0], "poses",
-             # Other programs had the processor for the rest of the time.
-             lambda m: (f"{m['median_ms']:.2f} / {m['high_ms']:.2f} ms (of the processor "
-                        f"{m['own_median_ms']:.2f} / {m['own_high_ms']:.2f})",
-                        m["median_ms"] <= 1 and m["high_ms"] <= 2)),
-        _row(found, "grab", _GRAB[1], "poses",
-             lambda m: (f"{m['drawn_median_ms']:.1f} / {m['drawn_high_ms']:.1f} ms ({m['who']})",
-                        m["drawn_high_ms"] < 33)),
-        _row(found, "grab memory", _GRAB[2], "grabs",
-             lambda m: (f"{m['grown_mb']:+.1f} MB over the last 4/5", m["grown_mb"] < 5))]
+def _part(part: str, seconds: float, *rows: tuple[Asked, str, str, Judged], grows: bool = False,
+          ) -> Part:
+    """A part of the probe: of each row the requirement, the measure that it is read from, the
+    number that gives its trials, if any, and what its numbers say.
+    """
+    def measured(setting: Setting) -> list[Row]:
+        found = _probed(setting, part)
+        return [_row(found.get(name), asked, *more) for asked, name, *more in rows]
+    return Part(measured, seconds, tuple(row[0] for row in rows), grows=grows)
 
 
-def _window_rows(setting: Setting) -> list[Row]:
-    found = _probed(setting, "window")
-    return [
-        _row(found, "window", _WINDOW[0], "frames",
-             lambda m: (f"{m['per_second']:.0f} ({m['who']})", m["per_second"] >= 30)),
-        _row(found, "window", _WINDOW[1], "frames",
-             lambda m: (f"{m['median_ms']:.0f} / {m['high_ms']:.0f} ms", m["high_ms"] <= 60))]
-
-
-def _import_rows(setting: Setting) -> list[Row]:
-    found = _probed(setting, "import")
-    return [
-        _row(found, "import", _IMPORT[0], None,
-             lambda m: (f"{m['seconds']:.2f} s", m["seconds"] <= 3 and m["points"] == 1_000_000)),
-        _row(found, "import", _IMPORT[1], None,
-             lambda m: (f"{m['reading_ms']:.0f} / {m['shown_ms']:.0f} ms",
-                        m["reading_ms"] <= 50 and m["shown_ms"] <= 250))]
-
-
-def _register_rows(setting: Setting) -> list[Row]:
-    return [_row(_probed(setting, "register"), "register", _REGISTER, None,
-                 lambda m: (f"{m['again_ms']:.0f} ms ({m['first_ms']:.0f} with the first import)",
-                            m["again_ms"] <= 100))]
-
-
-def _job_rows(setting: Setting) -> list[Row]:
-    return [_row(_probed(setting, "job memory"), "job memory", _JOBS, "jobs",
-                 lambda m: (f"{m['grown_mb']:+.1f} MB over the last 4/5; "
-                            f"{m['threads']} threads, {m['files']} files open",
-                            m["grown_mb"] < 5 and m["threads"] < 5))]
-
-
-def _undo_rows(setting: Setting) -> list[Row]:
-    return [_row(_probed(setting, "undo"), "undo", _UNDO, "sequences",
-                 lambda m: (f"{m['wrong_count']} of {m['sequences']} wrong ({m['steps']} steps)",
-                            m["wrong_count"] == 0))]
-
-
-def _row(found: dict[str, Any], name: str, asked: Asked, count: str | None,
-         judged: Callable[[dict[str, Any]], tuple[str, bool]]) -> Row:
-    """The row of a measure; ``count`` names the number that gives its trials."""
-    numbers = found.get(name)
+def _row(numbers: dict[str, Any] | None, asked: Asked, count: str, judged: Judged) -> Row:
     if numbers is None or "error" in numbers:
         return Row(*asked, "could not be measured", None, 0)
     return Row(*asked, *judged(numbers), numbers[count] if count else 1)
 
 
 PARTS = {
-    "frame-write": Part(_frame_rows, 15, (_FRAME,)),
-    "grab": Part(_grab_rows, 240, _GRAB),
-    "window": Part(_window_rows, 120, _WINDOW),
-    "import": Part(_import_rows, 20, _IMPORT),
-    "register": Part(_register_rows, 15, (_REGISTER,)),
-    "undo": Part(_undo_rows, 40, (_UNDO,), grows=True),
-    "job-memory": Part(_job_rows, 30, (_JOBS,))}
+    "frame-write": _part("frame write", 15, (
+        Asked("frame write of 50,000 vertices", "0.5 ms"), "frame write", "frames",
+        lambda m: (f"{m['median_ms']:.2f} ms (95 %: {m['high_ms']:.2f})", m["median_ms"] <= 0.5))),
+    "grab": _part(
+        "grab", 240,
+        (Asked("grab loop on Blender's side, median / 95 %", "1 / 2 ms"), "grab", "poses",
+         # Other programs had the processor for the rest of the time.
+         lambda m: (f"{m['median_ms']:.2f} / {m['high_ms']:.2f} ms (of the processor "
+                    f"{m['own_median_ms']:.2f} / {m['own_high_ms']:.2f})",
+                    m["median_ms"] <= 1 and m["high_ms"] <= 2)),
+        (Asked("pose to drawn mesh (without drawing), median / 95 %", "under 33 ms"), "grab",
+         "poses", lambda m: (f"{m['drawn_median_ms']:.1f} / {m['drawn_high_ms']:.1f} ms "
+                             f"({m['who']})", m["drawn_high_ms"] < 33)),
+        (Asked("memory over grabs", "flat"), "grab memory", "grabs",
+         lambda m: (f"{m['grown_mb']:+.1f} MB over the last 4/5", m["grown_mb"] < 5))),
+    "window": _part(
+        "window", 120,
+        (Asked("grab in a window, frames per second", "30"), "window", "frames",
+         lambda m: (f"{m['per_second']:.0f} ({m['who']})", m["per_second"] >= 30)),
+        (Asked("grab in a window, mouse to drawn frame, median / 95 %", "95 %: 60 ms"), "window",
+         "frames", lambda m: (f"{m['median_ms']:.0f} / {m['high_ms']:.0f} ms",
+                              m["high_ms"] <= 60))),
+    "import": _part(
+        "import", 20,
+        (Asked("import of 1,000,000 points", "3 s"), "import", "",
+         lambda m: (f"{m['seconds']:.2f} s", m["seconds"] <= 3 and m["points"] == 1_000_000)),
+        (Asked("the interface stands while it is read / shown", "50 / 250 ms"), "import", "",
+         lambda m: (f"{m['reading_ms']:.0f} / {m['shown_ms']:.0f} ms",
+                    m["reading_ms"] <= 50 and m["shown_ms"] <= 250))),
+    "register": _part("register", 15, (
+        Asked("registering", "100 ms"), "register", "",
+        lambda m: (f"{m['again_ms']:.0f} ms ({m['first_ms']:.0f} with the first import)",
+                   m["again_ms"] <= 100))),
+    "undo": _part("undo", 40, (
+        Asked("undo and redo, random sequences", "state consistent, no crash"), "undo",
+        "sequences", lambda m: (f"{m['wrong_count']} of {m['sequences']} wrong ({m['steps']} "
+                                "steps)", m["wrong_count"] == 0)), grows=True),
+    "job-memory": _part("job memory", 30, (
+        Asked("memory over job runs", "flat"), "job memory", "jobs",
+        lambda m: (f"{m['grown_mb']:+.1f} MB over the last 4/5; {m['threads']} threads, "
+                   f"{m['files']} files open", m["grown_mb"] < 5 and m["threads"] < 5)))}
 """The table, in order of importance; each part has a Blender of its own."""
