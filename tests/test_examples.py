@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import limber
-from limber.batch.jobs.job_file import read_jobs
+from limber.batch.job_file import read_jobs
 from limber.batch.stage_task import run_task
 from limber.core.progress import SILENT
 from limber.recordings.recording import read_pull

@@ -282,7 +282,7 @@ def test_no_file_imports_itself_in_a_circle():
 
 
 # Lines between processes of ours, and lines that a killed program may have left half written.
-OWN_LINES = {"robot", "session", "core.json_lines", "batch.batch_progress", "store.lock",
+OWN_LINES = {"robot", "session", "core.json_values", "batch.batch_progress", "store.lock",
              "geometry.tets.tetwild_process"}
 
 

@@ -362,8 +362,8 @@ def test_a_cell_is_shown_where_its_file_says(bpy, addon, beam, tmp_path):
     """Arm, gripper and an obstacle that lets one see through; shown again they are not doubled."""
     from limber.cell.cell_file import Cell
     from limber.cell.obstacles import Box
-    from limber.results.scene.cell_objects import add_cell
     from limber.results.scene.contents import scene_data as data_of
+    from limber.results.scene.still_objects import add_cell
     from limber.store import Branch
 
     cell_data = data_of(Branch.open(beam.folder))

@@ -9,7 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from limber.results.scene.arrays import FORMAT
+from limber.results.scene.colours import FORMAT
 from limber.results.scene.contents import scene_data
 from limber.store import Branch
 

@@ -12,9 +12,8 @@ import psutil
 import pytest
 
 from limber.batch.batch_progress import Records
-from limber.batch.jobs.branch_jobs import StageTask
-from limber.batch.jobs.command_lines import line_of_task, task_of_line
-from limber.batch.jobs.job_file import read_jobs
+from limber.batch.job_file import StageTask, read_jobs
+from limber.batch.scheduler_scripts import line_of_task, task_of_line
 from limber.cli import main
 from limber.core.errors import InputError
 from limber.stages.registry import stage_description

@@ -15,7 +15,7 @@ import pytest
 
 from limber.batch.batch_progress import Records, numbers_of, path_of_page
 from limber.batch.batch_summary import write_page
-from limber.batch.jobs.job_file import read_jobs
+from limber.batch.job_file import read_jobs
 from limber.batch.run import run_jobs
 from limber.cli import main
 from limber.core.errors import BranchFolderError
@@ -169,7 +169,7 @@ def test_two_batches_exclude_each_other(orchard):
 
 def test_records_and_log_stay_short(orchard, monkeypatch):
     """Of many runs each task's last line is kept; the log's oldest lines go."""
-    from limber.batch import batch_log, batch_progress
+    from limber.batch import batch_progress
 
     jobs = read_jobs(orchard / "jobs.toml")
     held, branch = Records(jobs), jobs.branches[0]
@@ -183,8 +183,8 @@ def test_records_and_log_stay_short(orchard, monkeypatch):
     with again.writing():
         assert len(held.path.read_text().splitlines()) == 2
     assert Records(jobs).of(branch, branch.tasks[0]).seconds == 39.0
-    monkeypatch.setattr(batch_log, "MOST_BYTES", 500)
-    with batch_log.BatchLog(jobs) as lines:
+    monkeypatch.setattr(batch_progress, "MOST_BYTES", 500)
+    with batch_progress.BatchLog(jobs) as lines:
         for number in range(100):
             lines.tell("one", f"line {number}\nof %s text")
     files = sorted(jobs.out.glob("jobs.log*"))
@@ -215,7 +215,7 @@ def test_numbers_of_a_result():
 
 def test_pictures_of_a_branch(tmp_path, branch_template):
     """Two sides; coloured where the modulus varies, brown where it does not, none without axes."""
-    from limber.batch.pictures import pictures
+    from limber.batch.batch_summary import pictures
 
     example = Path(__file__).parents[2] / "blend_files" / "bending_branch"
     shown = pictures(example)

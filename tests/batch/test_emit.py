@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from limber.batch.jobs.job_file import read_jobs
-from limber.batch.jobs.scheduler_scripts import commands, write_script
+from limber.batch.job_file import read_jobs
+from limber.batch.scheduler_scripts import commands, write_script
 
 JOBS = '''
 time_limit = "10 min"

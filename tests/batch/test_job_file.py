@@ -5,9 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from limber.batch.jobs.job_file import read_jobs
-from limber.batch.jobs.stage_tables import why_not_in_batches
-from limber.batch.jobs.toml_positions import toml_lines
+from limber.batch.job_file import read_jobs, toml_lines, why_not_in_batches
 from limber.core.errors import InputError
 from limber.core.units import in_unit
 from limber.stages.registry import stage_description, stage_summaries

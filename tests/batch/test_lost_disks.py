@@ -7,7 +7,7 @@ import os
 import pytest
 
 from limber.batch.batch_progress import Records
-from limber.batch.jobs.job_file import read_jobs
+from limber.batch.job_file import read_jobs
 from limber.cli import main
 from limber.store import Branch, journal
 
@@ -101,8 +101,8 @@ def test_lost_results_stop_the_batch(orchard, batch, here, monkeypatch, trouble)
             if trouble == "gone":
                 out.rename(orchard / "away")
             else:
-                from limber.store import growing_files
-                patch.setattr(growing_files.os, "fsync", no_room)
+                from limber.store import journal
+                patch.setattr(journal.os, "fsync", no_room)
 
     def no_room(_handle):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

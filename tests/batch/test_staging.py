@@ -11,12 +11,11 @@ from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.utils import infer_storage_options
 
 from limber.batch.batch_progress import Records
-from limber.batch.jobs.branch_jobs import BranchJob, JobFile
-from limber.batch.jobs.job_file import read_jobs
-from limber.batch.jobs.scheduler_scripts import write_script
-from limber.batch.machines.staging import bring_in, put_out
+from limber.batch.job_file import BranchJob, JobFile, read_jobs
 from limber.batch.remote_files import checked_address, fetch, is_address, matching, plain_name
 from limber.batch.run import run_jobs
+from limber.batch.scheduler_scripts import write_script
+from limber.batch.staging import bring_in, put_out
 from limber.cli import main
 from limber.core.errors import BranchFolderError, Cancelled, InputError, WorkError
 from limber.core.files.atomic import file_digest

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.batch.jobs.toml_positions import toml_lines
+from limber.batch.job_file import toml_lines
 from limber.core.errors import InputError, WorkError
 from limber.core.files import reading
 from limber.core.files.atomic import file_digest, replacing, require_file

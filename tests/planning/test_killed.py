@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from limber.cli.main import call
-from limber.core.files.temporary_names import is_owned_name
+from limber.core.files.atomic import is_owned_name
 from limber.store import Branch
 
 ROOT = Path(__file__).parents[2]

@@ -117,7 +117,7 @@ def test_a_field_says_which_model_it_came_from(small_model, small_mesh, small_sk
 
 def test_sessions_and_fields_learn_the_same():
     """So either finds what the other has learnt."""
-    from limber.session.session_start import reduced_settings
-    from limber.session.settings import SessionSettings
+    from limber.session.protocol import SessionSettings
+    from limber.session.session_branch import reduced_settings
 
     assert reduced_settings(SessionSettings()) == model_cache.SHARED

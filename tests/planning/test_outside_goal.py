@@ -16,7 +16,7 @@ from limber.planning.goals.goal import GoalKind
 from limber.planning.goals.goal_kinds import KINDS
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSettings
-from limber.results.scene.paths import _goal as drawn
+from limber.results.scene.animation import _goal as drawn
 from limber.stages.paths import plan as plan_stage
 from limber.stages.paths.plan import plan as plan_paths
 

@@ -11,8 +11,8 @@ from types import ModuleType, SimpleNamespace
 import pytest
 from tests.stages.test_registry import parsed, sample
 
-from limber.batch.jobs.command_lines import line_of_task, task_of_line
-from limber.batch.jobs.job_file import read_jobs
+from limber.batch.job_file import read_jobs
+from limber.batch.scheduler_scripts import line_of_task, task_of_line
 from limber.cli import main
 from limber.core.errors import InputError
 from limber.stages import registry

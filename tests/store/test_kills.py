@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from limber.core.files.temporary_names import is_owned_name, owned_name
+from limber.core.files.atomic import is_owned_name, owned_name
 from limber.store import Branch
 
 # Every change of a name on the disk is counted; the process dies before the one asked for.
@@ -170,7 +170,7 @@ def test_only_what_dead_processes_left_is_swept(fresh):
     again = folder / f".stage-old.{host}-{process_id}-{int(start) - 100}-{token}"
     again.mkdir()
     (again / "half.vtu").write_text("half")
-    sleeper = subprocess.Popen([sys.executable, "-c", "from limber.core.files.temporary_names "
+    sleeper = subprocess.Popen([sys.executable, "-c", "from limber.core.files.atomic "
                                 "import owned_name\n"
                                 "print(owned_name('x.json'), flush=True)\nimport time\n"
                                 "time.sleep(60)"], stdout=subprocess.PIPE, text=True)

@@ -14,8 +14,7 @@ from limber.mechanics.dynamics.modes import lowest_modes
 from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
 from limber.mechanics.statics.solve import solve_static
 from limber.results.exports.abaqus import inp_text
-from limber.results.exports.mjcf import mjcf_text
-from limber.results.exports.rigid_links import matched, rod_tree
+from limber.results.exports.rigid_links import matched, mjcf_text, rod_tree
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ from limber.reduced.reduced_model import ReducedModel, ReducedSettings, ReducedS
 from limber.reduced.refresh import checked, estimate_error
 from limber.reduced.training import Snapshots, Trainer, TrainingSettings, sample_poses
 from limber.session.client import InteractiveSession
-from limber.session.session_start import load_held, reduced_settings
-from limber.session.settings import SessionSettings
+from limber.session.protocol import SessionSettings
+from limber.session.session_branch import load_held, reduced_settings
 from limber.store import Branch
 
 LENGTH = 0.6

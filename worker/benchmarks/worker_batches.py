@@ -20,7 +20,7 @@ import psutil
 
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.worker_branch_files import TEMPLATE
-from limber.batch.jobs.branch_jobs import StageTask
+from limber.batch.job_file import StageTask
 from limber.batch.stage_task import run_task
 from limber.core.processes import Pool
 from limber.core.progress import SILENT

@@ -241,7 +241,7 @@ def _jobs(_template: Path, folder: Path) -> list[Path]:
 
 
 def _read_jobs(_template: Path, path: Path) -> Any:
-    from limber.batch.jobs.job_file import read_jobs
+    from limber.batch.job_file import read_jobs
 
     (path.parent / "a.xyz").write_text("0 0 0\n")
     read_jobs(path)

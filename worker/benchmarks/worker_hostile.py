@@ -32,7 +32,7 @@ from benchmarks.worker_branch_files import TEMPLATE
 from benchmarks.worker_files import addon_module
 from limber.cli.main import call
 from limber.core.errors import LimberError
-from limber.core.files.temporary_names import owned_name
+from limber.core.files.atomic import owned_name
 from limber.store import Branch
 
 SECRET = "The words of the victim, 5f0c2a7e."

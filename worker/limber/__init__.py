@@ -17,7 +17,7 @@ takes. The command ``limber`` does the same in a terminal, and the Blender add-o
 
 from typing import TYPE_CHECKING
 
-from limber.core.lazy import exports as _exports
+from limber.core.optional import exports as _exports
 from limber.core.threads import same_digits as _same_digits
 from limber.version import VERSION as __version__
 

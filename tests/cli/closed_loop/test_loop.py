@@ -17,9 +17,8 @@ from limber.cli.closed_loop.cell_layout import (
     gripper_at,
     write_touched,
 )
-from limber.cli.closed_loop.comparison import Planned, compared, comparison
+from limber.cli.closed_loop.comparison import Planned, Watch, compared, comparison
 from limber.cli.closed_loop.loop import ClosedLoop
-from limber.cli.closed_loop.robot_observer import Watch
 from limber.cli.robot_commands.calibrate import _points
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices

@@ -20,7 +20,7 @@ from tests.subjects.tasks import (
 from limber.core.errors import Cancelled, ConvergenceError, InputError
 from limber.core.processes import Pool, core_budget, run_tasks, worker_count
 from limber.core.processes import pool as pool_module
-from limber.core.processes.budget import free_memory_mb
+from limber.core.processes.process_limits import free_memory_mb
 from limber.core.progress import Progress
 
 

@@ -10,9 +10,7 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.results.exports.abaqus import inp_text
-from limber.results.exports.mjcf import mjcf_text
-from limber.results.exports.rigid_links import rod_tree, tip_compliance
-from limber.results.exports.urdf import urdf_text
+from limber.results.exports.rigid_links import mjcf_text, rod_tree, tip_compliance, urdf_text
 from limber.results.exports.usd import as_deformable, write_usd
 
 LOAD = np.array([0.01, 0.006, 0.0])

@@ -7,8 +7,8 @@ from limber.cell.cell_file import Cell
 from limber.cell.obstacles import Box, Solid
 from limber.core.numerics.rigid import matrices
 from limber.geometry.surface.surface import Surface
-from limber.results.scene.arrays import SceneData
-from limber.results.scene.cell_objects import add_cell
+from limber.results.scene.colours import SceneData
+from limber.results.scene.still_objects import add_cell
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0, 0, 0, 1.2)},
             tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0)},

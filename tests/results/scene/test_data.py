@@ -287,7 +287,7 @@ def test_stress_over_strength(tmp_path, mesh):
 
 def test_rods_lie_about_their_lines(mesh):
     """Each vertex at the radius of its point, across the line; lines without length have none."""
-    from limber.results.scene.rods import rods
+    from limber.results.scene.colours import rods
 
     points = np.array([[0, 0, 0], [0, 0, 1.0], [1.0, 0, 1.0]])
     vertices, faces, node = rods(points, np.array([[0, 1], [1, 2], [1, 1]]),
@@ -300,7 +300,7 @@ def test_rods_lie_about_their_lines(mesh):
 
 def test_balls_lie_about_their_points():
     """Twelve vertices a point, all at the radius; their triangles look outwards."""
-    from limber.results.scene.rods import balls
+    from limber.results.scene.colours import balls
 
     points = np.array([[0, 0, 0], [5.0, 0, 1.0]])
     vertices, faces, node = balls(points, 0.1)

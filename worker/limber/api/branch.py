@@ -365,7 +365,7 @@ class Branch:
         Args:
             mode: Mode of the marked grasp: ``clamped`` (the pose is held) or ``pinned`` (the
             position).
-            settings: Fields of :class:`limber.session.settings.SessionSettings`.
+            settings: Fields of :class:`limber.session.protocol.SessionSettings`.
 
         Returns:
             The session; use it in a ``with`` statement.
@@ -377,7 +377,7 @@ class Branch:
         ...     session.wait(session.move([0.02, 0, 0.25, 0, 0, 0])).energy
         """
         from limber.session.client import InteractiveSession
-        from limber.session.settings import SessionSettings
+        from limber.session.protocol import SessionSettings
 
         known = list(SessionSettings.model_fields)
         for name in settings:

@@ -1,17 +1,19 @@
 """The progress of a batch: lines appended as it proceeds, so that they survive any end."""
 
 import json
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import Any
 
-from limber.batch.jobs.branch_jobs import BranchJob, JobFile, StageTask
-from limber.core.files.temporary_names import is_alive
+from limber.batch.job_file import BranchJob, JobFile, StageTask
+from limber.core.files.atomic import is_alive
 from limber.core.not_none import present
-from limber.store.growing_files import Stream, stream_lines
+from limber.store.journal import Stream, stream_lines
 
 _LEAST_LINES, _MOST_TIMES = 2000, 4
 """The file is shortened when it has this many lines, and this many times the valid ones."""
@@ -129,3 +131,38 @@ def path_of_table(jobs: JobFile) -> Path:
 def path_of_page(jobs: JobFile) -> Path:
     """Return the path of the summary."""
     return jobs.out / f"{jobs.path.stem}.html"
+
+
+# The log of a batch: a text file of limited size.
+
+MOST_BYTES = 1_000_000
+LOGS_KEPT = 3
+"""Older files that are kept besides the newest: ``JOBS.log.1`` ..."""
+
+
+def path_of_log(jobs: JobFile) -> Path:
+    """Return the path of the newest lines."""
+    return jobs.out / f"{jobs.path.stem}.log"
+
+
+class BatchLog:
+    """Appends lines with their time to a batch's log; use it in a ``with``.
+
+    A line that cannot be written, on a full disk, is printed on standard error instead.
+    """
+
+    def __init__(self, jobs: JobFile):
+        self._handler = RotatingFileHandler(path_of_log(jobs), maxBytes=MOST_BYTES,
+                                            backupCount=LOGS_KEPT, encoding="utf-8", delay=True)
+        self._handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+
+    def tell(self, *parts: str) -> None:
+        """Append a line made of these parts."""
+        text = " ".join(" ".join(filter(None, parts)).split())
+        self._handler.handle(logging.makeLogRecord({"msg": "%s", "args": (text,)}))
+
+    def __enter__(self) -> "BatchLog":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._handler.close()

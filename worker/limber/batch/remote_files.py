@@ -16,8 +16,7 @@ from typing import Any
 from filelock import FileLock
 
 from limber.core.errors import InputError, LimberError, MissingDependencyError, WorkError
-from limber.core.files.atomic import write_atomically
-from limber.core.files.temporary_names import owned_name, sweep_beside
+from limber.core.files.atomic import owned_name, sweep_beside, write_atomically
 from limber.core.optional import require_extra
 from limber.store.disk_errors import LEAST_FREE_BYTES
 

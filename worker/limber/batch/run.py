@@ -7,12 +7,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from limber.batch.batch_log import BatchLog
-from limber.batch.batch_progress import DONE, FAILED, KEPT, RUNNING, Record, Records, numbers_of
-from limber.batch.jobs.branch_jobs import BranchJob, JobFile, StageTask
-from limber.batch.machines.cluster import Cluster, ClusterLostError
-from limber.batch.machines.staging import AT_ONCE, Staging
+from limber.batch.batch_progress import (
+    DONE,
+    FAILED,
+    KEPT,
+    RUNNING,
+    BatchLog,
+    Record,
+    Records,
+    numbers_of,
+)
+from limber.batch.cluster import Cluster, ClusterLostError
+from limber.batch.job_file import BranchJob, JobFile, StageTask
 from limber.batch.stage_task import is_shown, run_task
+from limber.batch.staging import AT_ONCE, Staging
 from limber.core.errors import Cancelled, LimberError, WorkError
 from limber.core.processes import Pool, worker_count
 from limber.core.progress import SILENT, Progress
@@ -39,7 +47,7 @@ def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
         retry_failed: Try failed tasks again.
         workers: Largest number of parallel branches; by default the file's, or the core budget. On
             a queue's cluster: the number of jobs to request.
-        cluster: Where to run, one of :data:`limber.batch.jobs.job_file.CLUSTERS`; by default the
+        cluster: Where to run, one of :data:`limber.batch.job_file.CLUSTERS`; by default the
             file's, or this process's own pool.
         scheduler: Address of a Dask scheduler to use instead.
         progress: Cancelling it stops all; finished results stay.

@@ -6,11 +6,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from limber.batch.jobs.branch_jobs import StageTask
+from limber.batch.job_file import StageTask
 from limber.core.errors import BranchBusyError, Cancelled, LimberError
 from limber.core.json_values import plain
 from limber.core.machine_errors import machine_error
-from limber.core.processes.process_tree import memory_mb
+from limber.core.processes.process_limits import memory_mb
 from limber.core.progress import Progress
 from limber.stages.registry import stage_description
 from limber.store.manifest import read_manifest

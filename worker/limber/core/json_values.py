@@ -1,6 +1,7 @@
 """Values in JSON form, and their check."""
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterable, Iterator, Mapping
 from functools import reduce
 from pathlib import Path
 from typing import Any, TypeVar
@@ -83,3 +84,23 @@ def _boolean_as_number(content: Any, made: Any) -> tuple[str | int, ...] | None:
         if (place := _boolean_as_number(item, part)) is not None:
             return (key, *place)
     return None
+
+
+# JSON objects that a program writes line by line, between other lines.
+
+
+def json_object(line: str | bytes) -> dict[str, Any] | None:
+    """Return the object of a line; None for any other or truncated line."""
+    try:
+        content = json.loads(line)
+    except (ValueError, RecursionError):
+        # Native libraries (fTetWild, Blender) print lines of their own.
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def json_objects(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
+    """Yield the objects of those lines that contain one."""
+    for line in lines:
+        if (content := json_object(line)) is not None:
+            yield content

@@ -1,10 +1,14 @@
 """Optional packages, loaded when they are needed."""
 
+import importlib
 import importlib.metadata
 import importlib.util
 import shlex
 import sys
+from collections.abc import Callable, Mapping
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 from limber.core.errors import MissingDependencyError
 
@@ -49,3 +53,33 @@ def how_to_install(extra: str) -> str:
 def pip_install(*words: str) -> str:
     """Return the advice to install packages: with this Python's pip, whichever is on the PATH."""
     return f"Install with `{shlex.join([sys.executable, '-m', 'pip', 'install', *words])}`."
+
+
+# Loading on first use: `limber --help` imports no heavy package.
+
+
+def exports(package: str, modules: Mapping[str, str],
+            ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return ``__getattr__`` and ``__dir__`` of a package (PEP 562).
+
+    Args:
+        package: Name of the package.
+        modules: Names, each with the module (relative to the package) that defines it.
+    """
+    def get(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
+
+    def names() -> list[str]:
+        return sorted(modules)
+
+    return get, names
+
+
+def loaded(function: Any) -> Any:
+    """Return a function, or the object at the path ``module:name``."""
+    if not isinstance(function, str):
+        return function
+    module, _, name = function.partition(":")
+    return attrgetter(name)(importlib.import_module(module))

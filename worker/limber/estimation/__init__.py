@@ -11,7 +11,7 @@ Traceback (most recent call last):
 pydantic_core._pydantic_core.ValidationError: ...
 """
 
-from limber.core.lazy import exports
+from limber.core.optional import exports
 
 _PLACES = {
     "Estimate": "fit_assessment",

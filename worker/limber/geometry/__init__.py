@@ -8,7 +8,7 @@ A generated branch and its scan, with the ground truth:
 (1, True, (4,))
 """
 
-from limber.core.lazy import exports
+from limber.core.optional import exports
 
 _PLACES = {
     "BranchSpec": "settings",

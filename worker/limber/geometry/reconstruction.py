@@ -10,8 +10,8 @@ import numpy as np
 from limber.core.alignment import Alignment
 from limber.core.constants import STANDARD_GRAVITY, UNIT_METRES
 from limber.core.errors import InputError
-from limber.core.lazy import loaded
 from limber.core.not_none import present
+from limber.core.optional import loaded
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf

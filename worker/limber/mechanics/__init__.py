@@ -13,7 +13,7 @@ A 20 cm beam whose end is displaced sideways by 1 cm:
 (True, True)
 """
 
-from limber.core.lazy import exports
+from limber.core.optional import exports
 
 _PLACES = {
     "BranchModel": "model",

@@ -12,7 +12,7 @@ Positions for the grasp within a branch's reach:
 (32, 3)
 """
 
-from limber.core.lazy import exports
+from limber.core.optional import exports
 
 _PLACES = {
     "EnergyField": "field.energy_field",

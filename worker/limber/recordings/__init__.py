@@ -8,7 +8,7 @@ Description of a recording, in SI units:
 ('pose', 'quasi_static')
 """
 
-from limber.core.lazy import exports
+from limber.core.optional import exports
 
 _PLACES = {
     "GraspEntry": "recording",

@@ -11,7 +11,7 @@ import numpy as np
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
-from limber.core.json_lines import json_objects
+from limber.core.json_values import json_objects
 from limber.robot.motion.followed_path import log_path
 
 GRAVITY = 9.81

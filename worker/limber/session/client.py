@@ -15,8 +15,7 @@ from limber.core.errors import InputError, WorkError
 from limber.core.not_none import present
 from limber.core.processes.child import Child
 from limber.session.frame_buffer import Frame, FrameReader
-from limber.session.protocol import PROTOCOL
-from limber.session.settings import SessionSettings
+from limber.session.protocol import PROTOCOL, SessionSettings
 from limber.version import VERSION
 
 _GRACE_SECONDS = 3.0
@@ -34,7 +33,7 @@ class InteractiveSession:
     Args:
         branch_folder: The branch.
         mode: Mode of the marked grasp, which is held at the start: ``clamped`` or ``pinned``.
-        settings: Further fields of :class:`limber.session.settings.SessionSettings`.
+        settings: Further fields of :class:`limber.session.protocol.SessionSettings`.
         start_seconds: Longest duration of the start.
 
     Attributes:

@@ -14,9 +14,8 @@ from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
 from limber.reduced.reduced_dynamics import ReducedStepper
 from limber.reduced.reduced_model import ReducedModel, ReducedState, ReducedStaticSettings
 from limber.session.frame_buffer import HeldAt, Status
-from limber.session.protocol import Load
+from limber.session.protocol import Load, SessionSettings
 from limber.session.session_branch import Answer, HeldBranch
-from limber.session.settings import SessionSettings
 from limber.session.trainer_process import Checked, Learning, Learnt, key_of
 
 RATE = 60.0

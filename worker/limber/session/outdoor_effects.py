@@ -4,6 +4,12 @@ It takes seconds; the branch can be moved meanwhile. The answer is for the branc
 folder, with the moduli and loads of the session at the time of the request.
 """
 
+import json
+import os
+import queue
+import sys
+import threading
+from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from dataclasses import replace
 from functools import partial
@@ -13,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import Cancelled, InputError, LimberError
+from limber.core.json_values import plain
 from limber.core.processes import Pool
 from limber.core.progress import Progress
 from limber.mechanics.loads.load_effects import (
@@ -24,13 +31,54 @@ from limber.mechanics.loads.load_effects import (
     with_peak,
 )
 from limber.mechanics.loads.outdoor import Outdoors
-from limber.session.event_writer import Events
-from limber.session.protocol import Effects
-from limber.session.session_branch import HeldBranch
-from limber.session.session_start import load_held
-from limber.session.settings import SessionSettings
+from limber.session.protocol import Effects, SessionSettings
+from limber.session.session_branch import HeldBranch, load_held
 from limber.store import Branch
 from limber.store.loading import known_damping
+
+# Writes a session's events in a thread: a client that does not read does not stop the frames.
+
+_WAITING_LIMIT = 1000
+
+
+class Events:
+    """JSON lines on standard output; unread lines are dropped.
+
+    Args:
+        gone: Called once when the reader has closed.
+    """
+
+    def __init__(self, gone: Callable[[], None] = lambda: None):
+        self._gone = gone
+        self._lines: queue.Queue[str | None] = queue.Queue(maxsize=_WAITING_LIMIT)
+        self._thread = threading.Thread(target=self._write, daemon=True)
+        self._thread.start()
+
+    def say(self, **line: Any) -> None:
+        """Write one event."""
+        try:
+            self._lines.put_nowait(json.dumps(plain(line), default=str))
+        except queue.Full:
+            return  # nobody reads it
+
+    def close(self) -> None:
+        """Report the end of the session, and write waiting events for at most a second."""
+        self.say(event="closed")
+        try:
+            self._lines.put(None, timeout=1.0)
+        except queue.Full:
+            return
+        self._thread.join(1.0)
+
+    def _write(self) -> None:
+        while (line := self._lines.get()) is not None:
+            try:
+                print(line, flush=True)
+            except (OSError, ValueError):
+                # Data that Python still buffers would fail again at exit.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                self._gone()
+                return
 
 
 class EffectsTeller:

@@ -6,12 +6,13 @@ input end the session.
 """
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from limber.core.errors import InputError
-from limber.core.json_lines import json_object
+from limber.core.json_values import json_object
 from limber.core.settings import GraspMode
 
 PROTOCOL = 2
@@ -243,3 +244,34 @@ class Lines:
             self._is_dropping = True
         else:
             self._part += rest
+
+
+# The settings of a session.
+
+
+class SessionSettings(BaseModel):
+    """Options of `limber session`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mode: GraspMode = Field(
+        "rigid", description="rigid: the marked grasp holds position and rotation. "
+            "point: it holds the position only.")
+    grasp: bool = Field(True, description="Start with the marked grasp held. Otherwise no grasp "
+        "is held.")
+    gravity: bool = Field(True, description="The branch carries its own weight, as when it was "
+        "scanned.")
+    reduced: bool = Field(
+        True, description="Learn a reduced model of the held branch. Otherwise the full model "
+            "answers.")
+    grasps: int = Field(160, ge=2, description="Number of full solutions to learn from.")
+    size: int = Field(80, ge=13, description="Reduced coordinates.")
+    fields: int = Field(130, ge=10, description="Reduced strain fields.")
+    young_spread: float = Field(
+        1.0, ge=1, description="Factor within which Young's modulus will change. 1: it is "
+            "constant.")
+    cache: bool = Field(True, description="Use and keep learnt models.")
+    cache_folder: Path | None = Field(
+        None, description="Folder for learnt models instead of the user's cache.")
+    positions: Path | None = Field(
+        None, description="File for the frames. Default: a temporary file.")

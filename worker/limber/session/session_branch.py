@@ -5,12 +5,14 @@ and publishes the answers.
 """
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import pose_between
+from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.grasp import RADIAN, Grasp
 from limber.mechanics.loads.loaded_branch import LoadedBranch
@@ -19,8 +21,12 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import solve_static
 from limber.mechanics.strain import carried_strain
 from limber.reduced.model_cache import as_control_points
+from limber.reduced.reduced_model import ReducedSettings
+from limber.reduced.training import TrainingSettings
 from limber.session.frame_buffer import HeldAt
-from limber.session.protocol import GRASP_LIMIT, Load
+from limber.session.protocol import GRASP_LIMIT, Load, SessionSettings
+from limber.store import Branch
+from limber.store.loading import load_branch, load_skeleton, stiffness_deviation
 
 FULL_STEP = 0.05
 """Longest step towards the target poses that the full model takes before it shows a frame, as a
@@ -330,3 +336,26 @@ class _AtVertices:
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         return np.maximum.reduceat(values[self._tets], self._starts)
+
+
+# The initial branch of a session, and the inputs of its reduced model.
+
+
+def reduced_settings(settings: SessionSettings) -> ReducedSettings:
+    """Return the data from which the reduced model is made."""
+    training = TrainingSettings(grasp_count=settings.grasps, young_spread=settings.young_spread)
+    return ReducedSettings(size=settings.size, field_count=settings.fields, training=training,
+                           vibration_count=1 if settings.young_spread == 1 else 0)
+
+
+def load_held(folder: Path, settings: SessionSettings,
+              progress: Progress = SILENT) -> HeldBranch:
+    """Return the branch of a folder as it hangs, without grasps.
+
+    Raises:
+        BranchFolderError: no branch folder, or no mesh in it. InputError: it lacks the material.
+    """
+    branch = Branch.read(folder)
+    axes = load_skeleton(branch) if branch.has("skeleton.swc") else None
+    return HeldBranch(load_branch(branch, gravity=settings.gravity, progress=progress), axes,
+                      stiffness_deviation(branch))

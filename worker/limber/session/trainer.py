@@ -39,8 +39,8 @@ from limber.reduced.model_cache import (
     model_key,
 )
 from limber.reduced.refresh import RefreshingModel
-from limber.session.session_start import load_held, reduced_settings
-from limber.session.settings import SessionSettings
+from limber.session.protocol import SessionSettings
+from limber.session.session_branch import load_held, reduced_settings
 
 
 def say(**line: Any) -> None:

@@ -15,7 +15,7 @@ from limber.core.processes.child import Child
 from limber.mechanics.grasp import Grasp
 from limber.reduced.model_cache import read_model
 from limber.reduced.reduced_model import ReducedModel, ReducedState
-from limber.session.settings import SessionSettings
+from limber.session.protocol import SessionSettings
 
 _CHECK_INTERVAL = 1.0
 

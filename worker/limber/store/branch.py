@@ -27,13 +27,15 @@ from pydantic import BaseModel
 
 from limber.core.constants import GRAVITY
 from limber.core.errors import BranchFolderError
-from limber.core.files.atomic import file_digest
-from limber.core.files.temporary_names import owned_name, sweep
+from limber.core.files.atomic import file_digest, owned_name, sweep
 from limber.core.json_values import plain
 from limber.store import journal
 from limber.store.disk_errors import gone, in_words, require_room, require_there
 from limber.store.folder_state import (
+    Checker,
+    Damage,
     begin,
+    damage_error,
     drop_empty,
     finish_pending,
     inside,
@@ -42,7 +44,7 @@ from limber.store.folder_state import (
     refuse_links,
     settle,
 )
-from limber.store.growing_files import Stream
+from limber.store.journal import Stream
 from limber.store.lock import commit_lock, run_lock
 from limber.store.manifest import (
     MANIFEST,
@@ -56,7 +58,6 @@ from limber.store.manifest import (
     results_version,
     version_entry,
 )
-from limber.store.verify import Checker, Damage, damage_error
 
 _STREAMS = ".streams"
 

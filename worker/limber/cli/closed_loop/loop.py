@@ -19,16 +19,16 @@ from limber.cell.cell_file import Cell, read_cell, write_cell
 from limber.cell.known_arms import arm_named
 from limber.cli.closed_loop.cell_layout import (
     GRASP_FRACTION,
+    TaskSizes,
     base_beside,
     bending_modulus,
     grasp_of,
     gripper_at,
     sideways,
+    wish_for,
     write_touched,
 )
-from limber.cli.closed_loop.comparison import Planned, compared
-from limber.cli.closed_loop.robot_observer import Watch
-from limber.cli.closed_loop.task_sizes import TaskSizes, wish_for
+from limber.cli.closed_loop.comparison import Planned, Watch, compared
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.json_values import plain
 from limber.core.numerics.rigid import matrices

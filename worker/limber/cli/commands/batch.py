@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from limber.batch.jobs.job_file import CLUSTERS
+from limber.batch.job_file import CLUSTERS
 from limber.cli.main import Run, stage_command
 
 _NAMED = 10
@@ -60,9 +60,9 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     """
     from limber.batch.batch_progress import Records, path_of_page, path_of_table
     from limber.batch.batch_summary import counts, failures, write_page, write_table
-    from limber.batch.jobs.job_file import read_jobs
-    from limber.batch.machines.staging import put_summary
+    from limber.batch.job_file import read_jobs
     from limber.batch.run import plan_of, run_jobs
+    from limber.batch.staging import put_summary
     from limber.core.errors import InputError, WorkError
 
     if cluster is not None and scheduler is not None:
@@ -71,7 +71,7 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
                          "one.", "Omit one of them.")
     jobs = read_jobs(job_file)
     if emit is not None:
-        from limber.batch.jobs.scheduler_scripts import write_script
+        from limber.batch.scheduler_scripts import write_script
 
         script = write_script(jobs, emit)
         run.close(f"A script for {len(jobs.branches)} branches.", where=script)

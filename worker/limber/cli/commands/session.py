@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from limber.session.settings import SessionSettings
+from limber.session.protocol import SessionSettings
 from limber.stages.command_line import settings_options
 
 

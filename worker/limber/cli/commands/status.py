@@ -15,7 +15,7 @@ def command(run: Run, job_file: Path) -> dict[str, Any]:
     """Show the progress of a job file's batch, also while it runs; each failure with its reason."""
     from limber.batch.batch_progress import RUNNING, Records
     from limber.batch.batch_summary import counts, failures
-    from limber.batch.jobs.job_file import read_jobs
+    from limber.batch.job_file import read_jobs
 
     jobs = read_jobs(job_file)
     records = Records(jobs)

@@ -3,8 +3,7 @@
 It depends only on errors and progress, so that every package may use it.
 """
 
-from limber.core.processes.budget import core_budget, worker_count
 from limber.core.processes.pool import Pool, run_tasks
-from limber.core.processes.process_limits import Limits
+from limber.core.processes.process_limits import Limits, core_budget, worker_count
 
 __all__ = ["Limits", "Pool", "core_budget", "run_tasks", "worker_count"]

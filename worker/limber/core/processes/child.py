@@ -18,11 +18,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from limber.core.errors import Cancelled, InputError, LimberError, SafetyStop, WorkError
-from limber.core.json_lines import json_objects
-from limber.core.processes.budget import CORES
+from limber.core.json_values import json_objects
 from limber.core.processes.end_with_parent import PARENT_PIPE
-from limber.core.processes.process_limits import UNLIMITED, Limits, LimitWatch
-from limber.core.processes.process_tree import kill_tree
+from limber.core.processes.process_limits import CORES, UNLIMITED, Limits, LimitWatch, kill_tree
 from limber.core.progress import SILENT, Progress
 
 Found = TypeVar("Found")

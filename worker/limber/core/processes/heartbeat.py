@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from limber.core.processes.process_tree import computed_seconds
+from limber.core.processes.process_limits import computed_seconds
 
 INTERVAL_SECONDS = 2.0
 

@@ -14,8 +14,8 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from limber.core.errors import LimberError, WorkError
-from limber.core.processes.budget import CORES
 from limber.core.processes.end_with_parent import end_by_kernel
+from limber.core.processes.process_limits import CORES
 from limber.core.progress import Progress, report_damage_to
 
 _REPORT_SECONDS = 0.05

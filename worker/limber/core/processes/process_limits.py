@@ -1,10 +1,52 @@
 """Limits of a process, and their check."""
 
+import contextlib
+import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-from limber.core.errors import WorkError
-from limber.core.processes.process_tree import computed_seconds, is_ready, memory_mb
+from limber.core.errors import InputError, WorkError
+
+# A process and all its descendants: memory, time, termination.
+
+
+def memory_mb(process_id: int) -> float:
+    """Return the memory [MB] of a process and all its descendants."""
+    return sum(_of_each(process_id, lambda each: each.memory_info().rss)) / 1e6
+
+
+def computed_seconds(process_id: int) -> float:
+    """Return the processor time [s] of a process and all its descendants."""
+    # Including ended children that their parent has waited for.
+    kinds = ("user", "system", "children_user", "children_system")
+    return sum(getattr(times, kind, 0.0)
+               for times in _of_each(process_id, lambda each: each.cpu_times()) for kind in kinds)
+
+
+def is_ready(process_id: int) -> bool:
+    """Return whether a process, or one of its descendants, computes or waits for a processor."""
+    return "running" in _of_each(process_id, lambda each: each.status())
+
+
+def kill_tree(process_id: int) -> None:
+    """Kill a process and all its descendants."""
+    _of_each(process_id, lambda each: each.kill())
+
+
+def _of_each(process_id: int, do: Callable[[Any], Any]) -> list[Any]:
+    """Return ``do`` of each process, except those that have ended or belong to another user."""
+    import psutil
+
+    found = []
+    with contextlib.suppress(psutil.NoSuchProcess):
+        process = psutil.Process(process_id)
+        for each in (*process.children(recursive=True), process):
+            with contextlib.suppress(psutil.NoSuchProcess, psutil.AccessDenied):
+                found.append(do(each))
+    return found
 
 
 @dataclass(frozen=True)
@@ -86,4 +128,86 @@ class LimitWatch:
             return WorkError(f"{self._name} was stopped after it did nothing for {idle:.0f} s.",
                              "It waits for something that does not come.",
                              "Check the disk or the connection that it reads from.")
+        return None
+
+
+# Number of parallel processes: cores and memory, divided among child processes.
+#
+# A process that starts others passes each a part of its own cores in the environment variable
+# ``LIMBER_CORES``. A child process divides no more than that among its own children. A user may set
+# the variable to reserve cores for other programs.
+
+CORES = "LIMBER_CORES"
+_SPARED_MEMORY = 0.15
+"""Fraction of the free memory that is left unused: estimates of a task's need are rough."""
+
+
+def core_budget() -> int:
+    """Return how many cores this process may use.
+
+    Raises:
+        InputError: ``LIMBER_CORES`` is not a positive whole number.
+    """
+    text = os.environ.get(CORES)
+    if text is None:
+        return _machine_cores()
+    try:
+        count = int(text)
+    except ValueError:
+        count = 0
+    if count < 1:
+        raise InputError(f"{CORES} is {text!r}.",
+                         "It sets the number of cores that Limber may use.",
+                         "Set it to a whole number of at least 1, or unset it.")
+    return count
+
+
+def worker_count(task_count: int, *, requested: int | None = None,
+                 memory_mb_each: float = 0.0) -> int:
+    """Return how many processes to start for ``task_count`` tasks, at least 1.
+
+    Args:
+        task_count: Number of tasks; more processes would idle.
+        requested: Number requested by the user; the budget still applies.
+        memory_mb_each: Estimated memory per task; only as many processes run as fit into the free
+        memory.
+    """
+    count = min(core_budget(), max(task_count, 1), requested or task_count or 1)
+    if memory_mb_each > 0:
+        room = (1 - _SPARED_MEMORY) * free_memory_mb() / memory_mb_each
+        count = min(count, int(room))
+    return max(count, 1)
+
+
+def free_memory_mb() -> float:
+    """Return the memory [MB] still available, also within a container's limit."""
+    import psutil
+
+    free = psutil.virtual_memory().available
+    limit, used = (_number(Path("/sys/fs/cgroup", name))
+                   for name in ("memory.max", "memory.current"))
+    if limit is not None and used is not None:
+        free = min(free, max(limit - used, 0))
+    return free / 1e6
+
+
+def _machine_cores() -> int:
+    """Cores that the system allows this process: affinity, and a container's quota."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (
+        os.cpu_count() or 1)
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text(encoding="ascii").split()
+        if quota != "max":
+            cores = min(cores, max(int(int(quota) / int(period)), 1))
+    except (OSError, ValueError):
+        # No container, or one of another kind.
+        return cores or 1
+    return cores or 1
+
+
+def _number(path: Path) -> int | None:
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        # Missing, or "max".
         return None

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import Cancelled
-from limber.core.json_lines import json_object
+from limber.core.json_values import json_object
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.nuisances import CellErrors, Eliminated, ErrorSlopes, eliminated

@@ -18,8 +18,14 @@ import numpy as np
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
-from limber.core.files.declared_sizes import check_las, check_pcd, check_ply, header_bytes
-from limber.core.files.reading import read_arrays, require_size
+from limber.core.files.reading import (
+    check_las,
+    check_pcd,
+    check_ply,
+    header_bytes,
+    read_arrays,
+    require_size,
+)
 from limber.core.files.text_columns import (
     LINES_AT_ONCE,
     ColumnsError,

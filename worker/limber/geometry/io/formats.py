@@ -19,8 +19,8 @@ from typing import Any, Generic, TypeVar
 
 from limber.core.errors import InputError, LimberError, MissingDependencyError
 from limber.core.files.atomic import require_no_pipe
-from limber.core.lazy import loaded
 from limber.core.machine_errors import machine_error
+from limber.core.optional import loaded
 from limber.geometry.io.isolated_readers import read_apart
 
 Function = Callable[..., Any] | str

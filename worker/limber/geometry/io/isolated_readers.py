@@ -13,7 +13,7 @@ import numpy as np
 
 from limber.core.errors import InputError, WorkError
 from limber.core.files.reading import read_arrays
-from limber.core.lazy import loaded
+from limber.core.optional import loaded
 from limber.core.processes.child import run_module
 from limber.core.processes.end_with_parent import end_by_kernel
 from limber.core.processes.process_limits import Limits

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.files.declared_sizes import check_ply
+from limber.core.files.reading import check_ply
 
 
 @dataclass(frozen=True)

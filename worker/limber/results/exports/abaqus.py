@@ -4,7 +4,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.mechanics.model import BranchModel
-from limber.results.exports.elastic import require_elastic
+from limber.results.exports.rigid_links import require_elastic
 
 _STEP = 0.005
 """Relative difference of moduli below which they share one material."""

@@ -7,9 +7,10 @@ elements, including flattened and off-axis sections. Shear and the stiffening ef
 left out; :func:`matched` corrects for both on average.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from xml.etree import ElementTree
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,8 +20,30 @@ from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import HungTwig
+from limber.mechanics.materials.laws import MaterialLaw, is_hookean_at_rest
+from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
-from limber.results.exports.elastic import require_elastic
+
+# The material laws that can be exported to other programs.
+
+
+def require_elastic(law: MaterialLaw, program: str, *, at_any_strain: bool = False) -> None:
+    """Refuse a law that is not described by Young's modulus and Poisson's ratio alone.
+
+    Args:
+        program: The program that receives these two numbers.
+        at_any_strain: Whether the program also computes large strains with them.
+
+    Raises:
+        InputError: it is another law.
+    """
+    if law.is_hookean or (not at_any_strain and is_hookean_at_rest(law)):
+        return
+    raise InputError(f"{program} does not support the material {law.name!r}.",
+                     "The file can only state Young's modulus and Poisson's ratio, which do not "
+                     "describe this law.",
+                     "Export the branch with st_venant_kirchhoff.")
+
 
 _SAMPLES_A_SEGMENT = 12
 _SPLITS = 1
@@ -333,3 +356,174 @@ def _with_hung(tree: RodTree, model: BranchModel) -> RodTree:
 def _about(mass: float, arm: np.ndarray) -> np.ndarray:
     """Parallel-axis term of a mass at ``arm`` from the axis."""
     return mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+
+
+# MuJoCo's MJCF: rigid links on hinges with springs, hanging as the branch was scanned.
+
+_TIMESTEP = 1e-3
+
+
+def mjcf_text(tree: RodTree, damping: RayleighDamping, name: str,
+              sites: Mapping[str, tuple[float, float, float]]) -> str:
+    """Return an MJCF model that is at rest in its scanned shape.
+
+    Each link except the fixed one has three hinges (two for bending, one for torsion). Of Rayleigh
+    damping, MJCF supports the stiffness-proportional part but not the mass-proportional part.
+
+    Args:
+        tree: From :func:`limber.results.exports.rigid_links.rod_tree`.
+        damping: Identified or assumed damping.
+        name: Name of the model.
+        sites: Positions on the branch [m] to follow, by name.
+    """
+    root = ElementTree.Element("mujoco", model=name)
+    root.append(ElementTree.Comment(
+        f" Limber: m, kg, s. Damping: {damping.stiffness:.6g} s times the stiffness. The part of "
+        f"{damping.mass:.6g} 1/s times the mass is omitted, because MJCF cannot express it. "))
+    ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true")
+    ElementTree.SubElement(root, "option", timestep=f"{_TIMESTEP:g}", integrator="implicitfast",
+                           gravity=_numbers(tree.gravity))
+    default = ElementTree.SubElement(root, "default")
+    # The links of a branch do not collide with each other.
+    ElementTree.SubElement(default, "geom", contype="0", conaffinity="1", mass="0",
+                           rgba="0.45 0.33 0.22 1")
+    world = ElementTree.SubElement(root, "worldbody")
+    bodies: dict[int, ElementTree.Element] = {}
+    slack = tree.carried
+    for link in range(tree.count):
+        parent = int(tree.parent[link])
+        holder = world if parent < 0 else bodies[parent]
+        origin = tree.joint[link] - (tree.joint[parent] if parent >= 0 else 0.0)
+        body = ElementTree.SubElement(holder, "body", name=f"link{link}", pos=_numbers(origin))
+        bodies[link] = body
+        if parent >= 0:
+            for axis in range(3):
+                stiffness = float(tree.stiffness[link, axis])
+                ElementTree.SubElement(
+                    body, "joint", name=f"link{link}_{'bend1 bend2 twist'.split()[axis]}",
+                    type="hinge", axis=_numbers(tree.axes[link, axis]),
+                    stiffness=f"{stiffness:.9g}", springref=f"{slack[link, axis]:.9g}",
+                    damping=f"{damping.stiffness * stiffness:.9g}")
+        _add_mjcf_inertial(body, tree, link)
+        vector = tree.end[link] - tree.joint[link]
+        if np.linalg.norm(vector) > 1e-6:
+            ElementTree.SubElement(body, "geom", type="capsule", size=f"{tree.radius[link]:.6g}",
+                                   fromto=f"0 0 0 {_numbers(vector)}")
+    for label, point in sites.items():
+        link = tree.link_at(point)
+        ElementTree.SubElement(bodies[link], "site", name=label, size="0.004",
+                               pos=_numbers(np.asarray(point) - tree.joint[link]))
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_mjcf_inertial(body: ElementTree.Element, tree: RodTree, link: int) -> None:
+    inertia = tree.inertia[link]
+    # MuJoCo does not accept a body whose mass rounds to zero.
+    floor = 1e-12 * np.eye(3)
+    i = inertia + floor
+    ElementTree.SubElement(
+        body, "inertial", mass=f"{max(tree.mass[link], 1e-9):.9g}",
+        pos=_numbers(tree.centre[link] - tree.joint[link]),
+        fullinertia=_numbers((i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2])))
+
+
+def _numbers(values: np.ndarray | tuple[float, ...]) -> str:
+    return " ".join(f"{value:.9g}" for value in values)
+
+
+# URDF: rigid links on revolute joints, with springs as Gazebo and related programs read them.
+
+_LEAST_MASS, _LEAST_INERTIA = 1e-9, 1e-12
+_AXES = ("bend1", "bend2", "twist")
+_WIDEST = 1.5
+"""Limit of a joint [rad], far beyond the rotation of any link of a branch."""
+
+
+def urdf_text(tree: RodTree, damping: RayleighDamping, name: str) -> str:
+    """Return a URDF model of a branch; link ``link0`` is held by ``world``.
+
+    URDF has no springs. Stiffness and the unstressed angle of each spring are written in
+    ``<gazebo>`` (springStiffness, springReference) and again in ``<limber>``, for the user's own
+    programs. A joint rotates about one axis, so there are two links without size between
+    neighbours.
+
+    Args:
+        tree: From :func:`limber.results.exports.rigid_links.rod_tree`.
+        damping: Only its stiffness-proportional part is used.
+        name: Name of the model.
+    """
+    root = ElementTree.Element("robot", name=name)
+    ElementTree.SubElement(root, "link", name="world")
+    slack = tree.carried
+    for link in range(tree.count):
+        _add_link(root, tree, link)
+        parent = int(tree.parent[link])
+        if parent < 0:
+            joint = ElementTree.SubElement(root, "joint", name="base", type="fixed")
+            _connect(joint, "world", "link0", tree.joint[0])
+            continue
+        holder, origin = f"link{parent}", tree.joint[link] - tree.joint[parent]
+        for number, label in enumerate(_AXES):
+            held = f"link{link}" if number == 2 else f"link{link}_{label}"
+            if number < 2:
+                _add_urdf_inertial(ElementTree.SubElement(root, "link", name=held), 0.0,
+                                   np.zeros(3), np.zeros((3, 3)))
+            _add_joint(root, f"joint{link}_{label}", holder, held, origin, tree.axes[link, number],
+                       float(tree.stiffness[link, number]), float(slack[link, number]), damping)
+            holder, origin = held, np.zeros(3)
+    ElementTree.indent(root)
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_link(root: ElementTree.Element, tree: RodTree, link: int) -> None:
+    element = ElementTree.SubElement(root, "link", name=f"link{link}")
+    _add_urdf_inertial(element, float(tree.mass[link]), tree.centre[link] - tree.joint[link],
+                       tree.inertia[link])
+    vector = tree.end[link] - tree.joint[link]
+    length = float(np.linalg.norm(vector))
+    if length < 1e-6:
+        return
+    for kind in ("visual", "collision"):
+        part = ElementTree.SubElement(element, kind)
+        # A cylinder's axis is z through its centre.
+        roll_pitch_yaw = (0.0, float(np.arccos(np.clip(vector[2] / length, -1.0, 1.0))),
+                          float(np.arctan2(vector[1], vector[0])))
+        ElementTree.SubElement(part, "origin", xyz=_numbers(vector / 2),
+                               rpy=_numbers(roll_pitch_yaw))
+        shape = ElementTree.SubElement(part, "geometry")
+        ElementTree.SubElement(shape, "cylinder", radius=f"{tree.radius[link]:.6g}",
+                               length=f"{length:.9g}")
+
+
+def _add_urdf_inertial(element: ElementTree.Element, mass: float, centre: np.ndarray,
+                       inertia: np.ndarray) -> None:
+    part = ElementTree.SubElement(element, "inertial")
+    ElementTree.SubElement(part, "origin", xyz=_numbers(centre), rpy="0 0 0")
+    ElementTree.SubElement(part, "mass", value=f"{max(mass, _LEAST_MASS):.9g}")
+    i = inertia + _LEAST_INERTIA * np.eye(3)
+    ElementTree.SubElement(part, "inertia", ixx=f"{i[0, 0]:.9g}", iyy=f"{i[1, 1]:.9g}",
+                           izz=f"{i[2, 2]:.9g}", ixy=f"{i[0, 1]:.9g}", ixz=f"{i[0, 2]:.9g}",
+                           iyz=f"{i[1, 2]:.9g}")
+
+
+def _add_joint(root: ElementTree.Element, name: str, parent: str, child: str, origin: np.ndarray,
+               axis: np.ndarray, stiffness: float, slack: float, damping: RayleighDamping) -> None:
+    joint = ElementTree.SubElement(root, "joint", name=name, type="revolute")
+    _connect(joint, parent, child, origin)
+    ElementTree.SubElement(joint, "axis", xyz=_numbers(axis))
+    ElementTree.SubElement(joint, "limit", lower=f"{-_WIDEST}", upper=f"{_WIDEST}",
+                           effort="1000", velocity="1000")
+    ElementTree.SubElement(joint, "dynamics", damping=f"{damping.stiffness * stiffness:.9g}",
+                           friction="0")
+    spring = {"spring_stiffness": f"{stiffness:.9g}", "spring_reference": f"{slack:.9g}"}
+    ElementTree.SubElement(joint, "limber", spring)
+    gazebo = ElementTree.SubElement(root, "gazebo", reference=name)
+    ElementTree.SubElement(gazebo, "springStiffness").text = spring["spring_stiffness"]
+    ElementTree.SubElement(gazebo, "springReference").text = spring["spring_reference"]
+
+
+def _connect(joint: ElementTree.Element, parent: str, child: str, origin: np.ndarray) -> None:
+    ElementTree.SubElement(joint, "parent", link=parent)
+    ElementTree.SubElement(joint, "child", link=child)
+    ElementTree.SubElement(joint, "origin", xyz=_numbers(origin), rpy="0 0 0")

@@ -13,8 +13,7 @@ import numpy as np
 
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
-from limber.results.exports.elastic import require_elastic
-from limber.results.exports.rigid_links import tip_compliance
+from limber.results.exports.rigid_links import require_elastic, tip_compliance
 
 if TYPE_CHECKING:
     from pxr import Usd, Vt

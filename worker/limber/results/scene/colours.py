@@ -1,8 +1,16 @@
 """Colour scales: units, tick labels and colours."""
 
+import io
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from limber.core.files.atomic import write_atomically
+from limber.core.json_values import plain
+from limber.core.numerics.rigid import any_normal
 
 # Colours as sRGB, evenly spaced; both maps stay monotonic in greyscale.
 _COLOUR_MAPS = {
@@ -92,3 +100,109 @@ def _stops(name: str) -> list[list[float]]:
     colours = [linear_of(np.array([int(text[i:i + 2], 16) / 255 for i in (1, 3, 5)])).tolist()
                for text in _COLOUR_MAPS[name]]
     return [[number / (len(colours) - 1), *colour] for number, colour in enumerate(colours)]
+
+
+# The file that passes a scene to Blender's process: arrays by name, and their meaning.
+
+FORMAT = 2
+"""Version of the .npz file; the add-on refuses any other."""
+
+
+@dataclass
+class SceneData:
+    """Arrays by name and a dictionary that describes them; see limber.results.scene.contents"""
+
+    arrays: dict[str, np.ndarray]
+    info: dict[str, Any] = field(default_factory=dict)
+
+    def write(self, path: Path) -> None:
+        """Write one .npz file that ``numpy.load(path, allow_pickle=False)`` reads.
+
+        A path without the suffix is given it.
+        """
+        text = json.dumps(plain(self.info), allow_nan=False)
+        path = path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
+        # Not directly into the file: an archive that cannot be written raises again when it is
+        # garbage-collected.
+        content = io.BytesIO()
+        np.savez(content, info=np.array(text), **self.arrays)
+        write_atomically(path, content.getvalue())
+
+
+# Lines and points of a scene as thin rods and small balls, coloured by a value at each point.
+
+_SIDES = 6
+
+
+def add_rods(data: SceneData, name: str, title: str, points: np.ndarray, lines: np.ndarray,
+             radius: float | np.ndarray, values: np.ndarray, scale: dict[str, Any], *,
+             ball_from: int | None = None, ball_radius: float = 0.0) -> None:
+    """Add lines between points as rods, coloured by a value.
+
+    Args:
+        data: Gets ``rods:NAME`` and ``rod_faces:NAME``, ``rod_color:NAME``; and
+            ``info["rods"][NAME]``.
+        name: Name of the rods in the file.
+        title: Title that the user reads.
+        points: Positions [m], shape [n, 3].
+        lines: Indices of the two points that each line joins, shape [l, 2].
+        radius: Radius of the rods [m], or one per point.
+        values: At each point, shape [n].
+        scale: Colour scale of the values.
+        ball_from: Points from this one on are balls of ``ball_radius`` [m].
+    """
+    parts = [(*rods(points, np.asarray(lines, int).reshape(-1, 2), radius), 0)]
+    if ball_from is not None:
+        parts.append((*balls(points[ball_from:], ball_radius), ball_from))
+    counts = np.cumsum([0, *(len(vertices) for vertices, *_ in parts)])
+    faces = np.concatenate([part + count for (_, part, _, _), count in
+                            zip(parts, counts[:-1], strict=True)])
+    if not len(faces):
+        return
+    node = np.concatenate([part + first for _, _, part, first in parts])
+    data.arrays |= {f"rods:{name}": np.concatenate([part for part, *_ in parts]),
+                    f"rod_faces:{name}": faces,
+                    f"rod_color:{name}": colours_of(np.asarray(values, float), scale)[node]}
+    data.info["rods"][name] = {"title": title, "scale": scale}
+
+
+def balls(points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices [v, 3] m, triangles [f, 3] and the point of each vertex [v]: icosahedra."""
+    golden = (1 + np.sqrt(5)) / 2
+    base = np.array([[0.0, a, b] for a in (-1, 1) for b in (-golden, golden)])
+    corners = np.concatenate([np.roll(base, turn, axis=1) for turn in range(3)])
+    # Its triangles join corners that are 2 apart.
+    near = np.abs(np.linalg.norm(corners[:, None] - corners, axis=2) - 2) < 1e-9
+    triples = [(i, j, k) for i in range(12) for j in range(i) for k in range(j)
+               if near[i, j] and near[j, k] and near[i, k]]
+    one = np.array([triple if np.linalg.det(corners[list(triple)]) > 0 else triple[::-1]
+                    for triple in triples])
+    corners *= radius / np.linalg.norm(corners[0])
+    node = np.repeat(np.arange(len(points)), 12)
+    faces = (12 * np.arange(len(points))[:, None, None] + one).reshape(-1, 3)
+    return points[node] + np.tile(corners, (len(points), 1)), faces, node
+
+
+def rods(points: np.ndarray, lines: np.ndarray, radius: float | np.ndarray,
+         ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices [v, 3] m, triangles [f, 3] and the point of each vertex [v] of open tubes.
+
+    Lines without length get no rod.
+    """
+    points = np.asarray(points, float)
+    size = np.broadcast_to(np.asarray(radius, float), len(points))
+    vector = points[lines[:, 1]] - points[lines[:, 0]]
+    length = np.linalg.norm(vector, axis=1)
+    lines, vector = lines[length > 0], vector[length > 0] / length[length > 0, None]
+    first = any_normal(vector)
+    second = np.cross(vector, first)
+    angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
+    ring = (first[:, None] * np.cos(angle)[:, None] + second[:, None] * np.sin(angle)[:, None])
+    ends = points[lines][:, :, None] + size[lines][:, :, None, None] * ring[:, None]
+    node = np.repeat(lines, _SIDES, axis=1).ravel()
+    k = np.arange(_SIDES)
+    after = (k + 1) % _SIDES
+    one = np.concatenate([np.column_stack([k, after, k + _SIDES]),
+                          np.column_stack([after, after + _SIDES, k + _SIDES])])
+    faces = 2 * _SIDES * np.arange(len(lines))[:, None, None] + one
+    return ends.reshape(-1, 3), faces.reshape(-1, 3), node

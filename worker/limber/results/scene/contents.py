@@ -66,17 +66,13 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loads.loaded_branch import NamedTarget
 from limber.results.findings import modulus_origin
 from limber.results.motion_files import node_average
-from limber.results.scene.animation import add_motion
-from limber.results.scene.arrays import FORMAT, SceneData
-from limber.results.scene.colours import colour_scale
-from limber.results.scene.fit_errors import add_fit
-from limber.results.scene.observation import add_observation
-from limber.results.scene.paths import add_plan
-from limber.results.scene.reach import add_reach
-from limber.results.scene.robot_links import add_robot
+from limber.results.scene.animation import add_fit, add_motion, add_observation, add_plan
+from limber.results.scene.colours import FORMAT, SceneData, colour_scale
 from limber.results.scene.still_objects import (
     add_cloud,
     add_marks,
+    add_reach,
+    add_robot,
     add_scalar,
     add_skeleton,
     add_skeleton_rods,

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.core.files.temporary_names import owned_name
+from limber.core.files.atomic import owned_name
 from limber.robot.driver.link import COLUMNS
 
 FILE = ".robot-live.json"

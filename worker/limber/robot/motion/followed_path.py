@@ -21,8 +21,7 @@ import platformdirs
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
-from limber.core.json_lines import json_objects
-from limber.core.json_values import plain
+from limber.core.json_values import json_objects, plain
 
 _FORMAT = 1
 

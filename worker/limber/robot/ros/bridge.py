@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from typing import Any
 
 from limber.core.errors import WorkError
-from limber.core.json_lines import json_object
+from limber.core.json_values import json_object
 from limber.core.optional import require_extra
 
 SECONDS = 2.0

@@ -94,9 +94,7 @@ def _write_skeleton(branch: Branch, path: Path, chosen: Format) -> dict[str, Any
 
 def _write_links(branch: Branch, path: Path, settings: ExportSettings, progress: Progress,
                  ) -> dict[str, Any]:
-    from limber.results.exports.mjcf import mjcf_text
-    from limber.results.exports.rigid_links import matched, rod_tree
-    from limber.results.exports.urdf import urdf_text
+    from limber.results.exports.rigid_links import matched, mjcf_text, rod_tree, urdf_text
     from limber.store.loading import known_damping, load_branch, load_skeleton, load_targets
 
     skeleton = load_skeleton(branch)

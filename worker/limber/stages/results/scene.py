@@ -18,7 +18,7 @@ from limber.stages.result import Written
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.results.scene.arrays import SceneData
+    from limber.results.scene.colours import SceneData
 
 _MOVING = (".webp", ".gif", ".png")
 _TURN_SECONDS = 6.0
@@ -78,8 +78,8 @@ def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = 
     """
     from limber.cell.cell_file import read_cell
     from limber.cell.obstacles import cell_obstacles
-    from limber.results.scene.cell_objects import add_cell
     from limber.results.scene.contents import scene_data
+    from limber.results.scene.still_objects import add_cell
     from limber.store.loading import load_targets
 
     if (inputs.output is None) == (inputs.data is None):

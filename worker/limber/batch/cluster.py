@@ -13,14 +13,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from limber.batch.jobs.branch_jobs import JobFile, StageTask
-from limber.batch.jobs.command_lines import line_of_task
-from limber.batch.machines.dask_worker import run_line, stop_lines, unfit
+from limber.batch.dask_worker import run_line, stop_lines, unfit
+from limber.batch.job_file import JobFile, StageTask
+from limber.batch.scheduler_scripts import line_of_task
 from limber.core.errors import Cancelled, InputError, WorkError
 from limber.core.not_none import present
 from limber.core.optional import require_extra
 from limber.core.processes import worker_count
-from limber.core.processes.budget import CORES, core_budget
+from limber.core.processes.process_limits import CORES, core_budget
 from limber.core.progress import Progress
 from limber.version import VERSION
 
@@ -53,7 +53,7 @@ class Cluster:
 
     Args:
         jobs: The job file; its limits hold for each stage.
-        kind: One of :data:`~limber.batch.jobs.job_file.CLUSTERS`, or None with an ``address``.
+        kind: One of :data:`~limber.batch.job_file.CLUSTERS`, or None with an ``address``.
         address: Address of a running scheduler: ``tls://HOST:PORT``, or ``tcp://`` on loopback.
         workers: Number of workers to start, or of jobs to request from a queue.
         progress: Reports the wait for the first worker; cancelling it ends the wait.

@@ -11,7 +11,7 @@ from multiprocessing import current_process
 from pathlib import Path
 from typing import Any
 
-from limber.batch.jobs.command_lines import task_of_line
+from limber.batch.scheduler_scripts import task_of_line
 from limber.batch.stage_task import run_task
 from limber.core.errors import BranchBusyError, Cancelled, LimberError
 from limber.core.processes import Limits, Pool

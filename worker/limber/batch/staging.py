@@ -13,7 +13,7 @@ from pathlib import Path
 from threading import Event
 
 from limber.batch.batch_progress import path_of_page, path_of_table
-from limber.batch.jobs.branch_jobs import BranchJob, JobFile
+from limber.batch.job_file import BranchJob, JobFile
 from limber.batch.remote_files import (
     copy_here,
     fetch,
@@ -23,9 +23,8 @@ from limber.batch.remote_files import (
     take_away,
 )
 from limber.core.errors import BranchFolderError, Cancelled, InputError, WorkError
-from limber.core.files.atomic import file_digest, write_atomically
+from limber.core.files.atomic import file_digest, owned_name, sweep_beside, write_atomically
 from limber.core.files.reading import read_json
-from limber.core.files.temporary_names import owned_name, sweep_beside
 from limber.store.folder_state import settled_manifest
 from limber.store.manifest import MANIFEST, Manifest, checked_name, read_manifest
 

@@ -1,1 +1,0 @@
-"""The job file and the command lines that come from it."""

@@ -1,1 +1,0 @@
-"""Machines beyond this process: clusters and staging of files."""
