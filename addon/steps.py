@@ -10,8 +10,8 @@ from .stages import stages
 
 WAYS = frozenset({"move"})
 """Vectors in metres that are displacements, not positions: the 3D cursor does not give them."""
-REGIONS = ("goal", "tip_goal", "target_box", "workspace_low")
-"""Fields of a plan that the active object gives: a ball, or (with its related fields) a box."""
+REGIONS = ("goal", "tip_goal", "target_box", "workspace")
+"""Fields of a plan that the active object gives: a ball or a box."""
 SCAN_PLACES = frozenset({"root", "crop_low", "crop_high", "camera_at"})
 """Positions in the coordinates of a scan's file."""
 PLACES = {"fruit": (0.1,), "cut": ()}

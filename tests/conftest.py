@@ -94,7 +94,7 @@ def plain_pull() -> Pull:
 @pytest.fixture(scope="session")
 def branch_template(tmp_path_factory, small, small_bench):
     """A branch folder as reconstruct leaves it, with one virtual pull of 12 frames."""
-    from limber.estimation.simulated_pull import VirtualPullSettings
+    from limber.estimation.settings import VirtualPullSettings
     from limber.stages.pulls.virtual_pull import virtual_pull
     from limber.store import Branch
 

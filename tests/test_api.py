@@ -378,18 +378,17 @@ def test_surfaces_become_branches(tmp_path):
 
     path = tmp_path / "rod.stl"
     trimesh.creation.cylinder(0.01, 0.2, sections=8).export(path)
-    assert limber.mesh(path, tmp_path / "rod.branch", elements_across=2).mesh.tet_count > 100
+    assert limber.mesh(path, tmp_path / "rod.branch").mesh.tet_count > 100
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_verbs_are_the_commands(own, tmp_path):
     """A command with the same settings finds all done, and prints what the verb returned."""
-    fit = {"fractions": (0.5,), "key_frames": 4, "hold_out": False, "mesh_check": False}
+    fit = {"fractions": (0.5,), "quick": True}
     done = {}
     for command, verb, *options in (
-            ("estimate", lambda: own.estimate(**fit), "--fractions", 0.5, "--key-frames", 4,
-             "--no-hold-out", "--no-mesh-check"),
+            ("estimate", lambda: own.estimate(**fit), "--fractions", 0.5, "--quick"),
             ("energy", lambda: own.energy_field(samples=30, workers=1), "--samples", 30),
             ("plan", lambda: own.plan(name="p", iterations=200, workers=1), "--name", "p",
              "--iterations", 200),

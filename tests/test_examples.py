@@ -131,7 +131,7 @@ def test_headless_estimation(branch_folder, tmp_path):
     recording = tmp_path / "pull-2.mcap"
     export_pull(branch_folder, "pull-1", recording)
     run("bash", SCRIPTS / "estimate.sh", branch_folder, recording, ESTIMATE=(
-        "--pull pull-2 --key-frames 4 --fractions 0.5 --no-hold-out --no-mesh-check"))
+        "--pull pull-2 --fractions 0.5 --quick"))
     told = json.loads((tmp_path / "small-estimate.json").read_text())
     assert told["status"] == "done" and told["converged"] and min(told["young_pa"]) > 0
     assert len(read_pull(branch_folder / "pulls" / "pull-2").times) > 10

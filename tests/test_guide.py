@@ -28,7 +28,7 @@ def test_the_guide_builds_without_a_warning(tmp_path):
         capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     commands = (tmp_path / "html" / "reference" / "commands.html").read_text(encoding="utf-8")
-    assert "--max-strain" in commands and "--bridge-limit" in commands
+    assert "--max-strain" in commands and "--gap-factor" in commands
 
 
 def test_every_public_name_says_what_it_is():

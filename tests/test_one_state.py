@@ -7,7 +7,7 @@ import pytest
 
 from limber.core.progress import Progress
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.settings import EstimateSettings, VirtualPullSettings
+from limber.estimation.settings import FitSpec, PullSpec
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull
 from limber.geometry.tets.tet_mesh import mark
 from limber.geometry.tets.tree_sweep import curved_beam
@@ -74,7 +74,7 @@ def test_weight_matters_here(folder, expected):
 def test_simulate(folder, expected):
     """Along its whole way, at the end of it."""
     grasp, _, state, _ = expected
-    settings = SimulateSettings(kind="static", move=tuple(MOVE), frame_rate=3,
+    settings = SimulateSettings(kind="static", move=tuple(MOVE), duration=3 / 60,
                                 grasp_mode="point")
     loaded = load_branch(Branch.open(folder), gravity=True, progress=REFUSING)
     motion = motion_of(load_case_of(loaded.model, settings, None, grasp.centre), settings)
@@ -94,7 +94,7 @@ def test_energy_and_plan(folder, expected):
 def test_estimate_and_predict(folder, expected):
     """The forward of an estimate at the same pose; its state, under its own force, again."""
     grasp, pose, state, _ = expected
-    subject = load_subject(Branch.open(folder), EstimateSettings())
+    subject = load_subject(Branch.open(folder), FitSpec())
     entry = PullEntry(grasp=GraspEntry(point_m=tuple(grasp.centre), radius_m=0.012,
                                        mode="point"))
     pull = _recorded(pose, state.reaction_force, entry)
@@ -122,10 +122,10 @@ def _recorded(pose, force, entry):
 def test_virtual_pull(folder, expected):
     """A virtual pull of the same mesh: its measured wrench is the force at its measured pose."""
     branch = Branch.open(folder)
-    subject = load_subject(branch, EstimateSettings())
+    subject = load_subject(branch, FitSpec())
     truth = TrueBranch(subject.mesh, subject.skeleton, subject.control_points,
                        (0.2, 0.4, 0.6, 0.8), subject.start.young, branch.gravity)
-    settings = VirtualPullSettings(frames=4, position_noise=0.0, force_noise=0.0, reach=0.2,
+    settings = PullSpec(frames=4, position_noise=0.0, force_noise=0.0, reach=0.2,
                                    poisson=0.35, density=900.0, phase=0.3)
     pull, moved = simulate_pull(truth, "virtual", settings)
     assert not pull.entry.weightless and pull.entry.gravity_m_s2 is None

@@ -44,7 +44,7 @@ PAPER = [
     ("equation 4 and algorithm 1: Nelder-Mead", "estimate", "method", "nelder-mead"),
     ("algorithm 1: initial E_k", "estimate", "young", 1e8),
     ("algorithm 1: initial nu", "estimate", "poisson", 0.38),
-    ("algorithm 1: nu in theta", "estimate", "fit_poisson", True),
+    ("algorithm 1: nu in theta", "estimate", "also", ("poisson",)),
     ("inverse-distance weighting", "estimate", "field", "inverse_distance"),
     ("equation 5: alpha_def", "plan", "deformation_weight", 2.0),
     ("equation 5: alpha_dis", "plan", "distance_weight", 0.5),

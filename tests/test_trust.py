@@ -139,7 +139,6 @@ def test_options_are_finite_and_directions_have_a_length(name, value):
     ("stages.motion.load:LoadSettings", {"wind": (300.0, 0.0, 0.0)}, "83.3333 m/s would be 300"),
     ("stages.motion.load:LoadSettings", {"fruit": ((0, 0, 0.3, 1e20),)}, "no branch bears"),
     ("recordings:ImportSettings", {"weight": 1e6}, "for 1e+06 mN write 1000"),
-    ("estimation:SwingSettings", {"density": 1.1}, "for 1.1 g/cm^3 write 1100"),
     ("estimation:VirtualPullSettings", {"young": (1e8, 9.0)}, "for 9 GPa write 9e9")])
 def test_moduli_and_densities_are_those_of_matter(model, values, told):
     """GPa for Pa and g/cm^3 for kg/m^3: the likely slip is named."""

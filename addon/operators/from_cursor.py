@@ -91,8 +91,8 @@ class LIMBER_OT_from_object(bpy.types.Operator):
         if self.region == "target_box":
             goal_ball.choose(plan, "target_box")
             given = {"target_box": low + high}
-        elif self.region == "workspace_low":
-            given = {"workspace_low": low, "workspace_high": high}
+        elif self.region == "workspace":
+            given = {"workspace": low + high}
         else:
             given = {self.region: tuple((a + b) / 2 for a, b in zip(low, high, strict=True))}
             # An empty gives a point: the tolerance stays.

@@ -90,7 +90,7 @@ def test_settings_without_a_value_are_shown(addon):
     stage = part("stages").stages()["reconstruct"]
     found = part("plain_words").settings_in(
         "Crop it (--crop-low, --crop-high), join (--plants joined), give --root or --crop-low; "
-        "--no-keep-sheets, --output, --such-a-thing.", stage)
+        "--no-force, --output, --such-a-thing.", stage)
     assert [field.name for field in found] == ["crop_low", "crop_high", "root"]
 
 

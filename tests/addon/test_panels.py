@@ -154,9 +154,9 @@ def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, first
 
 def test_the_expert_settings_are_shown_on_demand(bpy, panels):
     """Few need them: a switch shows them."""
-    assert "bridge_limit" not in _draw_step(bpy, "skeleton").names("prop")
+    assert "twig_radius" not in _draw_step(bpy, "skeleton").names("prop")
     bpy.context.scene.limber.show_expert = True
-    assert "bridge_limit" in _draw_step(bpy, "skeleton").names("prop")
+    assert "twig_radius" in _draw_step(bpy, "skeleton").names("prop")
 
 
 @pytest.mark.slow

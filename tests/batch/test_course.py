@@ -30,7 +30,6 @@ folders = ["*.branch"]
 run = "target"
 name = "flower"
 at = [0.0, 0.0, 0.2]
-farthest = "50 cm"
 [[job.stage]]
 run = "virtual-pull"
 name = "pull-2"

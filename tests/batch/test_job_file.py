@@ -114,11 +114,11 @@ def test_a_sweep_is_every_combination(write):
     ("[[job]]\n[[job.stage]]\nrun = 'reconstruct'", 1, "either scans or folders"),
     ("[[job]]\nscans = ['none*.ply']\n[[job.stage]]\nrun = 'reconstruct'", 2, "No file matches"),
     ("[[job]]\nscans = ['scans/*.ply']", 1, "no [[job.stage]]"),
-    (SCANS + "\n# a comment\nbridge_limt = 2", 8, "Did you mean bridge_limit?"),
-    (SCANS + "bridge_limit = -1", 6, "greater than or equal to 0"),
-    (SCANS + "bridge_limit = [1, 2]", 6, "should be a valid number"),
+    (SCANS + "\n# a comment\ngap_factr = 2", 8, "Did you mean gap_factor"),
+    (SCANS + "gap_factor = -1", 6, "greater than 1"),
+    (SCANS + "gap_factor = [1, 2]", 6, "should be a valid number"),
     (SCANS + 'density = "8 mm"', 6, "It must be in kg/m^3"),
-    (SCANS + 'bridge_limit = "8 mm"', 6, "This value has no unit"),
+    (SCANS + 'gap_factor = "8 mm"', 6, "This value has no unit"),
     (SCANS + 'unit = "yd"', 6, "should be 'm', 'cm', 'mm', 'in' or 'um'"),
     (SCANS + 'output = "x"', 6, "The batch sets"),
     (SCANS + '[[job.stage]]\nrun = "reconstuct"', 7, "Did you mean reconstruct?"),
@@ -145,7 +145,7 @@ def test_what_is_wrong_is_told_with_its_line(write, text, line, said):
 
 
 def test_every_problem_is_told_at_once(write):
-    told = refusal(write('outt = 1\n' + SCANS + "bridge_limit = -1\nmesh_side = 3\n"))
+    told = refusal(write('outt = 1\n' + SCANS + "gap_factor = -1\nmesh_side = 3\n"))
     assert [word for word in ("line 1:", "line 7:", "line 8:") if word in told] == [
         "line 1:", "line 7:", "line 8:"]
 
@@ -249,5 +249,5 @@ def test_an_endless_sweep_is_refused_before_it_is_made(write):
     values = list(range(1, 101))
     told = refusal(write(SCANS + "[job.sweep]\n" + "".join(
         f'"reconstruct.{name}" = {values}\n' for name in (
-            "seed", "young", "density", "poisson", "up", "twig_radius", "leaf_density", "leaves"))))
+            "seed", "young", "density", "poisson", "up", "twig_radius", "radius_low", "leaves"))))
     assert "The sweep has 1e+16 combinations" in told and "line 6" in told

@@ -20,7 +20,6 @@ folders = ["*.branch"]
 run = "target"
 name = "{name}"
 at = [0.0, 0.0, 0.2]
-farthest = "50 cm"
 """ for name in ("flower", "fruit"))
 
 

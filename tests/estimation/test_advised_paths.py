@@ -14,7 +14,7 @@ from limber.core.errors import LimberError
 from limber.estimation.fit import fit_branch
 from limber.estimation.fit_assessment import judge_model, require_result
 from limber.estimation.fitting.objective import EvaluationLog
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import marked_points
 from limber.estimation.uncertainty.model_error import total_interval
 from limber.recordings.recording import CalibrationEntry
@@ -36,7 +36,7 @@ def off(small, small_pull):
 
 def followed(bench, small, pull, young=None, **settings):
     """The result of an estimate from a start, as its interval; None: refused."""
-    chosen = EstimateSettings(hold_out=False, mesh_check=False, poisson=0.36, key_frames=6,
+    chosen = FitSpec(hold_out=False, mesh_check=False, poisson=0.36, key_frames=6,
                               young=young, **settings)
     subject = subject_of(bench, small)
     if young is not None:

@@ -12,11 +12,11 @@ from limber.estimation.control_point_count import equal_fractions, is_open, supp
 from limber.estimation.estimated_branch import subject_of
 from limber.estimation.fit import fit_branch
 from limber.estimation.fitting.objective import EvaluationLog
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.geometry.skeleton.skeleton import FRACTIONS
 from limber.recordings.recording import EXACT
 
-QUICK = EstimateSettings(key_frames=6, hold_out=False, mesh_check=False, gravity=False,
+QUICK = FitSpec(key_frames=6, hold_out=False, mesh_check=False, gravity=False,
                          poisson=0.35)
 
 
@@ -64,7 +64,7 @@ def test_a_modulus_that_goes_up_and_down_needs_more_than_four():
 def test_an_estimate_chooses_them_if_none_are_given(branch_folder, capsys):
     """The truth has four, at the paper's positions."""
     assert call(["estimate", str(branch_folder), "--json", "--progress", "none",
-                 "--key-frames", "6", "--no-mesh-check"]) == 0
+                 "--quick"]) == 0
     line = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
     evidence = {int(count): value for count, value in line["control_point_evidence"].items()}
     assert evidence[len(line["fractions"])] > max(evidence.values()) - 3
@@ -74,8 +74,8 @@ def test_an_estimate_chooses_them_if_none_are_given(branch_folder, capsys):
 
 
 def test_given_control_points_stay_and_other_methods_have_four():
-    assert is_open(EstimateSettings()) and EstimateSettings().initial_fractions == FRACTIONS
+    assert is_open(FitSpec()) and FitSpec().initial_fractions == FRACTIONS
     for given in ({"fractions": FRACTIONS}, {"method": "nelder-mead"}, {"forward": "reduced"},
                   {"field": "inverse_distance"}):
-        assert not is_open(EstimateSettings(**given))
-        assert EstimateSettings(**given).initial_fractions == FRACTIONS
+        assert not is_open(FitSpec(**given))
+        assert FitSpec(**given).initial_fractions == FRACTIONS

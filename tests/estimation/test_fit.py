@@ -12,7 +12,7 @@ from limber.estimation.estimated_branch import require_scale_in_principle
 from limber.estimation.fitting.objective import EvaluationLog, Objective, Stopped
 from limber.estimation.fitting.optimise import best_so_far, gauss_newton, nelder_mead
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.identifiability import (
     identifiability,
@@ -21,7 +21,7 @@ from limber.estimation.uncertainty.identifiability import (
 )
 from limber.recordings.recording import Observations
 
-SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=5)
+SETTINGS = FitSpec(poisson=0.36, hold_out=False, key_frames=5)
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 
 
@@ -49,7 +49,7 @@ def test_sensitivities_equal_central_differences(small_bench, small_pull):
     """Every column of the Jacobian, for log E and Poisson's ratio, in both kinds of drive."""
     for drive in ("pose", "force"):
         entry = small_pull.entry.model_copy(update={"drive": drive})
-        settings = SETTINGS.model_copy(update={"fit_poisson": True, "key_frames": 3})
+        settings = SETTINGS.model_copy(update={"also": ("poisson",), "key_frames": 3})
         objective = small_bench.objective([replace(small_pull, entry=entry)], settings)
         free = np.r_[np.log(0.8 * TRUTH), 0.33]
         exact = objective.evaluate(free, jacobian=True).jacobian

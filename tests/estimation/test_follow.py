@@ -74,10 +74,10 @@ def test_it_says_enough_only_where_noise_alone_limits(plain_pull, calibration, t
 
 def test_a_pull_that_is_being_recorded_is_found_where_it_grows(bare_branch):
     """A recorder's lines stand beside the folder's files until it has ended."""
-    from limber.estimation.settings import EstimateSettings
+    from limber.estimation.settings import FitSpec
     from limber.stages.moduli.estimate import _followed
 
-    settings = EstimateSettings(pull=("live",))
+    settings = FitSpec(pull=("live",))
     with bare_branch.stream("pulls/live/pull.toml") as lines:
         lines.append("# growing")
         name, where = _followed(bare_branch, settings)
@@ -92,7 +92,7 @@ def test_a_pull_that_is_being_recorded_is_found_where_it_grows(bare_branch):
 def test_a_recording_that_ends_is_followed_to_its_last_frame(bare_branch, tmp_path, plain_pull,
                                                              monkeypatch):
     """Its files move into the branch then; slow preparations may even see nothing else of it."""
-    from limber.estimation.settings import EstimateSettings
+    from limber.estimation.settings import FitSpec
     from limber.stages.moduli.estimate import _followed
 
     monkeypatch.setattr(follow, "QUIET_SECONDS", 1.5)
@@ -104,7 +104,7 @@ def test_a_recording_that_ends_is_followed_to_its_last_frame(bare_branch, tmp_pa
         for line in lines if stream is streams[0] else lines[:len(lines) // 2]:
             stream.append(line)
     times = []
-    for frame, _ in follow.paced(_followed(bare_branch, EstimateSettings(pull=("live",)))[1], 1e3):
+    for frame, _ in follow.paced(_followed(bare_branch, FitSpec(pull=("live",)))[1], 1e3):
         times.append(frame.time)
         if len(times) == 10:
             for stream, lines in zip(streams[1:], texts[1:], strict=True):

@@ -9,13 +9,13 @@ from benchmarks.paper_branches import FRACTIONS
 from limber.estimation.estimated_branch import Subject, forwards_of, parameter_space
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.parameters import Values
-from limber.estimation.settings import EstimateSettings, VirtualPullSettings
+from limber.estimation.settings import FitSpec, PullSpec
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull
 from limber.estimation.uncertainty.shape_error import grip_error
 from limber.geometry.skeleton.skeleton import control_points
 from limber.recordings.recording import EXACT
 
-SETTINGS = EstimateSettings(hold_out=False, poisson=0.36, key_frames=4)
+SETTINGS = FitSpec(hold_out=False, poisson=0.36, key_frames=4)
 SIGMA, STEP = 1e-3, 5e-4
 
 
@@ -24,7 +24,7 @@ def clamped(small):
     truth = TrueBranch(small.mesh(slice_length=2.6, sides=6), small.skeleton,
                        control_points(small.skeleton, FRACTIONS), FRACTIONS,
                        np.array(small.young), is_weightless=True)
-    return simulate_pull(truth, "pull-1", VirtualPullSettings(
+    return simulate_pull(truth, "pull-1", PullSpec(
         young=small.young, poisson=0.36, frames=8, mode="rigid", grasp_fraction=0.85, phase=0.5,
         seed=2, reach=0.2, position_noise=0.0, force_noise=0.0, torque_noise=0.0))[0]
 

@@ -13,15 +13,15 @@ from limber.estimation.forward.dynamic_pull import DynamicForward
 from limber.estimation.forward.forward_model import course_of, motion_response, nodal_loads
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.parameters import Values
-from limber.estimation.settings import EstimateSettings
-from limber.estimation.simulated_pull import VirtualPullSettings, simulate_pull
+from limber.estimation.settings import FitSpec
+from limber.estimation.simulated_pull import PullSpec, simulate_pull
 from limber.mechanics.dynamics.integration import simulate_dynamics
 from limber.mechanics.points import point_operator
 from limber.recordings.recording import GraspEntry, grasp_on
 from limber.recordings.synchronisation import frames_of
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
-SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=6)
+SETTINGS = FitSpec(poisson=0.36, hold_out=False, key_frames=6)
 
 
 def driven(pull, **entry):
@@ -100,7 +100,7 @@ def test_a_clamped_gripper_needs_its_torque(small, small_bench):
 
     (As long as the pull does not press the branch together: held it stays, pushed it buckles.)
     """
-    pull = simulate_pull(small.truth(), "pull-1", VirtualPullSettings(
+    pull = simulate_pull(small.truth(), "pull-1", PullSpec(
         young=small.young, poisson=0.36, frames=8, mode="rigid", phase=0.5, seed=2,
         gravity=False, reach=0.1, position_noise=0.0, force_noise=0.0, torque_noise=0.0))[0]
     sensor = pull.entry.sensor
@@ -169,7 +169,7 @@ def test_a_gripper_that_compresses_the_branch_is_not_replaced_by_its_force(small
     """Under force and torque alone its states are unstable: a fit by them ended with the outermost
     modulus 11 times too large, outside its interval, without a word.
     """
-    settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=6, phase=0.5, seed=4,
+    settings = PullSpec(young=small.young, poisson=0.36, frames=6, phase=0.5, seed=4,
                                    mode="rigid", pose_sigma=1e-5, position_noise=0.0,
                                    force_noise=0.0, torque_noise=0.0, gravity=False)
     pull = simulate_pull(small.truth(), "pull-1", settings)[0]

@@ -10,7 +10,7 @@ from benchmarks.paper_branches import measured
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.simulated_pull import VirtualPullSettings, simulate_pull
+from limber.estimation.simulated_pull import PullSpec, simulate_pull
 from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.model_error import ModelError, path_error
 from limber.estimation.uncertainty.next_actions import (
@@ -77,7 +77,7 @@ def test_a_calibration_gives_what_was_promised(today, small_bench, noisy, action
 @pytest.mark.parametrize("pose_sigma", [0.0, 1e-3])
 def test_a_recorded_torque_gives_what_was_promised(small, small_bench, pose_sigma):
     """A clamping gripper whose torque was not recorded leaves the outer moduli undetermined."""
-    settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=10, mode="rigid",
+    settings = PullSpec(young=small.young, poisson=0.36, frames=10, mode="rigid",
                                    grasp_fraction=0.85, phase=0.5, torque_noise=0.0)
     pull = simulate_pull(small.truth(), "pull-1", settings)[0]
     calibration = CELL.model_copy(update={

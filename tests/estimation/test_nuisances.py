@@ -32,7 +32,7 @@ from limber.estimation.forward import quasi_static
 from limber.estimation.forward.forward_model import PointDirections
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.settings import EstimateSettings, VirtualPullSettings
+from limber.estimation.settings import FitSpec, PullSpec
 from limber.estimation.simulated_pull import CellErrors, marked_points, simulate_pull
 from limber.estimation.uncertainty.covariance import ADVICE, largest, variance_parts
 from limber.estimation.uncertainty.model_error import path_error, path_prescribed
@@ -48,7 +48,7 @@ from limber.recordings.recording import (
 from limber.recordings.synchronisation import frames_of
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
-SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=6)
+SETTINGS = FitSpec(poisson=0.36, hold_out=False, key_frames=6)
 SHIFT = np.array([1.5e-3, -1e-3, 1e-3])
 TURN = np.array([0.01, -0.02, 0.015])
 
@@ -468,7 +468,7 @@ def test_points_aside_of_the_scanned_axis_move_no_modulus(small_bench, small):
     truth = small.truth()
     sides = np.random.default_rng(4).standard_normal((4, 3))
     sides *= 3e-3 / np.linalg.norm(sides, axis=1, keepdims=True)
-    settings = VirtualPullSettings(young=small.young, poisson=small.poisson, frames=16, reach=0.4,
+    settings = PullSpec(young=small.young, poisson=small.poisson, frames=16, reach=0.4,
                                    position_noise=0.0, force_noise=0.0, phase=0.3)
     pull = measured(simulate_pull(replace(truth, control_points=truth.control_points + sides),
                                   "pull-1", settings)[0], 3, points=5e-4, force=0.01)

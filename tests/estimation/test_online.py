@@ -8,7 +8,7 @@ import pytest
 from benchmarks.paper_branches import Bench, measured
 from limber.estimation.online.filter import FRAME_ITERATIONS, OnlineEstimator, OnlineFrame
 from limber.estimation.online.full_model import FullBranch, Here
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.recordings.synchronisation import frames_of
 from limber.reduced.model_cache import build_reduced
 from limber.reduced.reduced_model import ReducedModel, ReducedSettings
@@ -35,7 +35,7 @@ def pull(small_pull):
 
 @pytest.fixture(scope="module")
 def batch(bench, pull):
-    return bench.fit([pull], EstimateSettings(hold_out=False, key_frames=16)).values.young
+    return bench.fit([pull], FitSpec(hold_out=False, key_frames=16)).values.young
 
 
 @pytest.fixture(scope="module")

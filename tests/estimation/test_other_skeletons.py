@@ -12,7 +12,7 @@ from limber.geometry.skeleton.edits import DeleteBranch, SetRadius
 from limber.stages.moduli import other_skeletons
 from limber.store import Branch
 
-QUICK = ("--progress", "none", "--key-frames", "6", "--no-mesh-check", "--fractions",
+QUICK = ("--progress", "none", "--quick", "--fractions",
          "0.2,0.4,0.6,0.8", "--json", "--force")
 
 

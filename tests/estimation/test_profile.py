@@ -10,10 +10,10 @@ from benchmarks.paper_branches import measured
 from limber.core.progress import Progress
 from limber.estimation.fitting.objective import Evaluation
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.covariance import Uncertainty, bend_of, limit_of, profiled
 
-SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=6)
+SETTINGS = FitSpec(poisson=0.36, hold_out=False, key_frames=6)
 NOISE = 40.0
 """Variance over the stated, for wide intervals of a pull that tells its moduli well."""
 

@@ -12,10 +12,10 @@ from limber.estimation.fit import fit_pulls
 from limber.estimation.fitting import reduced_fit
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.fitting.reduced_fit import CorrectedForward, Reduction
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.stages.moduli.estimate import estimate
 
-SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=16)
+SETTINGS = FitSpec(poisson=0.36, hold_out=False, key_frames=16)
 REDUCED = SETTINGS.model_copy(update={"forward": "reduced"})
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 
@@ -155,7 +155,7 @@ def test_other_control_points_make_another_basis(branch_folder):
     """Estimated again with other fractions: the basis for the first ones is not taken (it has
     another number of moduli), and the estimate is near the first where both have a point.
     """
-    settings = EstimateSettings(forward="reduced", mesh_check=False, key_frames=8)
+    settings = FitSpec(forward="reduced", mesh_check=False, key_frames=8)
     first = estimate(branch_folder, settings)
     again = estimate(branch_folder, settings.model_copy(update={"fractions": (0.2, 0.5, 0.8)}))
     assert len(again["young_pa"]) == 3

@@ -8,14 +8,14 @@ import pytest
 from limber.core.errors import InputError
 from limber.estimation.forward.gripper_path import MotionWanted
 from limber.estimation.rod import Rod
-from limber.estimation.settings import VirtualPullSettings
+from limber.estimation.settings import PullSpec
 from limber.estimation.simulated_pull import simulate_pull
 from limber.geometry.skeleton.skeleton import Skeleton
 
 LENGTH, RADIUS, YOUNG, DENSITY = 0.5, 2e-3, 1e9, 900.0
 BENDING = YOUNG * np.pi / 4 * RADIUS**4
 GRAVITY = np.array([0.0, 0.0, -9.81])
-EXACT = VirtualPullSettings(position_noise=0.0, force_noise=0.0, torque_noise=0.0, frames=4,
+EXACT = PullSpec(position_noise=0.0, force_noise=0.0, torque_noise=0.0, frames=4,
                             duration=6.0, phase=0.5, poisson=0.36)
 
 

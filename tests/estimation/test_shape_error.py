@@ -13,7 +13,7 @@ from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.interpolation_prior import open_field
 from limber.estimation.parameters import Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty import shape_error as module
 from limber.estimation.uncertainty.shape_error import (
     SectionMean,
@@ -25,7 +25,7 @@ from limber.mechanics.added_masses import HungTwig
 from limber.mechanics.model import BranchModel
 from limber.recordings.recording import CalibrationEntry
 
-SETTINGS = EstimateSettings(hold_out=False, poisson=0.36)
+SETTINGS = FitSpec(hold_out=False, poisson=0.36)
 QUANTILE = 2.306 / 1.960  # Student's with 8 shapes over the normal one
 
 

@@ -12,8 +12,8 @@ from limber.core.progress import Progress
 from limber.estimation import fit
 from limber.estimation.fitting import reduced_fit
 from limber.estimation.parameters import Values
-from limber.estimation.settings import EstimateSettings
-from limber.estimation.simulated_pull import VirtualPullSettings
+from limber.estimation.settings import FitSpec
+from limber.estimation.simulated_pull import PullSpec
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.recordings.recording import read_pull
 from limber.results.report.estimate_figures import report_figures
@@ -22,7 +22,7 @@ from limber.stages.pulls.virtual_pull import virtual_pull
 from limber.store import Branch
 from limber.store.loading import load_estimated_subject, stiffness_deviation
 
-QUICK = EstimateSettings(key_frames=6)
+QUICK = FitSpec(key_frames=6)
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 
 
@@ -35,7 +35,7 @@ def test_virtual_pull_is_a_recording_with_its_truth(branch_folder):
     truth = pull.entry.truth
     assert truth["young_pa"] == TRUTH.tolist()
     assert truth["tet_count"] > 1.1 * TetMesh.read(branch_folder / "mesh.vtu").tet_count
-    again = virtual_pull(branch_folder, "again", VirtualPullSettings(
+    again = virtual_pull(branch_folder, "again", PullSpec(
         young=tuple(TRUTH), poisson=0.36, frames=12, seed=4, phase=0.5))
     assert again["frame_count"] == 12
     same = read_pull(branch_folder / "pulls" / "again")
@@ -46,8 +46,7 @@ def test_virtual_pull_is_a_recording_with_its_truth(branch_folder):
 def test_estimate_from_the_command_line(branch_folder, capsys, monkeypatch):
     """The JSON line has the promised keys, the mesh the new modulus, a second call does nothing.
     """
-    arguments = ["estimate", str(branch_folder), "--json", "--progress", "none",
-                 "--key-frames", "6"]
+    arguments = ["estimate", str(branch_folder), "--json", "--progress", "none"]
     assert call(arguments) == 0
     line = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
     assert line["status"] == "done" and line["converged"] and line["method"] == "gauss-newton"
@@ -127,7 +126,7 @@ def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, m
     """
     for name, few in (("SIZE", 10), ("STATES_PER_PULL", 6), ("STATES_AROUND", 6)):
         monkeypatch.setattr(reduced_fit, name, few)
-    settings = EstimateSettings(forward=forward, key_frames=4, shapes=0)
+    settings = FitSpec(forward=forward, key_frames=4, shapes=0)
     clean, early, late = (tmp_path / name for name in ("clean", "early", "late"))
     for folder in (clean, early, late):
         shutil.copytree(branch_folder, folder)
@@ -162,12 +161,12 @@ def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, m
 def test_pulls_that_are_not_there(branch_folder):
     """A name that does not exist is answered with those that do."""
     with pytest.raises(InputError, match="pull-1"):
-        estimate(branch_folder, EstimateSettings(pull=("pull-9",)))
+        estimate(branch_folder, FitSpec(pull=("pull-9",)))
 
 
 def test_without_force_the_estimate_refuses(branch_folder):
     """Through the whole stage: positions alone are refused, and nothing is written."""
-    virtual_pull(branch_folder, "blind", VirtualPullSettings(
+    virtual_pull(branch_folder, "blind", PullSpec(
         young=tuple(TRUTH), frames=5, seed=1, phase=0.5))
     robot = branch_folder / "pulls" / "blind" / "robot.csv"
     lines = [",".join(line.split(",")[:7]) for line in robot.read_text().splitlines()]
@@ -179,17 +178,17 @@ def test_without_force_the_estimate_refuses(branch_folder):
     assert call(["import-pull", str(branch_folder), str(target), "--name", "deaf",
                  "--progress", "none"]) == 0
     with pytest.raises(InputError, match="soft or stiff"):
-        estimate(branch_folder, EstimateSettings(pull=("deaf",)))
+        estimate(branch_folder, FitSpec(pull=("deaf",)))
     assert not (branch_folder / "estimate.json").exists()
 
 
 @pytest.mark.slow
 def test_following_a_pull(branch_folder):
     """Frame by frame the intervals narrow; it ends at what all frames together give."""
-    virtual_pull(branch_folder, "long", VirtualPullSettings(
+    virtual_pull(branch_folder, "long", PullSpec(
         young=tuple(TRUTH), poisson=0.36, frames=24, seed=6, phase=0.5, position_noise=5e-4))
     # What follows frame by frame knows one form of the field.
-    settings = EstimateSettings(pull=("long",), key_frames=6, field="inverse_distance")
+    settings = FitSpec(pull=("long",), key_frames=6, field="inverse_distance")
     result = follow(branch_folder, settings, pace=0, training_count=12)
     assert result["frame_count"] == 24 and result["method"] == "online"
     stored = json.loads((branch_folder / "estimate-online.json").read_text())

@@ -6,7 +6,7 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import rotated
-from limber.estimation.settings import VirtualPullSettings
+from limber.estimation.settings import PullSpec, VirtualPullSettings
 from limber.estimation.simulated_pull import CellErrors
 from limber.recordings.recording import (
     EXACT,
@@ -73,7 +73,7 @@ def test_errors_scatter_as_the_calibration_states():
 
 def test_a_virtual_pull_states_what_was_drawn(branch_folder):
     """The calibration goes into the fit's prior, the drawn errors into the truth alone."""
-    settings = VirtualPullSettings(frames=4, cell_errors="realistic", force_bias_sigma=0.0, seed=2)
+    settings = PullSpec(frames=4, cell_errors="realistic", force_bias_sigma=0.0, seed=2)
     virtual_pull(branch_folder, "real", settings)
     entry = read_pull(branch_folder / "pulls" / "real").entry
     assert entry.calibration == CalibrationEntry().model_copy(update={"force_bias_sigma_n": 0.0})
@@ -85,5 +85,21 @@ def test_a_virtual_pull_states_what_was_drawn(branch_folder):
 
 def test_depth_images_have_no_such_errors(branch_folder):
     with pytest.raises(InputError, match="--camera cannot be combined"):
-        virtual_pull(branch_folder, "seen", VirtualPullSettings(
+        virtual_pull(branch_folder, "seen", PullSpec(
             frames=4, camera=True, cell_errors="realistic"))
+
+
+def test_errors_can_be_stated_in_a_file(branch_folder, tmp_path):
+    """What its table states not is as by default; a change of the file runs the stage again."""
+    file = tmp_path / "sensor.toml"
+    file.write_text("[calibration]\nforce_bias_sigma_n = 0.01\n")
+    settings = VirtualPullSettings(frames=4, cell_errors=str(file))
+    virtual_pull(branch_folder, "small", settings)
+    path = branch_folder / "pulls" / "small"
+    assert read_pull(path).entry.calibration == CalibrationEntry(force_bias_sigma_n=0.01)
+    file.write_text("[calibration]\nforce_bias_sigma_n = 0.02\n")
+    virtual_pull(branch_folder, "small", settings)
+    assert read_pull(path).entry.calibration == CalibrationEntry(force_bias_sigma_n=0.02)
+    file.write_text("[calibration]\nbias = 0.02\n")
+    with pytest.raises(InputError, match="bias"):
+        virtual_pull(branch_folder, "small", settings)

@@ -11,8 +11,8 @@ from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.forward.dynamic_pull import DynamicForward
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.settings import EstimateSettings
-from limber.estimation.simulated_pull import TrueBranch, VirtualPullSettings, simulate_pull
+from limber.estimation.settings import FitSpec
+from limber.estimation.simulated_pull import PullSpec, TrueBranch, simulate_pull
 from limber.estimation.uncertainty.identifiability import identifiability
 from limber.geometry.skeleton.skeleton import control_points
 from limber.recordings.recording import read_pull, write_pull
@@ -39,7 +39,7 @@ def bench(small):
 
 
 def simulated(truth, **settings):
-    return simulate_pull(truth, "pull-1", VirtualPullSettings(**(EXACT | settings)))[0]
+    return simulate_pull(truth, "pull-1", PullSpec(**(EXACT | settings)))[0]
 
 
 @pytest.mark.slow
@@ -79,7 +79,7 @@ def test_a_clamped_grasp_twists_and_its_torque_tells_the_outer_moduli(truth, ben
     """The torque's derivatives equal central differences; with it E4 is known far better."""
     pull = simulated(truth, mode="rigid", frames=8, grasp_fraction=0.85)
     assert np.linalg.norm(pull.wrenches[-1, 3:]) > 1e-3
-    settings = EstimateSettings(poisson=0.36, hold_out=False, key_frames=4)
+    settings = FitSpec(poisson=0.36, hold_out=False, key_frames=4)
     sensor = pull.entry.sensor.model_copy(update={
         "position_sigma_m": 1e-3, "force_sigma_n": 0.02 * np.abs(pull.wrenches[:, :3]).max(),
         "torque_sigma_nm": 0.02 * np.abs(pull.wrenches[:, 3:]).max()})

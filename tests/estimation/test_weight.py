@@ -12,7 +12,7 @@ from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace
-from limber.estimation.settings import EstimateSettings, VirtualPullSettings
+from limber.estimation.settings import FitSpec, PullSpec
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull
 from limber.geometry.tets.tet_mesh import mark
 from limber.geometry.tets.tree_sweep import curved_beam
@@ -39,7 +39,7 @@ def scanned(small):
 def subject(scanned, **settings):
     mesh, skeleton = scanned
     fruit = (PointMass(tuple(skeleton.nodes[-1]), 0.02),)
-    return subject_of(mesh, skeleton, fruit, GRAVITY, EstimateSettings(**SETTINGS, **settings))
+    return subject_of(mesh, skeleton, fruit, GRAVITY, FitSpec(**SETTINGS, **settings))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def pull(scanned):
     prestress = subject(scanned)
     truth = TrueBranch(prestress.mesh, prestress.skeleton, prestress.control_points,
                        (0.2, 0.4, 0.6, 0.8), TRUTH, GRAVITY)
-    settings = VirtualPullSettings(frames=6, reach=0.15, position_noise=0.0, force_noise=0.0,
+    settings = PullSpec(frames=6, reach=0.15, position_noise=0.0, force_noise=0.0,
                                    poisson=0.36, density=900.0, phase=0.4)
     made = simulate_pull(truth, "pull", settings)[0]
     assert not made.entry.weightless
@@ -55,7 +55,7 @@ def pull(scanned):
 
 
 def fitted(scanned, pull, **settings):
-    about = EstimateSettings(**SETTINGS, **settings)
+    about = FitSpec(**SETTINGS, **settings)
     start = replace(subject(scanned, **settings))
     if settings.get("gravity", True):
         # The truth has no fruit.
@@ -80,11 +80,11 @@ def test_a_branch_too_soft_for_its_weight_is_estimated_without(scanned):
     assert not start.carries_itself(replace(start.start, young=soft))
     truth = TrueBranch(start.mesh, start.skeleton, start.control_points, (0.2, 0.4, 0.6, 0.8),
                        soft, GRAVITY, is_weightless=True)
-    pull = simulate_pull(truth, "pull", VirtualPullSettings(
+    pull = simulate_pull(truth, "pull", PullSpec(
         frames=6, reach=0.15, position_noise=0.0, force_noise=0.0, poisson=0.36, phase=0.4))[0]
     pull = replace(pull, entry=pull.entry.model_copy(update={"weightless": False}))
     messages: list[str] = []
-    found = fit_branch([pull], start, EstimateSettings(**SETTINGS), log=EvaluationLog(None, ""),
+    found = fit_branch([pull], start, FitSpec(**SETTINGS), log=EvaluationLog(None, ""),
                        progress=Progress(on_warning=messages.append))
     assert found.is_weightless and any("too soft to carry" in text for text in messages)
     np.testing.assert_allclose(found.values.young, soft, rtol=0.02)
@@ -98,7 +98,7 @@ def test_where_the_force_leads_nowhere_the_path_leads(scanned, pull, monkeypatch
     pull = replace(pull, entry=pull.entry.model_copy(update={"calibration": known}))
     monkeypatch.setattr(ObservedPathForward, "simulate", lambda *_, **__: None)
     messages: list[str] = []
-    found = fit_branch([pull], start, EstimateSettings(**SETTINGS), log=EvaluationLog(None, ""),
+    found = fit_branch([pull], start, FitSpec(**SETTINGS), log=EvaluationLog(None, ""),
                        progress=Progress(on_warning=messages.append))
     assert [forward.drive for forward in found.objective.forwards] == ["pose"]
     assert any("The gripper's recorded path is prescribed" in text for text in messages)
@@ -108,7 +108,7 @@ def test_where_the_force_leads_nowhere_the_path_leads(scanned, pull, monkeypatch
 def test_forward_derivatives_under_weight(scanned, pull):
     """Positions and forces to log E and log density against central differences, fruit and all."""
     start = subject(scanned)
-    forward = forwards_of([pull], start, EstimateSettings(**SETTINGS))[0]
+    forward = forwards_of([pull], start, FitSpec(**SETTINGS))[0]
     assert isinstance(forward, QuasiStaticForward)
     values = replace(start.start, young=TRUTH)
     found = forward.simulate(values, ("density",), True)
@@ -139,7 +139,7 @@ def test_virtual_pull_takes_the_body_that_was_meshed(tmp_path):
                  MeshSurfaceSettings(up=(0.0, 0.0, 1.0), unit="m", root=(-0.15, 0.0, 0.0)))
     gravity = np.array(Branch.open(folder).gravity)
     assert abs(gravity[2]) < 1e-6 * np.linalg.norm(gravity), "the slat lay level"
-    settings = VirtualPullSettings(young=(3e9,) * 4, weight=0.5, frames=2, position_noise=0.0)
+    settings = PullSpec(young=(3e9,) * 4, weight=0.5, frames=2, position_noise=0.0)
     virtual_pull(folder, "hung", settings)
     from limber.recordings.recording import read_pull
 

@@ -284,7 +284,7 @@ def test_mesh_a_box_in_millimetres(tmp_path):
     box = trimesh.creation.box((30, 30, 100))
     box.export(tmp_path / "beam.stl")
     result = mesh_surface(tmp_path / "beam.stl", tmp_path / "b.branch",
-                          MeshSurfaceSettings(unit="mm", elements_across=2))
+                          MeshSurfaceSettings(unit="mm"))
     assert result["mesh_volume_m3"] == pytest.approx(9e-5, rel=0.02)
     assert result["length_m"] == pytest.approx(0.1, rel=0.02)
     mesh = TetMesh.read(tmp_path / "b.branch" / "mesh.vtu")

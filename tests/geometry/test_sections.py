@@ -6,7 +6,7 @@ from scipy.integrate import cumulative_trapezoid, trapezoid
 
 from limber.core.constants import STANDARD_GRAVITY
 from limber.core.errors import InputError
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.geometry.bodies import mesh_sections, read_sections
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.mechanics.added_masses import PointMass
@@ -72,7 +72,7 @@ def test_own_sag_gives_the_modulus(tmp_path):
     mesh_surface(path, branch, SETTINGS)
     assert sum(mass.mass for mass in load_point_masses(Branch.open(branch))) == HUNG
     fine, masses = mesh_sections(read_sections(path, "m"),
-                                 SETTINGS.model_copy(update={"elements_across": 4.5}))
+                                 SETTINGS, elements_across=4.5)
     model = BranchModel(fine.mesh, young=YOUNG, poisson=0.35, density=DENSITY,
                         gravity=fine.numbers["gravity_m_s2"], point_masses=[
                             PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in masses])
@@ -86,7 +86,7 @@ def test_own_sag_gives_the_modulus(tmp_path):
     write_stream(tmp_path / "sag.csv", Stream(times, seen.reshape(200, -1), tuple(
         f"m{k}_{axis}_m" for k in range(len(places)) for axis in "xyz")))
     import_pull(branch, tmp_path / "sag.csv", "sag", ImportSettings(weight=0, own_weight=True))
-    found = estimate(branch, EstimateSettings(fractions=(0.5,), density_sigma=0.01))
+    found = estimate(branch, FitSpec(fractions=(0.5,), density_sigma=0.01))
     low, high = found["young_interval_pa"][0]
     assert found["young_pa"][0] == pytest.approx(YOUNG, rel=0.02)
     assert low < YOUNG < high and high / low < 1.2

@@ -13,6 +13,7 @@ from limber.geometry.surface.implicit_surface import level_surface
 from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.surface_checks import check_surface
 from limber.geometry.surface.tubes import branch_surface
+from limber.geometry.tets import tetrahedra
 from limber.geometry.tets.tet_mesh import (
     TetMesh,
     dihedral_angles,
@@ -281,11 +282,10 @@ def test_tetwild_fills_a_branch_and_is_cached(y_skeleton, tmp_path, monkeypatch)
     """fTetWild keeps the volume, comes out oriented, and the second time from the cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     surface = branch_surface(y_skeleton, sides=6, spacing=4)
-    settings = MeshSettings(mesh_time_limit=120)
-    mesh, cached = tetrahedralise(surface, edge_length=0.06, epsilon=0.002, settings=settings)
+    mesh, cached = tetrahedralise(surface, edge_length=0.06, epsilon=0.002, time_limit=120)
     assert not cached and mesh.volumes.min() > 0
     assert mesh.volumes.sum() == pytest.approx(surface.volume, rel=0.03)
-    again, cached = tetrahedralise(surface, edge_length=0.06, epsilon=0.002, settings=settings)
+    again, cached = tetrahedralise(surface, edge_length=0.06, epsilon=0.002, time_limit=120)
     assert cached
     np.testing.assert_array_equal(mesh.nodes, again.nodes)
 
@@ -293,7 +293,8 @@ def test_tetwild_fills_a_branch_and_is_cached(y_skeleton, tmp_path, monkeypatch)
 def test_tetwild_time_limit_hands_over_to_the_sweep(y_skeleton, tmp_path, monkeypatch):
     """Out of time, fTetWild is stopped; asked for it, the sweep takes over and says so."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    meshed = mesh_branch(y_skeleton, MeshSettings(mesher="ftetwild", mesh_time_limit=0.05))
+    monkeypatch.setattr(tetrahedra, "_SECONDS", 0.05)
+    meshed = mesh_branch(y_skeleton, MeshSettings(mesher="ftetwild"))
     assert meshed.mesher == "sweep"
     assert "stopped" in meshed.warnings[0] and "sweep mesher was used instead" in meshed.warnings[0]
 

@@ -60,7 +60,7 @@ def test_motion_writes_what_the_design_says(folder):
 
 def test_static_force_and_vtu_series(folder):
     """A force in balance: energy grows, the series has each frame with strain and stress."""
-    settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), frame_rate=4, vtu=True,
+    settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), duration=4 / 60, vtu=True,
                                 gravity=False, name="pull")
     result = simulate(folder, settings)
     frames = json.loads((folder / "frames" / "pull.json").read_text())
@@ -76,7 +76,7 @@ def test_static_force_and_vtu_series(folder):
 
 def test_torn_branch_exits_with_3_and_keeps_good_frames(folder):
     """A pose that tears the branch: exit code 3, place and reason, frames up to there."""
-    settings = SimulateSettings(kind="static", move=(3.0, 0, 0), frame_rate=5, gravity=False)
+    settings = SimulateSettings(kind="static", move=(3.0, 0, 0), duration=5 / 60, gravity=False)
     with pytest.raises(ConvergenceError, match=r"at \("):
         simulate(folder, settings)
     branch = Branch.open(folder)
@@ -85,7 +85,7 @@ def test_torn_branch_exits_with_3_and_keeps_good_frames(folder):
     assert stored["frame_count"] >= 2
     assert branch.has("frames/simulate.pc2")
     assert call(["simulate", str(folder), "--kind", "static", "--move", "3", "0", "0",
-                 "--frame-rate", "5", "--no-gravity", "--progress", "none"]) == 3
+                 "--duration", "0.0833333", "--no-gravity", "--progress", "none"]) == 3
 
 
 def test_motion_and_force_at_once_are_refused(folder):
@@ -181,7 +181,7 @@ def test_grasp_in_the_base_exits_with_2(folder, capsys):
 def test_load_in_wrong_units_warns(folder):
     """A force far too large: a warning that names strain, place and units."""
     said = []
-    settings = SimulateSettings(kind="static", grasp_force=(20000.0, 0, 90000.0), frame_rate=2,
+    settings = SimulateSettings(kind="static", grasp_force=(20000.0, 0, 90000.0), duration=2 / 60,
                                 gravity=False)
     simulate(folder, settings, progress=Progress(on_warning=said.append))
     assert any("units" in message and "at (" in message for message in said), said
@@ -189,7 +189,7 @@ def test_load_in_wrong_units_warns(folder):
 
 def test_frames_say_strain_and_stress_of_each(folder):
     """Largest principal strain and stress per frame, growing with a pull that grows."""
-    settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), frame_rate=4,
+    settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), duration=4 / 60,
                                 gravity=False)
     result = simulate(folder, settings)
     frames = json.loads((folder / "frames" / "simulate.json").read_text())
@@ -203,7 +203,7 @@ def test_frames_say_strain_and_stress_of_each(folder):
 def test_series_reads_back_elsewhere(folder):
     """meshio, which is not what wrote them, reads each VTU of the series with all its fields."""
     meshio = pytest.importorskip("meshio")
-    settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), frame_rate=2, vtu=True,
+    settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), duration=2 / 60, vtu=True,
                                 gravity=False)
     simulate(folder, settings)
     files = sorted((folder / "frames" / "simulate").glob("*.vtu"))
@@ -223,7 +223,7 @@ def _frames(folder, name="simulate"):
 def test_a_second_gripper_props_the_branch(folder):
     """A load at half the length, the tip held: the prop carries 5/16 of it (beam theory)."""
     simulate(folder, SimulateSettings(
-        kind="static", gravity=False, frame_rate=1, grasp_mode="point", grasp_radius=0.008,
+        kind="static", gravity=False, duration=1 / 60, grasp_mode="point",
         load_at=((0, 0, 0.15, 0.1, 0, 0),), hold_at=((0, 0, 0.3),)))
     held = np.array(_frames(folder)["hold_forces_n"])
     assert held.shape == (2, 1, 3)
@@ -260,8 +260,9 @@ def test_a_load_grows_as_a_grasp_force_does(folder):
 def test_a_hung_mass_presses_the_branch(folder):
     """One kilogram at the tip of an upright beam: shorter by m g L / (E A) from the start."""
     assert call(["simulate", str(folder), "--kind", "static", "--mass-at", "0", "0", "0.3", "0.4",
-                 "--mass-at", "0", "0", "0.3", "0.6", "--frame-rate", "1", "--progress", "none",
-                 "--young", "5e8", "--no-rest-shape", "--grasp-force", "0", "0", "0"]) == 0
+                 "--mass-at", "0", "0", "0.3", "0.6", "--duration", "0.0166667",
+                 "--progress", "none", "--young", "5e8", "--no-rest-shape",
+                 "--grasp-force", "0", "0", "0"]) == 0
     mesh = TetMesh.read(folder / "mesh.vtu")
     surface = np.unique(mesh.surface_faces())
     positions, _, _ = read_pc2(folder / "frames" / "simulate.pc2")
@@ -284,7 +285,7 @@ def test_a_way_from_a_table_is_followed(folder, tmp_path):
     part = np.linspace(0, 1, 7)
     rows = [f"{5 + p:.9f},{1 + 20 * p:.9f},{2:.1f},{3 - p:.9f}" for p in part]
     way.write_text("\n".join(["t_s,x_mm,y_mm,z_mm", *rows]) + "\n")
-    common = ["--kind", "static", "--grasp-mode", "point", "--no-gravity", "--frame-rate", "6",
+    common = ["--kind", "static", "--grasp-mode", "point", "--no-gravity",
               "--progress", "none"]
     assert call(["simulate", str(folder), "--along", str(way), "--name", "way", *common]) == 0
     assert call(["simulate", str(folder), "--move", "0.02", "0", "-0.001", *common]) == 0
@@ -298,7 +299,8 @@ def test_a_pull_is_replayed(folder, tmp_path):
     """Grasp, way, kind and name are the recording's; beside it, not instead of a simulation."""
     from limber.store import Branch
 
-    call(["simulate", str(folder), "--kind", "static", "--frame-rate", "4", "--progress", "none"])
+    call(["simulate", str(folder), "--kind", "static", "--duration", "0.0666667",
+          "--progress", "none"])
     branch = Branch.open(folder)
     with branch.stage("pull:a") as stage:
         stage.path("pulls/a/pull.toml").write_text(

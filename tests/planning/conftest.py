@@ -11,6 +11,7 @@ from limber.geometry.tets.tet_mesh import mark
 from limber.geometry.tets.tree_sweep import curved_beam
 from limber.mechanics import BranchModel
 from limber.mechanics.loads.loaded_branch import hang
+from limber.planning import make_plan
 from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.certificate import lower_bound
 from limber.planning.field.energy_field import fit_field
@@ -127,3 +128,9 @@ def planned_branch(tmp_path_factory, small_mesh, small_skeleton):
 def coarse_bound(monkeypatch):
     """The bound without its last, finest grid, where something else is tested: half a minute."""
     monkeypatch.setattr(lower_bound, "_MOST_CELLS", 60_000)
+
+
+@pytest.fixture
+def rough_plan(monkeypatch):
+    """The first plan is passed on, however wrong the field is along it."""
+    monkeypatch.setattr(make_plan, "FIELD_ERROR", 20.0)

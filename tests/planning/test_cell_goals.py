@@ -22,7 +22,8 @@ from limber.stages.paths.plan import plan as plan_paths
 from limber.stages.paths.plan_cell import cell_positions, hiding
 from limber.store import Branch
 
-SETTINGS = PlanSettings(iterations=300, field_error=20.0, inertia=False)
+pytestmark = pytest.mark.usefixtures("rough_plan")
+SETTINGS = PlanSettings(iterations=300, inertia=False)
 AWAY = 0.04  # [m] that the tip must be brought
 
 

@@ -56,7 +56,7 @@ def test_the_table_has_means_deviations_and_changes(trials):
 @pytest.mark.slow  # a plan on a branch's field
 def test_the_command_writes_table_and_figure(planned_branch, tmp_path, monkeypatch):
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
-    settings = CompareSettings(trials=1, iterations=300, engine="own", seed=3)
+    settings = CompareSettings(trials=1, seed=3)
     result = compare(folder, settings, workers=1, progress=Progress(on_warning=pytest.fail))
     with (folder / "comparisons/planners.csv").open() as file:
         rows = list(csv.DictReader(file))

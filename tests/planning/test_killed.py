@@ -106,7 +106,7 @@ def assert_same(now: np.ndarray, then: np.ndarray, name: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_killed_plan_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
     """While both paths are solved on the full model."""
-    ask = (folder, "--start-seed", "3", "--iterations", "100", "--field-error", "20", "--name",
+    ask = (folder, "--start-seed", "3", "--iterations", "100", "--name",
            "new")
     before = Branch.open(folder).names("plans")
     killed_at_work(command("plan", *ask), kind)

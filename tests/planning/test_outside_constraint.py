@@ -16,6 +16,7 @@ from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSettings
 from limber.stages.paths.plan import plan as plan_paths
 
+pytestmark = pytest.mark.usefixtures("rough_plan")
 RADIUS = 0.015  # [m]
 SOFT = 0.04  # [m] over which the value falls
 
@@ -63,7 +64,7 @@ def test_a_constraint_from_outside_is_kept(planned_branch, tmp_path):
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
     there = read_plan(folder / "plans/there.json")
     rest, goal = there.motion.poses[0, :3], tuple(there.plan.poses[-1, :3])
-    options = {"iterations": 100, "goal": goal, "field_error": 20.0, "inertia": False}
+    options = {"iterations": 100, "goal": goal, "inertia": False}
 
     def nearest(name, place):
         poses = read_plan(folder / f"plans/{name}.json").motion.poses[:, :3]

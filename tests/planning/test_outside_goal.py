@@ -20,6 +20,8 @@ from limber.results.scene.animation import _goal as drawn
 from limber.stages.paths import plan as plan_stage
 from limber.stages.paths.plan import plan as plan_paths
 
+pytestmark = pytest.mark.usefixtures("rough_plan")
+
 
 class SideSettings(PlanSettings):
     """Those of a plan, and how far to the side."""
@@ -86,7 +88,7 @@ def test_a_goal_from_outside_is_planned_to(planned_branch, tmp_path):
     says, and file and picture show it."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
     rest = read_plan(folder / "plans/there.json").motion.poses[0]
-    settings = SideSettings(goal_side=rest[0] + 0.08, iterations=100, field_error=20.0)
+    settings = SideSettings(goal_side=rest[0] + 0.08, iterations=100)
     done = plan_paths(folder, settings, name="side", workers=1)
     told = json.loads((folder / "plans/side.json").read_text())
     assert told["goal"] == {"kind": "side", "x_m": settings.goal_side, "chosen": False,
@@ -109,7 +111,7 @@ def test_a_goal_from_outside_has_its_option(planned_branch, tmp_path, monkeypatc
     monkeypatch.setattr(plan_stage, "STAGE", replace(plan_stage.STAGE, settings=SideSettings))
     rest = read_plan(folder / "plans/there.json").motion.poses[0]
     code = call(["plan", str(folder), "--name", "side", "--goal-side", f"{rest[0] + 0.05:.3f}",
-                 "--iterations", "100", "--field-error", "20", "--json"])
+                 "--iterations", "100", "--json"])
     last = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
     assert code == 0 and last["goal"]["kind"] == "side"
 

@@ -11,6 +11,8 @@ from limber.planning.planners.trees import PLANNERS, chosen_engine
 from limber.planning.settings import PlanSettings
 from limber.stages.paths.plan import plan as plan_paths
 
+pytestmark = pytest.mark.usefixtures("rough_plan")
+
 
 class LineSettings(PlanSettings):
     """Those of a plan, with one more planner."""
@@ -43,7 +45,7 @@ def line():
 def test_a_planner_from_outside_finds_the_baseline(planned_branch, tmp_path, line):
     """Asked for the shortest and the gentle path, its line is the baseline, named as its own."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
-    done = plan_paths(folder, LineSettings(field_error=20.0), name="line", workers=1)
+    done = plan_paths(folder, LineSettings(), name="line", workers=1)
     shortest, gentle = line.searched
     assert shortest.weights.energy == 0.0 < gentle.weights.energy
     assert done["engine"] == "line"

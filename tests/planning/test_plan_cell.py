@@ -22,7 +22,8 @@ from limber.stages.paths.plan_cell import KeptClear, cell_positions, hiding
 from limber.store import Branch
 
 # No plan made anew because a field of 60 samples is rough.
-SETTINGS = PlanSettings(iterations=300, field_error=20.0)
+pytestmark = pytest.mark.usefixtures("rough_plan")
+SETTINGS = PlanSettings(iterations=300)
 
 
 @pytest.fixture

@@ -31,9 +31,10 @@ from limber.stages.paths.plan import plan as plan_paths
 from limber.store import Branch
 from limber.store.loading import load_grasp_model
 
+pytestmark = pytest.mark.usefixtures("rough_plan")
 ENERGY = EnergySettings(samples=60)
 # No plan made anew because a field of 60 samples is rough.
-QUICK = {"iterations": 300, "start_seed": 3, "field_error": 20.0}
+QUICK = {"iterations": 300, "start_seed": 3}
 
 
 @pytest.fixture
@@ -176,8 +177,8 @@ def test_refusals_leave_the_folder_as_it_was(copied, monkeypatch):
     with pytest.raises(InputError, match=r"in millimetres\?"):
         plan_paths(copied, PlanSettings(start=(20.0, 0.0, 400.0)), name="bad")
     with pytest.raises(InputError, match=r"workspace .*in millimetres\?"):
-        plan_paths(copied, PlanSettings(workspace_low=(50.0, -100.0, 0.0),
-                                        workspace_high=(100.0, 100.0, 500.0)), name="bad")
+        plan_paths(copied, PlanSettings(
+            workspace=(50.0, -100.0, 0.0, 100.0, 100.0, 500.0)), name="bad")
     with pytest.raises(InputError, match="tip-goal"):
         plan_paths(copied, PlanSettings(goal=(0, 0, 1), tip_goal=(0, 0, 1)), name="bad")
     with pytest.raises(InputError, match="outside the sampled region"):
@@ -310,8 +311,8 @@ def test_tip_goal_puts_the_real_tip_there(copied):
     """With a goal for the tip, the full model's tip ends within the tolerance."""
     field = EnergyField.read(copied / "energy.npz")
     wanted = field.tip(np.array(default_goal(field, 0.01).position))[0]
-    done = plan_paths(copied, PlanSettings(tip_goal=tuple(wanted), iterations=300,
-                                           field_error=20.0), name="tip", workers=1)
+    done = plan_paths(copied, PlanSettings(tip_goal=tuple(wanted), iterations=300),
+                      name="tip", workers=1)
     assert np.linalg.norm(np.array(done["plan"]["tip_end_m"]) - wanted) <= 0.01 * 1.001
 
 

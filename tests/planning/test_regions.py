@@ -98,10 +98,10 @@ def test_a_start_in_the_goal_stays_there(ridge_field):
 
 def test_an_empty_workspace_names_its_axis():
     """The side that is wrong, and none of those that were not given."""
-    asked = PlanSettings(workspace_low=(-1.0, 0.2, 0.0), workspace_high=(1.0, 0.1, 1.0))
+    asked = PlanSettings(workspace=(-1.0, 0.2, 0.0, 1.0, 0.1, 1.0))
     with pytest.raises(InputError, match=r"workspace is empty along y, from 0\.200 to 0\.100 m"):
         Limits.of(asked)
-    inner = Limits.of(PlanSettings(workspace_low=(-1.0, -1.0, -1.0)))
+    inner = Limits.of(PlanSettings(workspace=(-1.0, -1.0, -1.0, 20.0, 20.0, 20.0)))
     with pytest.raises(InputError, match=r"empty along x, from -1\.000 to -2\.000 m"):
         inner.with_cell(None, np.array([-2.0, 1.0, 1.0]), np.inf, ())
 

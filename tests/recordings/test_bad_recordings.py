@@ -150,9 +150,8 @@ def pull_with(bare_folder, name, change):
 
 def estimated(branch_folder, capsys, *options, code=0):
     capsys.readouterr()
-    assert call(["estimate", str(branch_folder), "--key-frames", "4", "--no-mesh-check",
-                 "--fractions", "0.6", "--field", "inverse_distance", "--json",
-                 "--progress", "none", *options]) == code
+    assert call(["estimate", str(branch_folder), "--quick", "--fractions", "0.6",
+                 "--field", "inverse_distance", "--json", "--progress", "none", *options]) == code
     return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
 
 

@@ -293,14 +293,14 @@ def test_a_robots_log_alone_is_a_pull(tmp_path, bare_folder):
 
 def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
     """One command imports the bag under a name of its own, and estimates from it."""
-    from limber.estimation.settings import EstimateSettings
+    from limber.estimation.settings import FitSpec
     from limber.stages.inputs import BranchInputs
     from limber.stages.moduli import estimate as stage
 
     pull = read_pull(branch_folder / "pulls" / "pull-1")
     write_mcap(tmp_path / "run 7.mcap", branch_folder / "pulls" / "pull-1", pull)
     monkeypatch.setattr(stage, "estimate", lambda folder, settings, **_: {"used": settings.pull})
-    told = stage.run(BranchInputs(branch_folder=branch_folder), EstimateSettings(),
+    told = stage.run(BranchInputs(branch_folder=branch_folder), FitSpec(),
                      stage.EstimateOptions(bag=tmp_path / "run 7.mcap"), SILENT)
     assert told == {"used": ("run-7",)}
     again = read_pull(branch_folder / "pulls" / "run-7")

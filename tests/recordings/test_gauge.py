@@ -63,8 +63,7 @@ def test_a_gauge_and_a_ruler_give_the_modulus(branch_folder, table, capsys):
     """Of one slope only the common scale is known: the moduli between are assumed to vary."""
     assert imported(branch_folder, table) == 0
     assert call(["estimate", str(branch_folder), "--pull", "gauge", "--fractions", "0.4",
-                 "--no-gravity", "--no-mesh-check", "--no-hold-out", "--json", "--progress",
-                 "none"]) == 0
+                 "--no-gravity", "--quick", "--json", "--progress", "none"]) == 0
     line = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
     (low, high), = line["young_interval_pa"]
     assert low < YOUNG < high and high / low < 2

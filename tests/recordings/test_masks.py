@@ -61,9 +61,6 @@ class StandInYolo:
     def __init__(self, weights: str):
         self.weights = weights
 
-    def set_classes(self, classes):
-        StandInYolo.calls.append(("set_classes", classes))
-
     def predict(self, image, *, conf, verbose, retina_masks, classes):
         StandInYolo.calls.append(("predict", image[0, 0].tolist(), conf, retina_masks, classes))
         data = np.zeros((2, *image.shape[:2]))
@@ -71,6 +68,11 @@ class StandInYolo:
         data[1, 4, 4] = 0.2
         masks = None if conf > 0.9 else types.SimpleNamespace(data=data)
         return [types.SimpleNamespace(masks=masks)]
+
+
+class StandInYoloE(StandInYolo):
+    def set_classes(self, classes):
+        StandInYolo.calls.append(("set_classes", classes))
 
 
 @pytest.fixture
@@ -86,7 +88,7 @@ def weights(tmp_path, monkeypatch):
 
 def test_yolo_joins_masks_of_the_named_class(weights):
     """Classes go in by number, colours as BGR, masks come back joined and thresholded."""
-    segment = YoloSegmenter(weights, class_name="potted plant")
+    segment = YoloSegmenter(weights, prompt="potted plant")
     image = np.zeros((6, 7, 3), np.uint8)
     image[0, 0] = (1, 2, 3)
     mask = segment(image)
@@ -94,8 +96,9 @@ def test_yolo_joins_masks_of_the_named_class(weights):
     assert StandInYolo.calls == [("predict", [3, 2, 1], 0.25, True, [58])]
 
 
-def test_yolo_text_prompt_and_nothing_found(weights):
+def test_yolo_text_prompt_and_nothing_found(weights, monkeypatch):
     """A prompt becomes the model's only class; no detection is an empty mask."""
+    monkeypatch.setattr(sys.modules["ultralytics"], "YOLO", StandInYoloE)
     segment = YoloSegmenter(weights, prompt="potted plant", confidence=0.95)
     assert not segment(np.zeros((6, 7, 3), np.uint8)).any()
     assert StandInYolo.calls[0] == ("set_classes", ["potted plant"])
@@ -106,7 +109,7 @@ def test_yolo_says_what_is_missing(weights, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="does not download models"):
         YoloSegmenter(tmp_path / "none.pt")
     with pytest.raises(InputError, match="potted plant"):
-        YoloSegmenter(weights, class_name="oak")
+        YoloSegmenter(weights, prompt="oak")
     monkeypatch.setitem(sys.modules, "ultralytics", None)
     with pytest.raises(MissingDependencyError, match="ultralytics"):
         YoloSegmenter(weights)

@@ -120,14 +120,14 @@ def planned_in(folder, force: float = 1.5) -> None:
 @pytest.fixture(scope="package")
 def planned_template(branch_template, tmp_path_factory):
     """The small branch with its true moduli in the mesh, and a plan."""
-    from limber.estimation.simulated_pull import VirtualPullSettings
+    from limber.estimation.simulated_pull import PullSpec
     from limber.mechanics.materials.materials import young_weights
     from limber.stages.pulls.virtual_pull import load_truth
     from limber.store.loading import load_mesh
 
     folder = shutil.copytree(branch_template, tmp_path_factory.mktemp("plans") / "planned.branch")
     branch = Branch.open(folder)
-    truth = load_truth(branch, VirtualPullSettings())
+    truth = load_truth(branch, PullSpec())
     mesh = load_mesh(branch)
     young = young_weights(mesh, truth.control_points) @ np.asarray(truth.young, float)
     held = np.linalg.norm(mesh.nodes - load_skeleton(branch).point_at(FRACTION), axis=1) < 0.012

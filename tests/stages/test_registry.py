@@ -25,12 +25,12 @@ NAMES = list(stage_summaries())
 OTHERS = {
     "reconstruct": ({"cloud": "scan.ply", "output": "a.branch", "mask": "m.png"},
                     {"up": (0.0, -1.0, 0.0), "upright": False, "unit": "mm", "young": 2.5e8,
-                     "plants": "largest", "bridge_limit": 0.2}),
+                     "plants": "largest", "gap_factor": 4.0}),
     "simulate": ({"branch_folder": "a.branch"},
                  {"move": (-0.1, 0.0, 1e-3), "gravity": False, "kind": "static",
                   "load_at": ((0.0, 0.0, 0.1, 1.0, -2.0, 0.5), (0.0, 0.0, 0.2, 0.0, 0.0, -1.0))}),
     "estimate": ({"branch_folder": "-odd.branch"},
-                 {"pull": ("one", "two"), "fractions": (0.25, 0.75), "hold_out": False}),
+                 {"pull": ("one", "two"), "fractions": (0.25, 0.75), "quick": True}),
 }
 
 

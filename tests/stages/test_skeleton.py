@@ -171,7 +171,7 @@ def test_one_killed_after_its_skeleton_goes_on_from_there(made, tmp_path, monkey
     # Other settings, other programs and --force know nothing of it.
     branch, digests = Branch.open(target), before.stages["skeleton"].reads
     assert load_search(branch, SETTINGS, digests) is not None
-    assert load_search(branch, SETTINGS.model_copy(update={"bridge_limit": 0.2}), digests) is None
+    assert load_search(branch, SETTINGS.model_copy(update={"gap_factor": 4.0}), digests) is None
     with monkeypatch.context() as other:
         other.setattr(store, "program_versions", lambda: before.stages["skeleton"].programs | {
             "numpy": "0"})

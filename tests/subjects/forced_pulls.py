@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.paper_branches import measured
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.recordings.recording import Pull
 
-SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=4)
+SETTINGS = FitSpec(poisson=0.36, hold_out=False, key_frames=4)
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 
 

@@ -27,7 +27,7 @@ from limber.estimation.forward.gripper_path import MotionWanted, moved
 from limber.estimation.interpolation_prior import open_field
 from limber.estimation.next_pull import Cell, Known, PullChoice, suggest
 from limber.estimation.parameters import Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import CellErrors, marked_points
 from limber.estimation.uncertainty.covariance import inverse_information
 from limber.estimation.uncertainty.model_error import total_interval
@@ -45,7 +45,7 @@ from limber.recordings.recording import (
     SensorEntry,
     grasp_on,
 )
-from limber.stages.pulls.suggest_pull import SuggestPullSettings
+from limber.stages.pulls.suggest_pull import CANDIDATES
 
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)
 GRAVITY = (0.0, 0.0, -9.80665)
@@ -57,7 +57,7 @@ LEVELS_OFF = 0.1
 POSITION_NOISE_M, FORCE_NOISE = 1e-3, 0.02
 POISSON, DENSITY = 0.35, 900.0
 """Inputs given to the fit."""
-SETTINGS = EstimateSettings(hold_out=False)
+SETTINGS = FitSpec(hold_out=False)
 FIRST_PULL, FIRST_TURN = PullChoice(0.92, 0.0, 0.4), 2.0
 """At the obvious position, near the tip; further pulls where `limber suggest-pull` suggests."""
 _MOST_STRAIN = 0.02
@@ -215,7 +215,7 @@ def _suggested(found: Estimate, pulls: list[Pull], subject: Subject) -> PullChoi
     """The most informative pull that `limber suggest-pull` finds after an estimate."""
     written = summary(found, SETTINGS) | details(found, subject, pulls)
     offered = suggest(subject, found.values, Known.estimated(plain(written)),
-                      Cell.of(pulls[-1]), SuggestPullSettings().fractions,
+                      Cell.of(pulls[-1]), CANDIDATES,
                       max_strain=_MOST_STRAIN, workers=1)
     return max(offered.pulls, key=lambda pull: pull.bits).choice
 

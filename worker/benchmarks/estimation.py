@@ -25,8 +25,8 @@ from limber.estimation.online.filter import OnlineFrame
 from limber.estimation.online.follow import begin
 from limber.estimation.online.full_model import Beside
 from limber.estimation.parameters import Values
-from limber.estimation.settings import EstimateSettings
-from limber.estimation.simulated_pull import VirtualPullSettings, simulate_pull, write_depth_frames
+from limber.estimation.settings import FitSpec
+from limber.estimation.simulated_pull import PullSpec, simulate_pull, write_depth_frames
 from limber.estimation.vibration.ringing import identify
 from limber.geometry.generated import generate_branch
 from limber.geometry.reconstruction import mesh_skeleton
@@ -38,7 +38,7 @@ from limber.recordings.recording import Pull
 from limber.recordings.synchronisation import frames_of
 from limber.stages.moduli.vibration import VibrationSettings, young_of
 
-SETTINGS = EstimateSettings(hold_out=False)
+SETTINGS = FitSpec(hold_out=False)
 PULL_COUNTS, DRIVES = (1, 3), ("pose", "force")
 
 _TABLE = tuple(Asked(f"paper's table, {branch.name}: E1..E4 [1e7 Pa], nu", " ".join(
@@ -69,7 +69,7 @@ def _exact(branch: PaperBranch) -> tuple[np.ndarray, float, int]:
     """Errors of the moduli, Poisson's ratio and count of simulations, from data without noise."""
     bench = Bench(branch)
     found = bench.fit([measured(exact_pull(branch, 0), 0, points=0.0, force=0.0)],
-                      EstimateSettings(hold_out=False, fit_poisson=True, key_frames=20))
+                      FitSpec(hold_out=False, also=("poisson",), key_frames=20))
     return bench.errors(found), found.values.poisson, found.objective.forward_count
 
 
@@ -168,7 +168,7 @@ def _depth_rows(setting: Setting) -> list[Row]:
     branches = BRANCHES[1:2] if setting.quick else BRANCHES
     for branch in setting.budget.items(branches):
         truth = branch.truth()
-        settings = VirtualPullSettings(
+        settings = PullSpec(
             young=branch.young, poisson=branch.poisson, frames=40, reach=0.4, phase=0.3,
             camera=True, seed=setting.seed)
         pull, states = simulate_pull(truth, "pull-1", settings)
@@ -205,7 +205,7 @@ def _optimiser_rows(setting: Setting) -> list[Row]:
     branch = BRANCHES[1]
     bench = Bench(branch)
     pull = measured(exact_pull(branch, 0, frames=40), setting.seed)
-    settings = EstimateSettings(hold_out=False, key_frames=8)
+    settings = FitSpec(hold_out=False, key_frames=8)
     start = scaled_start(bench.objective([pull], settings), Values(np.full(4, 1e7), 0.35, 900.0))
     ours, theirs = (bench.objective([pull], settings) for _ in range(2))
     free = ours.space.pack(start)

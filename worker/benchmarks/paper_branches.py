@@ -11,8 +11,8 @@ from limber.estimation.fit_assessment import Estimate
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.settings import EstimateSettings
-from limber.estimation.simulated_pull import TrueBranch, VirtualPullSettings, simulate_pull
+from limber.estimation.settings import FitSpec
+from limber.estimation.simulated_pull import PullSpec, TrueBranch, simulate_pull
 from limber.geometry.reconstruction import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton, control_points
@@ -102,7 +102,7 @@ BRANCHES = (
 
 def exact_pull(branch: PaperBranch, number: int, frames: int = 100) -> Pull:
     """One pull of the true branch without noise; ``number`` selects its direction."""
-    settings = VirtualPullSettings(
+    settings = PullSpec(
         young=branch.young, poisson=branch.poisson, frames=frames, position_noise=0.0,
         force_noise=0.0, reach=0.4, phase=2.1 * number + 0.3, seed=number)
     return simulate_pull(branch.truth(), f"pull-{number + 1}", settings)[0]
@@ -136,19 +136,19 @@ class Bench:
         self.weights = young_weights(self.mesh, self.points)
         self.model = BranchModel(self.mesh, young=1e7, poisson=0.35, density=900.0, gravity=None)
 
-    def objective(self, pulls: list[Pull], settings: EstimateSettings) -> Objective:
+    def objective(self, pulls: list[Pull], settings: FitSpec) -> Objective:
         """The objective of ``limber estimate``."""
         forwards = [QuasiStaticForward(pull.name, self.model, self.weights, pull.entry,
                                        frames_of(pull), np.array(pull.entry.rest_points_m
                                                                  or self.points),
                                        key_count=settings.key_frames) for pull in pulls]
         poisson = 0.35 if settings.poisson is None else settings.poisson
-        extra = ("poisson",) if settings.fit_poisson else ()
+        extra = ("poisson",) if "poisson" in settings.also else ()
         start = Values(np.full(len(self.points), 1e7), poisson, 900.0)
         return Objective(forwards, ParameterSpace.separate(start, extra),
                          force_sigma=[pull.entry.sensor.force_sigma_n for pull in pulls])
 
-    def fit(self, pulls: list[Pull], settings: EstimateSettings, *, cache: Path | None = None,
+    def fit(self, pulls: list[Pull], settings: FitSpec, *, cache: Path | None = None,
             ) -> Estimate:
         """Fit as ``limber estimate`` does; warnings are in the result, bases in ``cache``."""
         objective = self.objective(pulls, settings)

@@ -278,12 +278,11 @@ def no_path_seconds(known: EnergyField, goal: GraspGoal) -> dict[str, tuple[floa
     force = 0.5 * float(np.linalg.norm(known.force(reached), axis=1).min())
     middle = 0.5 * (known.rest + goal.centre(known))
     axis = int(np.argmax(np.abs(goal.centre(known) - known.rest)))
-    side = "workspace_high" if (goal.centre(known) - known.rest)[axis] > 0.0 else "workspace_low"
-    corner = np.full(3, 20.0 if side == "workspace_high" else -20.0)
-    corner[axis] = middle[axis]
+    corners = np.array([np.full(3, -20.0), np.full(3, 20.0)])
+    corners[int((goal.centre(known) - known.rest)[axis] > 0.0), axis] = middle[axis]
     found = {}
     for word, limit in (("force", {"max_force": force}),
-                        ("workspace", {side: tuple(map(float, corner))})):
+                        ("workspace", {"workspace": tuple(map(float, corners.ravel()))})):
         began, asked = time.perf_counter(), settings.model_copy(update=limit)
         try:
             plan_within(known, known.rest.copy(), goal, asked, Limits.of(asked))
@@ -562,7 +561,7 @@ def _asked(kind: float | str, tips: np.ndarray, generator: np.random.Generator,
     place = tips[generator.integers(len(tips))]
     outward = generator.normal(size=3)
     outward /= np.linalg.norm(outward)
-    common = {"inertia": False, "iterations": 500, "field_error": 20.0}
+    common = {"inertia": False, "iterations": 500}
     if not isinstance(kind, str):
         # Its border is a little behind a position that the tip reaches.
         centre = place + (kind - min(0.5 * kind, 0.01)) * outward

@@ -30,7 +30,7 @@ from limber.cli.closed_loop.loop import OPEN_FACTOR, ClosedLoop
 from limber.cli.terminal import table_lines
 from limber.core.errors import LimberError, SafetyStop
 from limber.core.progress import Progress
-from limber.estimation.simulated_pull import VirtualPullSettings
+from limber.estimation.simulated_pull import PullSpec
 from limber.geometry.generated import generate_branch
 from limber.geometry.tets.tet_mesh import base_nodes
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
@@ -78,7 +78,7 @@ def random_branch(folder: Path, seed: int) -> tuple[Branch, tuple[float, ...]]:
     with branch.stage("reconstruct") as stage:
         made.skeleton.write_swc(stage.path("skeleton.swc"))
         _write_mesh(stage.path("mesh.vtu"), mesh, np.full(mesh.tet_count, 1e9))
-    truth = load_truth(branch, VirtualPullSettings())
+    truth = load_truth(branch, PullSpec())
     shares = young_weights(mesh, truth.control_points) @ np.asarray(truth.young, float)
     with branch.stage("estimate") as stage:
         _write_mesh(stage.path("mesh.vtu"), mesh, shares)

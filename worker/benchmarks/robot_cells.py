@@ -8,7 +8,7 @@ import numpy as np
 from limber.cell.cell_file import Cell, write_cell
 from limber.cell.known_arms import arm_named
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
-from limber.estimation.simulated_pull import VirtualPullSettings
+from limber.estimation.simulated_pull import PullSpec
 from limber.robot.motion.execution import across
 from limber.robot.virtual.branch_solver import BranchSetting
 from limber.robot.virtual.launch import VirtualRobot
@@ -55,7 +55,7 @@ def sideways(branch: Branch, fraction: float = 0.92) -> np.ndarray:
 def robot_holding(branch: Branch, cell: Cell, folder: Path, *, seed: int = 0,
                   young: tuple[float, ...] = ()) -> VirtualRobot:
     """Return a virtual robot with the true branch of a folder in its gripper."""
-    truth = load_truth(branch, VirtualPullSettings(young=young))
+    truth = load_truth(branch, PullSpec(young=young))
     setting = BranchSetting.of_truth(truth, cell, folder / "truth.vtu")
     path = folder / "setting.json"
     path.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}), encoding="utf-8")

@@ -22,7 +22,7 @@ from benchmarks.worlds.sources import LEFT_OUT, branch_case
 from limber.core.errors import LimberError
 from limber.estimation.estimated_branch import forwards_of, parameter_space, subject_of
 from limber.estimation.fitting.objective import Objective
-from limber.estimation.settings import EstimateSettings, VirtualPullSettings
+from limber.estimation.settings import FitSpec, PullSpec
 from limber.estimation.simulated_pull import CellErrors, TrueBranch, simulate_pull
 from limber.estimation.uncertainty.covariance import inverse_information
 from limber.estimation.uncertainty.shape_error import SectionMean
@@ -52,7 +52,7 @@ is chosen for the branch.
 """
 LACKS = ("scan", "cloud", "point")
 """A helpful refusal names one of these."""
-SETTINGS = EstimateSettings(hold_out=False)
+SETTINGS = FitSpec(hold_out=False)
 
 
 PARTS = ("sensor", "geometry", "mesh")
@@ -232,7 +232,7 @@ def _looped(folder: Path, case: ScanCase, rng: np.random.Generator) -> _Loop:
     axes = case.truth.moved(branch.manifest.alignment.apply(case.truth.nodes))
     meshed = mesh_skeleton(axes, reconstructing)
     truth = TrueBranch(meshed.mesh, axes, control_points(axes), FRACTIONS, drawn, branch.gravity)
-    settings = VirtualPullSettings(model="rod", position_noise=0.0, force_noise=0.0, frames=60,
+    settings = PullSpec(model="rod", position_noise=0.0, force_noise=0.0, frames=60,
                                    reach=0.3, seed=int(rng.integers(2**31)))
     exact = simulate_pull(truth, "pull-1", settings)[0]
     peak = float(np.linalg.norm(exact.wrenches[:, :3], axis=1).max())

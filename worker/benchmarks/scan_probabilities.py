@@ -63,12 +63,13 @@ def skeletonised(case: ScanCase) -> tuple[Skeleton, float, float, list[dict]]:
     """The skeleton of a case in its file's frame, with no twig dropped; the noise [m], the root's
     probability, and the bridges.
     """
-    settings = ReconstructSettings(**case.settings | {"twig_probability": 0.0})
+    settings = ReconstructSettings(**case.settings)
     up = np.array(settings.up, float)
     prepared = prepare(Cloud(case.points), 1.0, settings, up=up)
     if case.leaf is not None:
         prepared, _ = without_leaves(prepared)
-    found = skeletonise(prepared.cloud.points, settings, up=up, view=prepared.view)
+    found = skeletonise(prepared.cloud.points, settings, up=up, view=prepared.view,
+                        twig_probability=0.0)
     if prepared.view is not None:
         found, _ = seen_skeleton(found, prepared)
     found = found.moved(lambda points: points + prepared.origin)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.trials import column, sound
 from limber.core.errors import LimberError
-from limber.estimation.settings import EstimateSettings, PredictSettings, SwingSettings
+from limber.estimation.settings import FitSpec, PredictSettings, SwingSettings
 from limber.geometry.bodies import Sections, mesh_sections, read_sections
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -123,7 +123,7 @@ def estimate_beam(branch: Path, recording: Path, load: float, name: str) -> Beam
     pull = import_pull(branch, recording, name, ImportSettings(
         nominal=str(branch.parent / "nominal.csv"), coordinates="scan", weight=load,
         own_weight=True, grasp_point=(float(x), float(y), float(z)), grasp_radius=0.012))
-    found = estimate(branch, EstimateSettings(pull=(name,), fractions=(0.5,), density_sigma=0.02),
+    found = estimate(branch, FitSpec(pull=(name,), fractions=(0.5,), density_sigma=0.02),
                      force=True)
     down = -np.array(pull["load_n"]) / load
     measured = -np.mean(np.array(pull["displacement_m"])[TIPS] @ down)
@@ -255,7 +255,7 @@ def beam_rows(setting: Setting) -> list[Row]:
             branch = _bricks(folder / f"beam-{cells[0]}", cells)
             _imported(branch, folder / "hung.csv", "hung")
             # Poisson's ratio is given: near one half it would take up a coarse mesh's stiffness.
-            found.append(estimate(branch.folder, EstimateSettings(
+            found.append(estimate(branch.folder, FitSpec(
                 fractions=(0.5,), density_sigma=0.02, poisson_sigma=0.0))["young_pa"][0])
     young = np.array(found)
     spread = float(np.ptp(young) / young.mean())
@@ -357,7 +357,7 @@ def _sag(seed: int) -> dict[str, Any]:
             f"m{k}_{axis}_m" for k in range(len(places)) for axis in "xyz")))
         import_pull(folder / "beam.branch", folder / "sag.csv", "sag",
                     ImportSettings(weight=0, own_weight=True))
-        found = estimate(folder / "beam.branch", EstimateSettings(fractions=(0.5,),
+        found = estimate(folder / "beam.branch", FitSpec(fractions=(0.5,),
                                                                   density_sigma=0.01))
     low, high = found["young_interval_pa"][0]
     return {"error": abs(found["young_pa"][0] / young - 1), "held": low <= young <= high}
@@ -370,7 +370,7 @@ def _drawn_sag(folder: Path, rng: np.random.Generator,
     density, poisson = rng.uniform(500, 1100), float(np.clip(rng.normal(0.35, 0.05), 0.2, 0.47))
     table = _drawn_table(folder / "beam.csv", rng)
     told = MeshSurfaceSettings(unit="mm", density=density * rng.normal(1, 0.01), young=1e9)
-    fine, masses = mesh_sections(table, told.model_copy(update={"elements_across": 4.0}))
+    fine, masses = mesh_sections(table, told, elements_across=4.0)
     model = BranchModel(
         fine.mesh, young=young, poisson=poisson, density=density,
         gravity=fine.numbers["gravity_m_s2"], point_masses=[
@@ -410,7 +410,7 @@ def real_row(_setting: Setting) -> list[Row]:
         folder = Path(temporary)
         bricks = _bricks(folder / "swing", _SWING_MESH)
         _imported(bricks, RECORDING, "swing", "swing")
-        swung = swing(bricks.folder, SwingSettings(poisson=POISSON, density_sigma=0.02))
+        swung = swing(bricks.folder, SwingSettings(density_sigma=0.02))
         found = estimate_beam(made_branch(folder), RECORDING, LOAD_N, "csv")
     (low, high), (soft, stiff) = found.interval, swung["young_interval_pa"]
     least, most = swung["damping_ratio_interval"]

@@ -30,7 +30,7 @@ from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.next_pull import PullChoice
 from limber.estimation.parameters import Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import CellErrors
 from limber.estimation.uncertainty.next_actions import ANOTHER_PULL
 from limber.recordings.recording import CalibrationEntry, Pull
@@ -59,7 +59,7 @@ _ADVICE = Asked("interval expected after an action over that got by following it
                    "within 20 %")
 _PAPER = Asked("the paper's branches, noisy: worst error; simulations and seconds, its method / "
                   "ours", "6 %; 20 times fewer")
-_SETTINGS = EstimateSettings(hold_out=False, mesh_check=False)
+_SETTINGS = FitSpec(hold_out=False, mesh_check=False)
 _PLAIN = _SETTINGS.model_copy(update={"field": "inverse_distance", "poisson": 0.35,
                                      "poisson_sigma": 0.0})
 _BETTER = {

@@ -157,7 +157,7 @@ def test_who_keeps_leaves_is_not_refused_for_them() -> None:
 def test_few_leaves_need_no_consent() -> None:
     """Up to a tenth of the points passes, more does not."""
     cloud = Cloud(np.random.default_rng(0).random((1000, 3)))
-    prepared = prepare(cloud, 1.0, ReconstructSettings(keep_sheets=True))
+    prepared = prepare(cloud, 1.0, ReconstructSettings(keep=("sheets",)))
     check_agreed(prepared, [Leaf(np.arange(len(prepared.cloud) // 10), 1e-3)], "m")
     with pytest.raises(InputError, match="11 % of the points look like 1 leaf"):
         check_agreed(prepared, [Leaf(np.arange(110), 1e-3)], "m")
@@ -167,7 +167,7 @@ def test_a_refusal_shows_its_points_by_class(tmp_path, monkeypatch) -> None:
     """Wood brown, leaves green, a stake blue, the rest red, in the file's coordinates; after
     success none."""
     cloud = Cloud(np.random.default_rng(0).random((60, 3)) + 100.0)
-    prepared = prepare(cloud, 1.0, ReconstructSettings(keep_sheets=True))
+    prepared = prepare(cloud, 1.0, ReconstructSettings(keep=("sheets",)))
     seen: list[Cloud] = []
     with shown_if_refused(seen.append, prepared, [], []):
         pass

@@ -105,7 +105,7 @@ def test_ground_and_walls_are_cut_out(turned):
     assert prepared.counts["sheets"] > 0.99 * len(plane)
     assert len(prepared.cloud) > 0.97 * len(branch)
     assert any("flat sheet" in text for text in prepared.warnings)
-    assert len(prepare(both, 1.0, PreparationSettings(keep_sheets=True)).cloud) == len(both)
+    assert len(prepare(both, 1.0, PreparationSettings(keep=("sheets",))).cloud) == len(both)
 
 
 @pytest.mark.slow

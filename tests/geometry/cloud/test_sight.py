@@ -105,7 +105,7 @@ def test_flying_pixels_are_counted() -> None:
     prepared = prepare(Cloud(points), 1.0)
     assert prepared.counts["flying"] > 0.03 * len(points)
     assert any("flying" in text for text in prepared.warnings)
-    kept = prepare(Cloud(points), 1.0, PreparationSettings(keep_flying=True))
+    kept = prepare(Cloud(points), 1.0, PreparationSettings(keep=("flying",)))
     assert "flying" not in kept.counts and len(kept.cloud.points) > len(prepared.cloud.points)
     twice = prepare(Cloud(np.concatenate([points, points[::5]])), 1.0)
     assert twice.counts["flying"] == prepared.counts["flying"]

@@ -11,7 +11,7 @@ from limber.core.errors import Cancelled, InputError
 from limber.core.progress import Progress
 from limber.geometry.cloud.cloud import thinned
 from limber.geometry.generated import GeneratedBranch, generate_branch
-from limber.geometry.settings import SkeletonSettings
+from limber.geometry.skeleton import skeletonise as module
 from limber.geometry.skeleton.contraction import cloud_laplacian, contract, tangent_laplacian
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.search_result import SkeletonResult
@@ -108,11 +108,12 @@ def test_gap_is_bridged_and_reported():
 
 
 @pytest.mark.slow
-def test_gap_over_the_limit_is_split():
+def test_gap_over_the_limit_is_split(monkeypatch):
     """With no bridging allowed the smaller piece is left away, and that is told."""
     stem = np.vstack([_tube([0, 0, 0], [0, 0, 0.6], 0.01, 4000),
                       _tube([0, 0, 0.68], [0, 0, 0.76], 0.01, 600)])
-    result = skeletonise(stem, SkeletonSettings(bridge_limit=0.0))
+    monkeypatch.setattr(module, "_BRIDGE_LIMIT", 0.0)
+    result = skeletonise(stem)
     assert result.split_off[0]["points"] == pytest.approx(600, abs=60)
     assert result.skeleton.length < 0.66
 

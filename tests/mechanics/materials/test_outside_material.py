@@ -306,7 +306,7 @@ def folder(tmp_path):
 
 def simulated(capsys, folder, material, *options):
     code = call(["simulate", str(folder), "--material", material, "--duration", "0.1", "--hold",
-                 "0", "--frame-rate", "20", "--move", "0.05", "0", "-0.005", "--json", *options])
+                 "0", "--move", "0.05", "0", "-0.005", "--json", *options])
     return code, capsys.readouterr()
 
 

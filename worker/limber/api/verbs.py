@@ -81,7 +81,7 @@ def mesh(surface: PathLike, folder: PathLike, *, quiet: bool = False, **settings
         surface: The file: STL, PLY, OBJ, a CSV of sections, or a cylinder model.
         folder: The branch folder to make or replace.
         quiet: Show no progress.
-        settings: ``unit``, ``root`` [3], ``elements_across``, ``young`` [Pa] and those that
+        settings: ``unit``, ``root`` [3], ``young`` [Pa] and those that
             ``limber.settings("mesh")`` lists.
 
     Raises:

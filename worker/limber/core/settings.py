@@ -12,7 +12,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import core_schema
@@ -132,6 +132,12 @@ class Settings(BaseModel):
     groups: ClassVar[Groups] = {}
     common: ClassVar[tuple[str, ...]] = ()
     results_version: ClassVar[int] = 1
+
+    @classmethod
+    def of(cls, settings: "Settings") -> Self:
+        """Return these settings with the further ones that only Python sets, at their defaults."""
+        return settings if isinstance(settings, cls) else cls(**{
+            name: getattr(settings, name) for name in settings.model_fields_set})
 
     @classmethod
     def group_of(cls, name: str) -> str:

@@ -16,10 +16,12 @@ from limber.core.optional import exports
 _PLACES = {
     "Estimate": "fit_assessment",
     "EstimateSettings": "settings",
+    "FitSpec": "settings",
     "EvaluationLog": "fitting.objective",
     "OnlineEstimator": "online.filter",
     "PredictSettings": "settings",
     "Subject": "estimated_branch",
+    "PullSpec": "settings",
     "VirtualPullSettings": "settings",
     "fit_branch": "fit",
     "predict_rest": "prediction",

@@ -16,7 +16,7 @@ from limber.core.errors import InputError
 from limber.estimation.fit_assessment import Estimate
 from limber.estimation.interpolation_prior import bump_deviations, hats, stations_of
 from limber.estimation.parameters import LINK_DEVIATION, Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.covariance import repeated, scaled_rows
 from limber.geometry.skeleton.skeleton import FRACTIONS
 
@@ -49,7 +49,7 @@ class Support:
     start: Values
 
 
-def is_open(settings: EstimateSettings) -> bool:
+def is_open(settings: FitSpec) -> bool:
     """Whether the number of control points is to be chosen: it is not given, and can be.
 
     Nelder-Mead has no derivatives; the paper's field and a reduced model have no bumps.

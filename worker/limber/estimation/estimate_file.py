@@ -10,7 +10,7 @@ from limber.core.files.reading import checked_as, read_json
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit_assessment import Estimate
 from limber.estimation.fitting.objective import Evaluation, Objective
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.covariance import largest, outliers
 from limber.estimation.uncertainty.drift import drift, pull_moduli, scale_steps
 from limber.estimation.uncertainty.model_error import bending_interval, total_interval
@@ -204,7 +204,7 @@ def read_estimate(path: Path) -> dict[str, Any]:
 # The output of an estimate: the result of the stage and ``estimate.json``.
 
 
-def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
+def summary(found: Estimate, settings: FitSpec) -> dict[str, Any]:
     """Return the stage's result: DESIGN's keys and more."""
     values, sure = found.values, found.uncertainty
     return {
@@ -224,7 +224,7 @@ def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
         "forward_count": found.objective.forward_count, "converged": found.fit.converged,
         "stopped": found.stopped, "is_weightless": found.is_weightless, "held_out": found.held_out,
         "variance_factor": sure.variance_factor, "warnings": found.warnings,
-        "creep": found.creep, "orders": settings.orders, "section": settings.section,
+        "creep": found.creep, "orders": "orders" in settings.also, "section": settings.section,
         "forward": settings.forward} | _bending(found) | _reduced_error(found) | _by_pull(found)
 
 

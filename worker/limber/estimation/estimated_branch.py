@@ -13,7 +13,7 @@ from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
 from limber.estimation.interpolation_prior import YoungField, open_field
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import EstimateSettings, FitSpec
 from limber.geometry.skeleton.skeleton import Skeleton, control_points
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import PointMass
@@ -97,7 +97,7 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     if settings.field == "open" and settings.forward == "full" and (
             settings.method == "gauss-newton"):
         field = open_field(mesh, skeleton, weights, settings.initial_fractions,
-                           log_factor=np.log(factor), by_order=settings.orders)
+                           log_factor=np.log(factor), by_order="orders" in settings.also)
     return Subject(mesh, skeleton, points, weights, model, start, field)
 
 
@@ -154,7 +154,7 @@ def neck(skeleton: Skeleton) -> list[str]:
             "out. Its stiffness goes with the fourth power of the radius."]
 
 
-def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
+def forwards_of(pulls: list[Pull], subject: Subject, settings: FitSpec,
                 shifts: Mapping[str, np.ndarray] | None = None) -> list[Forward]:
     """Make the forward simulation of each pull.
 
@@ -214,7 +214,7 @@ def require_scale_in_principle(forwards: list[Forward]) -> None:
 
 
 def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subject: Subject,
-             settings: EstimateSettings) -> Forward:
+             settings: FitSpec) -> Forward:
     if entry.motion == "swing":
         raise InputError(f"{name} is a free swing: no gripper holds the branch.",
                          "Its release, load and damping are fitted together over time.",
@@ -229,7 +229,7 @@ def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subj
                 key_count=settings.key_frames, field=subject.field)
 
 
-def observes_path(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> bool:
+def observes_path(entry: PullEntry, frames: Frames, settings: FitSpec) -> bool:
     """Whether a slow pull's force is prescribed and the gripper's recorded path is observed.
 
     This is so if the force was measured (for a clamped grasp the torque too) and the gripper's
@@ -244,16 +244,17 @@ def observes_path(entry: PullEntry, frames: Frames, settings: EstimateSettings) 
             and (entry.grasp.mode == "point" or uses_torque(entry, frames)))
 
 
-def parameter_space(subject: Subject, forwards: list[Forward], settings: EstimateSettings,
+def parameter_space(subject: Subject, forwards: list[Forward], settings: FitSpec,
                     ) -> ParameterSpace:
     """Return the free parameters, with the priors of those that were not requested.
 
     Poisson's ratio, the density if weight or inertia acts, and the form of the field are free
-    within their priors; requested ones (``--fit-poisson``, ``--fit-density``) are free without a
+    within their priors; requested ones (``--also``) are free without a
     prior.
     """
-    fitted = {"poisson": settings.fit_poisson, "density": settings.fit_density,
-              "alpha": settings.fit_damping, "beta": settings.fit_damping}
+    fitted = {name: part in settings.also for name, part in (
+        ("poisson", "poisson"), ("density", "density"), ("alpha", "damping"),
+        ("beta", "damping"))}
     chosen = {name for name, is_fitted in fitted.items() if is_fitted}
     form = subject.field.names if subject.field is not None else ()
     priors = [(name, 0.0, 1.0) for name in form]
@@ -271,13 +272,13 @@ def parameter_space(subject: Subject, forwards: list[Forward], settings: Estimat
                           priors=tuple(priors))
 
 
-def _with_overrides(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> PullEntry:
+def _with_overrides(entry: PullEntry, frames: Frames, settings: FitSpec) -> PullEntry:
     overrides = {"drive": settings.drive, "motion": settings.motion,
                  "calibration": _with_free_errors(entry, frames, settings)}
     return entry.model_copy(update={k: v for k, v in overrides.items() if v is not None})
 
 
-def _with_free_errors(entry: PullEntry, frames: Frames, settings: EstimateSettings,
+def _with_free_errors(entry: PullEntry, frames: Frames, settings: FitSpec,
                       ) -> CalibrationEntry | None:
     """Return the pull's calibration; of what is not calibrated at all, nothing is known."""
     known = calibration_of(entry)

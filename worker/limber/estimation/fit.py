@@ -54,7 +54,7 @@ from limber.estimation.fitting.reduced_fit import Reduction, fit_reduced
 from limber.estimation.forward.forward_model import Forward, under_its_weight
 from limber.estimation.forward.observed_path import is_path_observed
 from limber.estimation.parameters import Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.covariance import averaged, profiled, uncertainty
 from limber.estimation.uncertainty.creep import with_creep
 from limber.estimation.uncertainty.identifiability import (
@@ -76,7 +76,7 @@ class _ForceLeadsNowhereError(WorkError):
     """No equilibrium under a pull's measured force; there may be one along its path."""
 
 
-def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, *,
+def fit_branch(pulls: list[Pull], subject: Subject, settings: FitSpec, *,
                log: EvaluationLog, cache: Path | None = None, near: Values | None = None,
                quick: bool = False, progress: Progress = SILENT) -> Estimate:
     """Estimate Young's modulus of a branch from its pulls.
@@ -93,7 +93,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
     if log.resumed_count:
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run are reused.")
 
-    def once(branch: Subject, chosen: EstimateSettings, log: EvaluationLog) -> Estimate:
+    def once(branch: Subject, chosen: FitSpec, log: EvaluationLog) -> Estimate:
         if not chosen.free_frame:
             return in_frame(pulls, branch, chosen, log)
         found = _in_free_frame(pulls, lambda seen: in_frame(
@@ -106,7 +106,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
         require_one_explanation(found, other)
         return found
 
-    def in_frame(pulls: list[Pull], branch: Subject, chosen: EstimateSettings,
+    def in_frame(pulls: list[Pull], branch: Subject, chosen: FitSpec,
                  log: EvaluationLog) -> Estimate:
         shifts: dict[str, np.ndarray] = {}
         begin, earlier = near, None
@@ -121,7 +121,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
                 shifts, begin, earlier, log = far.shifts, far.values, far, EvaluationLog(None, "")
         raise AssertionError("the last round looks for no far points")
 
-    def of_forwards(forwards: list[Forward], branch: Subject, chosen: EstimateSettings,
+    def of_forwards(forwards: list[Forward], branch: Subject, chosen: FitSpec,
                     log: EvaluationLog, near: Values | None, far: FarPoints | None) -> Estimate:
         objective = Objective(forwards, parameter_space(branch, forwards, chosen),
                               log=log, force_sigma=[pull.entry.sensor.force_sigma_n
@@ -195,7 +195,7 @@ def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
     return found
 
 
-def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
+def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
               progress: Progress = SILENT, *, cache: Path | None = None, digest: str = "",
               near: Values | None = None, far: FarPoints | None = None, quick: bool = False,
               ) -> Estimate:
@@ -251,7 +251,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     return found
 
 
-def complete(found: Estimate, settings: EstimateSettings, progress: Progress = SILENT) -> None:
+def complete(found: Estimate, settings: FitSpec, progress: Progress = SILENT) -> None:
     """Compute the intervals of a quick fit by the profile of its likelihood, and judge it.
 
     A fit without a valid result has no intervals.
@@ -265,7 +265,7 @@ def complete(found: Estimate, settings: EstimateSettings, progress: Progress = S
         hold_out(found, progress)
 
 
-def _standing(objective: Objective, start: Values, settings: EstimateSettings, progress: Progress,
+def _standing(objective: Objective, start: Values, settings: FitSpec, progress: Progress,
               reduction: Reduction | None) -> tuple[Values, Evaluation]:
     """Return initial values that have equilibria, and their evaluation."""
     judged_on = objective
@@ -317,7 +317,7 @@ def _without_equilibrium(objective: Objective) -> WorkError:
         "Otherwise check the grasp point, the frame of reference and the units.")
 
 
-def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
+def _fitted(objective: Objective, start: np.ndarray, settings: FitSpec,
             progress: Progress, reduction: Reduction | None, far: FarPoints | None, *,
             is_near: bool) -> tuple[Fit, Objective]:
     def optimise(chosen: Objective, free: np.ndarray, is_near: bool = False) -> Fit:
@@ -351,7 +351,7 @@ def _resumed(objective: Objective, start: np.ndarray) -> np.ndarray:
     return start
 
 
-def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
+def _refined(fit: Fit, objective: Objective, settings: FitSpec,
              progress: Progress) -> Fit:
     """Simulate more key frames if the spline error between them exceeds the measurement noise."""
     for _ in range(3):
@@ -366,8 +366,8 @@ def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
         if not coarse or settings.method == "nelder-mead":
             if coarse:
                 progress.warn(
-                    "The error of the interpolated frames exceeds a third of the noise. Increase "
-                    "--key-frames.")
+                    "The error of the interpolated frames exceeds a third of the noise. --method "
+                    "gauss-newton simulates more frames.")
             return fit
         for forward in coarse:
             forward.refine()
@@ -377,7 +377,7 @@ def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
     return fit
 
 
-def _linked_at_the_end(fit: Fit, objective: Objective, settings: EstimateSettings,
+def _linked_at_the_end(fit: Fit, objective: Objective, settings: FitSpec,
                        progress: Progress) -> tuple[Fit, Objective]:
     """Link what the data do not determine at the solution, and fit again if the links differ.
 

@@ -18,7 +18,7 @@ from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton
 from limber.estimation.forward.forward_model import Forward
 from limber.estimation.forward.observed_path import AT_REST_M
 from limber.estimation.parameters import Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.covariance import Uncertainty, largest, outliers, variance_parts
 from limber.estimation.uncertainty.creep import creep_sentence
 from limber.estimation.uncertainty.identifiability import (
@@ -274,7 +274,7 @@ def _score(forward: Forward, distance: float, force: float, *, in_fit: bool) -> 
             "relative_force": force / peak if peak > 0 else np.nan}
 
 
-def score_unused(pull: Pull, subject: Subject, found: Estimate, settings: EstimateSettings) -> None:
+def score_unused(pull: Pull, subject: Subject, found: Estimate, settings: FitSpec) -> None:
     """Score the prediction of a pull that the estimate does not use, into ``found.held_out``.
 
     Raises:
@@ -373,7 +373,7 @@ def _listed(young: np.ndarray) -> str:
     return ", ".join(f"{value / 1e6:.4g}" for value in young)
 
 
-def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: EstimateSettings,
+def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: FitSpec,
                 *, axes: Path | None, cloud: np.ndarray | None,
                 progress: Progress = SILENT) -> None:
     """Compute the errors of shape and mesh, which residuals do not show.
@@ -428,7 +428,7 @@ def _path_error(found: Estimate, progress: Progress) -> np.ndarray | None:
     return error
 
 
-def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSettings,
+def _geometry_error(subject: Subject, found: Estimate, settings: FitSpec,
                     axes: Path | None, cloud: np.ndarray | None, progress: Progress) -> ModelError:
     """From the scan's axis and radii; none for a skeleton that was not fitted to a scan."""
     if axes is None:

@@ -22,7 +22,7 @@ from limber.estimation.estimated_branch import Subject, forwards_of, parameter_s
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward.gripper_path import MotionWanted, moved
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.strain import strain_state
@@ -269,7 +269,7 @@ def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: K
     """
     simulated = cell.in_frames(_FRAMES)
     pull, displacements = _without_noise(choice, subject, values, simulated)
-    settings = EstimateSettings(key_frames=4)
+    settings = FitSpec(key_frames=4)
     at = replace(subject, start=values, model=_model(subject, values))
     forwards = forwards_of([pull], at, settings)
     space = parameter_space(at, forwards, settings)

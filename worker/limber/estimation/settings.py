@@ -1,5 +1,6 @@
 """Settings of estimates, virtual pulls and predictions, without heavy imports."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -18,17 +19,18 @@ if TYPE_CHECKING:
 
     from limber.recordings.recording import CalibrationEntry
 
+_QUICK = {"key_frames": 4, "hold_out": False, "mesh_check": False, "shapes": 0}
+
 
 class EstimateSettings(Settings):
     """Options for estimating Young's modulus from pulls."""
 
     groups: ClassVar[Groups] = {
         "input": ("pull", "drive", "motion", "fractions", "free_frame"),
-        "material": ("young", "poisson", "density", "gravity", "fit_poisson", "fit_density",
-                     "fit_damping", "orders", "pith_radius", "bark_thickness", "bark_modulus"),
-        "solver": ("method", "delta_m2", "forward", "key_frames"),
-        "uncertainty": ("field", "poisson_sigma", "density_sigma", "hung_sigma", "hold_out",
-                        "mesh_check", "shapes"),
+        "material": ("young", "poisson", "density", "gravity", "also", "pith_radius",
+                     "bark_thickness", "bark_modulus"),
+        "solver": ("method", "delta_m2", "forward", "quick"),
+        "uncertainty": ("field", "poisson_sigma", "density_sigma", "hung_sigma"),
     }
     common = ("pull", "fractions")
 
@@ -42,6 +44,10 @@ class EstimateSettings(Settings):
         "full", description="reduced: a reduced model of slow pose-driven pulls, corrected by "
         "the full model. Its basis is kept in the branch folder, so further estimates take "
         "seconds.")
+    quick: bool = Field(
+        False, description="A first look: few simulated frames, no fit without each pull, no "
+        "finer mesh and no other shapes of the branch. Its intervals are too narrow.",
+        json_schema_extra={"switch": True})
     drive: Literal["pose", "force"] | None = Field(
         None, description="pose: the gripper's pose is prescribed, and its force is compared. "
         "force: the measured force is prescribed, as in the paper. Default: as each pull states.")
@@ -57,7 +63,7 @@ class EstimateSettings(Settings):
     young: float | None = Field(
         None, gt=0, description="Initial Young's modulus [Pa] where no measured force gives one.")
     poisson: float | None = Field(
-        None, ge=0, lt=0.495, description="Poisson's ratio; constant unless --fit-poisson is "
+        None, ge=0, lt=0.495, description="Poisson's ratio; constant unless --also poisson is "
             "given.")
     density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
     gravity: bool = Field(
@@ -70,36 +76,21 @@ class EstimateSettings(Settings):
     density_sigma: float = Field(
         0.1, ge=0, description="Relative standard deviation of the density, if weight or inertia "
             "acts.")
-    fit_poisson: bool = Field(False, description="Estimate Poisson's ratio too.")
-    fit_density: bool = Field(False, description="Estimate the density too.")
-    fit_damping: bool = Field(False, description="Estimate Rayleigh damping too (dynamic only).")
-    orders: bool = Field(
-        False, description="Estimate the modulus of side branches over that of the main path, one "
-        "ratio for each branching order. Pull or observe side branches: otherwise the pulls do not "
-        "determine it.")
+    hung_sigma: float = Field(
+        0.4, ge=0, description="Relative standard deviation of the mass of twigs and leaves "
+        "outside the mesh. The default is the difference between two programs' volumes of one "
+        "crown.")
+    also: tuple[Literal["poisson", "density", "damping", "orders"], ...] = Field(
+        (), description="What to estimate too. poisson: Poisson's ratio. density. damping: "
+        "Rayleigh damping (dynamic only). orders: the modulus of side branches over that of the "
+        "main path, one ratio for each branching order. Pull or observe side branches: otherwise "
+        "the pulls do not determine it.")
     pith_radius: float = Field(
         0.0, ge=0, description="Radius of a hollow or of pith that carries nothing [m]. The "
         "modulus is then that of the wood, and the mesh has an equivalent one for bending.")
     bark_thickness: float = Field(0.0, ge=0, description="Thickness of the bark [m].")
     bark_modulus: float = Field(
         0.0, ge=0, description="Young's modulus of the bark over that of the wood.")
-    key_frames: int = Field(
-        12, ge=3, description="Number of simulated frames. A spline interpolates the others. The "
-        "number is doubled if that changes the result.")
-    hung_sigma: float = Field(
-        0.4, ge=0, description="Relative standard deviation of the mass of twigs and leaves "
-        "outside the mesh. The default is the difference between two programs' volumes of one "
-        "crown.")
-    hold_out: bool = Field(
-        True, description="With several pulls, fit without each one in turn, and compare it with "
-            "its prediction.")
-    mesh_check: bool = Field(
-        True, description="Measure the excess stiffness of this mesh on a finer mesh, and include "
-        "it in the intervals.")
-    shapes: int = Field(
-        16, ge=0, description="Number of posterior samples of the branch's shape given the scan. "
-        "The pulls are simulated on each one to include the uncertainty of the shape in the "
-        "intervals. 0: only the uncertainty of the radii.")
 
     _young = field_validator("young")(possible_young)
     _density = field_validator("density")(possible_density)
@@ -128,37 +119,53 @@ class EstimateSettings(Settings):
         return layers if self.pith_radius or self.bark_thickness else {}
 
 
+class FitSpec(EstimateSettings):
+    """An estimate, with what only Python sets."""
+
+    key_frames: int = Field(
+        12, ge=3, description="Number of simulated frames. A spline interpolates the others. The "
+        "number is doubled if that changes the result.")
+    hold_out: bool = Field(
+        True, description="With several pulls, fit without each one in turn, and compare it with "
+            "its prediction.")
+    mesh_check: bool = Field(
+        True, description="Measure the excess stiffness of this mesh on a finer mesh, and include "
+        "it in the intervals.")
+    shapes: int = Field(
+        16, ge=0, description="Number of posterior samples of the branch's shape given the scan. "
+        "The pulls are simulated on each one to include the uncertainty of the shape in the "
+        "intervals. 0: only the uncertainty of the radii.")
+
+    @classmethod
+    def of(cls, settings: Settings) -> Self:
+        found = super().of(settings)
+        return found.model_copy(update=_QUICK) if found.quick else found
+
+
 class SwingSettings(Settings):
     """Options for estimating Young's modulus and damping from a free swing."""
 
     groups: ClassVar[Groups] = {
         "input": ("pull",),
-        "material": ("poisson", "density"),
         "uncertainty": ("density_sigma",),
     }
     common = ("pull",)
 
     pull: str | None = Field(None, description="Name of the swing. Default: the only one.")
-    poisson: float | None = Field(None, ge=0, lt=0.495, description="Poisson's ratio.")
-    density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
     density_sigma: float = Field(
         0.1, ge=0, description="Relative standard deviation of the density. A swing determines "
         "the modulus through inertia, so this uncertainty enters the modulus in full.")
-
-    _density = field_validator("density")(possible_density)
 
 
 class VirtualPullSettings(Settings):
     """A simulated pull."""
 
     groups: ClassVar[Groups] = {
-        "material": ("young", "poisson", "density", "damping", "gravity", "own_weight", "shape"),
+        "material": ("young", "poisson", "density", "gravity", "own_weight", "shape"),
         "motion": ("model", "motion", "drive", "weight", "frames", "duration", "grasp_fraction",
             "mode", "reach", "phase"),
-        "noise": ("position_noise", "force_noise", "torque_noise", "camera", "outliers", "seed"),
-        "errors of the cell": ("cell_errors", "pose_sigma", "pose_turn_sigma", "force_gain_sigma",
-            "force_bias_sigma", "force_drift_sigma", "torque_bias_sigma", "camera_sigma",
-            "camera_turn_sigma", "point_sigma", "clock_sigma"),
+        "noise": ("position_noise", "force_noise", "camera", "seed"),
+        "errors of the cell": ("cell_errors",),
     }
     common = ("cell_errors", "seed")
 
@@ -180,8 +187,6 @@ class VirtualPullSettings(Settings):
     weight: float | None = Field(
         None, gt=0, description="Instead of pulling sideways, hang a weight on the grasp that "
         "grows to this value [N]. The pull is slow and force-driven.")
-    damping: tuple[float, float] = Field(
-        (0.5, 0.002), description="True Rayleigh damping of a dynamic pull [1/s, s].")
     frames: int | None = Field(
         None, ge=2, description="Number of recorded frames. Default: 24, or 60 for a dynamic "
         "pull.")
@@ -204,8 +209,6 @@ class VirtualPullSettings(Settings):
     position_noise: float = Field(1e-3, ge=0, description="Noise of the observed points [m].")
     force_noise: float = Field(
         0.02, ge=0, description="Noise of the force as a fraction of its largest value.")
-    torque_noise: float = Field(
-        0.02, ge=0, description="Noise of the torque as a fraction of its largest value (rigid).")
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
     own_weight: bool = Field(
@@ -217,13 +220,53 @@ class VirtualPullSettings(Settings):
         "shape.")
     camera: bool = Field(
         False, description="Record depth images of a simulated D455 instead of points.")
-    outliers: float = Field(0.0, ge=0, lt=0.5, description="Fraction of points displaced by 5 cm.")
-    cell_errors: Literal["none", "realistic"] = Field(
+    cell_errors: str = Field(
         "none", description="Errors of the cell that stay during the recording, drawn from the "
-        "seed. realistic: those of a cell that was set up with care and not measured since "
-        "(gripper 1 mm and 1 degree, force gain 2 %, zero and drift 1 N, camera 1 mm, points 5 mm "
-        "along the branch). The pull "
-        "states their standard deviations as its calibration. Each can be set by its own option.")
+        "seed: none, realistic, or a TOML file whose table [calibration] has their standard "
+        "deviations, as pull.toml has. realistic: those of a cell that was set up with care and "
+        "not measured since (gripper 1 mm and 1 degree, force gain 2 %, zero and drift 1 N, "
+        "camera 1 mm, points 5 mm along the branch). The pull states them as its calibration.")
+    seed: int = Field(0, ge=0, description="Seed of all random numbers.")
+
+    @property
+    def calibration(self) -> "CalibrationEntry":
+        """Standard deviations of the cell's errors.
+
+        Raises:
+            InputError: they are in a file that cannot be read.
+        """
+        from limber.recordings.recording import EXACT, CalibrationEntry, read_calibration
+
+        if self.cell_errors == "none":
+            return EXACT
+        return (CalibrationEntry() if self.cell_errors == "realistic"
+                else read_calibration(Path(self.cell_errors)))
+
+    @property
+    def frame_count(self) -> int:
+        return self.frames or (60 if self.motion == "dynamic" else 24)
+
+    @property
+    def times(self) -> "np.ndarray":
+        """Time stamps [s], shape [frame_count]."""
+        import numpy as np
+
+        duration = self.duration or (1.5 if self.motion == "dynamic" else 6.0)
+        return np.linspace(0.0, duration, self.frame_count)
+
+    _young = field_validator("young")(possible_young)
+    _density = field_validator("density")(possible_density)
+    _force = field_validator("weight")(possible_force)
+
+
+class PullSpec(VirtualPullSettings):
+    """A simulated pull, with what only Python sets."""
+
+    damping: tuple[float, float] = Field(
+        (0.5, 0.002), description="True Rayleigh damping of a dynamic pull [1/s, s].")
+    torque_noise: float = Field(
+        0.02, ge=0, description="Noise of the torque as a fraction of its largest value (rigid).")
+    outliers: float = Field(0.0, ge=0, lt=0.5, description="Fraction of points displaced by 5 cm.")
     pose_sigma: float | None = Field(
         None, ge=0, description="Error of the position of the gripper's frame, each axis [m].")
     pose_turn_sigma: float | None = Field(
@@ -244,14 +287,10 @@ class VirtualPullSettings(Settings):
         "point [m].")
     clock_sigma: float | None = Field(
         None, ge=0, description="Offset of the observer's clock from the robot's [s].")
-    seed: int = Field(0, ge=0, description="Seed of all random numbers.")
 
     @property
     def calibration(self) -> "CalibrationEntry":
-        """Standard deviations of the cell's errors; those not requested are exact."""
-        from limber.recordings.recording import EXACT, CalibrationEntry
-
-        begun = CalibrationEntry() if self.cell_errors == "realistic" else EXACT
+        """Standard deviations of the cell's errors, each as requested."""
         sigmas = {"pose_sigma_m": self.pose_sigma, "pose_sigma_rad": self.pose_turn_sigma,
                   "force_gain_sigma": self.force_gain_sigma,
                   "force_bias_sigma_n": self.force_bias_sigma,
@@ -259,24 +298,8 @@ class VirtualPullSettings(Settings):
                   "torque_bias_sigma_nm": self.torque_bias_sigma,
                   "camera_sigma_m": self.camera_sigma, "camera_sigma_rad": self.camera_turn_sigma,
                   "point_sigma_m": self.point_sigma, "clock_sigma_s": self.clock_sigma}
-        return begun.model_copy(update={
+        return super().calibration.model_copy(update={
             name: value for name, value in sigmas.items() if value is not None})
-
-    @property
-    def frame_count(self) -> int:
-        return self.frames or (60 if self.motion == "dynamic" else 24)
-
-    @property
-    def times(self) -> "np.ndarray":
-        """Time stamps [s], shape [frame_count]."""
-        import numpy as np
-
-        duration = self.duration or (1.5 if self.motion == "dynamic" else 6.0)
-        return np.linspace(0.0, duration, self.frame_count)
-
-    _young = field_validator("young")(possible_young)
-    _density = field_validator("density")(possible_density)
-    _force = field_validator("weight")(possible_force)
 
 
 class PredictSettings(Settings):

@@ -20,7 +20,7 @@ from limber.core.numerics.rigid import composed, rotated
 from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.gripper_path import MotionMade, MotionWanted, moved
 from limber.estimation.rod import Rod, RodMotion
-from limber.estimation.settings import VirtualPullSettings
+from limber.estimation.settings import PullSpec
 from limber.estimation.uncertainty.model_error import refined
 from limber.geometry.cloud.camera import D455, Camera, write_camera
 from limber.geometry.shape_samples import reshaped, sample_skeletons
@@ -178,7 +178,7 @@ class TrueBranch:
         return shares @ self.young / shares.sum(axis=1)
 
 
-def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
+def true_branch(skeleton: Skeleton, settings: PullSpec, *,
                 body: TetMesh | None = None, scan: np.ndarray | None = None,
                 fractions: tuple[float, ...] = FRACTIONS,
                 young: Sequence[float] = DEFAULT_YOUNG_PA,
@@ -224,7 +224,7 @@ def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random
                     "Scan with less noise, or give --shape fitted.")
 
 
-def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *,
+def simulate_pull(truth: TrueBranch, name: str, settings: PullSpec, *,
                   progress: Progress = SILENT) -> tuple[Pull, list[np.ndarray]]:
     """Pull the true branch and measure it; returns the pull and the true displacements [m].
 
@@ -271,7 +271,7 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     return pull, displacements
 
 
-def _requested(truth: TrueBranch, settings: VirtualPullSettings, entry: PullEntry,
+def _requested(truth: TrueBranch, settings: PullSpec, entry: PullEntry,
                phase: float) -> MotionWanted:
     point = np.array(entry.grasp.point_m)
     arc = settings.grasp_fraction * truth.skeleton.arc_length[truth.skeleton.main_path()[-1]]
@@ -282,7 +282,7 @@ def _requested(truth: TrueBranch, settings: VirtualPullSettings, entry: PullEntr
         / np.linalg.norm(truth.gravity))
 
 
-def _rod(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool) -> Rod:
+def _rod(truth: TrueBranch, settings: PullSpec, is_weightless: bool) -> Rod:
     """The true branch as a rod, with the same moduli between the control points.
 
     Raises:
@@ -299,7 +299,7 @@ def _rod(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool) 
                   settings.grasp_fraction, as_scanned=not settings.own_weight)
 
 
-def _marked(truth: TrueBranch, settings: VirtualPullSettings) -> tuple[np.ndarray, np.ndarray]:
+def _marked(truth: TrueBranch, settings: PullSpec) -> tuple[np.ndarray, np.ndarray]:
     """Distances of the observed points along the branch from the control points [m], [K], and where
     they are [m], [K, 3].
     """
@@ -310,7 +310,7 @@ def _marked(truth: TrueBranch, settings: VirtualPullSettings) -> tuple[np.ndarra
     return shifts, points
 
 
-def _misread(exact: Pull, shifts: np.ndarray, settings: VirtualPullSettings,
+def _misread(exact: Pull, shifts: np.ndarray, settings: PullSpec,
              ) -> tuple[PullEntry, np.ndarray, np.ndarray, np.ndarray]:
     """Return entry, poses, wrenches and positions as a cell with errors records them."""
     if settings.camera:
@@ -327,7 +327,7 @@ def _misread(exact: Pull, shifts: np.ndarray, settings: VirtualPullSettings,
     return entry, seen.poses, seen.wrenches, observed.positions
 
 
-def _model(truth: TrueBranch, settings: VirtualPullSettings,
+def _model(truth: TrueBranch, settings: PullSpec,
            progress: Progress) -> BranchModel:
     weights = young_weights(truth.mesh, truth.control_points)
     has_weight = settings.gravity and not truth.is_weightless
@@ -337,7 +337,7 @@ def _model(truth: TrueBranch, settings: VirtualPullSettings,
     return model if settings.own_weight else hang(model, progress=progress).model
 
 
-def _kind(settings: VirtualPullSettings,
+def _kind(settings: PullSpec,
           ) -> Literal["pull", "turned", "shake", "release", "weight"]:
     if settings.weight is not None:
         if settings.motion == "dynamic":
@@ -350,7 +350,7 @@ def _kind(settings: VirtualPullSettings,
     return "turned" if settings.mode == "rigid" and settings.drive == "pose" else "pull"
 
 
-def _entry(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool) -> PullEntry:
+def _entry(truth: TrueBranch, settings: PullSpec, is_weightless: bool) -> PullEntry:
     point = truth.skeleton.point_at(settings.grasp_fraction)
     radius = truth.skeleton.radius_at(settings.grasp_fraction)
     known = {"young_pa": truth.young.tolist(), "poisson": settings.poisson,
@@ -373,7 +373,7 @@ def _entry(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool
 
 
 def write_depth_frames(folder: Path, truth: TrueBranch, pull: Pull, displacements: list[np.ndarray],
-                        settings: VirtualPullSettings) -> None:
+                        settings: PullSpec) -> None:
     """Write simulated D455 depth images of a pull: ``depth/`` and ``camera.toml``."""
     camera = viewing(truth.mesh.nodes, displacements)
     write_camera(folder / "camera.toml", camera)

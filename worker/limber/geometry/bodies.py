@@ -21,12 +21,15 @@ from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, upright_rotat
 from limber.geometry.skeleton.sweep import bending_factor, frames, resample, rings, tangents
 from limber.geometry.surface.surface import Surface
 from limber.geometry.tets.tet_mesh import TetMesh, mark, measure_quality
-from limber.geometry.tets.tetrahedra import MeshSettings, tetrahedralise
+from limber.geometry.tets.tetrahedra import tetrahedralise
 from limber.geometry.tets.tree_sweep import swept
 
 # From the closed surface of any slender body to tetrahedra with axis, base and grasp.
 
+ELEMENTS_ACROSS = 3.0
+"""Elements across a body's thickness."""
 _SECTIONS = 24  # cross-sections of an axis
+_SECONDS = 600.0  # of processor time for fTetWild; there are no axes to sweep along
 
 
 @dataclass(frozen=True)
@@ -60,16 +63,12 @@ def mesh_body(surface: Surface, settings: MeshSurfaceSettings,
         surface, None if settings.root is None else np.array(settings.root) * scale)
     alignment, surface, skeleton = aligned_body(surface, skeleton, scale, settings)
     thick = float(np.median(skeleton.radius))
-    limits = MeshSettings(mesh_time_limit=settings.mesh_time_limit,
-                          mesh_memory_limit_mb=settings.mesh_memory_limit_mb)
     try:
         mesh, cached = tetrahedralise(
-            surface, edge_length=2 * thick / settings.elements_across, epsilon=0.02 * thick,
-            settings=limits, stop_energy=10.0, progress=progress.part(0.1, 0.9))
+            surface, edge_length=2 * thick / ELEMENTS_ACROSS, epsilon=0.02 * thick,
+            time_limit=_SECONDS, stop_energy=10.0, progress=progress.part(0.1, 0.9))
     except MeshingError as error:  # there are no axes to sweep along
-        raise MeshingError(
-            error.seen, error.why, "Raise --mesh-time-limit or --mesh-memory-limit-mb, lower "
-            "--elements-across, or simplify the surface.") from error
+        raise MeshingError(error.seen, error.why, "Simplify the surface.") from error
     mesh = mark(mesh, skeleton, young=settings.young, poisson=settings.poisson,
                 density=settings.density, fractions=FRACTIONS,
                 grasp_fraction=settings.grasp_fraction)
@@ -270,6 +269,7 @@ SECTIONS = Format("sections", (".csv",), read_sections)
 
 
 def mesh_sections(sections: Sections, settings: MeshSurfaceSettings,
+                  elements_across: float = ELEMENTS_ACROSS,
                   ) -> tuple[MeshedBody, list[dict[str, Any]]]:
     """Sweep tetrahedra along drawn sections and mark base, control points and grasp.
 
@@ -281,7 +281,7 @@ def mesh_sections(sections: Sections, settings: MeshSurfaceSettings,
     """
     skeleton = Skeleton.from_edges(sections.axis, np.arange(len(sections.axis)) - 1,
                                    sections.radius)
-    mesh = _swept(sections, settings)
+    mesh = _swept(sections, settings, elements_across)
     faces = mesh.surface_faces()
     used, corners = np.unique(faces, return_inverse=True)
     surface = Surface(mesh.nodes[used], corners.reshape(-1, 3))
@@ -298,13 +298,14 @@ def mesh_sections(sections: Sections, settings: MeshSurfaceSettings,
         "hung_mass_kg": float(sections.mass.sum())}), masses
 
 
-def _swept(sections: Sections, settings: MeshSurfaceSettings) -> TetMesh:
+def _swept(sections: Sections, settings: MeshSurfaceSettings,
+           elements_across: float) -> TetMesh:
     """Linear tetrahedra whose cross-sections bend as the ellipses do."""
     thin = np.minimum(sections.width, sections.height) / 2
-    spacing = SLICE / settings.elements_across * thin
+    spacing = SLICE / elements_across * thin
     centres, width = resample(sections.axis, sections.width, spacing)
     height = resample(sections.axis, sections.height, spacing)[1]
-    sides = max(6, round(SIDES * settings.elements_across))
+    sides = max(6, round(SIDES * elements_across))
     tangent = tangents(centres)
     upper, across = frames(centres, tangent, _upper(tangent[0], np.array(settings.up)))
     ring = rings(np.zeros_like(centres), np.ones(len(centres)), upper, across, sides,
@@ -370,8 +371,7 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
     alignment, skeleton = _aligned(read, scale, settings)
     meshed = mesh_skeleton(skeleton, ReconstructSettings(
         young=settings.young, poisson=settings.poisson, density=settings.density,
-        grasp_fraction=settings.grasp_fraction, mesh_time_limit=settings.mesh_time_limit,
-        mesh_memory_limit_mb=settings.mesh_memory_limit_mb, leave_out=True), progress)
+        grasp_fraction=settings.grasp_fraction, leave_out=True), progress)
     return MeshedBody(alignment, skeleton, meshed.surface, meshed.mesh, meshed.numbers | {
         "point_count": len(meshed.surface.vertices),
         "gravity_m_s2": gravity_after(alignment, settings.up)}), meshed.masses

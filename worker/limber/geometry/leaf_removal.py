@@ -18,6 +18,9 @@ from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT
 UNASKED = 0.1
 """Fraction of the points up to which leaves are removed without the user's consent."""
 
+LEAF_DENSITY = 0.2
+"""Mass of leaves per area of one side [kg/m^2]."""
+
 _LEAST = 0.05  # smallest fraction of points that is removed as leaves
 # Distance in radii up to which a point is on a round axis; a filled blade to which a rod was fitted
 # has a third of its points there.
@@ -140,7 +143,7 @@ def leaf_mask(leaves: list[Leaf], count: int) -> np.ndarray:
     return found
 
 
-def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton, density: float,
+def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton,
                 ) -> list[dict[str, Any]]:
     """Return the masses and positions of leaves: sheets of even thickness on the nearest axes.
 
@@ -148,7 +151,6 @@ def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton, dens
         leaves: Leaves of the scan.
         points: The scan [m], shape [n, 3], in the skeleton's frame.
         skeleton: Skeleton of the wood.
-        density: Mass of a leaf per area [kg/m^2].
 
     Returns:
         For each leaf ``kind`` ("leaf"), ``mass_kg``, ``area_m2``, ``centre_m``, ``attached_m``
@@ -159,9 +161,9 @@ def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton, dens
         blade = points[leaf.points]
         distance, node = tree.query(blade)
         centre = blade.mean(axis=0)
-        second = leaf.area * density * np.cov(blade.T, bias=True)
+        second = leaf.area * LEAF_DENSITY * np.cov(blade.T, bias=True)
         masses.append({
-            "kind": "leaf", "mass_kg": leaf.area * density, "area_m2": leaf.area,
+            "kind": "leaf", "mass_kg": leaf.area * LEAF_DENSITY, "area_m2": leaf.area,
             "centre_m": centre.tolist(),
             "attached_m": skeleton.nodes[node[np.argmin(distance)]].tolist(),
             "inertia_kg_m2": (np.trace(second) * np.eye(3) - second).tolist()})
@@ -174,4 +176,4 @@ def leaves_text(masses: list[dict[str, Any]], share: float) -> str:
     return (f"Limber detected and removed {count} ({100 * share:.0f} % of the points, "
             f"{1e4 * sum(m['area_m2'] for m in masses):.0f} cm2). Their mass of "
             f"{1e3 * sum(m['mass_kg'] for m in masses):.3g} g is attached to the stems "
-            "(--leaf-density). --leaves keep treats all points as wood.")
+            f"({LEAF_DENSITY:g} kg/m^2). --leaves keep treats all points as wood.")

@@ -89,8 +89,8 @@ def report_pruned_twigs(masses: list[dict[str, Any]], meshed: float, settings: R
         raise MeshingError(text,
                            "Their weight would act on the branch, but they could neither bend nor "
                            "be grasped.",
-                           "Accept this (--leave-out), mesh with fTetWild and more time (--mesher "
-                           "ftetwild --mesh-time-limit 600), or correct the skeleton there.")
+                           "Accept this (--leave-out), mesh with fTetWild (--mesher ftetwild), or "
+                           "correct the skeleton there.")
     progress.warn(f"{text} Their mass is kept.")
 
 

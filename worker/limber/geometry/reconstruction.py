@@ -262,7 +262,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
     hung: list[dict[str, Any]] = []
     if leaves:
         cloud = _with_leaves(prepared, leaves, alignment, found.skeleton)
-        hung = leaf_masses(leaves, cloud.points, found.skeleton, settings.leaf_density)
+        hung = leaf_masses(leaves, cloud.points, found.skeleton)
         meshed = replace(meshed, masses=[*meshed.masses, *hung])
         warnings.append(leaves_text(hung, float(cloud.attributes["leaf"].mean())))
         progress.warn(warnings[-1])

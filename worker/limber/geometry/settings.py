@@ -23,7 +23,7 @@ class PreparationSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("crop_low", "crop_high", "camera_at"),
-        "shape": ("keep_sheets", "keep_flying"),
+        "shape": ("keep",),
     }
 
     crop_low: tuple[float, float, float] | None = Field(
@@ -33,26 +33,21 @@ class PreparationSettings(Settings):
     camera_at: tuple[float, float, float] | None = Field(
         None, description="Position of the depth camera, in the file's coordinates. Default: the "
         "origin, if the cloud is an image seen from there.")
-    keep_sheets: bool = Field(
-        False, description="Keep walls and ground. Default: wide flat sheets are removed.")
-    keep_flying: bool = Field(
-        False, description="Keep points that look like flying pixels of a depth camera. Default: "
-        "they are removed from a cloud that one camera saw.")
+    keep: tuple[Literal["sheets", "flying"], ...] = Field(
+        (), description="What is usually removed and is to be kept. sheets: walls and ground, "
+        "which are wide and flat. flying: points that look like flying pixels, in a cloud that "
+        "one depth camera saw.")
 
 
 class SkeletonSettings(Settings):
     """Settings of the skeleton."""
 
     groups: ClassVar[Groups] = {
-        "shape": ("bridge_limit", "twig_probability", "plants"),
+        "shape": ("plants",),
         "the paper's equations": ("contraction_weight", "gap_factor", "radii",
                                   "radius_neighbours", "radius_low", "radius_high"),
     }
 
-    bridge_limit: float = Field(
-        0.15, ge=0, le=1, description="Bridge gaps up to this fraction of the cloud's diagonal.")
-    twig_probability: float = Field(
-        0.5, ge=0, le=1, description="Remove twigs whose probability is lower. 0 keeps all.")
     plants: Literal["refuse", "largest", "joined"] = Field(
         "refuse", description="Two plants in one cloud: refuse the cloud, keep the largest, or "
             "join them.")
@@ -91,7 +86,7 @@ class MeshSettings(Settings):
     """Settings of the tetrahedra."""
 
     groups: ClassVar[Groups] = {
-        "mesh": ("mesher", "mesh_spacing", "mesh_time_limit", "mesh_memory_limit_mb"),
+        "mesh": ("mesher", "mesh_spacing"),
     }
 
     mesher: Literal["auto", "ftetwild", "sweep"] = Field(
@@ -99,9 +94,6 @@ class MeshSettings(Settings):
         "a twig. ftetwild: fTetWild, with the sweep as its fallback.")
     mesh_spacing: float = Field(
         2.5, gt=0.3, le=8, description="Distance between cross-sections in local radii.")
-    mesh_time_limit: float = Field(60.0, gt=0, description="fTetWild's limit of processor time "
-                                   "[s].")
-    mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
 
 
 class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
@@ -110,7 +102,7 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
         "shape": ("twig_radius", "leaves", "unexplained", "leave_out"),
-        "material": ("young", "poisson", "density", "leaf_density"),
+        "material": ("young", "poisson", "density"),
         "mesh": ("grasp_fraction",),
     }
     common = ("unit", "up", "root", "leaves")
@@ -143,8 +135,6 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
     density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
-    leaf_density: float = Field(
-        0.2, ge=0, description="Mass of leaves per area of one side [kg/m^2].")
     grasp_fraction: float = Field(
         GRASP_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the main "
             "path.")
@@ -158,7 +148,7 @@ class MeshSurfaceSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
-        "mesh": ("elements_across", "mesh_time_limit", "mesh_memory_limit_mb", "grasp_fraction"),
+        "mesh": ("grasp_fraction",),
         "material": ("young", "poisson", "density"),
     }
     common = ("unit",)
@@ -170,11 +160,6 @@ class MeshSurfaceSettings(Settings):
         None, description="A point near the fixed end, in the file's coordinates. Default: the "
         "thicker end.")
     upright: bool = Field(True, description="Turn the long axis to z, and gravity with it.")
-    elements_across: float = Field(
-        3.0, gt=0.2, le=20, description="Number of elements across the body's thickness.")
-    mesh_time_limit: float = Field(120.0, gt=0, description="fTetWild's limit of processor time "
-                                   "[s].")
-    mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
     young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
     density: float = Field(900.0, gt=0, description="Density [kg/m^3].")
@@ -185,27 +170,31 @@ class MeshSurfaceSettings(Settings):
     _density = field_validator("density")(possible_density)
 
 
-class BranchSpec(Settings):
+class GeneratedSettings(Settings):
     """Settings of a generated branch and its scan."""
 
     groups: ClassVar[Groups] = {
-        "shape": ("length", "radius_root", "radius_tip", "bend", "fork_count"),
-        "scan": ("noise", "point_spacing", "unevenness", "occlusion", "view", "gap_count"),
-        "material": ("young_mean",),
+        "shape": ("length", "radius_root", "fork_count"),
+        "scan": ("noise", "point_spacing", "occlusion", "view", "gap_count"),
     }
 
     length: float = Field(0.9, gt=0.05, description="Length of the main axis [m].")
     radius_root: float = Field(0.009, gt=0, description="Radius at the root [m].")
-    radius_tip: float = Field(0.004, gt=0, description="Radius at the tip [m].")
-    bend: float = Field(0.6, ge=0, description="Turn of the main axis from root to tip [rad].")
     fork_count: int = Field(3, ge=0, le=12, description="Number of side twigs.")
     noise: float = Field(0.001, ge=0, description="Standard deviation of the points [m].")
     point_spacing: float = Field(0.002, gt=0, description="Mean distance of the points [m].")
-    unevenness: float = Field(0.4, ge=0, lt=1, description="Variation of the point density, 0 to "
-        "1.")
     occlusion: float = Field(0.1, ge=0, lt=0.6, description="Fraction of the surface that is "
         "missing.")
     view: Literal["round", "one-sided"] = Field(
         "round", description="Scanned from all around, or from one side as a depth camera does.")
     gap_count: int = Field(0, ge=0, le=5, description="Number of stretches of 2 cm without points.")
+
+
+class BranchSpec(GeneratedSettings):
+    """A generated branch, with what only Python sets."""
+
+    radius_tip: float = Field(0.004, gt=0, description="Radius at the tip [m].")
+    bend: float = Field(0.6, ge=0, description="Turn of the main axis from root to tip [rad].")
+    unevenness: float = Field(0.4, ge=0, lt=1, description="Variation of the point density, 0 to "
+        "1.")
     young_mean: float = Field(1e8, gt=0, description="Typical Young's modulus [Pa].")

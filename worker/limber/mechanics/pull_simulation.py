@@ -16,7 +16,7 @@ from limber.mechanics.dynamics.integration import simulate_dynamics
 from limber.mechanics.dynamics.motion import EnergyMomentumSettings, MotionSettings, NewmarkSettings
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
-from limber.mechanics.settings import Point, SimulateSettings
+from limber.mechanics.settings import FRAME_RATE, GRASP_RADIUS_M, Point, SimulateSettings
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.solve import solve_static
 
@@ -187,7 +187,9 @@ def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
 
 
 def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTable | None = None,
-                 grasp_point: np.ndarray | Sequence[float] | None = None) -> LoadCase:
+                 grasp_point: np.ndarray | Sequence[float] | None = None, *,
+                 grasp_radius: float = GRASP_RADIUS_M, frame_rate: float = FRAME_RATE,
+                 ) -> LoadCase:
     """Return the load case that settings request.
 
     Args:
@@ -195,14 +197,15 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
         settings: Settings of the pull.
         along: The grasp's path instead of a motion of the settings.
         grasp_point: The position of the marked grasp [m]; None: the patch's centre.
+        grasp_radius: [m]; frame_rate: [1/s].
 
     Raises:
         InputError: options do not fit. ConvergenceError: no equilibrium of the branch was found.
     """
     def patch(point: Point, mode: Literal["rigid", "point"]) -> Grasp:
-        if mode == "rigid" and settings.grasp_radius > 0:
-            return Grasp.gripping(model.mesh, np.array(point), settings.grasp_radius)
-        return Grasp.at(model.mesh, np.array(point), settings.grasp_radius, mode)
+        if mode == "rigid":
+            return Grasp.gripping(model.mesh, np.array(point), grasp_radius)
+        return Grasp.at(model.mesh, np.array(point), grasp_radius, mode)
 
     grasp = (Grasp.from_mesh(model.mesh, settings.grasp_mode, grasp_point)
              if settings.grasp_point is None else patch(settings.grasp_point, settings.grasp_mode))
@@ -218,7 +221,7 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
         force = bending_force(model, grasp)
     start = solve_static(model, grasp=[grasp, *holds],
                          grasp_force=np.zeros((1 + len(holds), 3))).require()
-    times, part = _ramp(settings, along.duration if along else settings.duration)
+    times, part = _ramp(settings, along.duration if along else settings.duration, frame_rate)
     changes = along.changes(times) if along else part[:, None] * np.concatenate(
         [settings.move or (0.0, 0, 0), settings.turn or (0.0, 0, 0)])
     first = present(start.pose, "pose of the grasps")[0]
@@ -257,14 +260,15 @@ def motion_of(case: LoadCase, settings: SimulateSettings,
     return dynamic_motion(case, scheme, progress)
 
 
-def _ramp(settings: SimulateSettings, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def _ramp(settings: SimulateSettings, duration: float, frame_rate: float,
+          ) -> tuple[np.ndarray, np.ndarray]:
     """Return times [s] and the fraction of the pull at each.
 
     In motion it starts and ends at rest, and the end pose is held.
     """
     hold = settings.hold if settings.kind == "dynamic" else 0.0
-    count = max(2, round((duration + hold) * settings.frame_rate) + 1)
-    times = np.arange(count) / settings.frame_rate
+    count = max(2, round((duration + hold) * frame_rate) + 1)
+    times = np.arange(count) / frame_rate
     part = np.clip(times / duration, 0, 1)
     return times, part**2 * (3 - 2 * part) if settings.kind == "dynamic" else part
 

@@ -8,6 +8,10 @@ from limber.core.constants import STANDARD_GRAVITY
 from limber.core.settings import GraspMode, Groups, OneOf, Settings, possible_force, possible_young
 from limber.mechanics.materials.laws import material_names
 
+GRASP_RADIUS_M = 0.01
+"""Radius of the grasp, and of the patches that hold or carry a load."""
+FRAME_RATE = 60.0
+"""Frames per second."""
 Point = tuple[float, float, float]
 PointLoad = tuple[float, float, float, float, float, float]
 PlacedMass = tuple[float, float, float, float]
@@ -17,9 +21,9 @@ class SimulateSettings(Settings):
     """Options of `limber simulate`; without motion and force, it bends the branch a little."""
 
     groups: ClassVar[Groups] = {
-        "output": ("name", "frame_rate", "vtu"),
+        "output": ("name", "vtu"),
         "motion": ("kind", "move", "turn", "grasp_force", "duration", "hold"),
-        "grasp and loads": ("grasp_point", "grasp_radius", "grasp_mode", "hold_at", "load_at",
+        "grasp and loads": ("grasp_point", "grasp_mode", "hold_at", "load_at",
             "mass_at"),
         "material": ("young", "material", "gravity", "rest_shape", "damping_mass",
             "damping_stiffness"),
@@ -40,9 +44,6 @@ class SimulateSettings(Settings):
     grasp_point: tuple[float, float, float] | None = Field(
         None, description="Position of the grasp X Y Z [m]. Default: the grasp that the mesh "
             "marks.")
-    grasp_radius: float = Field(
-        0.01, gt=0, description="Radius of the grasp and of the patches of --hold-at and "
-        "--load-at [m].")
     grasp_mode: GraspMode = Field(
         "rigid", description="rigid: hold position and rotation. point: hold "
             "the position only.")
@@ -58,7 +59,6 @@ class SimulateSettings(Settings):
     duration: float = Field(1.0, gt=0, description="Duration of the pull [s].")
     hold: float = Field(0.5, ge=0, description="Duration of the hold at the end of the pull [s] "
         "(dynamic).")
-    frame_rate: float = Field(60.0, gt=0, le=2000, description="Frames per second.")
     step: float = Field(1 / 60, gt=0, description="Longest time step [s] (dynamic).")
     scheme: Literal["energy_momentum", "newmark"] = Field(
         "energy_momentum", description="Time integration (dynamic). energy_momentum: conserves "

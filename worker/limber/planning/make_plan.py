@@ -50,6 +50,9 @@ from limber.planning.search_files import CostToGo
 from limber.planning.settings import PlanSettings
 from limber.planning.timing import DEFAULT_PACE, Pace
 
+FIELD_ERROR = 3.0
+"""Largest error of the field's energy along a plan, compared with the full model [%] (RMS). If it
+is larger, the states found join the field, and planning is repeated."""
 _REPLANS = 3  # of the same plan at most: each takes as long as the first
 _SLOWINGS = 4  # of the motion at most, until it keeps the limits
 _LAST, _LAST_EVERY = 4, 2  # states at a path's end that become samples; every second one
@@ -115,7 +118,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     if isinstance(goal, TargetGoal):
         aim = goal.with_margin(field, limits.on(field), start)
     rounds = _Rounds(grasp_model, settings, limits, goal, start, uncertainty, workers, field, aim,
-                     limits, pace or Pace(settings.speed, settings.acceleration), progress)
+                     limits, pace or Pace(settings.speed), progress)
     count = _REPLANS + 1
     for number in range(count):
         ahead = rounds.progress.part(number / count, (number + 1) / count)
@@ -190,7 +193,7 @@ class _Rounds:
         plan = self.plan = self._solved(pair, ahead)
         is_last = is_last or stopped
         off = field_error(self.field, plan.solved)
-        is_near = is_last or pair.stays or off <= self.settings.field_error / 100.0
+        is_near = is_last or pair.stays or off <= FIELD_ERROR / 100.0
         broken = self._broken(plan, is_near, ahead)
         self.round_records.append({
             "broken": broken, "sample_count": len(self.field.samples.poses),
@@ -390,7 +393,7 @@ class _Rounds:
                 self.progress.warn(
                     f"The motion was slowed down to {1e3 * self.pace.speed:.1f} mm/s. At a higher "
                     "speed the branch's inertia breaks a limit.")
-        for message in doubts_of(summary, self.settings.field_error, baseline, plan):
+        for message in doubts_of(summary, FIELD_ERROR, baseline, plan):
             self.progress.warn(message)
         trees = {name: path.tree for name, path in pair.trees.items() if path.tree is not None}
         return PlannedMotion(summary, baseline, plan, self.field, trees, self.pace,

@@ -41,10 +41,10 @@ class PlanSettings(Settings):
                            "goal_seed", "goal_tolerance", "start", "start_seed"),
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
-                               "wood", "max_damage", "max_stress", "workspace_low",
-                               "workspace_high", "clearance", "turn_slack", "confidence"),
-        "timing": ("speed", "acceleration", "hold", "inertia"),
-        "solver": ("planner", "iterations", "engine", "field_error", "seed"),
+                               "wood", "max_damage", "max_stress", "workspace",
+                               "clearance", "turn_slack", "confidence"),
+        "timing": ("speed", "hold", "inertia"),
+        "solver": ("planner", "iterations", "engine", "seed"),
     }
     common = ("goal", "tip_goal", "target", "max_force", "max_strain")
 
@@ -105,11 +105,8 @@ class PlanSettings(Settings):
     max_stress: float | None = Field(None, gt=0, description=(
         "Largest principal stress anywhere in the branch at any pose [Pa], for the stiff end of "
         "the estimate's intervals."))
-    workspace_low: tuple[float, float, float] | None = Field(None, description=(
-        "Lower corner of the box that the grasp must stay in, in the branch's frame [m]."),
-        json_schema_extra=BOX)
-    workspace_high: tuple[float, float, float] | None = Field(None, description=(
-        "Upper corner of that box [m]."),
+    workspace: tuple[float, float, float, float, float, float] | None = Field(None, description=(
+        "Box that the grasp must stay in: lower corner, upper corner, in the branch's frame [m]."),
         json_schema_extra=BOX)
     clearance: float | None = Field(None, ge=0, le=0.5, description=(
         "Least distance of branch, gripper and arm from the cell's obstacles [m]. Default: twice "
@@ -123,9 +120,6 @@ class PlanSettings(Settings):
         "Probability that the limits hold, given the uncertainty of the estimated Young's "
         "modulus. Default: the limits are checked for the estimate only."))
     speed: float = Field(0.02, gt=0, le=0.25, description="Largest speed of the gripper [m/s].")
-    acceleration: float = Field(0.1, gt=0, le=2.0, description=(
-        "Largest acceleration of the gripper [m/s^2]. The motion is at rest at both ends of the "
-        "path."))
     hold: float = Field(2.0, ge=0, le=3600, description=(
         "Time to hold the branch at the path's end [s]."))
     inertia: bool = Field(True, description=(
@@ -138,8 +132,4 @@ class PlanSettings(Settings):
         "D-RRT*.")
     engine: Literal["auto", "ompl", "own"] = Field("auto", description=(
         "Implementation of RRT* and D-RRT*: OMPL's or our own. auto: OMPL if it is installed."))
-    field_error: float = Field(3.0, gt=0, description=(
-        "Largest error of the field's energy along the plan, compared with the full model [%] "
-        "(root mean square). If it is larger, the states found are added to the field and "
-        "planning is repeated."))
     seed: int = Field(0, ge=0, description="Seed of both planners.")

@@ -298,8 +298,7 @@ def _yolo_masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
         raise InputError(f"{source} has no colour images.", "YOLO segments the branch in colour "
                                                             "images.",
                          "Record rgb/ (and rgb.txt), or omit --yolo-weights.")
-    segment = YoloSegmenter(settings.yolo_weights, prompt=settings.yolo_prompt,
-                            class_name=settings.yolo_class)
+    segment = YoloSegmenter(settings.yolo_weights, prompt=settings.yolo_prompt)
     masks: list[np.ndarray | None] = []
     for stamp in stamps:
         file = _nearest(images, stamp, stamps)
@@ -372,11 +371,11 @@ def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,
 class YoloSegmenter:
     """A YOLO segmentation model from a weights file on this computer, through ``ultralytics``.
 
-    With ``prompt`` the model must be an open-vocabulary one (YOLO-World, YOLOE); the paper's prompt
-    was "potted plant". Otherwise ``class_name`` selects one of the model's own classes.
+    ``prompt`` is that of an open-vocabulary model (YOLO-World, YOLOE), such as the paper's "potted
+    plant", or one of the classes of a model that has only its own.
     """
 
-    def __init__(self, weights: Path, *, prompt: str | None = None, class_name: str | None = None,
+    def __init__(self, weights: Path, *, prompt: str | None = None,
                  confidence: float = 0.25):
         weights = Path(weights)
         if not weights.is_file():
@@ -392,7 +391,7 @@ class YoloSegmenter:
                 "segmenter.") from error
         self._model = YOLO(str(weights))
         self._confidence = confidence
-        self._classes = self._chosen_classes(prompt, class_name)
+        self._classes = self._chosen_classes(prompt)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the union of the masks found in an image [height, width, 3], as bool."""
@@ -409,20 +408,16 @@ class YoloSegmenter:
                             "The masks must have the image's size.", "Update ultralytics.")
         return joined
 
-    def _chosen_classes(self, prompt: str | None, class_name: str | None) -> list[int] | None:
+    def _chosen_classes(self, prompt: str | None) -> list[int] | None:
         model: Any = self._model
-        if prompt is not None:
-            if not hasattr(model, "set_classes"):
-                raise InputError("This YOLO model does not accept a text prompt.",
-                                 "Its classes are fixed.",
-                                 "Select one of its classes, or use YOLOE.")
+        if prompt is None:
+            return None
+        if hasattr(model, "set_classes"):
             model.set_classes([prompt])
             return None
-        if class_name is None:
-            return None
-        numbers = [number for number, name in dict(model.names).items() if name == class_name]
+        numbers = [number for number, name in dict(model.names).items() if name == prompt]
         if not numbers:
-            raise InputError(f"The model has no class {class_name!r}.",
+            raise InputError(f"The model has no class {prompt!r}, and takes no text prompt.",
                              f"Its classes are {', '.join(map(str, dict(model.names).values()))}.",
-                             "Select one of these.")
+                             "Select one of these, or use YOLOE.")
         return numbers

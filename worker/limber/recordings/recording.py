@@ -14,7 +14,7 @@ import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from limber.core.errors import InputError
-from limber.core.files.reading import read_toml, toml_content
+from limber.core.files.reading import checked_as, read_toml, toml_content
 from limber.core.json_values import plain, validated
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.settings import possible_time
@@ -73,6 +73,16 @@ class CalibrationEntry(BaseModel):
     repeat_sigma: float = Field(
         0.02, ge=0, description="Relative variation of the stiffness of one branch between "
         "recordings: creep, temperature, how it is held.")
+
+
+def read_calibration(path: Path) -> CalibrationEntry:
+    """Read the table ``[calibration]`` of a TOML file; what it does not state is as by default.
+
+    Raises:
+        InputError: it cannot be read, or states another quantity.
+    """
+    what = "the errors of a cell (none, realistic or a TOML file with [calibration])"
+    return checked_as(path, CalibrationEntry, read_toml(path, what).get("calibration", {}), what)
 
 
 EXACT = CalibrationEntry(

@@ -22,7 +22,7 @@ class ImportSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("kind", "robot", "unit", "force_unit", "rate_hz", "nominal", "marker_frame",
-            "coordinates", "time_offset", "recorded", "yolo_weights", "yolo_prompt", "yolo_class"),
+            "coordinates", "time_offset", "recorded", "yolo_weights", "yolo_prompt"),
         "bags and robot logs": ("cell", "frame_pose", "wrench_topic", "pose_topic",
             "points_topic", "bag_clock"),
         "grasp and loads": ("grasp_point", "grasp_distance", "grasp_radius", "grasp_mode",
@@ -119,8 +119,8 @@ class ImportSettings(Settings):
         None, description="Weights file of your own YOLO segmentation model, for masks of an "
         "RGB-D folder's colour images (needs ultralytics).")
     yolo_prompt: str | None = Field(
-        None, description="Prompt for open-vocabulary models.")
-    yolo_class: str | None = Field(None, description="Name of the class that is the branch.")
+        None, description="What the branch is: a prompt for an open-vocabulary model, or the name "
+        "of a class of another.")
 
     _force = field_validator("weight", "load")(possible_force)
     _recorded = field_validator("recorded")(possible_time)

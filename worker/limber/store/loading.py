@@ -295,7 +295,7 @@ def load_estimated_subject(branch: Branch, known: dict[str, Any], *, gravity: bo
     return load_subject(branch, EstimateSettings(
         fractions=tuple(known["fractions"]), gravity=gravity and not known.get("is_weightless"),
         field="open" if known.get("field_form") else "inverse_distance",
-        orders=known.get("orders", False), **known.get("section", {})))
+        also=("orders",) if known.get("orders") else (), **known.get("section", {})))
 
 
 def known_pulls(branch: Branch) -> list[str]:

@@ -34,7 +34,7 @@ from limber.core.json_values import plain
 from limber.core.numerics.rigid import matrices
 from limber.core.processes.child import run_stage
 from limber.core.progress import SILENT, Progress
-from limber.estimation.settings import VirtualPullSettings
+from limber.estimation.settings import PullSpec
 from limber.estimation.simulated_pull import TrueBranch, true_branch
 from limber.geometry.generated import read_truth
 from limber.geometry.io.skeletons import read_swc
@@ -153,12 +153,12 @@ class ClosedLoop:
         young = bending_modulus(skeleton, GRASP_FRACTION, _PEAK_N, _TRAVEL_M)
         known = read_truth(scan / "truth.json")
         shares = np.array(known["young_pa"]) / np.exp(np.mean(np.log(known["young_pa"])))
-        return true_branch(skeleton, VirtualPullSettings(young=tuple(young * shares)),
+        return true_branch(skeleton, PullSpec(young=tuple(young * shares)),
                            fractions=tuple(known["fractions"]))
 
     def _setting(self, truth: TrueBranch, cell: Cell) -> BranchSetting:
         """Return the true branch: it deviates from the fit's assumptions within their limits."""
-        rng, defaults = np.random.default_rng([self.seed, 8]), VirtualPullSettings()
+        rng, defaults = np.random.default_rng([self.seed, 8]), PullSpec()
         poisson = float(np.clip(rng.normal(defaults.poisson, _POISSON_SIGMA), 0.2, 0.47))
         return BranchSetting.of_truth(
             truth, cell, self.folder / "truth.vtu", poisson=poisson,

@@ -64,7 +64,7 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
 
 def _setting(branch_folder: Path, cell: Any, young: str | None, folder: Path) -> Any:
     from limber.core.errors import InputError
-    from limber.estimation.simulated_pull import VirtualPullSettings
+    from limber.estimation.simulated_pull import PullSpec
     from limber.robot.virtual.branch_solver import BranchSetting
     from limber.stages.pulls.virtual_pull import load_truth
     from limber.store import Branch
@@ -76,5 +76,5 @@ def _setting(branch_folder: Path, cell: Any, young: str | None, folder: Path) ->
                          "Give --cell cell.toml.")
     branch = Branch.read(branch_folder)
     moduli = tuple(float(part) for part in young.split(",")) if young else ()
-    return BranchSetting.of_truth(load_truth(branch, VirtualPullSettings(young=moduli)), cell,
+    return BranchSetting.of_truth(load_truth(branch, PullSpec(young=moduli)), cell,
                                   folder / "truth.vtu")

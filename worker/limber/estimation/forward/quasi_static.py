@@ -420,7 +420,8 @@ class QuasiStaticForward(Forward):
         if known is None:
             raise WorkError(f"{self.name}: the simulation finds no equilibrium at the end of the "
                             "fit.", "It was found from another state during the fit.",
-                            "Simulate more frames (--key-frames).")
+                            "Omit --quick, or use fewer control points "
+                            "(--fractions).")
         model, worst = self.model_with(values), 0.0
         states = [state.displacement for state in self.states()]
         for first, second in zip(self.keys[:-1], self.keys[1:], strict=True):

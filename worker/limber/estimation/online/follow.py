@@ -19,7 +19,7 @@ from limber.estimation.forward.forward_model import under_its_weight
 from limber.estimation.online.filter import OnlineEstimator, OnlineFrame, OnlineState
 from limber.estimation.online.full_model import Beside, FullBranch, Here
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.model_error import ModelError, geometry_error, total_interval
 from limber.recordings.recording import Observations, Pull, calibration_of, grasp_on, read_pull
 from limber.recordings.sensor_checks import clean
@@ -45,7 +45,7 @@ PRIOR_DEVIATION = 0.4
 """Deviation of log E around the reduced model's training values; it covers a factor of two."""
 
 
-def follow(where: Callable[[], Path], name: str, subject: Subject, settings: EstimateSettings, *,
+def follow(where: Callable[[], Path], name: str, subject: Subject, settings: FitSpec, *,
            axes: Path | None = None, pace: float = 1.0, training_count: int = 60,
            progress: Progress = SILENT) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Estimate frame by frame from a pull.
@@ -175,7 +175,7 @@ class Begun:
             prior_deviation=self.prior_deviation, exact=exact)
 
 
-def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Progress,
+def begin(pull: Pull, subject: Subject, settings: FitSpec, progress: Progress,
           training_count: int) -> Begun:
     """Build the reduced model around an earlier estimate or a rough fit.
 
@@ -211,7 +211,7 @@ def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Pr
     return Begun(reduced, branch, pull, deviation)
 
 
-def _rough(pull: Pull, subject: Subject, settings: EstimateSettings) -> Values | None:
+def _rough(pull: Pull, subject: Subject, settings: FitSpec) -> Values | None:
     """A quick fit of the recording so far; None if the branch has not moved yet."""
     travel = np.linalg.norm(pull.poses[:, :3] - pull.entry.grasp.point_m, axis=1)
     if travel.max(initial=0.0) < MOVED * subject.model.extent:

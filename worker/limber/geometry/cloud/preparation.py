@@ -92,7 +92,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
                          "Check the columns and the number of digits of the export.")
     cloud = cloud.with_points(points)
     keep = _without_outliers(points)
-    if not settings.keep_sheets:
+    if "sheets" not in settings.keep:
         beside = np.flatnonzero(keep)[_beside_plant(points[keep], up, counts)]
         if len(beside):
             # What is usual for a plant does not depend on the ground around it.
@@ -180,12 +180,12 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
     if sight is None:
         return cloud, None
     view = View(scanner, sight.pitch)
-    if settings.keep_flying:
+    if "flying" in settings.keep:
         return cloud, view
     flying = flying_pixels(sight, _FLYING_ANGLE, _FLYING_SPECK)
     counts["flying"] = int(flying.sum())
     rest = cloud.subset(~flying)
-    _enough(rest, "Without flying pixels (--keep-flying keeps them), the depth camera's "
+    _enough(rest, "Without flying pixels (--keep flying keeps them), the depth camera's "
                   "cloud")
     return rest, view
 
@@ -303,10 +303,10 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
                      "missing.")
     if counts.get("sheets"):
         texts.append(f"{counts['sheets']} of {counts['read']} points lie on a wide flat sheet (a "
-                     "wall or the ground?) and were removed (--keep-sheets keeps them).")
+                     "wall or the ground?) and were removed (--keep sheets keeps them).")
     if counts.get("ground"):
         texts.append(f"{counts['ground']} of {counts['read']} points lie on rough ground and were "
-                     "removed (--keep-sheets keeps them).")
+                     "removed (--keep sheets keeps them).")
     step = _rounding(points)
     if step > 0:
         texts.append(f"The coordinates are rounded to {1000 * step:.4g} mm, which limits the "
@@ -314,7 +314,7 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
     flying = counts.get("flying", 0)
     if flying > 0.02 * counts["read"]:
         texts.append(f"{flying} of {counts['read']} points were discarded as flying pixels of a "
-                     "depth camera (--keep-flying keeps them).")
+                     "depth camera (--keep flying keeps them).")
     lost = counts.get("outliers", 0)
     if lost > 0.1 * len(points):
         texts.append(f"{lost} points were discarded as outliers.")

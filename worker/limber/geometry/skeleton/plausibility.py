@@ -165,7 +165,7 @@ def _doubt_texts(result: Any, where: Where) -> list[str]:
     if result.unlikely:
         longest = max(twig["length"] for twig in result.unlikely)
         texts.append(f"{len(result.unlikely)} twigs (up to {1000 * longest:.0f} mm) were "
-                     "discarded, because they probably do not exist (--twig-probability).")
+                     "discarded, because they probably do not exist.")
     if result.second_base is not None:
         texts.append(f"The plant has a second base at {_position_text(where(result.second_base))}. "
                      "Do two "

@@ -39,6 +39,8 @@ Apart = Callable[[np.ndarray], None]
 
 FIT_POINT_LIMIT = 60_000
 """More points do not improve the fit; they only slow it down."""
+_BRIDGE_LIMIT = 0.15  # longest bridge over a gap, as a fraction of the cloud's diagonal
+_TWIG_PROBABILITY = 0.5  # twigs that are less probable are dropped
 _CONTRACTED_POINTS = 12_000  # more are thinned evenly: the fit, not contraction, is precise
 # Most points of a sparse scan that are contracted. Of three generated crowns of 1,500 to 3,000
 # points contraction finds 93 to 99 % of the length and levels 86 to 99 %, and levels make false
@@ -50,7 +52,8 @@ _FEW = 5_000
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                 root: np.ndarray | None = None, up: np.ndarray | None = None,
                 view: View | None = None, where: Where | None = None,
-                show_apart: Apart | None = None, progress: Progress = SILENT) -> SkeletonResult:
+                show_apart: Apart | None = None, twig_probability: float = _TWIG_PROBABILITY,
+                progress: Progress = SILENT) -> SkeletonResult:
     """Find the rooted skeleton of a cloud.
 
     Args:
@@ -63,6 +66,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
         where: Transforms positions of the cloud to its file's coordinates, for errors; None: the
             same.
         show_apart: Receives the points of another plant, if the cloud is refused for it.
+        twig_probability: Twigs that are less probable are dropped.
         progress: Called during the work.
 
     Raises:
@@ -78,7 +82,8 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                         None if view is None else replace(view, eye=own.inside(view.eye)),
                         where or (lambda place: place),
                         None if show_apart is None else (
-                            lambda apart: show_apart(apart[original_order])), progress)
+                            lambda apart: show_apart(apart[original_order])),
+                        twig_probability, progress)
     contraction = found.contraction
     return replace(found.moved(own.outside), contraction=replace(
         contraction, points=own.outside(contraction.points)),
@@ -136,13 +141,14 @@ class _Search:
     def _joining(self) -> dict[str, Any]:
         settings = self.settings
         return {"gap_factor": settings.gap_factor, "up": self.up,
-                "bridge_limit": settings.bridge_limit * self.diagonal,
+                "bridge_limit": _BRIDGE_LIMIT * self.diagonal,
                 "join_plants": settings.plants == "joined"}
 
 
 def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | None,
                 up: np.ndarray, view: View | None, where: Where,
-                show_apart: Apart | None, progress: Progress) -> SkeletonResult:
+                show_apart: Apart | None, twig_probability: float, progress: Progress,
+                ) -> SkeletonResult:
     """The skeleton of points in the cloud's own frame, as are ``root`` and ``up``."""
     points = own.coordinates
     search = _Search(points, settings, up, float(np.linalg.norm(np.ptp(points, axis=0))))
@@ -178,7 +184,7 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
                                         float(np.median(graph.thickness)))
         (first, pruned), more = search.pruned(graph, start), 0
         skeleton = through_leaves(first, some, fitted.noise, fitted.radius_limits)
-    skeleton, unlikely = likely(skeleton, settings.twig_probability)
+    skeleton, unlikely = likely(skeleton, twig_probability)
     if skeleton is not fitted.skeleton:
         segment, residual = nearest_cylinders(skeleton, points)
     progress(1.0, "skeleton", nodes=skeleton.node_count)

@@ -19,6 +19,7 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetwild_process import run_tetwild
 
 _CACHE_VERSION = 1
+_SECONDS = 60.0  # of processor time for fTetWild
 _SIDES = 8  # of the sections that fTetWild fills; more only cost time, as its tetrahedra are larger
 _LEFT_OUT_LIMIT = 0.02  # fraction of the volume; thinner twigs are not worth fTetWild's time
 
@@ -106,12 +107,13 @@ def _wild(skeleton: Skeleton, settings: MeshSettings, progress: Progress,
     radii = np.sort(skeleton.radius)
     mesh, cached = tetrahedralise(
         surface, edge_length=4 * float(np.median(radii)),
-        epsilon=0.25 * float(radii[len(radii) // 10]), settings=settings, progress=progress)
+        epsilon=0.25 * float(radii[len(radii) // 10]), time_limit=_SECONDS,
+        progress=progress)
     return mesh, "ftetwild (cached)" if cached else "ftetwild", warnings
 
 
 def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,
-                   settings: MeshSettings | None = None, stop_energy: float = 30.0,
+                   time_limit: float = _SECONDS, stop_energy: float = 30.0,
                    coarsen: bool = False, progress: Progress = SILENT) -> tuple[TetMesh, bool]:
     """Fill a closed surface with quadratic tetrahedra by fTetWild; results are cached.
 
@@ -122,8 +124,8 @@ def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,
         surface: Closed, oriented.
         edge_length: Target edge length [m]; a finer surface makes finer tetrahedra.
         epsilon: Largest distance of the result from the surface [m].
-        settings: Limits of time and memory.
-        stop_energy: See :func:`limber.geometry.tets.tetwild_process.run_tetwild`.
+        time_limit: See :func:`limber.geometry.tets.tetwild_process.run_tetwild`.
+        stop_energy: Likewise.
         coarsen: Likewise.
         progress: Called while waiting.
 
@@ -134,14 +136,13 @@ def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,
         MeshingError: no mesh, or one that lost over 5 % of the volume or is in pieces.
         MissingDependencyError: pytetwild is not installed.
     """
-    settings = settings or MeshSettings()
     path = _cache_path(surface, edge_length, epsilon, stop_energy, coarsen)
     cached = _from_cache(path)
     if cached is None:
         nodes, tets = run_tetwild(
             surface.vertices, surface.faces, edge_length=edge_length, epsilon=epsilon,
-            stop_energy=stop_energy, coarsen=coarsen, time_limit=settings.mesh_time_limit,
-            memory_limit_mb=settings.mesh_memory_limit_mb, progress=progress)
+            stop_energy=stop_energy, coarsen=coarsen, time_limit=time_limit,
+            progress=progress)
         _to_cache(path, nodes, tets)
     else:
         nodes, tets = cached

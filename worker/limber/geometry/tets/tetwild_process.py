@@ -19,9 +19,11 @@ from limber.core.processes.end_with_parent import end_by_kernel
 from limber.core.processes.process_limits import Limits
 from limber.core.progress import SILENT, Progress
 
+_MEMORY_MB = 4000.0
+
 
 def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, epsilon: float,
-                stop_energy: float, coarsen: bool, time_limit: float, memory_limit_mb: float,
+                stop_energy: float, coarsen: bool, time_limit: float,
                 progress: Progress = SILENT) -> tuple[np.ndarray, np.ndarray]:
     """Fill a closed surface with tetrahedra by fTetWild (Hu et al. 2020).
 
@@ -33,7 +35,6 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
         stop_energy: Quality at which optimisation stops (fTetWild's AMIPS energy; 3 is best).
         coarsen: Merge elements as far as quality allows, which takes longer.
         time_limit: Processor time [s] after which it is stopped.
-        memory_limit_mb: Memory above which it is stopped.
         progress: Called while waiting; cancelling stops the process.
 
     Returns:
@@ -58,11 +59,11 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
             # It also writes a file (__tracked_surface.stl) to its working folder.
             code, last = run_module(__name__, [str(source), str(target)], "fTetWild",
                                     Limits(computed_seconds=time_limit,
-                                           memory_mb=memory_limit_mb), folder=Path(folder),
+                                           memory_mb=_MEMORY_MB), folder=Path(folder),
                                     waiting=waiting)
         except WorkError as error:
-            raise MeshingError(error.seen, error.why, "Raise --mesh-time-limit or "
-                               "--mesh-memory-limit-mb, or choose a coarser mesh.") from error
+            raise MeshingError(error.seen, error.why, "Choose --mesher sweep, or a coarser "
+                               "mesh.") from error
         if code != 0 or not target.exists():
             raise MeshingError(f"fTetWild ended with code {code} ({last or 'no message'}).",
                                "The surface may be too fine, or may be damaged.",

@@ -230,8 +230,9 @@ class Turbulence:
 
     Attributes:
         intensity: Standard deviation of the speed over its mean.
-        length: Turbulent length scale [m].
-        seconds: Duration for which the peak is expected.
+        length: Turbulent length scale [m]. The default is that of EN 1991-1-4 at 2 m above open
+            land; among trees it is about their height.
+        seconds: Duration for which the peak is expected; EN 1991-1-4 averages over ten minutes.
     """
 
     intensity: float

@@ -190,7 +190,7 @@ class Outdoors:
 
     Attributes:
         wind: Velocity of the air, uniform along the branch [m/s], shape [3].
-        drag: Drag coefficient of a cylinder across the wind.
+        drag: Drag coefficient of a cylinder across the wind, without leaves.
         snow: Mass per area of the branch projected on the ground [kg/m^2].
         fruit: Positions [m] and masses [kg].
         cuts: Positions on the branch [m]; the part beyond them is cut off.

@@ -71,7 +71,7 @@ class Limits:
         if not (both.low < both.high).all():
             raise InputError("The given workspace and the cell's workspace do not overlap.",
                              f"Their intersection is empty {empty_along(both.low, both.high)}.",
-                             "Correct --workspace-low and --workspace-high, or the cell file.")
+                             "Correct --workspace, or the cell file.")
         return both
 
     def values(self, grasps: np.ndarray, nodes: np.ndarray) -> dict[str, np.ndarray]:
@@ -101,12 +101,11 @@ class Limits:
                                  "Both limit the strain.",
                                  "Give only one of them.")
             strain = strain_limit(settings.wood)
-        low = np.array(settings.workspace_low or [-np.inf] * 3, float)
-        high = np.array(settings.workspace_high or [np.inf] * 3, float)
+        low, high = np.array(settings.workspace or [-np.inf] * 3 + [np.inf] * 3).reshape(2, 3)
         if not (low < high).all():
             raise InputError(f"The workspace is empty {empty_along(low, high)}.",
                              "Its lower corner must be below the upper one in x, y and z.",
-                             "Correct --workspace-low and --workspace-high.")
+                             "Correct --workspace.")
         return cls(settings.max_energy or np.inf, settings.max_force or np.inf,
                    strain, (settings.max_stress or np.inf) / stiffer,
                    settings.max_axial_force or np.inf, settings.max_torque or np.inf, low=low,

@@ -16,7 +16,7 @@ from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import EstimateSettings, FitSpec
 from limber.stages.inputs import BranchInputs, RunOptions
 from limber.stages.registry import StageDescription
 from limber.stages.result import Numbers, Picture, Result, frozen, of_files, shown
@@ -168,6 +168,7 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
     bases = _finished_bases(branch)
     log = EvaluationLog(log_path, json.dumps([plain(settings), digests], sort_keys=True))
     asked, initial, evidence = settings, subject, None
+    settings = FitSpec.of(settings)
     if is_open(settings):
         pulls = _placed(pulls, initial)
         found, settings, subject, evidence = _with_supported_points(
@@ -213,9 +214,9 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
 
 
 def _with_supported_points(
-        branch: Branch, pulls: list[Pull], subject: Subject, settings: EstimateSettings,
+        branch: Branch, pulls: list[Pull], subject: Subject, settings: FitSpec,
         log: EvaluationLog, progress: Progress,
-        ) -> tuple[fit_assessment.Estimate, EstimateSettings, Subject, dict[int, float] | None]:
+        ) -> tuple[fit_assessment.Estimate, FitSpec, Subject, dict[int, float] | None]:
     """Fit with as many control points as the pulls support, starting from a fit with four.
 
     Returns:
@@ -295,7 +296,7 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
     name, where = _followed(branch, settings)
     subject = load_subject(branch, settings)
     result, history = follow_pull(
-        where, name, subject, settings, pace=pace,
+        where, name, subject, FitSpec.of(settings), pace=pace,
         training_count=training_count, progress=progress,
         axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None)
     with branch.stage("estimate-online", settings, digests={"pull": name}) as stage:
@@ -331,7 +332,7 @@ def _cloud(branch: Branch) -> np.ndarray | None:
 
 
 def _score_unused_pulls(branch: Branch, names: list[str], subject: Subject,
-                        found: fit_assessment.Estimate, settings: EstimateSettings,
+                        found: fit_assessment.Estimate, settings: FitSpec,
                         initial: Subject, progress: Progress) -> None:
     """Score the branch's pulls that this estimate did not use.
 

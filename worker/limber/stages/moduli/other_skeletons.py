@@ -16,7 +16,7 @@ import numpy as np
 from limber.core.errors import Cancelled, LimberError
 from limber.core.json_values import validated
 from limber.core.progress import SILENT, Progress
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class _Graph:
 
 
 def add_other_skeletons(found: Estimate, branch: Branch, pulls: Sequence[Pull],
-                        settings: EstimateSettings, progress: Progress = SILENT) -> None:
+                        settings: FitSpec, progress: Progress = SILENT) -> None:
     """Add the differences of other likely skeletons' moduli to the errors of the model.
 
     Args:
@@ -95,7 +95,7 @@ def _graphs(branch: Branch) -> list[_Graph]:
 
 
 def _fitted(graph: _Graph, found: Estimate, branch: Branch, pulls: Sequence[Pull],
-            settings: EstimateSettings, progress: Progress) -> Estimate:
+            settings: FitSpec, progress: Progress) -> Estimate:
     """The same pulls on another skeleton."""
     from limber.estimation.estimated_branch import subject_of
     from limber.estimation.fit import fit_branch

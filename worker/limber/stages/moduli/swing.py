@@ -69,7 +69,6 @@ class Swing(Result):
 
 _DAMAGED = "The result of a swing was expected.", "The file is damaged. Run `limber swing` again."
 
-
 def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
           progress: Progress = SILENT) -> dict[str, Any]:
     """Estimate one level of Young's modulus, and damping, from a released branch.
@@ -89,8 +88,7 @@ def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
     branch = Branch.open(branch_folder)
     with branch.writing("limber swing"):
         pull = _pull(branch, settings.pull)
-        subject = load_subject(branch, EstimateSettings(
-            poisson=settings.poisson, density=settings.density))
+        subject = load_subject(branch, EstimateSettings())
         digests = {"mesh geometry": subject.mesh.geometry_digest(),
                    "pulls": pulls_digest(branch, [pull.name])}
         if not force and branch.is_current("swing", settings, digests=digests):

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 _FASTEST_WIND = 150.0  # m/s; more than tornadoes have
 _MOST_MULTIPLE = 50.0  # of the loads, up to which a limit load is sought
-_GUST_SECONDS = 600.0  # within which the peak is expected: EN 1991-1-4 averages over it
+_STRAIN_LIMIT = 0.01  # at which the wood is taken to fail
 _Place = tuple[float, float, float]
 _Fruit = tuple[float, float, float, float]
 
@@ -50,24 +50,19 @@ class LoadSettings(Settings):
     """Loads beside the weight that the branch had when it was scanned."""
 
     groups: ClassVar[Groups] = {
-        "loads": ("wind", "drag", "snow", "fruit", "cut"),
-        "gusts": ("gust", "gust_length", "gust_record"),
-        "limits": ("strain_limit", "limit_load"),
+        "loads": ("wind", "snow", "fruit", "cut"),
+        "gusts": ("gust", "gust_record"),
+        "limits": ("limit_load",),
         "output": ("name",)}
     common = ("wind", "snow", "fruit", "cut", "name")
 
     wind: tuple[float, float, float] | None = Field(
         None, description="Wind velocity in the branch's frame [m/s].",
         json_schema_extra={"metavar": "X Y Z"})
-    drag: float = Field(1.1, gt=0, le=5, description="Drag coefficient of a round branch across "
-                        "the wind, without leaves.")
     gust: float | None = Field(
         None, gt=0, le=1, description="Turbulence intensity of gusts: standard deviation of the "
         "wind speed over its mean, from 0.1 over water to 0.4 in a crown. Results are then those "
         "of the peak, by spectrum and peak factor of EN 1991-1-4, annex B.")
-    gust_length: float = Field(
-        27.0, gt=0, le=1000, description="Length scale of the gusts [m]. The default is that of "
-        "EN 1991-1-4 at 2 m above open land. Among trees it is about their height.")
     gust_record: Path | None = Field(
         None, description="Recorded gusts: a CSV file with time_s and speed_m_s along the "
         "direction of --wind.")
@@ -80,8 +75,6 @@ class LoadSettings(Settings):
     cut: tuple[_Place, ...] = Field(
         (), description="Position of a pruning cut [m]. May be given several times.",
         json_schema_extra={"metavar": "X Y Z"})
-    strain_limit: float = Field(
-        0.01, gt=0, lt=1, description="Strain at which the wood is taken to fail.")
     limit_load: bool = Field(
         False, description="Also find the limit load, as a multiple of these loads.")
     name: str | None = Field(
@@ -227,15 +220,15 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
     skeleton = load_skeleton(branch)
     model = load_branch(branch, loaded=True, progress=progress).model
     _require_near(model.mesh.nodes, [one[:3] for one in settings.fruit])
-    loads = Outdoors(wind, settings.drag, settings.snow, tuple(
-        PointMass(one[:3], one[3]) for one in settings.fruit), settings.cut)
+    loads = Outdoors(wind, snow=settings.snow, cuts=settings.cut, fruit=tuple(
+        PointMass(one[:3], one[3]) for one in settings.fruit))
     outdoors = LoadedOutdoors(model, skeleton, loads)
     peak = None
     if gusts is not None:
         progress(0.1, "gusts")
         outdoors, peak = with_peak(outdoors, gusts, known_damping(branch, progress))
     bent, result = load_effects(
-        outdoors, strain_limit=settings.strain_limit, deviation=stiffness_deviation(branch),
+        outdoors, strain_limit=_STRAIN_LIMIT, deviation=stiffness_deviation(branch),
         most=_MOST_MULTIPLE if settings.limit_load else None, progress=progress.part(0.2, 1.0))
     result |= {"frequencies_before_hz": lowest_modes(model, len(bent.frequencies)).frequencies,
                "gusts": peak}
@@ -292,8 +285,7 @@ def _gusts(settings: LoadSettings) -> Gusts | None:
                          "Omit one of them.")
     if settings.gust_record is not None:
         return WindRecord.read(settings.gust_record)
-    return None if settings.gust is None else Turbulence(
-        settings.gust, settings.gust_length, _GUST_SECONDS)
+    return None if settings.gust is None else Turbulence(settings.gust)
 
 
 def _require_near(nodes: np.ndarray, points: list[_Place]) -> None:

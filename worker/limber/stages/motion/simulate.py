@@ -14,7 +14,7 @@ from limber.core.errors import ConvergenceError, InputError
 from limber.core.files.atomic import write_atomically
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
-from limber.mechanics.settings import SimulateSettings
+from limber.mechanics.settings import FRAME_RATE, GRASP_RADIUS_M, SimulateSettings
 from limber.stages.inputs import BranchInputs, RunOptions
 from limber.stages.registry import StageDescription
 from limber.stages.result import FORCE, Picture, Result, Vector, frozen, of_files, shown
@@ -104,7 +104,8 @@ class Simulation(Result):
 
 
 def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
-             along: PoseTable | None = None, key: str = KEY, force: bool = False,
+             along: PoseTable | None = None, grasp_radius: float = GRASP_RADIUS_M,
+             frame_rate: float = FRAME_RATE, key: str = KEY, force: bool = False,
              progress: Progress = SILENT) -> dict[str, Any]:
     """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
 
@@ -112,6 +113,7 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
         branch_folder: Folder with a mesh.
         settings: Settings of the pull.
         along: The grasp's path instead of a motion of the settings.
+        grasp_radius: [m]; frame_rate: [1/s].
         key: Key of its entry in the manifest.
 
     Returns:
@@ -134,7 +136,7 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     branch = Branch.open(branch_folder)
     branch.require("mesh.vtu", "reconstruct")
     require_one_drive(settings, along)
-    digests = {"along": along.digest()} if along else {}
+    digests = {"along": along.digest(), "grasp_radius": str(grasp_radius)} if along else {}
     law = material_named(settings.material)
     if not law.is_compiled:
         digests["material"] = law_digest(law)
@@ -146,12 +148,13 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
         return stored.result
     progress(0.0, "preparing")
     model = with_masses(_model(branch, settings, progress), settings)
-    case = load_case_of(model, settings, along, load_grasp_point(branch))
+    case = load_case_of(model, settings, along, load_grasp_point(branch), grasp_radius=grasp_radius,
+                        frame_rate=frame_rate)
     motion = motion_of(case, settings, progress.part(0.2, 0.9))
     for message in motion.warnings:
         progress.warn(message)
     with branch.stage(key, settings, reads=reads, digests=digests) as stage:
-        result = _write(stage, case.model, settings, motion)
+        result = _write(stage, case.model, settings, motion, frame_rate)
         stage.result.update(result)
     progress(1.0, "done")
     if not motion.converged:
@@ -177,7 +180,7 @@ def _model(branch: Branch, settings: SimulateSettings, progress: Progress) -> Br
 
 
 def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
-           motion: SimulatedMotion) -> dict[str, Any]:
+           motion: SimulatedMotion, frame_rate: float) -> dict[str, Any]:
     from limber.mechanics.strain import strain_state
     from limber.results.motion_files import (
         surface_fields,
@@ -200,7 +203,7 @@ def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
     np.savez_compressed(stage.path(f"frames/{settings.name}.npz"),
                         **surface_fields(model.mesh, states))
     frames = {
-        "frame_count": len(displacement), "rate": settings.frame_rate,
+        "frame_count": len(displacement), "rate": frame_rate,
         "times_s": motion.times.tolist(), "energies_j": motion.energy.tolist(),
         "kinetic_energies_j": motion.kinetic_energy.tolist(),
         "grasp_forces_n": motion.grasp_force.tolist(),
@@ -225,17 +228,22 @@ def run(inputs: SimulateInputs, settings: SimulateSettings, options: RunOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
     if inputs.pull is not None:
-        settings, replayed = _replay(Branch.open(inputs.branch_folder), inputs, settings)
-        return simulate(inputs.branch_folder, settings, along=replayed,
-                        key=f"replay:{inputs.pull}", force=options.force, progress=progress)
+        settings, replayed, grasp_radius = _replay(Branch.open(inputs.branch_folder), inputs,
+                                                   settings)
+        # Each frame at rest is a separate equilibrium, and a recording may last for minutes.
+        rate = FRAME_RATE if settings.kind == "dynamic" else min(
+            FRAME_RATE, _MOST_REPLAYED / replayed.duration)
+        return simulate(inputs.branch_folder, settings, along=replayed, grasp_radius=grasp_radius,
+                        frame_rate=rate, key=f"replay:{inputs.pull}", force=options.force,
+                        progress=progress)
     along = _poses(inputs.along, settings.duration, progress) if inputs.along else None
     return simulate(inputs.branch_folder, settings, along=along, force=options.force,
                     progress=progress)
 
 
 def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
-            ) -> tuple[SimulateSettings, PoseTable]:
-    """Return the settings and the gripper's path of a recording.
+            ) -> tuple[SimulateSettings, PoseTable, float]:
+    """Return the settings, the gripper's path and the grasp's radius [m] of a recording.
 
     Raises:
         InputError: there is no recording of that name, or its gripper does not drive the branch.
@@ -257,14 +265,11 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
         raise InputError(f"{inputs.pull} is a free swing.", "A free swing has no gripper.",
                          "`limber swing` fits it.")
     grasp, path = pull.entry.grasp, PoseTable(pull.times, pull.poses)
-    is_static = pull.entry.motion == "quasi_static"
-    summary = {"name": inputs.pull, "kind": "static" if is_static else "dynamic", "hold": 0.0,
-               "grasp_point": grasp.point_m, "grasp_radius": grasp.radius_m,
-               "grasp_mode": grasp.mode, "move": None, "turn": None, "grasp_force": None}
-    if is_static:
-        # Each frame is a separate equilibrium, and a recording may last for minutes.
-        summary["frame_rate"] = min(settings.frame_rate, _MOST_REPLAYED / path.duration)
-    return settings.model_copy(update=summary), path
+    kind = "static" if pull.entry.motion == "quasi_static" else "dynamic"
+    return settings.model_copy(update={
+        "name": inputs.pull, "kind": kind, "hold": 0.0, "grasp_point": grasp.point_m,
+        "grasp_mode": grasp.mode, "move": None, "turn": None, "grasp_force": None,
+    }), path, grasp.radius_m
 
 
 def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:

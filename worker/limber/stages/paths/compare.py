@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -39,7 +39,7 @@ class CompareSettings(Settings):
     """Trials, their common goal, and the planning."""
 
     groups: ClassVar[Groups] = {"trials": ("trials", "goal", "seed"),
-                                "solver": ("max_detour", "iterations", "engine")}
+                                "solver": ("max_detour",)}
 
     trials: int = Field(10, ge=1, le=1000, description=(
         "Number of random deformed start configurations."))
@@ -51,10 +51,6 @@ class CompareSettings(Settings):
     max_detour: float | None = Field(8.1, ge=0, le=1000, description=(
         "Largest extra length of the gentle path over that of RRT* [%]. Default: the paper's "
         "mean."))
-    iterations: int = Field(3000, ge=100, le=200_000, description=(
-        "Number of samples of RRT* and D-RRT*."))
-    engine: Literal["auto", "ompl", "own"] = Field("auto", description=(
-        "Implementation of RRT* and D-RRT*: auto, ompl or own."))
 
 
 def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
@@ -82,8 +78,7 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
     key, reads = f"compare:{name}", ["energy.npz"]
     if not force and branch.is_current(key, settings, reads=reads):
         return branch.manifest.stages[key].result
-    asked = PlanSettings(**{each: getattr(settings, each) for each in (
-        "seed", "max_detour", "iterations", "engine")})
+    asked = PlanSettings(seed=settings.seed, max_detour=settings.max_detour)
     goal = (second_arm_goal(field) if settings.goal is None
             else near(np.array(settings.goal), asked.goal_tolerance))
     with branch.stage(key, settings, reads=reads) as stage:

@@ -228,7 +228,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         in_cell.check_goal(settings)
     with branch.stage(key, settings, reads=reads, digests=digests) as stage:
         limits = asked if in_cell is None else in_cell.limits
-        pace = Pace(settings.speed, settings.acceleration)
+        pace = Pace(settings.speed)
         if in_cell is not None:
             pace = in_cell.slowed(pace, progress)
         try:

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import InputError
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
@@ -30,6 +29,8 @@ if TYPE_CHECKING:
     from limber.estimation.parameters import Values
 
 FILE = "suggested_pull.json"
+CANDIDATES = (0.5, 0.67, 0.8, 0.92)
+"""Candidate grasps as fractions of the main path."""
 _CONFIDENCE = 0.95  # of plans made without one
 _MATTERS = 1.05  # factor on the usable part of a limit above which a pull changes a plan
 _USED = 0.95  # fraction of a limit with the confidence: a nearer plan is held back by it
@@ -48,10 +49,8 @@ class SuggestPullInputs(BranchInputs):
 class SuggestPullSettings(Settings):
     """Limits of a pull."""
 
-    groups: ClassVar[Groups] = {"limits": ("fractions", "max_strain", "max_force")}
+    groups: ClassVar[Groups] = {"limits": ("max_strain", "max_force")}
 
-    fractions: tuple[float, ...] = Field((0.5, 0.67, 0.8, 0.92), min_length=1, description=(
-        "Candidate grasps as fractions of the main path."))
     max_strain: float = Field(0.01, gt=0, lt=1, description=(
         "Largest principal strain during a pull (0.01 is 1 %)."))
     max_force: float | None = Field(None, gt=0, description="Largest force of the gripper [N].")
@@ -75,10 +74,6 @@ def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: st
     """
     from limber.estimation.next_pull import suggest
 
-    if any(not 0.0 < fraction <= 1.0 for fraction in settings.fractions):
-        raise InputError(f"--fractions {settings.fractions}.",
-                         "Grasps are fractions of the main path's length.",
-                         "Give numbers greater than 0 and at most 1.")
     branch = Branch.open(branch_folder)
     branch.require("mesh.vtu", "reconstruct")
     reads = [file for file in ("mesh.vtu", "skeleton.swc", "estimate.json") if branch.has(file)]
@@ -91,7 +86,7 @@ def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: st
         subject, values, known = _state(branch, settings)
         cell = _cell(branch)
         most = np.inf if settings.max_force is None else settings.max_force
-        found = suggest(subject, values, known, cell, settings.fractions, max_force=most,
+        found = suggest(subject, values, known, cell, CANDIDATES, max_force=most,
                         max_strain=settings.max_strain, workers=workers,
                         progress=progress.part(0.0, 0.8))
         stage.result.update(_summary(found, known) | {"instead": _instead(branch)})

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
-from limber.estimation.settings import VirtualPullSettings
+from limber.estimation.settings import PullSpec, VirtualPullSettings
 from limber.stages.inputs import BranchInputs, RunOptions, by_name
 from limber.stages.pulls.import_pull import Pull
 from limber.stages.registry import StageDescription
@@ -52,19 +52,22 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
     body = ("mesh.vtu",) if _is_meshed_body(branch) else ()
     reads = [file for file in ("skeleton.swc", "cloud.ply", "truth/skeleton.swc",
                                "truth/truth.json", *body) if branch.has(file)]
-    if not force and branch.is_current(key, settings, reads=reads):
+    digests = ({} if settings.cell_errors in ("none", "realistic") else
+               {"cell errors": settings.calibration.model_dump_json()})
+    if not force and branch.is_current(key, settings, reads=reads, digests=digests):
         return branch.manifest.stages[key].result
+    spec = PullSpec.of(settings)
     progress(0.02, "meshing the true branch")
-    truth = load_truth(branch, settings)
-    with branch.stage(key, settings, reads=reads) as stage:
+    truth = load_truth(branch, spec)
+    with branch.stage(key, settings, reads=reads, digests=digests) as stage:
         prefix = f"pulls/{name}/"
         for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
             stage.remove(old)
         folder = stage.path(prefix + "pull.toml").parent
-        pull, displacements = simulate_pull(truth, name, settings, progress=progress.part(0.1, 0.9))
+        pull, displacements = simulate_pull(truth, name, spec, progress=progress.part(0.1, 0.9))
         write_pull(folder, pull)
         if settings.camera:
-            write_depth_frames(folder, truth, pull, displacements, settings)
+            write_depth_frames(folder, truth, pull, displacements, spec)
         reaction = np.linalg.norm(pull.wrenches[:, :3], axis=1)
         stage.result.update({
             "pull": name, "young_true_pa": truth.young, "control_points_m": truth.control_points,
@@ -75,7 +78,7 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
     return stage.result
 
 
-def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
+def load_truth(branch: Branch, settings: PullSpec) -> TrueBranch:
     """The truth of a branch folder: its generator's, the meshed body, or one that fits its scan.
     """
     from limber.estimation.simulated_pull import true_branch
@@ -95,7 +98,7 @@ def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
     return replace(found, is_assumed=not known)
 
 
-def _scan(branch: Branch, settings: VirtualPullSettings) -> np.ndarray | None:
+def _scan(branch: Branch, settings: PullSpec) -> np.ndarray | None:
     """The points that determine a drawn shape; None if the truth is known, or there is no scan."""
     from limber.geometry.io.clouds import read_cloud
 

@@ -13,7 +13,7 @@ from limber.core.files.atomic import file_digest, write_atomically
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
-from limber.geometry.settings import BranchSpec
+from limber.geometry.settings import BranchSpec, GeneratedSettings
 from limber.stages.inputs import NoOptions, argument
 from limber.stages.registry import StageDescription
 from limber.stages.result import Numbers, Result, kept, shown
@@ -30,7 +30,7 @@ class GenerateInputs(Settings):
     folder: Path = argument("The folder to make.")
 
 
-class GenerateSettings(BranchSpec):
+class GenerateSettings(GeneratedSettings):
     """A generated branch and its seed."""
 
     groups: ClassVar[Groups] = {"shape": ("seed",)}

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from limber.mechanics.loads.loaded_branch import NamedTarget
 
 FILE = "targets.json"
+_FARTHEST_M = 0.03  # from the branch at which a target may be
 
 
 class TargetInputs(PlacedInputs):
@@ -32,7 +33,7 @@ class TargetInputs(PlacedInputs):
 class TargetSettings(Settings):
     """Position and mass of a target."""
 
-    groups: ClassVar[Groups] = {"input": ("at", "mass", "farthest", "remove")}
+    groups: ClassVar[Groups] = {"input": ("at", "mass", "remove")}
     common = ("at",)
 
     at: tuple[float, float, float] | None = Field(
@@ -41,8 +42,6 @@ class TargetSettings(Settings):
     mass: float = Field(
         0.0, ge=0, le=100, description="Additional mass [kg] that hung there when the branch was "
         "scanned.")
-    farthest: float = Field(
-        0.03, gt=0, description="Largest allowed distance from the branch [m].")
     remove: bool = Field(False, description="Remove this target.")
 
 
@@ -117,13 +116,13 @@ def _placed(mesh: Any, name: str, at: tuple[float, float, float], settings: Targ
     position = np.array(at)
     foot = nearest_inside(mesh, position[None])[0]
     distance = float(np.linalg.norm(position - foot))
-    if not distance <= settings.farthest:
+    if not distance <= _FARTHEST_M:
         low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
         raise InputError(
             f"Target {name} is {distance:.3g} m away from the branch.",
             f"The branch extends from ({_numbers(low)}) to ({_numbers(high)}) m. Its nearest "
-            f"point is ({_numbers(foot)}) m, and {settings.farthest:g} m are allowed.",
-            "Check the frame and the unit (metres, branch frame), or widen --farthest.")
+            f"point is ({_numbers(foot)}) m, and {_FARTHEST_M:g} m are allowed.",
+            "Check the frame and the unit (metres, branch frame).")
     return {"target": NamedTarget(name, at, settings.mass), "position_m": position,
             "mass_kg": settings.mass, "branch_point_m": foot, "distance_m": distance}
 
