@@ -13,8 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from limber.batch.batch_progress import Records, numbers_of, path_of_page
-from limber.batch.batch_summary import write_page
+from limber.batch.batch_progress import Records, numbers_of, path_of_page, write_page
 from limber.batch.job_file import read_jobs
 from limber.batch.run import run_jobs
 from limber.cli import main
@@ -214,7 +213,7 @@ def test_numbers_of_a_result():
 
 def test_pictures_of_a_branch(tmp_path, branch_template):
     """Two sides; coloured where the modulus varies, brown where it does not, none without axes."""
-    from limber.batch.batch_summary import pictures
+    from limber.batch.batch_progress import pictures
 
     example = Path(__file__).parents[2] / "blend_files" / "bending_branch"
     shown = pictures(example)

@@ -8,8 +8,13 @@ from scipy.interpolate import PchipInterpolator
 
 from benchmarks.paper_branches import Bench, PaperBranch
 from limber.core.errors import InputError
-from limber.estimation.interpolation_prior import YoungField, open_field
-from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
+from limber.estimation.parameters import (
+    LINK_DEVIATION,
+    ParameterSpace,
+    Values,
+    YoungField,
+    open_field,
+)
 from limber.mechanics.materials.materials import LayeredSection
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])

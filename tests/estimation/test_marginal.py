@@ -5,8 +5,7 @@ import pytest
 from scipy.optimize import least_squares, minimize
 
 from limber.estimation.fitting.objective import Evaluation
-from limber.estimation.interpolation_prior import YoungField
-from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.parameters import ParameterSpace, Values, YoungField
 from limber.estimation.uncertainty.covariance import marginal_step
 
 FORMS = np.linspace(-4, 4, 17)

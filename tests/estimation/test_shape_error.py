@@ -11,8 +11,7 @@ from limber.estimation.estimated_branch import Subject, forwards_of, parameter_s
 from limber.estimation.fit_assessment import _tell_largest_part
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.forward.observed_path import ObservedPathForward
-from limber.estimation.interpolation_prior import open_field
-from limber.estimation.parameters import Values
+from limber.estimation.parameters import Values, open_field
 from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty import shape_error as module
 from limber.estimation.uncertainty.shape_error import (

@@ -7,11 +7,8 @@ from limber.core.errors import MeshingError
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import bending_factor, polygon_factor, rings
-from limber.geometry.surface.distance import distance_to_surface
-from limber.geometry.surface.forks import smooth_forks
-from limber.geometry.surface.implicit_surface import level_surface
-from limber.geometry.surface.surface import Surface
-from limber.geometry.surface.surface_checks import check_surface
+from limber.geometry.surface.forks import level_surface, smooth_forks
+from limber.geometry.surface.surface import Surface, check_surface, distance_to_surface
 from limber.geometry.surface.tubes import branch_surface
 from limber.geometry.tets import tetrahedra
 from limber.geometry.tets.tet_mesh import (

@@ -8,9 +8,8 @@ from limber.geometry.skeleton.radii.fit_kernels import (
     normal_blocks,
     reach_on_circle,
 )
-from limber.geometry.surface.distance import _distances
-from limber.geometry.surface.face_crossings import pierced
-from limber.geometry.surface.rounded_union import fillet_level
+from limber.geometry.surface.forks import fillet_level
+from limber.geometry.surface.surface import _distances, pierced
 from limber.geometry.warm_up import warm_up
 
 

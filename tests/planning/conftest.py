@@ -16,7 +16,7 @@ from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.certificate import lower_bound
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_model import grasp_model_of
-from limber.planning.field.grasp_samples import GraspSamples
+from limber.planning.field.stored_states import GraspSamples
 from limber.stages.paths.energy import EnergySettings, sample_energy_field
 from limber.stages.paths.plan import plan as plan_paths
 from limber.store import Branch

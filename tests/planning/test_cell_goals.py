@@ -13,9 +13,8 @@ from limber.cell.obstacles import Box
 from limber.core.errors import NoPathError
 from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.field.energy_field import EnergyField
-from limber.planning.goals.goal import CellPlace, GoalRequest, goal_points, with_near_side
+from limber.planning.goals.goal import Ball, CellPlace, GoalRequest, goal_points, with_near_side
 from limber.planning.goals.goal_kinds import CellGoal, TargetGoal, goal_of
-from limber.planning.goals.regions import Ball
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.plan_file import read_plan
 from limber.stages.paths.plan import plan as plan_paths

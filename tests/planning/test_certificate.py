@@ -15,8 +15,8 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, arc_lengths, path_cost, resample
 from limber.planning.field.energy_field import knowing
 from limber.planning.field.valid_region import TrustRegion
+from limber.planning.goals.goal import Ball
 from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
-from limber.planning.goals.regions import Ball
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners import refine as refine_module
 from limber.planning.planners.detour import plan_detour

@@ -11,7 +11,7 @@ from limber.planning.certificate.subsolution import off_zero
 from limber.planning.cost import CostWeights
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import fit_field
-from limber.planning.field.grasp_samples import GraspSamples
+from limber.planning.field.stored_states import GraspSamples
 from limber.planning.goals.goal import allowed_points
 from limber.planning.goals.goal_kinds import GraspGoal
 from limber.planning.path_problem import GentleProblem

@@ -13,8 +13,8 @@ from limber.planning.certificate.feasibility import judge
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
+from limber.planning.goals.goal import Ball
 from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
-from limber.planning.goals.regions import Ball
 from limber.planning.path_problem import UNPROVEN, BlockedError, GentleProblem
 from limber.planning.settings import PlanSettings
 

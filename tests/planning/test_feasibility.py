@@ -13,7 +13,7 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.field.grasp_samples import GraspSamples
+from limber.planning.field.stored_states import GraspSamples
 from limber.planning.goals.goal_kinds import GraspGoal, default_goal
 from limber.planning.passages import solved_if_undecided
 from limber.planning.path_problem import BlockedError, GentleProblem

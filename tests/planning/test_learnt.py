@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.planning.field.energy_field import EnergyField
-from limber.planning.field.reduced_grasp import CorrectedResult, LearntGraspModel
+from limber.planning.field.grasp_model import CorrectedResult, LearntGraspModel
 from limber.planning.field.stored_states import taken
 from limber.reduced import model_cache
 from limber.reduced.model_cache import ReducedCache
@@ -22,7 +22,7 @@ FEW = ReducedSettings(size=40, field_count=70, training=TrainingSettings(
 @pytest.fixture(scope="module")
 def learnt(small_model, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("limber.planning.field.reduced_grasp.SHARED", FEW)
+        patch.setattr("limber.planning.field.grasp_model.SHARED", FEW)
         return LearntGraspModel.learnt(small_model, ReducedCache(tmp_path_factory.mktemp("kept")))
 
 
@@ -93,8 +93,8 @@ def test_no_state_is_jumped_to(learnt):
 def test_a_field_says_which_model_it_came_from(small_model, small_mesh, small_skeleton, tmp_path,
                                                monkeypatch):
     """Sampled on a model that is learnt once; samples that are added later are the full model's."""
-    monkeypatch.setattr("limber.planning.field.reduced_grasp.SHARED", FEW)
-    monkeypatch.setattr("limber.planning.field.reduced_grasp.default_folder",
+    monkeypatch.setattr("limber.planning.field.grasp_model.SHARED", FEW)
+    monkeypatch.setattr("limber.planning.field.grasp_model.default_folder",
                         lambda: tmp_path / "kept")
     branch = Branch.create(tmp_path / "small.branch")
     with branch.stage("mesh") as stage:

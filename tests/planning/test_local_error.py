@@ -11,9 +11,8 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.radial import LocalError, slack_slopes, slacks_at
-from limber.planning.goals.goal import allowed_points
+from limber.planning.goals.goal import Ball, allowed_points
 from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
-from limber.planning.goals.regions import Ball
 from limber.planning.passages import checked_wall, confirmed, not_confirmed
 from limber.planning.path_problem import BlockedError, GentleProblem
 from limber.planning.plan_file import read_plan

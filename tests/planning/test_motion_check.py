@@ -11,9 +11,8 @@ from limber.cell.obstacles import Box
 from limber.core.errors import NoPathError
 from limber.mechanics import simulate_dynamics
 from limber.mechanics.dynamics.motion import EnergyMomentumSettings
-from limber.planning.constraints.limits import Limits
+from limber.planning.constraints.limits import Limits, Obstacles
 from limber.planning.constraints.motion_check import MotionCheck, check_motion
-from limber.planning.constraints.obstacles import Obstacles
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSettings

@@ -5,7 +5,7 @@ import pytest
 
 from limber.cell.obstacles import Box, Solid, closest
 from limber.geometry.surface.surface import Surface
-from limber.planning.constraints.obstacles import Obstacles
+from limber.planning.constraints.limits import Obstacles
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],

@@ -10,8 +10,7 @@ from pydantic import Field
 
 from limber.core.errors import NoPathError
 from limber.core.settings import Groups
-from limber.planning.constraints.limits import CONSTRAINTS
-from limber.planning.constraints.obstacles import Constraint
+from limber.planning.constraints.limits import CONSTRAINTS, Constraint
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSettings
 from limber.stages.paths.plan import plan as plan_paths

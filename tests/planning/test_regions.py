@@ -9,7 +9,7 @@ from limber.core.errors import InputError
 from limber.planning.baseline_and_plan import plan_pair
 from limber.planning.constraints.limits import Limits
 from limber.planning.field.energy_field import fit_field
-from limber.planning.goals.goal import GoalRequest, goal_points
+from limber.planning.goals.goal import Ball, BoxRegion, GoalRequest, goal_points
 from limber.planning.goals.goal_kinds import (
     TargetGoal,
     View,
@@ -18,7 +18,6 @@ from limber.planning.goals.goal_kinds import (
     second_arm_goal,
     tip_goal,
 )
-from limber.planning.goals.regions import Ball, BoxRegion
 from limber.planning.path_problem import random_start
 from limber.planning.settings import PlanSettings
 

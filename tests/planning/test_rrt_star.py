@@ -11,9 +11,8 @@ from limber.core.progress import Progress
 from limber.planning.baseline_and_plan import _shortest_known
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights, arc_lengths, measure_path
-from limber.planning.goals.goal import goal_points
+from limber.planning.goals.goal import Ball, goal_points
 from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal, default_goal
-from limber.planning.goals.regions import Ball
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.rrt_star import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, OmplRrtStar, plan_path

@@ -13,8 +13,8 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.dynamics.modes import lowest_modes
 from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
 from limber.mechanics.statics.solve import solve_static
-from limber.results.exports.abaqus import inp_text
 from limber.results.exports.rigid_links import matched, mjcf_text, rod_tree
+from limber.results.exports.volumes import inp_text
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,8 @@ from limber.estimation.fit import fit_branch
 from limber.estimation.fit_assessment import Estimate, judge_model, require_result
 from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.forward.gripper_path import MotionWanted, moved
-from limber.estimation.interpolation_prior import open_field
 from limber.estimation.next_pull import Cell, Known, PullChoice, suggest
-from limber.estimation.parameters import Values
+from limber.estimation.parameters import Values, open_field
 from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import CellErrors, marked_points
 from limber.estimation.uncertainty.covariance import inverse_information

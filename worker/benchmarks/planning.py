@@ -51,8 +51,7 @@ from benchmarks.trials import Trial, column, sound, source_digest
 from limber.core.errors import LimberError
 from limber.core.progress import Progress
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.field.grasp_model import GraspModel, refusal
-from limber.planning.field.reduced_grasp import LearntGraspModel
+from limber.planning.field.grasp_model import GraspModel, LearntGraspModel, refusal
 from limber.planning.field.sampling import Sampled, sample_field, sample_positions
 from limber.planning.goals.goal_kinds import default_goal
 from limber.planning.settings import EnergySettings

@@ -8,7 +8,7 @@ from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.radii import visible_sides
 from limber.geometry.skeleton.radii.axis_fit import fit_axes, normal_equations
 from limber.geometry.skeleton.radii.fit_kernels import match_cylinders
-from limber.geometry.skeleton.radii.noisy_rings import mean_positions, weighted_target_distances
+from limber.geometry.skeleton.radii.sensor_effects import mean_positions, weighted_target_distances
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise

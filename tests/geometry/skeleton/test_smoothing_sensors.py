@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.radii.smoothing_sensors import sensor_smoothing
+from limber.geometry.skeleton.radii.sensor_effects import sensor_smoothing
 from limber.geometry.skeleton.radii.wood import ShapeEvidence, likeliest_shape
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
 

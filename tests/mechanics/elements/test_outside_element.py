@@ -12,7 +12,7 @@ from limber.geometry.tets import element_types
 from limber.geometry.tets.element_types import Quadrature, quadrature
 from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.mechanics.elements.shape_functions import has_curved_sides, node_weights
-from limber.results.exports.abaqus import inp_text
+from limber.results.exports.volumes import inp_text
 
 
 class Bubble:

@@ -35,8 +35,7 @@ from limber.mechanics.materials.laws import contracted, determinant, right_cauch
 from limber.mechanics.pull_simulation import SimulateSettings
 from limber.mechanics.strain import peak_load, strain_state
 from limber.reduced.strain_polynomial import make_polynomial
-from limber.results.exports.abaqus import inp_text
-from limber.results.exports.usd import as_deformable
+from limber.results.exports.volumes import as_deformable, inp_text
 from limber.store import Branch
 
 SHARE = 0.4

@@ -9,9 +9,8 @@ from tests.subjects.other_programs import bent_here, bent_in_calculix, bent_in_m
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
-from limber.results.exports.abaqus import inp_text
 from limber.results.exports.rigid_links import mjcf_text, rod_tree, tip_compliance, urdf_text
-from limber.results.exports.usd import as_deformable, write_usd
+from limber.results.exports.volumes import as_deformable, inp_text, write_usd
 
 LOAD = np.array([0.01, 0.006, 0.0])
 

@@ -13,9 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from limber.batch.dask_worker import run_line, stop_lines, unfit
 from limber.batch.job_file import JobFile, StageTask
 from limber.batch.scheduler_scripts import line_of_task
+from limber.batch.stage_task import run_line, stop_lines, unfit
 from limber.core.errors import Cancelled, InputError, WorkError
 from limber.core.not_none import present
 from limber.core.optional import require_extra

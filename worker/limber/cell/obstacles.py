@@ -11,8 +11,7 @@ from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices
 from limber.geometry.io.surfaces import SURFACES, usable_surface
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.surface.distance import distance_to_surface
-from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.surface import Surface, distance_to_surface
 
 # Constraints on a plan in addition to the limits on energy, force and loads.
 #

@@ -14,8 +14,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.estimation.fit_assessment import Estimate
-from limber.estimation.interpolation_prior import bump_deviations, hats, stations_of
-from limber.estimation.parameters import LINK_DEVIATION, Values
+from limber.estimation.parameters import LINK_DEVIATION, Values, bump_deviations, hats, stations_of
 from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.covariance import repeated, scaled_rows
 from limber.geometry.skeleton.skeleton import FRACTIONS

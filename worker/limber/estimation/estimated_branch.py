@@ -11,8 +11,7 @@ from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.forward_model import Forward, PointDirections, under_its_weight
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
-from limber.estimation.interpolation_prior import YoungField, open_field
-from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.parameters import ParameterSpace, Values, YoungField, open_field
 from limber.estimation.settings import EstimateSettings, FitSpec
 from limber.geometry.skeleton.skeleton import Skeleton, control_points
 from limber.geometry.tets.tet_mesh import TetMesh

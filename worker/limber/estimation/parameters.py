@@ -1,8 +1,15 @@
 """The estimated parameters and the free vector of the optimiser."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
+
+from limber.core.not_none import present
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
 
 YOUNG_BOUNDS_PA = (1e4, 1e11)
 POISSON_BOUNDS = (0.0, 0.495)
@@ -24,7 +31,7 @@ class Values:
         density: [kg/m^3].
         damping: Rayleigh's alpha [1/s] and beta [s].
         form: Interpolation of the modulus between the control points, in deviations from the
-            expected one (:mod:`limber.estimation.interpolation_prior`); empty: as expected.
+            expected one (:mod:`limber.estimation.parameters`); empty: as expected.
     """
 
     young: np.ndarray
@@ -164,3 +171,234 @@ def mechanics_names(extra: tuple[str, ...]) -> tuple[str, ...]:
              "beta": "damping_stiffness"}
     # Parameters of the field's form come with log E.
     return ("log_young", *(names[name] for name in extra if name in names))
+
+
+# Interpolation prior: Young's modulus between the control points is uncertain.
+#
+# The paper uses inverse-distance weights of the moduli. A modulus that is linear between the
+# control points, decreases monotonically, or differs in side branches explains a pull equally well,
+# with other moduli at the control points: by tens of percent if neighbours differ severalfold. The
+# field is therefore a mixture of the paper's field and one that is linear in its logarithm, with
+# bumps between the control points and beyond the outer ones. Mixture and bumps are unknowns in
+# addition to the moduli: the pull determines them, or they widen the intervals. Bumps are larger
+# the more the neighbouring moduli differ.
+
+MIXTURE = (0.5, 0.5)
+"""Mean and deviation of the fraction of the log-linear field in the mixture."""
+BUMP_BETWEEN, BUMP_BEYOND, BUMP_OF_ORDER = 0.1, 0.3, 0.3
+"""Deviations of log E from the mixture: halfway between control points, at base and tip beyond the
+outer ones, and of side branches from the point they grow from. For a branch with constant log E.
+"""
+STEP_BETWEEN, STEP_BEYOND = 0.15, 0.3
+"""The same as a fraction of the adjacent step of log E, which is added to those. A cubic between
+two control points differs from the straight line halfway by an eighth of the difference of its
+slopes at both. Slopes of 0 to 3 times the straight one's keep it monotone (Fritsch and Carlson
+1980); if all are equally likely, the deviation is 3/8 sqrt(2/12) = 0.153. Beyond the outer control
+points it may stop at once or continue for the length of a step: the uniform deviation, sqrt(1/12) =
+0.29.
+"""
+_ORDER = "form of side branches of order "
+
+
+@dataclass(frozen=True)
+class YoungField:
+    """Young's modulus of the tetrahedra from that at the control points.
+
+    Attributes:
+        weights: The paper's inverse-distance weights, shape [tet_count, K].
+        straight: Weights of the logarithms in the log-linear field, shape [tet_count, K]; None: the
+            field is the paper's, without further unknowns.
+        bumps: Effect of each further unknown on log E, 1 at most, shape [tet_count, B].
+        widths: Deviations of these changes if all moduli are the same, shape [B].
+        steps: Increase of them by a change of log E at the control points, shape [B, K].
+        names: Names of the mixture and the bumps, B + 1; empty without ``straight``.
+        log_factor: Log of the factor of a layered section in ``weights``, shape [tet_count].
+    """
+
+    weights: np.ndarray
+    straight: np.ndarray | None = None
+    bumps: np.ndarray | None = None
+    widths: np.ndarray | None = None
+    steps: np.ndarray | None = None
+    names: tuple[str, ...] = ()
+    log_factor: np.ndarray | float = 0.0
+
+    def young(self, values: Values) -> np.ndarray:
+        """Young's modulus of all tetrahedra [Pa], shape [tet_count]."""
+        plain = self.weights @ values.young
+        if self.straight is None:
+            return plain
+        form = self._form(values)
+        part = self._part(form)
+        sizes, _ = self._sizes(values)
+        return np.exp(np.log(plain) + part * self._deviation(values)
+                      + self.bumps @ (sizes * form[1:]))
+
+    def shares(self, values: Values, extra: tuple[str, ...]) -> np.ndarray:
+        """Derivative of log E of the tetrahedra to log E at the control points and, if they are
+        among the ``extra`` parameters, to the further unknowns, shape [K + B + 1, tet_count].
+        """
+        plain = self.weights @ values.young
+        shares = (self.weights * values.young).T / plain
+        if self.straight is None:
+            return shares
+        form = self._form(values)
+        part = self._part(form)
+        sizes, by_young = self._sizes(values)
+        shares = ((1 - part) * shares + part * self.straight.T
+                  + (self.bumps @ (form[1:, None] * by_young)).T)
+        if self.names[0] not in extra:
+            return shares
+        deviation = self._deviation(values)
+        return np.vstack([shares, MIXTURE[1] * deviation, (self.bumps * sizes).T])
+
+    def deviations(self, values: Values) -> np.ndarray:
+        """Change of log E by each bump, with these moduli, shape [B]."""
+        return np.zeros(0) if self.straight is None else self._sizes(values)[0]
+
+    def growth(self, values: Values) -> np.ndarray:
+        """Derivative of the logarithm of each further unknown's effect on the field to log E at the
+        control points, shape [B + 1, K].
+        """
+        plain = self.weights @ values.young
+        deviation = self._deviation(values)
+        by_young = self.straight - self.weights * values.young / plain[:, None]
+        sizes, sizes_by_young = self._sizes(values)
+        # For a uniform branch both fields of the mixture are the same.
+        return np.vstack([deviation @ by_young / max(float(deviation @ deviation), 1e-12),
+                          sizes_by_young / sizes[:, None]])
+
+    def order_moduli(self, values: Values, deviation: Mapping[str, float],
+                     ) -> list[dict[str, Any]]:
+        """Modulus of the side branches of each order over that of the main path.
+
+        Args:
+            deviation: Name of a free parameter to its standard deviation.
+
+        Returns:
+            Of each order ``order``, ``factor`` and its 95 % ``interval``.
+        """
+        found = []
+        sizes = self.deviations(values)
+        for number, name in enumerate(self.names[1:]):
+            if name.startswith(_ORDER) and name in deviation:
+                middle = sizes[number] * values.form[1 + number]
+                width = 1.96 * sizes[number] * deviation[name]
+                found.append({"order": int(name.removeprefix(_ORDER)),
+                              "factor": float(np.exp(middle)),
+                              "interval": np.exp([middle - width, middle + width]).tolist()})
+        return found
+
+    def _deviation(self, values: Values) -> np.ndarray:
+        """Log-linear field less the paper's, of the tetrahedra, shape [tet_count]."""
+        straight = present(self.straight, "log-linear field")
+        return straight @ np.log(values.young) + self.log_factor - np.log(
+            self.weights @ values.young)
+
+    def _sizes(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
+        """Deviations of the bumps [B], and their derivative to log E at the control points [B, K].
+        """
+        step = self.steps @ np.log(values.young)
+        sizes = np.hypot(present(self.widths, "bump of the field"), step)
+        return sizes, (step / sizes)[:, None] * self.steps
+
+    def _form(self, values: Values) -> np.ndarray:
+        return np.array(values.form) if len(values.form) else np.zeros(len(self.names))
+
+    def _part(self, form: np.ndarray) -> float:
+        return MIXTURE[0] + MIXTURE[1] * float(form[0])
+
+
+def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
+               fractions: tuple[float, ...], *, log_factor: np.ndarray | float = 0.0,
+               by_order: bool = False) -> YoungField:
+    """Return the field with an unknown interpolation; for a single modulus, the uniform one.
+
+    Args:
+        fractions: Positions of the control points on the main path, ascending, shape [K].
+        log_factor: Log of the factor of a layered section that is in the weights, [tet_count].
+        by_order: Whether side branches of each order have a modulus of their own.
+    """
+    positions = np.asarray(fractions, float)
+    is_uniform = len(positions) < 2 or bool(np.any(np.diff(positions) <= 0))
+    along, order = _element_positions(mesh, skeleton)
+    if is_uniform and not (by_order and order.any()):
+        return YoungField(weights)
+    straight = hats(along, positions)
+    places, widths, steps = ([], [], []) if is_uniform else _bumps(fractions)
+    stations = positions if is_uniform else stations_of(fractions)
+    names = ["form", *(f"form at {stations[place]:.2g}" for place in places)]
+    bumps = list(hats(along, stations)[:, places].T)
+    for number in np.unique(order[order > 0]) if by_order else [0] if order.any() else []:
+        names.append(f"{_ORDER}{number}" if by_order else "form of side branches")
+        bumps.append((order == number if by_order else order > 0).astype(float))
+        widths.append(LINK_DEVIATION if by_order else BUMP_OF_ORDER)
+        steps.append(np.zeros(len(positions)))
+    return YoungField(weights, straight, np.column_stack(bumps), np.array(widths),
+                      np.array(steps), tuple(names), log_factor)
+
+
+def stations_of(fractions: tuple[float, ...]) -> np.ndarray:
+    """Return the control points and the positions of the bumps on the main path, ascending."""
+    positions = np.asarray(fractions, float)
+    return np.sort(np.r_[positions, (positions[1:] + positions[:-1]) / 2,
+                         *([0.0] if positions[0] > 0 else []),
+                         *([1.0] if positions[-1] < 1 else [])])
+
+
+def bump_deviations(fractions: tuple[float, ...], log_young: np.ndarray,
+                    ) -> tuple[list[int], np.ndarray]:
+    """Return which stations have a bump, and their deviations of log E for these moduli; none for a
+    single control point.
+    """
+    if len(fractions) < 2:
+        return [], np.zeros(0)
+    places, widths, steps = _bumps(fractions)
+    return places, np.hypot(widths, np.array(steps) @ log_young)
+
+
+def _bumps(fractions: tuple[float, ...]) -> tuple[list[int], list[float], list[np.ndarray]]:
+    """Stations with a bump; its deviation, and its increase by log E at the control points [K]."""
+    positions = np.asarray(fractions, float)
+    places, widths, steps = [], [], []
+    for number, station in enumerate(stations_of(fractions)):
+        if np.any(np.isclose(station, positions)):
+            continue
+        inside = positions[0] < station < positions[-1]
+        places.append(number)
+        widths.append(BUMP_BETWEEN if inside else BUMP_BEYOND)
+        beside = int(np.clip(np.searchsorted(positions, station), 1, len(positions) - 1))
+        steps.append((STEP_BETWEEN if inside else STEP_BEYOND) * (
+            np.eye(len(positions))[beside] - np.eye(len(positions))[beside - 1]))
+    return places, widths, steps
+
+
+def _element_positions(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
+    """Position of each tetrahedron on the main path (0 to 1), and its branching order (0: main).
+    """
+    path = np.asarray(skeleton.main_path())
+    on_path = np.zeros(len(skeleton.nodes), bool)
+    on_path[path] = True
+    # A side branch has the position of its base.
+    root = np.arange(len(skeleton.nodes))
+    for node in range(len(root)):
+        climbed = node
+        while not on_path[climbed] and skeleton.parent[climbed] >= 0:
+            climbed = skeleton.parent[climbed]
+        root[node] = climbed
+    arc = skeleton.arc_length
+    middles, positions = [skeleton.nodes], [arc[root] / arc[path[-1]]]
+    child = np.flatnonzero(skeleton.parent >= 0)
+    parent = skeleton.parent[child]
+    for share in (0.25, 0.5, 0.75):
+        middles.append((1 - share) * skeleton.nodes[parent] + share * skeleton.nodes[child])
+        positions.append((1 - share) * positions[0][parent] + share * positions[0][child])
+    orders = np.where(on_path, 0, np.maximum(skeleton.order, 1))
+    side = np.concatenate([orders, *3 * [orders[child]]])
+    nearest = cKDTree(np.vstack(middles)).query(mesh.centroids)[1]
+    return np.clip(np.concatenate(positions)[nearest], 0.0, 1.0), side[nearest]
+
+
+def hats(along: np.ndarray, stations: np.ndarray) -> np.ndarray:
+    """Weights of linear interpolation between stations, constant beyond, shape [n, stations]."""
+    return np.column_stack([np.interp(along, stations, row) for row in np.eye(len(stations))])

@@ -8,8 +8,8 @@ from limber.geometry.skeleton.joining import join_pieces
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.surface.distance import distance_to_surface
 from limber.geometry.surface.forks import smooth_forks
+from limber.geometry.surface.surface import distance_to_surface
 from limber.geometry.surface.tubes import branch_surface
 
 

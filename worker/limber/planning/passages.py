@@ -10,9 +10,8 @@ from limber.planning.constraints.motion_check import learnt
 from limber.planning.cost import STEP, resample
 from limber.planning.field.energy_field import UNITS, EnergyField, limited
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.sampling import SolverPool, solve_branch
-from limber.planning.field.stored_states import Solved, samples_of
+from limber.planning.field.stored_states import GraspSamples, Solved, samples_of
 from limber.planning.goals.goal import Goal
 from limber.planning.goals.goal_kinds import near
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses, resolve_path

@@ -10,8 +10,7 @@ from limber.core.progress import SILENT, Progress
 from limber.mechanics import StaticResult
 from limber.planning.cost import PathMeasures, measure_path, resample
 from limber.planning.field.grasp_model import GraspModel, refusal
-from limber.planning.field.grasp_samples import LOADS
-from limber.planning.field.stored_states import straight_on
+from limber.planning.field.stored_states import LOADS, straight_on
 
 _APPROACH_STEP = 0.02  # [m] between poses on the path from rest to the start
 _MOST_UNSOLVED = 0.1  # fraction of a path's poses

@@ -5,7 +5,7 @@ import numpy as np
 from limber.core.progress import SILENT, Progress
 from limber.planning.baseline_and_plan import PlanSettings, plan_pair
 from limber.planning.field.energy_field import fit_field
-from limber.planning.field.grasp_samples import GraspSamples
+from limber.planning.field.stored_states import GraspSamples
 from limber.planning.goals.goal_kinds import GraspGoal
 
 

@@ -89,7 +89,7 @@ from limber.mechanics.loads.outdoor import Outdoors
 from limber.reduced.strain_polynomial import compile_kernels
 from limber.session import protocol
 from limber.session.frame_buffer import FrameWriter
-from limber.session.model_choice import Answering
+from limber.session.model_choice import Answering, Checked, Learnt
 from limber.session.outdoor_effects import EffectsTeller, Events
 from limber.session.protocol import (
     LINE_LIMIT,
@@ -101,7 +101,6 @@ from limber.session.protocol import (
     parse_command,
 )
 from limber.session.session_branch import Answer, load_held
-from limber.session.trainer_process import Checked, Learnt
 from limber.version import VERSION
 
 # The waiting commands, between the thread that reads the client and the one that solves.

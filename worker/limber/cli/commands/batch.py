@@ -58,8 +58,15 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     runs. Run it again after a stop, or after inputs have changed: results that are up to date are
     kept. The results are in OUT/JOBS.csv, one row per branch, and OUT/JOBS.html.
     """
-    from limber.batch.batch_progress import Records, path_of_page, path_of_table
-    from limber.batch.batch_summary import counts, failures, write_page, write_table
+    from limber.batch.batch_progress import (
+        Records,
+        counts,
+        failures,
+        path_of_page,
+        path_of_table,
+        write_page,
+        write_table,
+    )
     from limber.batch.job_file import read_jobs
     from limber.batch.run import plan_of, run_jobs
     from limber.batch.staging import put_summary

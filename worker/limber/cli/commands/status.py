@@ -13,8 +13,7 @@ from limber.cli.main import Run, stage_command
 @click.argument("job_file", type=click.Path(path_type=Path), metavar="JOBS.toml")
 def command(run: Run, job_file: Path) -> dict[str, Any]:
     """Show the progress of a job file's batch, also while it runs; each failure with its reason."""
-    from limber.batch.batch_progress import RUNNING, Records
-    from limber.batch.batch_summary import counts, failures
+    from limber.batch.batch_progress import RUNNING, Records, counts, failures
     from limber.batch.job_file import read_jobs
 
     jobs = read_jobs(job_file)

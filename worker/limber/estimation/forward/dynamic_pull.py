@@ -15,8 +15,7 @@ from limber.estimation.forward.forward_model import (
     nodal_loads,
     under_its_weight,
 )
-from limber.estimation.interpolation_prior import YoungField
-from limber.estimation.parameters import Values, mechanics_names
+from limber.estimation.parameters import Values, YoungField, mechanics_names
 from limber.mechanics.dynamics.integration import simulate_dynamics
 from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.materials.materials import RayleighDamping

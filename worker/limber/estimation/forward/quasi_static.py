@@ -24,8 +24,7 @@ from limber.estimation.forward.forward_model import (
     under_its_weight,
     wrench_sigma,
 )
-from limber.estimation.interpolation_prior import YoungField
-from limber.estimation.parameters import Values, equal_values, mechanics_names
+from limber.estimation.parameters import Values, YoungField, equal_values, mechanics_names
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials.materials import RayleighDamping

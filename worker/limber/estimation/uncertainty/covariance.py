@@ -11,8 +11,7 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.fitting.optimise import OUTLYING, Fit
 from limber.estimation.forward.dynamic_pull import DynamicForward
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.interpolation_prior import YoungField
-from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace
+from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, YoungField
 from limber.estimation.uncertainty.drift import scale_steps
 from limber.recordings.recording import calibration_of
 

@@ -7,8 +7,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.geometry.io.formats import Format, Registry
-from limber.geometry.surface.surface import Surface
-from limber.geometry.surface.surface_checks import crossings, pieces
+from limber.geometry.surface.surface import Surface, crossings, pieces
 
 SURFACES = Registry("surface", "limber.surfaces", [
     Format("triangles", (".stl", ".ply", ".obj", ".off", ".glb", ".gltf"), Surface.read)])

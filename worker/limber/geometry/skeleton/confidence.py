@@ -10,7 +10,7 @@ from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.radii.axis_fit import FORK, fit_with_steps, shared_error
 from limber.geometry.skeleton.radii.fit_kernels import match_cylinders, nearest_cylinders
 from limber.geometry.skeleton.radii.projected_widths import sight_field, width_covariance
-from limber.geometry.skeleton.radii.smoothing_sensors import sensor_smoothing
+from limber.geometry.skeleton.radii.sensor_effects import sensor_smoothing
 from limber.geometry.skeleton.radii.wood import (
     SPACINGS,
     WANDER,

@@ -10,20 +10,234 @@ below them at its rim, and is joined to them as a solid. The result is closed fo
 fork and any number of twigs there.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from limber.core.errors import MeshingError
+from limber.core.numerics.compiled import compiled_exactly
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import polygon_factor, tangents
-from limber.geometry.surface.cross_sections import SPACING, run_axis, sides_of_runs
-from limber.geometry.surface.implicit_surface import level_surface
-from limber.geometry.surface.rounded_union import distances, fillet_level, near_box, segments
-from limber.geometry.surface.surface import Surface
-from limber.geometry.surface.surface_checks import SurfaceCheck, check_surface, crossings
-from limber.geometry.surface.tubes import largest_piece, solid
+from limber.geometry.surface.surface import Surface, SurfaceCheck, check_surface, crossings
+from limber.geometry.surface.tubes import SPACING, largest_piece, run_axis, sides_of_runs, solid
+
+# Triangles of an implicit surface: marching tetrahedra, then smoothing on the surface itself.
+
+_CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0],
+                     [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]])
+# Six tetrahedra around the diagonal 0-7 of a cube (Kuhn): the same in each cube, so faces match.
+_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7],
+                  [0, 5, 1, 7]])
+_ROUNDS = 2  # rounds of smoothing of the vertices
+_NEAR = 0.05  # fraction of the step; a closer lattice point would make a sliver
+
+
+def level_surface(level: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray,
+                  step: float) -> Surface:
+    """Triangles of ``level(x) = 0`` around the solid where it is negative; closed by the box.
+
+    Marching tetrahedra (Doi and Koide 1991) on Kuhn's subdivision of a cubic lattice, which has
+    no ambiguous case: the result is a closed manifold. Vertices then move to the mean of their
+    neighbours and back along the gradient, which evens out the triangles.
+
+    Args:
+        level: Approximate distance [m] of points [n, 3], negative inside; called for many at once.
+        low: Corner of the box [m], shape [3].
+        high: The opposite corner [m].
+        step: Edge of the lattice's cubes [m].
+    """
+    count = np.maximum(np.ceil((high - low) / step).astype(int), 1) + 1
+    axes = [low[k] + step * np.arange(count[k]) for k in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    value = level(points)
+    value = np.where(np.abs(value) < _NEAR * step, np.where(value < 0, -1, 1) * _NEAR * step,
+                     value)
+    grid = value.reshape(count)
+    for axis in range(3):  # the box closes cut surfaces
+        for end in (0, -1):
+            face: list[slice | int] = [slice(None)] * 3
+            face[axis] = end
+            grid[tuple(face)] = np.maximum(grid[tuple(face)], _NEAR * step)
+    surface = _march(points, grid)
+    return _evened(surface, level, step) if len(surface.faces) else surface
+
+
+def _march(points: np.ndarray, grid: np.ndarray) -> Surface:
+    inside = grid < 0
+    count = np.array(grid.shape)
+    parts = [inside[c[0]:count[0] - 1 + c[0], c[1]:count[1] - 1 + c[1], c[2]:count[2] - 1 + c[2]]
+             for c in _CORNERS]
+    number = sum(part.astype(np.int8) for part in parts)
+    cube = np.argwhere((number > 0) & (number < 8))
+    if not len(cube):
+        return Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))
+    corner = np.ravel_multi_index(
+        (cube[:, None] + _CORNERS[None]).reshape(-1, 3).T, grid.shape).reshape(-1, 8)
+    tets = corner[:, _TETS].reshape(-1, 4)
+    value = grid.ravel()
+    # Corners inside come first, so that their number gives the case; the parity of the order is
+    # kept.
+    order = np.argsort(value[tets] >= 0, axis=1, kind="stable")
+    odd = np.zeros(len(order), bool)
+    for i in range(4):
+        for j in range(i):
+            odd ^= order[:, j] > order[:, i]
+    tets = np.take_along_axis(tets, order, axis=1)
+    within = (value[tets] < 0).sum(axis=1)
+    edges, flip = [], []
+    one, two, three = (np.flatnonzero(within == k) for k in (1, 2, 3))
+    a, b, c, d = (tets[:, k] for k in range(4))
+
+    def add(chosen: np.ndarray, *ends: tuple[np.ndarray, np.ndarray], turned: bool) -> None:
+        edges.append(np.stack([np.stack([p[chosen], q[chosen]], axis=1) for p, q in ends], axis=1))
+        flip.append(odd[chosen] ^ turned)
+
+    add(one, (a, b), (a, c), (a, d), turned=False)
+    add(two, (a, c), (a, d), (b, d), turned=False)
+    add(two, (a, c), (b, d), (b, c), turned=False)
+    add(three, (a, d), (b, d), (c, d), turned=False)
+    corners, turned = np.vstack(edges), np.concatenate(flip)
+    pairs = corners.reshape(-1, 2)
+    # Both ends in one number: this sorts ten times as fast as rows.
+    unique, index = np.unique(pairs.min(axis=1) * grid.size + pairs.max(axis=1),
+                              return_inverse=True)
+    faces = index.reshape(-1, 3)
+    faces[turned] = faces[turned][:, ::-1]
+    first, second = np.divmod(unique, grid.size)
+    low, high = value[first], value[second]
+    share = (low / (low - high))[:, None]
+    vertices = points[first] + share * (points[second] - points[first])
+    surface = Surface(vertices, faces)
+    return surface if surface.volume > 0 else Surface(vertices, faces[:, ::-1])
+
+
+def _evened(surface: Surface, level: Callable[[np.ndarray], np.ndarray], step: float,
+            ) -> Surface:
+    from scipy.sparse import coo_matrix
+
+    vertices, faces = surface.vertices, surface.faces
+    rows, columns = faces.ravel(), faces[:, [1, 2, 0]].ravel()  # each edge, once in each direction
+    near = coo_matrix((np.ones(len(rows)), (rows, columns)), (len(vertices),) * 2).tocsr()
+    degree = np.asarray(near.sum(axis=1))
+    for _ in range(_ROUNDS):
+        for _ in range(2):
+            vertices = (vertices + near @ vertices / degree) / 2
+        vertices = _onto(vertices, level, step)
+    return Surface(vertices, faces)
+
+
+def _onto(points: np.ndarray, level: Callable[[np.ndarray], np.ndarray], step: float,
+          ) -> np.ndarray:
+    """One step of Newton's method along the gradient, at most half a lattice step long."""
+    small = 0.05 * step
+    value = level(points)
+    gradient = np.stack([level(points + small * np.eye(3)[k]) - value for k in range(3)],
+                        axis=1) / small
+    shift = -value[:, None] * gradient / np.maximum((gradient**2).sum(axis=1), 0.25)[:, None]
+    size = np.linalg.norm(shift, axis=1, keepdims=True)
+    return points + shift * np.minimum(1, 0.5 * step / np.maximum(size, 1e-300))
+
+
+# Distances from round cylinders, and the level function of a fillet between them.
+
+
+def segments(points: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Rounded cones along a polyline: start [m], step [m], radius and its change [m], start along
+    the line and length [m]; shape [n - 1, 10].
+
+    Args:
+        points: Polyline [m], shape [n, 3].
+        radius: Radii [m], shape [n].
+    """
+    step = np.diff(points, axis=0)
+    length = np.linalg.norm(step, axis=1)
+    start = np.concatenate([[0], np.cumsum(length)])[:-1]
+    return np.column_stack([points[:-1], step, radius[:-1], np.diff(radius), start, length])
+
+
+def near_box(cones: np.ndarray, low: np.ndarray, high: np.ndarray, reach: float) -> np.ndarray:
+    """The cones that come within ``reach`` [m] of a box; at least the nearest one."""
+    middle, half = cones[:, :3] + cones[:, 3:6] / 2, cones[:, 9] / 2
+    outside = np.maximum(np.maximum(low - middle, middle - high), 0)
+    distance = np.linalg.norm(outside, axis=1) - half - cones[:, 6] - np.maximum(cones[:, 7], 0)
+    return cones[distance <= max(reach, float(distance.min()))]
+
+
+@compiled_exactly
+def nearest(cones: np.ndarray, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Distance [m] of a point from cones, negative inside; radius and position along there [m]."""
+    best, radius, along = np.inf, 0.0, 0.0
+    for k in range(len(cones)):
+        dx, dy, dz = x - cones[k, 0], y - cones[k, 1], z - cones[k, 2]
+        length = cones[k, 9]
+        t = 0.0
+        if length > 0:
+            t = (dx * cones[k, 3] + dy * cones[k, 4] + dz * cones[k, 5]) / (length * length)
+            t = min(max(t, 0.0), 1.0)
+        dx, dy, dz = dx - t * cones[k, 3], dy - t * cones[k, 4], dz - t * cones[k, 5]
+        here = cones[k, 6] + t * cones[k, 7]
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz) - here
+        if distance < best:
+            best, radius, along = distance, here, cones[k, 8] + t * length
+    return best, radius, along
+
+
+@compiled_exactly
+def distances(cones: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [m] of points [n, 3] from cones, negative inside, and the radii there [m]."""
+    distance, radius = np.empty(len(points)), np.empty(len(points))
+    for i in range(len(points)):
+        distance[i], radius[i], _ = nearest(cones, points[i, 0], points[i, 1], points[i, 2])
+    return distance, radius
+
+
+@compiled_exactly
+def fillet_level(points: np.ndarray, twig: np.ndarray, others: np.ndarray, first: np.ndarray,
+                 excess: np.ndarray, base: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Level of the solid around the crease between a twig and others, shape [n].
+
+    Args:
+        points: Positions [m], shape [n, 3].
+        twig: Its cones.
+        others: Cones of all the others, one after the other.
+        first: Index of the first cone of each of the others, and their total number, shape [k + 1].
+        excess: Excess of the polygons' corners over the circles, in radii; the twig's, then the
+            others', shape [k + 1].
+        base: A point [m] on the flat cut at the root and its normal, upwards, shape [2, 3].
+        shape: Radius of the fillet [m]; its reach and the distance at which its rim is lowest, in
+            fillet radii; its height over and depth under the cylinders, likewise; and its end along
+            the twig [m] (infinite: where the two are apart).
+    """
+    rho, reach, rim, margin, end = shape
+    count = len(first) - 1
+    distance, radius = np.empty(count), np.empty(count)
+    level = np.empty(len(points))
+    for i in range(len(points)):
+        x, y, z = points[i]
+        b, thick, along = nearest(twig, x, y, z)
+        level[i] = b - reach * rho
+        if level[i] > 0.2 * rho:
+            continue
+        a = np.inf
+        for k in range(count):
+            distance[k], radius[k], _ = nearest(others[first[k]:first[k + 1]], x, y, z)
+            a = min(a, distance[k])
+        cut = ((base[0, 0] - x) * base[1, 0] + (base[0, 1] - y) * base[1, 1]
+               + (base[0, 2] - z) * base[1, 2])
+        far = max(a, b, cut)
+        if along > end:
+            far = max(far, rho * (1 + (rim - 1) * (along - end) / thick))
+        over = min(max(1 - 2 * (far / rho - 1) / (rim - 1), -1.0), 1.0)
+        a = np.inf
+        for k in range(count):
+            a = min(a, distance[k] - over * (excess[k + 1] * radius[k] + margin * rho))
+        b -= over * (excess[0] * thick + margin * rho)
+        rounded = max(rho, min(a, b)) - np.hypot(max(rho - a, 0.0), max(rho - b, 0.0))
+        level[i] = max(rounded, far - reach * rho, cut)
+    return level
+
 
 ROUNDING = 0.5
 """Radius of a fillet, in radii of its twig or of its parent, whichever is thinner."""

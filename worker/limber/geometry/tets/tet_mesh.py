@@ -433,7 +433,7 @@ def measure_quality(mesh: TetMesh, surface_volume: float, skeleton: Skeleton | N
 
 
 def _surface_distances(mesh: TetMesh, skeleton: Skeleton, surface: Surface) -> dict[str, Any]:
-    from limber.geometry.surface.distance import distance_to_surface
+    from limber.geometry.surface.surface import distance_to_surface
 
     corner = mesh.nodes[mesh.surface_faces()]
     points = np.vstack([corner.reshape(-1, 3), corner.mean(axis=1),

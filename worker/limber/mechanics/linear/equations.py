@@ -17,8 +17,7 @@ from limber.core.numerics.sparse import (
     general_factor,
 )
 from limber.mechanics.elements.forces import lanes_last
-from limber.mechanics.elements.general import moduli_stiffness
-from limber.mechanics.elements.stiffness import LANES, tangent_stiffness
+from limber.mechanics.elements.stiffness import LANES, moduli_stiffness, tangent_stiffness
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.fronts import make_fronts, postordered
 from limber.mechanics.linear.supernodal import SupernodalFactor

@@ -17,13 +17,12 @@ from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.mechanics import simulate_dynamics
 from limber.mechanics.dynamics.motion import DynamicResult, NewmarkSettings
-from limber.planning.constraints.limits import Limits, sizes, with_unit
-from limber.planning.constraints.obstacles import Broken
+from limber.planning.constraints.limits import Broken, Limits, sizes, with_unit
 from limber.planning.cost import STEP
 from limber.planning.field.energy_field import UNITS, EnergyField, knowing
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.sampling import displacements_at
+from limber.planning.field.stored_states import GraspSamples
 from limber.planning.goals.goal import Goal
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 from limber.planning.timing import Pace, poses_at, time_law

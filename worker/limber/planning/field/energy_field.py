@@ -31,7 +31,6 @@ from limber.planning.field.fit_choice import (
     slopes_on,
     with_slopes,
 )
-from limber.planning.field.grasp_samples import LOADS, GraspSamples
 from limber.planning.field.radial import (
     LocalError,
     RadialInterpolant,
@@ -41,6 +40,7 @@ from limber.planning.field.radial import (
     slack_of,
     value_at,
 )
+from limber.planning.field.stored_states import LOADS, GraspSamples
 from limber.planning.field.valid_region import TrustRegion, trusted_at
 
 _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_nm",

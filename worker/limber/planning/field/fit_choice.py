@@ -8,8 +8,8 @@ import numpy as np
 from limber.core.errors import WorkError
 from limber.core.progress import Progress
 from limber.planning.field.chart import Chart
-from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.radial import RadialInterpolant
+from limber.planning.field.stored_states import GraspSamples
 from limber.planning.field.valid_region import TrustRegion
 
 KERNELS_TRIED = (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0), ("multiquadric", 2.0))

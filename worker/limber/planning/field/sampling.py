@@ -24,8 +24,8 @@ from limber.mechanics import StaticResult
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, refit
 from limber.planning.field.grasp_model import GraspModel, Reach, refusal
-from limber.planning.field.grasp_samples import GraspSamples
 from limber.planning.field.stored_states import (
+    GraspSamples,
     Solved,
     extrapolated,
     guess_of,

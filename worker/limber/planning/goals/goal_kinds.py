@@ -14,17 +14,15 @@ from limber.planning.field.sampling import SolverPool, solve_branch
 from limber.planning.field.valid_region import nearest_of
 from limber.planning.goals.goal import (
     NEARER,
+    Ball,
+    BoxRegion,
     CellPlace,
+    Convex,
     Goal,
     GoalKind,
     GoalRequest,
-    allowed_points,
-)
-from limber.planning.goals.regions import (
-    Ball,
-    BoxRegion,
-    Convex,
     Region,
+    allowed_points,
     ball,
     empty_along,
     position_text,

@@ -71,7 +71,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
         WorkError: too few poses could be solved.
     """
     from limber.planning.field.energy_field import fit_field
-    from limber.planning.field.reduced_grasp import LearntGraspModel
+    from limber.planning.field.grasp_model import LearntGraspModel
     from limber.planning.field.sampling import energy_inputs, refined, sample_field
     from limber.store.loading import load_grasp_model
 

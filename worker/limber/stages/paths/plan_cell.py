@@ -23,9 +23,8 @@ from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.constraints.limits import Limits
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals.goal import CellPlace
+from limber.planning.goals.goal import Ball, CellPlace, position_text
 from limber.planning.goals.goal_kinds import View
-from limber.planning.goals.regions import Ball, position_text
 from limber.planning.plan_file import PlanPath
 from limber.robot.live_view import LiveView
 from limber.robot.motion.execution import RobotMotion

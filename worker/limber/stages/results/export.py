@@ -119,7 +119,7 @@ def _write_links(branch: Branch, path: Path, settings: ExportSettings, progress:
 
 def _write_elements(branch: Branch, path: Path, settings: ExportSettings, progress: Progress,
                     ) -> dict[str, Any]:
-    from limber.results.exports.abaqus import inp_text
+    from limber.results.exports.volumes import inp_text
     from limber.store.loading import load_branch, load_skeleton
 
     model = load_branch(branch, gravity=False, progress=progress).model
@@ -136,7 +136,7 @@ def _write_elements(branch: Branch, path: Path, settings: ExportSettings, progre
 def _write_body(branch: Branch, path: Path, _settings: ExportSettings, progress: Progress,
                 ) -> dict[str, Any]:
     from limber.core.optional import require_extra
-    from limber.results.exports.usd import as_deformable, write_usd
+    from limber.results.exports.volumes import as_deformable, write_usd
     from limber.store.loading import known_damping, load_branch, load_skeleton
 
     require_extra("usd", ("pxr",), "USD")

@@ -22,7 +22,7 @@ from limber.geometry.skeleton.radii.fit_kernels import (
     normal_blocks,
     on_cylinders,
 )
-from limber.geometry.skeleton.radii.noisy_rings import (
+from limber.geometry.skeleton.radii.sensor_effects import (
     TargetDistances,
     held_across,
     mean_positions,

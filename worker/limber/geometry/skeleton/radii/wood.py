@@ -13,7 +13,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.radii.axis_fit import DISTINCT, FORK, second_differences
-from limber.geometry.skeleton.radii.smoothing_sensors import Smoothing
+from limber.geometry.skeleton.radii.sensor_effects import Smoothing
 from limber.geometry.skeleton.skeleton import MEASURED, UNRESOLVED, Skeleton
 
 # In logarithms of radii: a side branch against its carrier and the fall along a whole run (mean and
