@@ -90,13 +90,8 @@ D455 = Camera(width=1280, height=720, fx=640.0, fy=640.0, cx=639.5, cy=359.5)
 
 @dataclass(frozen=True)
 class SeenCloud:
-    """Points of one frame.
-
-    Attributes:
-        points: [m] in the branch's frame, shape [n, 3].
-        sigma: Standard deviation of each along its line of sight [m], shape [n].
-        view: Unit vectors from the camera to each point, branch frame, shape [n, 3].
-    """
+    """Points [n, 3] [m] of one frame with ``sigma`` [n] [m] along the lines of sight, and ``view``
+    [n, 3], unit vectors from the camera to them; all in the branch's frame."""
 
     points: np.ndarray
     sigma: np.ndarray
@@ -104,16 +99,8 @@ class SeenCloud:
 
 
 def depth_to_cloud(camera: Camera, depth: np.ndarray, mask: np.ndarray | None = None) -> SeenCloud:
-    """Back-project the pixels of a mask.
-
-    Args:
-        camera: Intrinsics and pose.
-        depth: Distance along the camera's axis [m], shape [height, width]; 0 or NaN: no reading.
-        mask: True on the branch, shape [height, width]; None takes every reading.
-
-    Raises:
-        InputError: the images are not of the camera's size.
-    """
+    """Back-project a depth image [height, width] [m] (0 or NaN: no reading) where ``mask`` is True;
+    None takes every reading. InputError if an image does not have the camera's size."""
     for name, image in (("depth image", depth), ("mask", mask)):
         if image is not None and image.shape != (camera.height, camera.width):
             raise InputError(f"The {name} has {image.shape[1]}x{image.shape[0]} pixels, but the "
@@ -142,11 +129,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def read_camera(path: Path) -> Camera:
-    """Read ``camera.toml``.
-
-    Raises:
-        InputError: the file is missing, or an entry is invalid (it is named).
-    """
+    """Read ``camera.toml``. InputError if it is missing, or an entry is invalid, which it names."""
     content = read_toml(path, "a file of camera intrinsics (depth images need it)")
     try:
         return validated(Camera, content)
@@ -171,11 +154,8 @@ LARGEST_PIXELS = 100_000_000
 
 
 def read_pixels(path: Path, what: str) -> np.ndarray:
-    """Return the pixels of an image, shape [height, width] or [height, width, channels].
-
-    Raises:
-        InputError: the file cannot be read as an image, or claims to be larger than any camera's.
-    """
+    """Return the pixels of an image, shape [height, width] or [height, width, channels]. InputError
+    if the file is no image, or claims to be larger than any camera's."""
     from PIL import Image
 
     try:

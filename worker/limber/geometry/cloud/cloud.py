@@ -25,15 +25,8 @@ _RESERVED = frozenset({"x", "y", "z", *PARTS, *(name for parts in PARTS.values()
 
 
 def property_names(titles: Iterable[str], taken: Collection[str] = ()) -> list[str]:
-    """Return a valid name of a PLY property for each title, all different.
-
-    A name has ASCII letters, digits and underscores; titles that are already such names are kept.
-    Names are compared without case, since some readers ignore it.
-
-    Args:
-        titles: Names of a file's columns: any text, may be empty or repeated.
-        taken: Names that are not to be used.
-    """
+    """Return a name for each title, all different when case is ignored and none in ``taken``: ASCII
+    letters, digits and underscores, as PLY needs. A title that is such a name is kept."""
     used = {name.lower() for name in taken}
     names = []
     for title in titles:
@@ -53,16 +46,8 @@ def property_names(titles: Iterable[str], taken: Collection[str] = ()) -> list[s
 def valid_columns(attributes: dict[str, np.ndarray], titles: dict[str, str], count: int,
                   taken: Collection[str] = ()) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return attributes that every writer accepts, and the file's names of those renamed.
-
-    ``normal`` and ``color`` (in 0..255) are of shape [n, 3]; all other attributes are columns of
-    numbers with valid names. Anything that is not a number per point is dropped.
-
-    Args:
-        attributes: Name to array, from a reader.
-        titles: The file's name of an attribute, where it differs.
-        count: Number of points n.
-        taken: Names that attributes must not have.
-    """
+    ``normal`` and ``color`` (0..255) have shape [n, 3]; all others are columns of numbers. What is
+    not a number for each of the ``count`` points is dropped."""
     kept: dict[str, np.ndarray] = {}
     columns: list[tuple[str, str, np.ndarray]] = []
     for name, values in attributes.items():
@@ -225,18 +210,9 @@ _STEP = 1e-6  # fraction of the cloud's size: finer than any scanner resolves, c
 
 @dataclass(frozen=True)
 class OwnFrame:
-    """A cloud's points in its own order and axes, from its middle, independent of its pose.
-
-    If a file is moved, rotated or given in another unit, its numbers are rounded differently. A
-    choice that compares two of them may then differ, and each choice affects others. So positions
-    here are on a grid coarse enough to hide rounding.
-
-    Attributes:
-        coordinates: Points in this frame [m], shape [n, 3].
-        order: Index of each point in the cloud, shape [n].
-        middle: The frame's origin [m], shape [3].
-        axes: The frame's axes as columns, shape [3, 3].
-    """
+    """Points [n, 3] [m] in the cloud's own ``order`` [n] and ``axes`` [3, 3] (columns) from its
+    ``middle``. A moved, rotated or scaled file is rounded differently, and choices would differ. So
+    coordinates are on a grid coarse enough to hide rounding."""
 
     coordinates: np.ndarray
     order: np.ndarray
@@ -265,23 +241,15 @@ class OwnFrame:
 
 
 def own_order(points: np.ndarray) -> np.ndarray:
-    """Return indices of points in an order that depends only on their positions, shape [n].
-
-    If ordered only by distance from the middle, regions grown from the first points would start
-    there.
-
-    Args:
-        points: Positions, shape [n, 3].
-    """
+    """Return indices [n] of points [n, 3] in an order that depends only on their positions. By
+    distance from the middle alone, regions grown from the first points would start there."""
     order = np.argsort(np.linalg.norm(points - points.mean(axis=0), axis=1), kind="stable")
     return order[np.random.default_rng(0).permutation(len(points))]
 
 
 def own_axes(points: np.ndarray) -> np.ndarray:
-    """The directions in which a cloud extends, longest first, as columns, shape [3, 3].
-
-    Right-handed; the first two point towards the longer tails of the cloud.
-    """
+    """The directions in which a cloud extends, longest first, as columns, shape [3, 3]. They are
+    right-handed; the first two point towards the longer tails."""
     offset = points - points.mean(axis=0)
     axes = np.linalg.eigh(offset.T @ offset)[1][:, ::-1]
     axes = axes * np.where(((offset @ axes)**3).sum(axis=0) < 0, -1.0, 1.0)
@@ -293,10 +261,8 @@ def own_axes(points: np.ndarray) -> np.ndarray:
 
 
 def thinned(points: np.ndarray, limit: int) -> np.ndarray:
-    """Indices of at most ``limit`` points, one from each cell of a grid that fits that number.
-
-    The grid follows the cloud's own axes, so a rotated cloud is thinned in the same way.
-    """
+    """Indices of at most ``limit`` points, one from each cell of a grid along the cloud's own axes,
+    so that a rotated cloud is thinned in the same way."""
     if len(points) <= limit:
         return np.arange(len(points))
     points = points @ own_axes(points)

@@ -26,15 +26,9 @@ TREES = Path(__file__).with_name("leaf_trees.npz")
 
 
 def surroundings(points: np.ndarray, spacing: float) -> np.ndarray:
-    """The shape of each point's surroundings at several scales, shape [n, 44].
-
-    Ratios of the second to the largest and of the smallest to the second standard deviation, the
-    smallest over the scale, and the logarithm of the number of filled cells: all without unit.
-
-    Args:
-        points: Positions [m], shape [n, 3].
-        spacing: Of the points [m].
-    """
+    """The shape of the surroundings of points [n, 3] [m] at several scales, shape [n, 44]: ratios
+    of the second to the largest and of the smallest to the second standard deviation, the smallest
+    over the scale, and the logarithm of the number of filled cells. All are without unit."""
     columns: list[np.ndarray] = []
     for step in range(_SCALES):
         scale = _FINEST * spacing * _STEP**step
@@ -109,23 +103,14 @@ _LIKELY, _SHARES = 2.5, (0.005, 0.95)
 
 @dataclass(frozen=True)
 class Leaf:
-    """One leaf, or several that touch.
-
-    Attributes:
-        points: Indices of its points.
-        area: Area of its blade [m^2], one side.
-    """
+    """One leaf, or several that touch: indices of its points, and the area of one side [m^2]."""
 
     points: np.ndarray
     area: float
 
 
 def find_leaves(points: np.ndarray) -> list[Leaf]:
-    """Find the leaves of a scan.
-
-    Args:
-        points: Positions [m], shape [n, 3].
-    """
+    """Find the leaves of a scan of points [n, 3] [m]."""
     own = OwnFrame.of(points)
     return [Leaf(own.order[leaf.points], leaf.area) for leaf in _found(own.coordinates)]
 
@@ -158,18 +143,9 @@ def _found(points: np.ndarray) -> list[Leaf]:
 
 def leaves_by_odds(points: np.ndarray, odds: np.ndarray, spacing: float, prior: float,
                    ) -> list[Leaf]:
-    """Find the leaves of a scan from the evidence of each point.
-
-    A scan with many certain leaves has more, and a bare one with a few flat clumps has none: the
-    odds are those of a training in which a fraction of the points was on leaves, and move with the
-    fraction in this scan (Saerens, Latinne and Decaestecker 2002, doi:10.1162/089976602753284446).
-
-    Args:
-        points: Positions [m], shape [n, 3].
-        odds: Logarithm of the odds that each point is on a leaf, shape [n].
-        spacing: Of the points [m].
-        prior: The same of any point of the training.
-    """
+    """Find leaves by each point's log odds [n] of being on one; ``prior`` is that of any point of
+    the training. They move with the fraction on leaves in this scan, so a few flat clumps are none
+    (Saerens, Latinne and Decaestecker 2002, doi:10.1162/089976602753284446)."""
     odds = np.clip(odds, -_MOST_ODDS, _MOST_ODDS)
     near = cKDTree(points).query(points, k=min(_AROUND, len(points)))[1]
     for _ in range(_ROUNDS):

@@ -31,15 +31,9 @@ _COARSEST_STEP = 5e-3  # fraction of the cloud's size: the thickness of its twig
 
 @dataclass(frozen=True)
 class Prepared:
-    """A cleaned cloud in metres near the origin, and a record of the cleaning.
-
-    Attributes:
-        cloud: The points that stayed, recentred.
-        origin: The subtracted origin [m], in the file's axes, shape [3].
-        counts: Number of dropped points, by reason.
-        warnings: Warnings for the user.
-        view: Position of the depth camera in the cloud's frame, if there was one camera.
-    """
+    """A cleaned cloud [m] near the origin: ``origin`` [3] [m] in the file's axes was subtracted. It
+    has the dropped points by reason in ``counts``, and its ``view`` if there was one depth
+    camera."""
 
     cloud: Cloud
     origin: np.ndarray
@@ -50,18 +44,9 @@ class Prepared:
 
 def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = None, *,
             eye: np.ndarray | None = None, up: np.ndarray | None = None) -> Prepared:
-    """Crop, convert to metres, recentre, and drop duplicates, flying pixels and outliers.
-
-    Args:
-        cloud: The cloud as read from the file.
-        scale: Metres per unit of the file.
-        settings: Settings to use.
-        eye: Position of the camera, if known, in the file's coordinates, shape [3].
-        up: The up direction, shape [3], to look for rough ground; None: for walls and floors only.
-
-    Raises:
-        InputError: too few points, or all of them at one position.
-    """
+    """Crop, convert to metres, recentre, and drop duplicates, flying pixels and outliers. ``eye``
+    [3] is the camera in the file's coordinates; with ``up`` [3] rough ground is found too.
+    InputError if too few points stay, or all are at one position."""
     settings = settings or PreparationSettings()
     counts = {"read": len(cloud) + cloud.left_out, "not_finite": cloud.not_finite}
     if cloud.left_out:
@@ -191,10 +176,8 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
 
 
 def _own_sight(points: np.ndarray) -> tuple[np.ndarray, Sight | None]:
-    """The cloud as an image, and its camera's position [m], shape [3].
-
-    Found from the order of its points, or as seen from the origin of the file's coordinates.
-    """
+    """The cloud as an image, and its camera's position [m], shape [3]: from the order of its
+    points, or as seen from the origin of the file's coordinates."""
     estimated = scan_line_view(points)
     if estimated is not None:
         sight = find_sight(points - estimated[0], forward=estimated[1])
@@ -223,11 +206,8 @@ def _first_of_each(points: np.ndarray) -> np.ndarray:
 
 
 def _without_outliers(points: np.ndarray) -> np.ndarray:
-    """Mask of the points to keep, shape [n].
-
-    A point is an outlier if it is far more isolated than is usual around it, or as isolated as most
-    places of a background are that the scan shows: stray points anywhere in its box.
-    """
+    """Mask [n] of the points to keep. An outlier is far more isolated than is usual around it, or
+    as isolated as most places of a background of stray points anywhere in the scan's box."""
     tree = cKDTree(points)
     count = min(_OUTLIER_NEIGHBOURS + 1, len(points))
     own, near = np.empty(len(points)), np.empty((len(points), count), np.int32)
@@ -255,12 +235,8 @@ def _without_outliers(points: np.ndarray) -> np.ndarray:
 
 
 def _stray_from(isolated: np.ndarray, stray: np.ndarray) -> float:
-    """The isolation above which points are outliers.
-
-    Args:
-        isolated: Isolation of each point of a scan, shape [n].
-        stray: Isolation at places anywhere in its box, shape [k].
-    """
+    """Isolation above which points are outliers, from that of the scan's points [n] and that at
+    places ``stray`` [k] anywhere in its box."""
     far = max(float(np.median(stray)), _OUTLIER_RATIO)
     count = float((isolated > far).sum()) / max(float((stray > far).mean()), 1 / len(stray))
     limit = _OUTLIER_RATIO
@@ -331,19 +307,9 @@ _FINEST = 1e-5  # first grid step, as a fraction of the scan's size
 
 
 def gathered(pieces: Iterable[Cloud], most: int = MOST_POINTS) -> Cloud:
-    """Put a scan together from its pieces; one point per cell of a grid if there are too many.
-
-    Needs memory for twice ``most`` points and a piece.
-
-    Args:
-        pieces: At least one, all with the same attributes.
-        most: Most points to keep.
-
-    Returns:
-        The first points in the cells of the finest grid that leaves no more than ``most``, of grids
-        each twice as wide as the last; ``left_out`` has the number of the others. The result does
-        not depend on the pieces: cells of one grid are within cells of the next.
-    """
+    """Join pieces with the same attributes. Of over ``most`` points it keeps the first in each cell
+    of the finest grid that leaves no more. Its cells are within those of the next, twice as wide,
+    so the pieces do not matter. It needs memory for twice ``most`` points and a piece."""
     grid = _Grid(most)
     held: list[Cloud] = []
     for piece in pieces:
@@ -409,17 +375,8 @@ _UNUSUAL = 10.0  # m
 
 
 def size_doubts(points: np.ndarray, what: str, unit: str, *, is_stated: bool) -> list[str]:
-    """Return a question about the unit of positions [m], shape [n, 3], of unusual extent.
-
-    Args:
-        points: The positions.
-        what: "surface"; for messages.
-        unit: The unit in which they were read.
-        is_stated: Whether the user or the file stated it.
-
-    Raises:
-        InputError: a plant of this size needs a stated unit, or none has it.
-    """
+    """Return a question about the unit of positions [n, 3] [m] of unusual extent; ``what`` is named
+    in it. InputError if a plant of this size needs a stated unit, or none has it."""
     extent = float(np.ptp(points, axis=0).max())
     is_possible = _POSSIBLE[0] <= extent <= _POSSIBLE[1]
     if is_possible and (is_stated or SHORTEST <= extent <= _UNUSUAL):

@@ -27,12 +27,7 @@ _FEWEST_READINGS = 200  # fewest readings of an image
 
 @dataclass(frozen=True)
 class View:
-    """Position from which a cloud was seen, and its image.
-
-    Attributes:
-        eye: The camera's position [m], shape [3].
-        pitch: Width of a pixel at distance 1.
-    """
+    """Position [m] [3] from which a cloud was seen, and the width of a pixel at distance 1."""
 
     eye: np.ndarray
     pitch: float
@@ -40,13 +35,8 @@ class View:
 
 @dataclass(frozen=True)
 class Sight:
-    """A cloud as the image of one camera.
-
-    Attributes:
-        pixels: Position of each point in the image, in pixels, shape [n, 2].
-        depth: Distance along the middle of the view [m], shape [n].
-        pitch: Width of a pixel at depth 1.
-    """
+    """A cloud as the image of one camera: ``pixels`` [n, 2], ``depth`` [n] [m] along the middle of
+    the view, and ``pitch``, the width of a pixel at depth 1."""
 
     pixels: np.ndarray
     depth: np.ndarray
@@ -54,10 +44,8 @@ class Sight:
 
     @cached_property
     def fill(self) -> float:
-        """Fraction of the pixels on the seen surface that are in the cloud; lower if thinned.
-
-        Estimated from the midpoints between pixels two apart: the fraction with a pixel there.
-        """
+        """Fraction of the pixels on the seen surface that are in the cloud; lower if thinned. It is
+        the fraction of the midpoints between pixels two apart with a pixel there."""
         tree = cKDTree(self.pixels)
         pairs = tree.query_pairs(_TWO[1], output_type="ndarray")
         pairs = pairs[np.linalg.norm(np.subtract(*self.pixels[pairs.T]), axis=1) > _TWO[0]]
@@ -70,17 +58,9 @@ class Sight:
 
 def find_sight(points: np.ndarray, eye: np.ndarray | None = None,
                forward: np.ndarray | None = None) -> Sight | None:
-    """View a cloud from its camera's position; None if it is not an image from there.
-
-    An image has one point per pixel, and pixels are evenly spaced. Points that were scanned from
-    all around, thinned or moved elsewhere are randomly placed in it.
-
-    Args:
-        points: Positions [m], shape [n, 3], camera and points in one frame.
-        eye: The camera's position [m], shape [3]; None: the origin, if the cloud looks like an
-            image from there. If given, only points too wide apart for one view are refused.
-        forward: Middle of the view, a unit vector, shape [3]; None: found from the points.
-    """
+    """View points [n, 3] [m] from ``eye`` [3] (None: the origin) along ``forward`` [3] (None:
+    found). None if that is no image, which has one point for each of evenly spaced pixels. If
+    ``eye`` is given, only points too wide apart for one view are refused."""
     if len(points) < _FEWEST_READINGS:
         return None
     offset = points if eye is None else points - eye
@@ -102,20 +82,9 @@ def find_sight(points: np.ndarray, eye: np.ndarray | None = None,
 
 
 def flying_pixels(sight: Sight, grazing: float, speck: int) -> np.ndarray:
-    """Find the pixels that are connected to no surface.
-
-    Two pixels are connected if noise and a surface seen at the angle ``grazing`` can explain the
-    difference of their depths. Noise is measured with a stereo camera's model: it grows with the
-    square of the depth. A group with no pixel beside it does not fly: there is no edge.
-
-    Args:
-        sight: The image.
-        grazing: Steepest surface that counts, between its normal and the line of sight [deg].
-        speck: Fewest connected pixels that fly by no coincidence.
-
-    Returns:
-        True where a pixel flies, shape [n].
-    """
+    """Mask [n] of pixels on no surface: fewer than ``speck`` connected ones, with others beside
+    them. Noise as of a stereo camera (it grows with depth squared) and a surface at ``grazing``
+    [deg] between normal and line of sight explain the depths of connected pixels."""
     depth, count = sight.depth, len(sight.depth)
     # Where pixels are missing, neighbours are farther away.
     pairs = cKDTree(sight.pixels).query_pairs(_BESIDE / np.sqrt(sight.fill), output_type="ndarray")
@@ -177,14 +146,8 @@ _TRIED, _RULERS = 300, 3000  # planes for a first estimate; planes on which it i
 
 
 def scan_line_view(points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Find a camera's position [m], shape [3], and its direction of view, a unit vector, shape [3].
-
-    Args:
-        points: In the order of the file [m], shape [n, 3].
-
-    Returns:
-        None where the order of the points is not that of an image.
-    """
+    """A camera's position [3] [m] and direction of view [3], from points [n, 3] [m] in the file's
+    order. None where that is not the order of an image."""
     if len(points) < _WINDOW:
         return None
     normals, offsets, weight = _planes(points)
@@ -227,11 +190,8 @@ def _planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _common_line(normals: np.ndarray, offsets: np.ndarray, weight: np.ndarray, extent: float,
                  ) -> tuple[np.ndarray | None, np.ndarray]:
-    """Direction [3] of the line in which most of the planes meet, and a point on it [m].
-
-    Windows over the end of a line are in no plane with the camera. Two planes propose a line, and
-    the line that most other planes pass through is taken.
-    """
+    """Direction [3] of the line in which most of the planes meet, and a point on it [m]. Two planes
+    propose it, most decide: windows over the end of a line are in no plane with the camera."""
     rng = np.random.default_rng(0)
     best, least, miss = None, np.inf, np.zeros(0)
     for one, other in rng.integers(len(normals), size=(_TRIED, 2)):
@@ -296,10 +256,8 @@ def _uniform_position(side: np.ndarray, depth: np.ndarray) -> float:
 
 
 def _turn(column: np.ndarray, row: np.ndarray) -> float | None:
-    """Angle [rad] by which to rotate the view so that pixels of all lines are equally wide.
-
-    Seen obliquely, they are p (cos a + row sin a) wide.
-    """
+    """Angle a [rad] by which to rotate the view so that pixels of all lines are equally wide. Seen
+    obliquely, they are p (cos a + row sin a) wide."""
     width, at = np.abs(np.diff(column)), (row[1:] + row[:-1]) / 2
     pitch = float(np.median(width))
     even = np.abs(width - pitch) < 2 * _EVEN * pitch

@@ -51,13 +51,8 @@ _WIRES_MOST = 12
 
 @dataclass(frozen=True)
 class Support:
-    """A thing beside the plant.
-
-    Attributes:
-        kind: ``pot``, ``stake``, ``post`` or ``wire``.
-        points: Indices of its points in the scan.
-        at: One of its points, in its middle [m], shape [3].
-    """
+    """A ``pot``, ``stake``, ``post`` or ``wire``: indices of its points in the scan, and ``at`` [3]
+    [m], the one in its middle."""
 
     kind: str
     points: np.ndarray
@@ -65,12 +60,7 @@ class Support:
 
 
 def find_supports(points: np.ndarray, up: np.ndarray) -> list[Support]:
-    """Return the pot, the stakes, the posts and the wires that a scan shows.
-
-    Args:
-        points: The scan [m], shape [n, 3].
-        up: The up direction, shape [3].
-    """
+    """Return the pot, the stakes, the posts and the wires in a scan of points [n, 3] [m]."""
     some = np.arange(0, len(points), len(points) // _SUPPORT_SAMPLE + 1)
     found = _in_sample(points[some], up / np.linalg.norm(up))
     if len(some) < len(points) and found:
@@ -82,13 +72,8 @@ def find_supports(points: np.ndarray, up: np.ndarray) -> list[Support]:
 
 def supports_text(supports: list[Support], count: int, where: Callable[[np.ndarray], np.ndarray],
                   ) -> str:
-    """Return a sentence that names the supports of a scan.
-
-    Args:
-        supports: At least one.
-        count: Number of points of the scan.
-        where: Transforms a position to the user's coordinates.
-    """
+    """Return a sentence that names the supports, at least one, of a scan of ``count`` points.
+    ``where`` takes a position to the user's coordinates."""
     named = [f"a {each.kind} ({100 * len(each.points) / count:.0f} % of the points) at ("
              + ", ".join(f"{value:.3f}" for value in where(each.at)) + ")" for each in supports]
     return (f"The scan shows {' and '.join(named)}: remove such points from the scan "
@@ -133,16 +118,8 @@ def _in_sample(points: np.ndarray, up: np.ndarray) -> list[Support]:
 
 
 def _circles(flat: np.ndarray, layer: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Circles that fit most points of each of the :data:`_SLICES` slices.
-
-    Args:
-        flat: Points from above [m], shape [n, 2].
-        layer: Slice of each, shape [n].
-
-    Returns:
-        Middles [m], shape [slices, 2], radii [m] and fractions of the points on the circle, shape
-        [slices] each; the fraction is 0 for slices of too few points.
-    """
+    """Circles through most points ``flat`` [n, 2] [m] of each slice ``layer`` [n]: middles
+    [slices, 2] and radii [m], and the fraction of points on them, which is 0 for too few points."""
     count = np.bincount(layer, minlength=_SLICES)
     total = np.stack([np.bincount(layer, values, _SLICES) for values in flat.T], axis=1)
     start = total / np.maximum(count, 1)[:, None]
@@ -243,14 +220,8 @@ def _rod(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, rest: np.ndarr
 
 def _wires(points: np.ndarray, placed: np.ndarray, rest: np.ndarray, held: np.ndarray,
            ) -> list[np.ndarray]:
-    """Indices of the points of each wire.
-
-    Args:
-        points: The sample [m], shape [n, 3].
-        placed: The same with the height as the last coordinate, shape [n, 3].
-        rest: Points of no other support, shape [r].
-        held: Points of other supports, placed likewise, shape [k, 3].
-    """
+    """Indices of the points of each wire among ``rest`` [r], which are on no other support.
+    ``placed`` is the sample, and ``held`` [k, 3] other supports, with the height last."""
     size = float(np.linalg.norm(np.ptp(placed, axis=0)))
     if len(rest) < _LONG * _LEAST:
         return []
@@ -277,17 +248,9 @@ def _wires(points: np.ndarray, placed: np.ndarray, rest: np.ndarray, held: np.nd
 
 def _wire(places: np.ndarray, free: np.ndarray, supports: cKDTree | None, every: np.ndarray,
           middle: np.ndarray, way: np.ndarray, reach: float) -> np.ndarray | None:
-    """Indices among ``every`` of the wire through ``middle``; None if that is none.
-
-    Args:
-        places: Positions with the height last [m], shape [r, 3].
-        free: Which of them may be on a wire, shape [r].
-        supports: The points of other supports.
-        every: All points of the sample, placed likewise, shape [n, 3].
-        middle: Where a thin line was seen [m], shape [3].
-        way: Its direction, shape [3].
-        reach: Half of the length that was looked at [m].
-    """
+    """Indices among ``every`` [n, 3] of the wire through ``middle`` [3] along ``way`` [3], seen
+    over ``reach`` [m] to both sides; None if that is none. ``free`` says which ``places`` [r, 3] it
+    may take; all positions have the height last."""
     way = np.array([way[0], way[1], 0.0]) / np.hypot(way[0], way[1])
     aside = np.array([-way[1], way[0], 0.0])
     frame = np.array([way, aside, [0.0, 0.0, 1.0]])
@@ -376,15 +339,8 @@ _FILLED = 0.25  # smallest fraction of its bounding box that a sheet fills
 
 
 def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
-    """Find the largest plane that is filled with points in both of its directions.
-
-    Args:
-        points: Positions [m], shape [n, 3].
-        least: Smallest number of points of a sheet.
-
-    Returns:
-        True where a point is on it, shape [n]; None if there is no such plane.
-    """
+    """Mask [n] of the largest plane that points [n, 3] [m] fill in both directions; None if none
+    has ``least`` points."""
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     reach = _REACH * diagonal
     order, rng = own_order(points), np.random.default_rng(0)
@@ -451,16 +407,7 @@ _ROUNDS = 10
 
 
 def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray | None:
-    """Find the ground below a plant.
-
-    Args:
-        points: Positions [m], shape [n, 3].
-        up: The up direction, shape [3].
-        least: Smallest number of points of the ground.
-
-    Returns:
-        True where a point is on it, shape [n]; None if there is none.
-    """
+    """Mask [n] of the points [n, 3] [m] on the ground below a plant; None if none has ``least``."""
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     up = up / np.linalg.norm(up)
     across = np.linalg.svd(up[None])[2][1:]
@@ -513,10 +460,8 @@ def _are_cells_broad(middle: np.ndarray, diagonal: float) -> bool:
 
 
 def _plane(middle: np.ndarray, low: np.ndarray):
-    """The plane through the cells' lowest points, and their median distance from it [m].
-
-    Reweighted, since plants have lower points over the ground of some cells.
-    """
+    """The plane through the cells' lowest points, and their median distance from it [m]. It is
+    reweighted, since plants have lower points over the ground of some cells."""
     system = np.column_stack([middle, np.ones(len(middle))])
     weight = np.ones(len(middle))
     for _ in range(_ROUNDS):
