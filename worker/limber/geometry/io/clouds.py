@@ -47,16 +47,8 @@ _LONG = 0.05
 
 
 def mesh_notes(path: Path, vertices: np.ndarray, faces: np.ndarray) -> list[str]:
-    """Return what a user should know whose cloud is a mesh.
-
-    Args:
-        path: Its file.
-        vertices: Positions, shape [n, 3].
-        faces: Triangles, shape [m, 3].
-
-    Raises:
-        InputError: half of the surface is of triangles so large that vertices do not show it.
-    """
+    """Return what a user should know whose cloud is a mesh of vertices [n, 3] and faces [m, 3].
+    InputError if half of its surface is in triangles too large for vertices to show it."""
     good = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
     corners = np.asarray(vertices, float)[faces[good]]
     if not len(corners):
@@ -109,10 +101,8 @@ def _triangles(content: Any) -> np.ndarray:
 
 
 def _ply_content(path: Path) -> tuple[Any, dict[str, str]]:
-    """Read a PLY file, and its names of the properties that are not ASCII.
-
-    A header is ASCII by the standard; programs write comments and names in other letters too.
-    """
+    """Read a PLY file, and its names of the properties that are not ASCII. A header is ASCII by the
+    standard; programs write comments and names in other letters too."""
     from plyfile import PlyData
 
     raw, body = header_bytes(path, b"end_header")
@@ -163,11 +153,8 @@ def _cloud(table: np.ndarray, titles: dict[str, str]) -> Cloud:
 
 
 def _tables(path: Path, header: str, body: int) -> Iterator[np.ndarray]:
-    """The points in pieces, structured by field; at least one piece, which may be empty.
-
-    Raises:
-        InputError: there are fewer points than the header declares.
-    """
+    """The points in pieces, structured by field; at least one piece, which may be empty. InputError
+    if there are fewer points than the header declares."""
     from pypcd4 import MetaData, PointCloud
 
     meta = MetaData.parse_header(header.splitlines())
@@ -195,11 +182,8 @@ def _tables(path: Path, header: str, body: int) -> Iterator[np.ndarray]:
 
 
 def _completed(path: Path, source: str) -> tuple[str, dict[str, str]]:
-    """A PCD header as its package reads it, and the file's names of renamed fields.
-
-    Versions before 0.7 lack entries; some programs end lines with blanks, or have special
-    characters in the names of fields.
-    """
+    """A PCD header as its package reads it, and the file's names of renamed fields. Versions before
+    0.7 lack entries; some programs write trailing blanks or special characters."""
     entries = {words[0]: words[1:] for line in source.splitlines()
                if (words := line.split()) and not words[0].startswith("#")}
     for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA"):
@@ -239,13 +223,8 @@ _HEIGHTS = re.compile(r"VERT_CS|VERTCRS|VERTICALCRS")
 
 
 def stated_metres(records: Iterable[Any]) -> np.ndarray:
-    """Return what one unit of x and y, and of z, is in metres, shape [2].
-
-    NaN stands for an unknown unit, 0 for degrees.
-
-    Args:
-        records: The variable length records that laspy read.
-    """
+    """Return what one unit of x and y, and of z, is in metres, from laspy's records, shape [2]: NaN
+    is an unknown unit, 0 stands for degrees."""
     found = np.full(2, np.nan)
     for record in records:
         if getattr(record, "string", ""):
@@ -275,11 +254,7 @@ def _length_unit(text: str) -> float:
 
 
 def in_metres(path: Path, cloud: Cloud, metres: np.ndarray) -> Cloud:
-    """Return the points of a LAS file in metres, if its units are known.
-
-    Raises:
-        InputError: the coordinates are degrees.
-    """
+    """Return the points of a LAS file in metres, if its units are known; InputError for degrees."""
     plane, height = metres
     if plane == _DEGREES:
         raise InputError(f"{path} has its coordinates in degrees of longitude and latitude.",
@@ -351,11 +326,8 @@ _SEEN_BYTES = 8
 
 
 def read_points3d(path: Path) -> Cloud:
-    """Return the points of a reconstruction, in its own unit, with colour and error.
-
-    Raises:
-        InputError: the file is cut short.
-    """
+    """Return the points of a reconstruction, in its own unit, with colour and error; InputError if
+    the file is cut short."""
     raw = path.read_bytes()
     count, = struct.unpack_from("<Q", raw)
     require_size(path, float(count) * _POINT.size + 8, len(raw), f"{count} points")
@@ -381,8 +353,7 @@ _HEAD = 10
 
 class _Scan(NamedTuple):
     """A scan: the number of its points, the matrix [4, 4] from points as rows to the common frame,
-    and the number of its columns.
-    """
+    and the number of its columns."""
 
     size: int
     matrix: np.ndarray
@@ -390,14 +361,8 @@ class _Scan(NamedTuple):
 
 
 def read_ptx(path: Path) -> Cloud:
-    """Return the points of all scans [m] in their common frame, with intensity and colour.
-
-    Of more than :data:`~limber.geometry.cloud.preparation.MOST_POINTS`, one in
-    each cell of a grid is kept.
-
-    Raises:
-        InputError: a scan is cut short, or a header or a line of it is invalid.
-    """
+    """Return the points of all scans [m] in their common frame, with intensity and colour, thinned
+    by :func:`gathered`. InputError if a scan is cut short, or one of its lines is invalid."""
     coding = coding_of(path)
     scans = _scans(path, coding)
     width = min((scan.width for scan in scans), default=0)
@@ -522,12 +487,8 @@ def read_cloud(path: Path, unit: str = "m") -> Cloud:
 
 
 def unit_of(cloud: Cloud, requested: str | None) -> tuple[str, list[str]]:
-    """Return the unit of a file's points, and a note for the user about it.
-
-    Args:
-        cloud: As read; its file may state a unit.
-        requested: By the user. None and m, which need not be given, leave it to the file.
-    """
+    """Return the unit of a file's points, and a note for the user about it. A request of None or m,
+    which need not be given, leaves it to the file."""
     if cloud.unit is None or cloud.unit == requested:
         return requested or "m", []
     if requested in (None, "m"):

@@ -36,11 +36,7 @@ _MOST_TEXT = 200
 
 
 def is_hdf5(path: Path) -> bool:
-    """Whether a file is HDF5, with Matlab's header or without.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Whether a file is HDF5, with Matlab's header or without; OSError if it cannot be read."""
     with open(path, "rb") as stream:
         head = stream.read(_STARTS[-1] + len(_SIGNATURE))
     return any(head[at:at + len(_SIGNATURE)] == _SIGNATURE for at in _STARTS)
@@ -48,19 +44,9 @@ def is_hdf5(path: Path) -> bool:
 
 def struct_arrays(path: Path, needed: tuple[str, ...], further: tuple[str, ...],
                   ) -> dict[str, np.ndarray]:
-    """Return the fields of the first struct of a file, or of its ``cylinder``, that has all needed.
-
-    Args:
-        needed: Names of fields with numbers.
-        further: Names of fields that are read if present.
-
-    Returns:
-        Arrays as Matlab has them, shape [rows, columns]; and ``creator``, the text of
-        ``rundata.creator``. Empty if no struct has those fields.
-
-    Raises:
-        OSError, ValueError, KeyError, RuntimeError: the file is damaged.
-    """
+    """Return the fields [rows, columns] of the first struct, or its ``cylinder``, with all needed
+    ones, and ``creator``, the text of ``rundata.creator``; empty if none has them. A damaged file
+    raises OSError, ValueError, KeyError or RuntimeError."""
     import h5py
 
     most = max(LARGEST_EXPANSION * path.stat().st_size, HARMLESS_BYTES)
@@ -128,19 +114,9 @@ _THICK = "UnmodRadius"
 
 
 def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
-    """Return the cylinders of a ``.mat`` file of TreeQSM or SmartQSM.
-
-    If a file has several models, the first is read. Cylinders without a parent that start at the
-    start of the first one are attached there.
-
-    Returns:
-        Arrays ``id``, ``parent`` (-1: none), ``start``, ``end``, ``radius`` and ``start_radius``,
-        which equals ``radius`` if the file does not state it.
-
-    Raises:
-        InputError: the file cannot be read, or has no cylinders.
-        MissingDependencyError: the file is of version 7.3, and h5py is not installed.
-    """
+    """Return ``id``, ``parent`` (-1: none), ``start``, ``end``, ``radius`` and ``start_radius`` of
+    a ``.mat`` file's first model. Cylinders without a parent are attached if they start where the
+    first does. MissingDependencyError for version 7.3 without h5py."""
     found = _fields(Path(path))
     if not found:
         raise InputError(f"{path} has no struct with the fields {', '.join(TREEQSM_FIELDS)}.",
@@ -183,10 +159,8 @@ def mat_v73_fields(path: Path) -> dict[str, np.ndarray]:
 
 
 def mat_fields(path: Path) -> dict[str, np.ndarray]:
-    """Return the fields of the cylinders and ``creator`` of a MAT file of an older version.
-
-    Empty without cylinders. scipy's compiled reader can crash on a damaged file.
-    """
+    """Return the fields of the cylinders and ``creator`` of a MAT file of an older version; empty
+    without cylinders. scipy's compiled reader can crash on a damaged file."""
     from scipy.io import loadmat
 
     content = loadmat(path, squeeze_me=True, struct_as_record=False)

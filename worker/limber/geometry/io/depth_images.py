@@ -17,17 +17,8 @@ _EXPORT = ("Export the depth itself, not a picture of it: a 16-bit PNG, each val
 
 
 def read_depth(depth_path: Path, camera_path: Path, mask_path: Path | None = None) -> Cloud:
-    """Back-project a depth image; coordinates in metres, in the frame of the camera's pose.
-
-    Args:
-        depth_path: 16-bit PNG; a value divided by the camera's ``depth_scale`` is in metres.
-        camera_path: ``camera.toml`` (see :mod:`limber.geometry.cloud.camera`).
-        mask_path: PNG of the same size, over 0 on the branch; None takes every reading.
-
-    Raises:
-        InputError: an image or the camera cannot be read, they do not belong together, or the
-            pixels cannot be distances.
-    """
+    """Back-project a 16-bit depth image into metres in the frame of the camera's pose, where the
+    mask is over 0; None takes every reading. InputError if the files do not belong together."""
     camera = read_camera(camera_path)
     mask = None if mask_path is None else read_mask(mask_path)
     depth = depth_metres(depth_path, camera, mask)
@@ -40,16 +31,8 @@ def read_depth(depth_path: Path, camera_path: Path, mask_path: Path | None = Non
 
 
 def depth_metres(path: Path, camera: Camera, mask: np.ndarray | None = None) -> np.ndarray:
-    """Read a depth image into metres, shape [height, width]; 0 or NaN means no reading.
-
-    Args:
-        path: The image.
-        camera: Its camera.
-        mask: True on the branch, if that is known, shape [height, width].
-
-    Raises:
-        InputError: the file is no image, or its pixels cannot be distances; states what was seen.
-    """
+    """Read a depth image into metres, shape [height, width]; 0 or NaN means no reading. ``mask`` is
+    True on the branch. InputError states what was seen if these cannot be distances."""
     pixels = read_pixels(path, "a 16-bit depth image (PNG)")
     _check_kind(path, pixels)
     _check_centre(camera)

@@ -41,15 +41,9 @@ class _Field:
 
 
 def read_e57(path: Path) -> Cloud:
-    """Return the points of all scans [m] in their common frame, with colour and scalars.
-
-    Of more than :data:`~limber.geometry.cloud.preparation.MOST_POINTS`, one in
-    each cell of a grid is kept.
-
-    Raises:
-        InputError: the file is damaged, is compressed in a way that the standard leaves open, or
-            has no scan with points.
-    """
+    """Return the points of all scans [m] in their common frame, with colour and scalars, thinned by
+    :func:`gathered`. InputError if damaged, without points, or of a compression that the standard
+    leaves open."""
     pages = _Pages(path)
     pages.check()
     start, length = struct.unpack("<QQ", pages.read(24, 16))
@@ -78,12 +72,8 @@ def read_e57(path: Path) -> Cloud:
 
 
 class _Pages:
-    """The content of a file without the checksums of its pages.
-
-    Attributes:
-        path: The file.
-        size: Its length without checksums [bytes].
-    """
+    """The content of a file without the checksums of its pages; ``size`` is without them
+    [bytes]."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -142,12 +132,7 @@ def checksums(pages: np.ndarray) -> np.ndarray:
 
 
 class _Scan:
-    """One scan of a file.
-
-    Attributes:
-        count: Number of its points.
-        attributes: Names of their colour and scalars.
-    """
+    """One scan of a file: the ``count`` of its points, and names of their colour and scalars."""
 
     def __init__(self, pages: _Pages, scan: ElementTree.Element):
         self._pages, self._scan = pages, scan

@@ -145,14 +145,9 @@ class Registry(Generic[Kind]):
 
 
 def known_format(path: Path, what: str, formats: Sequence[Kind]) -> Kind:
-    """Return the format of a path that should hold ``what``, among these.
-
-    The suffix decides. If several formats have it, or none, the content decides; of several, one
-    that does not check the content takes what no other recognises.
-
-    Raises:
-        InputError: no format is known, or the path is a pipe or a device.
-    """
+    """Return the format of a path that should hold ``what``. The suffix decides, then the content.
+    Of several, one that does not check the content takes what no other recognises. InputError if
+    none is known, or the path is a pipe or a device."""
     require_no_pipe(path)
     named = [one for one in formats if path.suffix.lower() in one.suffixes]
     plain = [one for one in named if one.recognises is None or len(named) == 1]

@@ -26,12 +26,8 @@ _REFUSED = 2
 
 def read_apart(reader: Callable[[Path], dict[str, np.ndarray]], path: Path,
                ) -> dict[str, np.ndarray]:
-    """Return what a function of a module reads from a file or folder, as arrays.
-
-    Raises:
-        InputError: the file cannot be read, or takes far more time or memory than its size
-        warrants.
-    """
+    """Return arrays that a module's function reads from a file or folder in another process.
+    InputError if it cannot, or takes far more time or memory than the file's size warrants."""
     parts = Path(path).rglob("*") if Path(path).is_dir() else [Path(path)]
     size_mb = sum(part.stat().st_size for part in parts if part.is_file()) / 1e6
     with tempfile.TemporaryDirectory(prefix="limber-read-") as folder:

@@ -49,17 +49,9 @@ class _Vertex:
 
 
 def read_mtg(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read the nodes of an MTG: vertices with positions, each attached to its parent.
-
-    A vertex without a radius or diameter has that of the node before it.
-
-    Args:
-        path: The file.
-        scale: Metres per unit, which an MTG does not state; None means metres.
-
-    Raises:
-        InputError: the file is not an MTG, has no positions or radii, or is not one tree.
-    """
+    """Read an MTG: vertices with positions, each attached to its parent; one without radius or
+    diameter has that of the node before it. ``scale`` is metres per unit (None: 1), which an MTG
+    does not state. InputError if it is not one tree with positions and radii."""
     lines = read_text(path, _WHAT).splitlines()
     scales, body = _sections(path, lines)
     reader = _Reader(path, scales, *_header(path, body))
@@ -221,11 +213,8 @@ class _Reader:
 
 
 def write_mtg(skeleton: Skeleton, path: Path) -> None:
-    """Write an MTG: a plant of axes of nodes, with positions and radii [m].
-
-    An axis is attached with ``+`` to the node that it grows from; nodes follow each other with
-    ``<``.
-    """
+    """Write an MTG: a plant of axes of nodes, with positions and radii [m]. An axis is attached
+    with ``+`` to the node that it grows from; nodes follow each other with ``<``."""
     depth = int(skeleton.order.max()) + 1
     tabs = "\t" * (depth + 1)
     lines = ["CODE:\tFORM-A", "", "CLASSES:",
@@ -261,28 +250,14 @@ _HEAD = 4096  # bytes searched for the format
 
 
 def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read a skeleton of any format of :data:`SKELETONS`.
-
-    Args:
-        path: The file.
-        scale: Metres per unit; None uses the file's own, or metres.
-
-    Raises:
-        InputError: its format is not known, or it is not a tree; see the formats' readers.
-    """
+    """Read a skeleton of any format of :data:`SKELETONS`. ``scale`` is metres per unit; None uses
+    the file's own, or metres. InputError if its format is not known, or it is not a tree."""
     return SKELETONS.read(Path(path), scale=scale)
 
 
 def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read an SWC file.
-
-    Args:
-        path: The file.
-        scale: Metres per unit; None uses the header's ``# unit:``, or metres.
-
-    Raises:
-        InputError: not an SWC tree; see :meth:`Skeleton.from_edges`.
-    """
+    """Read an SWC file. ``scale`` is metres per unit; None uses the header's ``# unit:``, or
+    metres. InputError if it is not a tree; see :meth:`Skeleton.from_edges`."""
     rows, header_scale = [], 1.0
     for number, line in enumerate(read_text(path, "a skeleton (SWC)").splitlines(), start=1):
         if line.startswith("#"):
@@ -329,19 +304,9 @@ def _is_cylinders(path: Path) -> bool:
 
 
 def read_cylinders(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read a cylinder model: columns id, parent, sx, sy, sz, ex, ey, ez, radius (any order).
-
-    A cylinder's end becomes a node attached to the end of its parent; the root's start becomes the
-    root node. The additions of :func:`write_cylinders` (deviations, states, probabilities) are read
-    if present. The names of rTwig and SimpleForest are known, too.
-
-    Args:
-        path: The CSV file.
-        scale: Metres per unit; None means metres.
-
-    Raises:
-        InputError: columns are missing, a value is not a number, or it is not one tree.
-    """
+    """Read columns id, parent, sx, sy, sz, ex, ey, ez, radius (any order; also by the names of
+    rTwig and SimpleForest), and what :func:`write_cylinders` adds. An end becomes a node attached
+    to its parent's end; the root's start is the root. InputError if it is not one tree."""
     rows = [{_ALIASES.get(name.strip().lower().replace("_", ""), name.strip()): value
              for name, value in row.items() if name is not None}
             for row in csv_records(path, "a cylinder model")]
@@ -394,12 +359,8 @@ def _tree_of(path: Path, table: np.ndarray, scale: float | None,
 
 
 def write_cylinders(skeleton: Skeleton, path: Path) -> None:
-    """Write one cylinder for each node but the root, as CSV in the skeleton's unit.
-
-    Columns: id, parent, start and end points, radius, length, axis, branch, order, the radius's
-    standard deviation, its state (0 measured, 1 limited, 2 interpolated, 3 unresolved, 4 bridged),
-    the probability that the node exists, and the radius at the start.
-    """
+    """Write one cylinder for each node but the root, as CSV in the skeleton's unit. The state of a
+    radius is 0 measured, 1 limited, 2 interpolated, 3 unresolved or 4 bridged."""
     start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
     length = np.linalg.norm(end - start, axis=1)
     axis = (end - start) / np.maximum(length, 1e-300)[:, None]

@@ -17,17 +17,9 @@ _ROUNDED = 1e-5
 
 
 def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
-    """Return a surface that encloses a solid, and warnings about changes or suspect features.
-
-    Args:
-        surface: As read [m].
-        path: Its file, for messages.
-
-    Raises:
-        InputError: it has holes, edges of more than two faces, faces that point in and out, several
-            bodies or cavities, no volume, or crossings (each message states where), or a size that
-            no branch has.
-    """
+    """Return a surface [m] that encloses a solid, and warnings about changes. InputError says where
+    it has holes, edges of over two faces, faces that point in and out, several bodies, cavities or
+    crossings; also if it has no volume."""
     warnings = []
     corner = surface.faces
     flat = ((corner[:, 0] == corner[:, 1]) | (corner[:, 1] == corner[:, 2])
