@@ -36,18 +36,9 @@ _NEAR = 0.05  # fraction of the step; a closer lattice point would make a sliver
 
 def level_surface(level: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray,
                   step: float) -> Surface:
-    """Triangles of ``level(x) = 0`` around the solid where it is negative; closed by the box.
-
-    Marching tetrahedra (Doi and Koide 1991) on Kuhn's subdivision of a cubic lattice, which has
-    no ambiguous case: the result is a closed manifold. Vertices then move to the mean of their
-    neighbours and back along the gradient, which evens out the triangles.
-
-    Args:
-        level: Approximate distance [m] of points [n, 3], negative inside; called for many at once.
-        low: Corner of the box [m], shape [3].
-        high: The opposite corner [m].
-        step: Edge of the lattice's cubes [m].
-    """
+    """Triangles of ``level(x) = 0``, about a distance [m] of points [n, 3], negative inside; closed
+    by the box ``low`` to ``high`` [3] [m]. Marching tetrahedra (Doi and Koide 1991) on Kuhn's cubes
+    of edge ``step`` [m] have no ambiguous case. Vertices are evened out on the surface."""
     count = np.maximum(np.ceil((high - low) / step).astype(int), 1) + 1
     axes = [low[k] + step * np.arange(count[k]) for k in range(3)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -144,13 +135,8 @@ def _onto(points: np.ndarray, level: Callable[[np.ndarray], np.ndarray], step: f
 
 
 def segments(points: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Rounded cones along a polyline: start [m], step [m], radius and its change [m], start along
-    the line and length [m]; shape [n - 1, 10].
-
-    Args:
-        points: Polyline [m], shape [n, 3].
-        radius: Radii [m], shape [n].
-    """
+    """Rounded cones along points [n, 3] [m], shape [n - 1, 10]: start [m], step [m], radius and its
+    change [m], start along the line and length [m]."""
     step = np.diff(points, axis=0)
     length = np.linalg.norm(step, axis=1)
     start = np.concatenate([[0], np.cumsum(length)])[:-1]
@@ -196,20 +182,10 @@ def distances(cones: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.nda
 @compiled_exactly
 def fillet_level(points: np.ndarray, twig: np.ndarray, others: np.ndarray, first: np.ndarray,
                  excess: np.ndarray, base: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Level of the solid around the crease between a twig and others, shape [n].
-
-    Args:
-        points: Positions [m], shape [n, 3].
-        twig: Its cones.
-        others: Cones of all the others, one after the other.
-        first: Index of the first cone of each of the others, and their total number, shape [k + 1].
-        excess: Excess of the polygons' corners over the circles, in radii; the twig's, then the
-            others', shape [k + 1].
-        base: A point [m] on the flat cut at the root and its normal, upwards, shape [2, 3].
-        shape: Radius of the fillet [m]; its reach and the distance at which its rim is lowest, in
-            fillet radii; its height over and depth under the cylinders, likewise; and its end along
-            the twig [m] (infinite: where the two are apart).
-    """
+    """Level [n] of the solid around the crease of a twig with others, whose cones start at
+    ``first`` [k + 1]. ``excess`` [k + 1]: polygon corners over circles in radii, the twig's first.
+    ``base`` [2, 3]: point [m] and normal of the root's cut. ``shape``: radius [m]; reach, lowest
+    rim and margin over and under the cylinders in radii of it; end along the twig [m] or inf."""
     rho, reach, rim, margin, end = shape
     count = len(first) - 1
     distance, radius = np.empty(count), np.empty(count)
@@ -254,19 +230,8 @@ _SCALES = (1.0, 0.83, 1.21)  # lattice steps tried in turn
 
 def smooth_forks(surface: Surface, skeleton: Skeleton, *, sides: int | None = None,
                  spacing: float = SPACING) -> tuple[Surface, SurfaceCheck, list[str]]:
-    """Round the creases between twigs and their parents.
-
-    Args:
-        surface: The union of the cylinders, :func:`branch_surface`: closed, oriented, not
-            crossing itself.
-        skeleton: The axes and radii from which it was made.
-        sides: The sides with which it was made.
-        spacing: The spacing with which it was made.
-
-    Returns:
-        The surface, within 2 % of the volume; its check; and warnings about forks that stayed
-        sharp.
-    """
+    """Round the creases of :func:`branch_surface`, made with these sides and spacing. Return the
+    surface, within 2 % of the volume, its check, and warnings about forks that stayed sharp."""
     forks = {fork.run: fork for fork in _forks(skeleton, sides, spacing)}
     made = {run: fork.fillet(_SCALES[0]) for run, fork in forks.items()}
     fillets = {run: solid(f.vertices, f.faces) for run, f in made.items() if f is not None}
@@ -293,14 +258,8 @@ def smooth_forks(surface: Surface, skeleton: Skeleton, *, sides: int | None = No
 
 
 def _uncrossed(fork: "_Fork", first: Any, others: list, tolerance: float) -> Any:
-    """A fillet from another lattice that crosses nothing around it; None if there is none.
-
-    Args:
-        fork: The fork.
-        first: The solid that crosses something.
-        others: The solids that it joins.
-        tolerance: How far triangles may move when they are joined [m].
-    """
+    """A fillet from another lattice than ``first``'s that crosses none of the ``others``; None if
+    there is none. Joining may move triangles by ``tolerance`` [m]."""
     import manifold3d
 
     low, high = _box(first)

@@ -96,15 +96,8 @@ class Surface:
 
 @dataclass(frozen=True)
 class SurfaceCheck:
-    """Findings about a surface.
-
-    Attributes:
-        watertight: Every edge belongs to exactly two faces.
-        oriented: The two run along it in opposite directions, and the volume is positive.
-        open_edges: Positions [m] of edges that do not have two faces, shape [k, 3].
-        crossings: Positions [m] where faces cross, shape [c, 3].
-        volume_m3: Enclosed volume.
-    """
+    """Findings about a surface: positions [m] of edges that do not have two faces [k, 3] and of
+    crossings [c, 3]. ``oriented``: the two faces of an edge agree, and the volume is positive."""
 
     watertight: bool
     oriented: bool
@@ -122,11 +115,7 @@ class SurfaceCheck:
                 "self_intersection_count": len(self.crossings), "pieces": self.piece_count}
 
     def require(self) -> "SurfaceCheck":
-        """Return self if valid.
-
-        Raises:
-            MeshingError: it is not; the message names the first position.
-        """
+        """Return self if valid; else MeshingError, which names the first position."""
         if not self.watertight:
             raise MeshingError(f"The surface has {len(self.open_edges)} open edges or edges with "
                                "more than two faces, one of them at "
@@ -176,11 +165,8 @@ def pieces(surface: Surface) -> np.ndarray:
 
 
 def crossings(surface: Surface) -> np.ndarray:
-    """Return points [m] where an edge of one face passes through another face, shape [c, 3].
-
-    Faces that share an edge are not compared; for faces that share a corner, only the edges
-    opposite to it are.
-    """
+    """Return points [m] where an edge of one face passes through another face, shape [c, 3]. Faces
+    that share an edge are not compared; of those that share a corner, only the opposite edges."""
 
     if len(surface.faces) == 0:
         return np.empty((0, 3))
@@ -211,16 +197,8 @@ _EDGE = 1e-7  # touching is not crossing: faces of a union meet at rounding dist
 @compiled_exactly
 def by_cell(first: np.ndarray, last: np.ndarray, counts: np.ndarray,
             ) -> tuple[np.ndarray, np.ndarray]:
-    """Grid cells that the boxes of faces overlap.
-
-    Args:
-        first: Lowest cell of each face, shape [n, 3].
-        last: Highest cell, shape [n, 3].
-        counts: Number of cells in each direction, shape [3].
-
-    Returns:
-        The number of each cell that contains part of a face, shape [k], and the face, shape [k].
-    """
+    """Numbers [k] of the grid cells that the faces' boxes, from cell ``first`` to ``last`` [n, 3],
+    overlap, and the face in each [k]. ``counts`` [3] is the number of cells in each direction."""
     total = 0
     for f in range(len(first)):
         total += ((last[f, 0] - first[f, 0] + 1) * (last[f, 1] - first[f, 1] + 1)
@@ -241,21 +219,9 @@ def by_cell(first: np.ndarray, last: np.ndarray, counts: np.ndarray,
 def pierced(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray,
             first: np.ndarray, counts: np.ndarray, keys: np.ndarray, owner: np.ndarray,
             ) -> np.ndarray:
-    """Points [m] where an edge of one face passes through another one, shape [c, 3].
-
-    Faces that share an edge are not compared; for faces that share a corner, only the edges
-    opposite to it are.
-
-    Args:
-        vertices: Positions [m], shape [v, 3].
-        faces: Corners, shape [n, 3].
-        low: Lowest corner of each face's box [m], shape [n, 3].
-        high: Highest corner [m].
-        first: Lowest cell of each face, shape [n, 3].
-        counts: Number of cells in each direction, shape [3].
-        keys: Cells in ascending order, shape [k], as :func:`by_cell` numbers them.
-        owner: The face in each.
-    """
+    """Points [m] where an edge of one face passes through another one, shape [c, 3]; see
+    :func:`crossings`. Faces have boxes ``low`` to ``high`` [n, 3] [m] from the cell ``first``;
+    ``keys`` [k] ascend, numbered by :func:`by_cell`, with the face ``owner`` in each."""
     found = [(0.0, 0.0, 0.0) for _ in range(0)]
     begin = 0
     while begin < len(keys):

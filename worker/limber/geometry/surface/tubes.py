@@ -36,10 +36,8 @@ def sides_of_runs(skeleton: Skeleton, requested: int | None = None) -> list[int]
 
 
 def run_axis(skeleton: Skeleton, run: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Axis [m], shape [k, 3], and radii [m] of a run, ``spacing`` radii from point to point.
-
-    A side run starts on its parent's axis, with a radius that stays inside the parent.
-    """
+    """Axis [m], shape [k, 3], and radii [m] of a run, ``spacing`` radii from point to point. A side
+    run starts on its parent's axis, with a radius that stays inside the parent."""
     nodes = skeleton.runs()[run]
     points, radius = skeleton.nodes[nodes], skeleton.radius[nodes].copy()
     if run > 0:
@@ -69,20 +67,9 @@ _CORNER = np.deg2rad(30.0)
 
 def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: float = SPACING,
                    ) -> Surface:
-    """Sweep a tube along each run and join them: watertight, rounded tips, a flat base.
-
-    Circular cross-sections orthogonal to the tangent, as in the paper's section on the
-    tetrahedral plant model; rotation-minimising frames keep them from twisting.
-
-    Args:
-        skeleton: Axes and radii.
-        sides: Sides of a cross-section; the polygon has the circle's area. None: 12, and more
-            on thick runs that carry thin twigs.
-        spacing: Distance of cross-sections in local radii.
-
-    Raises:
-        MeshingError: the union is empty or in several pieces.
-    """
+    """Sweep a tube along each run and join them: watertight, rounded tips, a flat base. Sections
+    are orthogonal to the tangent, as in the paper's tetrahedral plant model; a polygon has the
+    circle's area. MeshingError if the union is empty."""
     tubes = {run: tubes_of_run(skeleton, run, spacing) for run in range(skeleton.branch_count)}
     count = sides_of_runs(skeleton, sides)
     in_pieces: set[int] = set()
@@ -114,11 +101,7 @@ def _union(tubes: dict[int, list[Tube]], in_pieces: set[int], sides: list[int], 
 
 
 def largest_piece(joined) -> Surface:
-    """The surface of a union's largest piece.
-
-    Raises:
-        MeshingError: it is empty.
-    """
+    """The surface of a union's largest piece; MeshingError if it is empty."""
     pieces = joined.decompose()
     if not pieces:
         raise MeshingError("The union of the cylinders is empty.", "Some radii may be zero.",
@@ -205,11 +188,8 @@ def _split_at_bends(points: np.ndarray, radius: np.ndarray,
 
 def _split_at_folds(points: np.ndarray, radius: np.ndarray,
                     ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Cut a run where neighbouring cross-sections would cross; the parts overlap in one step.
-
-    A tube of radius r around a bend of radius under r folds into itself. Two straight parts that
-    overlap do not, and their union is the bend.
-    """
+    """Cut a run where neighbouring cross-sections would cross; the parts overlap in one step. A
+    tube of radius r folds into itself around a bend of radius under r; two parts do not."""
     tangent = tangents(points)
     step = np.diff(points, axis=0)
     length = np.linalg.norm(step, axis=1)
@@ -227,11 +207,7 @@ def _split_at_folds(points: np.ndarray, radius: np.ndarray,
 
 
 def solid(vertices: np.ndarray, faces: np.ndarray):
-    """A solid of manifold3d.
-
-    Raises:
-        MeshingError: the triangles do not close one.
-    """
+    """A solid of manifold3d; MeshingError if the triangles do not close one."""
     import manifold3d
 
     solid = manifold3d.Manifold(manifold3d.Mesh64(
