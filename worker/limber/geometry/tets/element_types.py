@@ -154,11 +154,7 @@ def register_element(element: ElementType) -> ElementType:
 
 
 def element_with(node_count: int) -> ElementType:
-    """Return the element with that many nodes.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the element with that many nodes; InputError if there is none."""
     if node_count not in _elements:
         known = ", ".join(f"{element.name} ({count})" for count, element in _elements.items())
         raise InputError(f"The tetrahedra have {node_count} nodes.", f"Known elements: {known}.",
@@ -176,9 +172,7 @@ def elements_by_cell_type() -> dict[str, ElementType]:
 
 
 def between_corners(element: ElementType, corners: np.ndarray) -> np.ndarray:
-    """Return the values of the nodes after the corners where a field is linear between those.
-
-    ``corners`` are the values at the corners, shape [tet_count, 4, ...].
-    """
+    """Return the values of the nodes after the corners where a field is linear between those, whose
+    values are ``corners`` [tet_count, 4, ...]."""
     found = [corners[:, list(parents)].mean(axis=1) for parents in element.parents]
     return np.stack(found, axis=1) if found else corners[:, :0]

@@ -225,20 +225,9 @@ CLAMP_BAND = 0.2
 def mark(mesh: TetMesh, skeleton: Skeleton, *, young: float, poisson: float, density: float,
          fractions: tuple[float, ...] = FRACTIONS, grasp_fraction: float = GRASP_FRACTION,
          ) -> TetMesh:
-    """Return the mesh with material, base, control points and grasp patch as data.
-
-    Args:
-        mesh: Quadratic tetrahedra of the branch.
-        skeleton: Its skeleton, in the same frame.
-        young: Young's modulus [Pa], the same everywhere.
-        poisson: Poisson's ratio.
-        density: Density [kg/m^3].
-        fractions: Positions of the control points along the main path.
-        grasp_fraction: Position of the grasp patch along the main path.
-
-    Raises:
-        MeshingError: the base or the grasp patch has under three nodes.
-    """
+    """Return a quadratic mesh with material (``young`` [Pa], ``density`` [kg/m^3]), base, and
+    control points and grasp patch at fractions of the main path. MeshingError if under three nodes
+    are in one."""
     tree = cKDTree(mesh.nodes)
     control = np.full(mesh.node_count, -1, np.int64)
     # Last first: where two are at the same node, the earlier one keeps it.
@@ -252,13 +241,9 @@ def mark(mesh: TetMesh, skeleton: Skeleton, *, young: float, poisson: float, den
 
 
 def base_nodes(mesh: TetMesh, skeleton: Skeleton) -> np.ndarray:
-    """1 for the nodes of the face at the root, else 0, shape [node_count].
-
-    Only the face is held. Nodes in a band above it would be held too where the mesh is fine enough
-    to have some there, and the branch would become shorter as the mesh becomes finer. Where there
-    is no flat face (a scan that is rounded or ragged below), a band of ``CLAMP_BAND`` radii is
-    held.
-    """
+    """1 for the nodes of the face at the root, else 0, shape [node_count]. Held nodes above it
+    would shorten the branch as the mesh becomes finer. Where there is no flat face (a scan rounded
+    or ragged below), they are those of a band of ``CLAMP_BAND`` radii."""
     path = skeleton.main_path()
     ahead = skeleton.nodes[path[1:]] - skeleton.nodes[path[0]]
     # A fit to few points may put a node onto the root.
@@ -328,11 +313,8 @@ def _checked(chosen: np.ndarray, what: str) -> np.ndarray:
 
 
 def fixed_mask(mesh: TetMesh, fixed: np.ndarray | None) -> np.ndarray:
-    """Return the mask of fixed nodes.
-
-    Raises:
-        InputError: fewer than three, or all on a line, so that the branch could rotate freely.
-    """
+    """Return the mask of fixed nodes; InputError if they are fewer than three or all on a line, so
+    that the branch could rotate freely."""
     if fixed is None:
         fixed = mesh.point_data.get("fixed", np.zeros(mesh.node_count))
         fixed = np.asarray(fixed) > 0.5
@@ -388,17 +370,13 @@ class MeshQuality:
     """Measures of a tetrahedral mesh.
 
     Attributes:
-        tet_count: Number of tetrahedra.
-        volume_m3: Their volume.
-        volume_ratio: That volume over the surface's.
+        volume_ratio: Its volume over the surface's.
         min_dihedral_deg: Smallest angle between two faces of a tetrahedron.
         min_radius_ratio: Smallest 3 r_in / r_out; 1 is regular, 0 flat.
-        mean_radius_ratio: Mean of these ratios.
         elements_across: Median over the nodes of the skeleton of the diameter over the mean edge
             of the elements there; None without a skeleton.
         surface_distance_mean: Mean distance of the mesh's boundary (its corners, edge middles and
             face centres) from the surface, in local radii; None without a surface.
-        surface_distance_max_m: The largest [m].
         fork_distance_mean: Mean of the distances within two radii of a fork, in radii.
         fork_distance_max: The largest of them, in radii.
     """
@@ -497,11 +475,8 @@ def _elements_across(mesh: TetMesh, skeleton: Skeleton) -> float:
 
 
 def shapes(corner: np.ndarray) -> np.ndarray:
-    """Volume over the cube of the mean edge, 1 if a tetrahedron is regular, negative if inverted.
-
-    Args:
-        corner: Corners [m], shape [..., 4, 3].
-    """
+    """Volume of tetrahedra [..., 4, 3] over the mean edge cubed: 1 is regular, negative is
+    inverted."""
     edges = [corner[..., i, :] - corner[..., j, :] for i in range(4) for j in range(i)]
     square = sum(np.einsum("...k,...k->...", e, e) for e in edges) / 6
     a, b, c = (corner[..., k, :] - corner[..., 0, :] for k in (1, 2, 3))

@@ -26,14 +26,8 @@ _LEFT_OUT_LIMIT = 0.02  # fraction of the volume; thinner twigs are not worth fT
 
 @dataclass(frozen=True)
 class MeshResult:
-    """Tetrahedra and their origin.
-
-    Attributes:
-        mesh: Quadratic, positively oriented, without data on it.
-        mesher: ``ftetwild``, ``ftetwild (cached)`` or ``sweep``.
-        warnings: Reasons why another mesher than the first was used.
-        left_out: Runs of the skeleton that are not in the mesh.
-    """
+    """Quadratic tetrahedra without data, from the ``mesher`` ``ftetwild``, ``ftetwild (cached)`` or
+    ``sweep``; ``warnings`` say why not from the first. Runs ``left_out`` are not in the mesh."""
 
     mesh: TetMesh
     mesher: str
@@ -115,27 +109,9 @@ def _wild(skeleton: Skeleton, settings: MeshSettings, progress: Progress,
 def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,
                    time_limit: float = _SECONDS, stop_energy: float = 30.0,
                    coarsen: bool = False, progress: Progress = SILENT) -> tuple[TetMesh, bool]:
-    """Fill a closed surface with quadratic tetrahedra by fTetWild; results are cached.
-
-    fTetWild's own tolerance is a thousandth of the bounding box, which removes 7 % of a thin
-    branch's volume; here it is absolute.
-
-    Args:
-        surface: Closed, oriented.
-        edge_length: Target edge length [m]; a finer surface makes finer tetrahedra.
-        epsilon: Largest distance of the result from the surface [m].
-        time_limit: See :func:`limber.geometry.tets.tetwild_process.run_tetwild`.
-        stop_energy: Likewise.
-        coarsen: Likewise.
-        progress: Called while waiting.
-
-    Returns:
-        The mesh, and whether it came from the cache.
-
-    Raises:
-        MeshingError: no mesh, or one that lost over 5 % of the volume or is in pieces.
-        MissingDependencyError: pytetwild is not installed.
-    """
+    """Fill a closed surface by :func:`run_tetwild`; also whether it came from the cache.
+    ``epsilon`` is absolute [m]: fTetWild's own, a thousandth of the box, removes 7 % of a thin
+    branch's volume. MeshingError without a mesh, or if it lost over 5 % of the volume."""
     path = _cache_path(surface, edge_length, epsilon, stop_energy, coarsen)
     cached = _from_cache(path)
     if cached is None:

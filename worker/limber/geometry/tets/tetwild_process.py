@@ -25,25 +25,10 @@ _MEMORY_MB = 4000.0
 def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, epsilon: float,
                 stop_energy: float, coarsen: bool, time_limit: float,
                 progress: Progress = SILENT) -> tuple[np.ndarray, np.ndarray]:
-    """Fill a closed surface with tetrahedra by fTetWild (Hu et al. 2020).
-
-    Args:
-        vertices: Positions [m], shape [n, 3].
-        faces: Triangles, shape [m, 3].
-        edge_length: Target edge length [m]; where the surface is finer, so are the tetrahedra.
-        epsilon: Largest distance of the result from the surface [m].
-        stop_energy: Quality at which optimisation stops (fTetWild's AMIPS energy; 3 is best).
-        coarsen: Merge elements as far as quality allows, which takes longer.
-        time_limit: Processor time [s] after which it is stopped.
-        progress: Called while waiting; cancelling stops the process.
-
-    Returns:
-        Nodes [m], shape [k, 3], and tetrahedra, shape [t, 4], in their original orientation.
-
-    Raises:
-        MissingDependencyError: pytetwild is not installed.
-        MeshingError: it failed, or took too long or too much memory.
-    """
+    """Fill a closed surface by fTetWild (Hu et al. 2020) to ``stop_energy`` (AMIPS, 3 is best):
+    nodes [k, 3] [m], and tetrahedra [t, 4] as it orients them, up to ``epsilon`` [m] from the
+    surface. Where that is finer than ``edge_length`` [m], so are they; ``coarsen`` merges them.
+    MeshingError also over ``time_limit`` [s] of processor time or ``_MEMORY_MB``."""
     if importlib.util.find_spec("pytetwild") is None:
         raise MissingDependencyError("pytetwild (fTetWild) is not installed.", "",
                                      "Install it, or choose --mesher sweep.")

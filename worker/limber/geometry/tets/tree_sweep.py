@@ -75,15 +75,8 @@ def straight_beam(length: float, radius_root: float, radius_tip: float | None = 
 
 def curved_beam(points: np.ndarray, radius: np.ndarray, *, slice_length: float = 2.0,
                 sides: int = 6, quadratic: bool = True) -> TetMesh:
-    """Mesh a round beam along a polyline, without data on the mesh.
-
-    Args:
-        points: Axis [m], shape [n, 3].
-        radius: Radii [m], shape [n].
-        slice_length: Length of a slice in local radii.
-        sides: Sides of the cross-section.
-        quadratic: 10-node tetrahedra, else 4-node ones.
-    """
+    """Mesh a round beam along an axis [n, 3] [m] with radii [n] [m], without data on the mesh;
+    ``slice_length`` is in local radii."""
     centres, radii = resample(np.asarray(points, float), np.asarray(radius, float),
                               slice_length * np.asarray(radius, float))
     mesh = sweep_run(centres, radii, sides=sides)
@@ -114,14 +107,9 @@ def tube(centres: np.ndarray, ring: np.ndarray) -> TetMesh:
 
 
 def split_wedges(wedges: np.ndarray) -> np.ndarray:
-    """Split triangular prisms into three tetrahedra each, consistently on shared faces.
-
-    Each quadrilateral is cut from its corner of the lowest index, so neighbours agree: Dompierre
-    et al., How to subdivide pyramids, prisms and hexahedra into tetrahedra (1999).
-
-    Args:
-        wedges: Corners, shape [n, 6]: a triangle and, above it, its copy.
-    """
+    """Split prisms [n, 6] (a triangle and, above it, its copy) into three tetrahedra each. Each
+    side is cut from its corner of the lowest index, so neighbours agree: Dompierre et al., How to
+    subdivide pyramids, prisms and hexahedra into tetrahedra (1999)."""
     turns = np.array([[0, 1, 2, 3, 4, 5], [1, 2, 0, 4, 5, 3], [2, 0, 1, 5, 3, 4],
                       [3, 5, 4, 0, 2, 1], [4, 3, 5, 1, 0, 2], [5, 4, 3, 2, 1, 0]])
     # After the rotation the lowest index is first, so two quadrilaterals are cut from corner 0.
@@ -156,13 +144,7 @@ def _with_beam_data(mesh: TetMesh, axis: np.ndarray, length: float, fractions: t
 
 @dataclass
 class RunAxis:
-    """One run's axis.
-
-    Attributes:
-        points: Its nodes [m], shape [n, 3].
-        radius: Radii there [m], shape [n].
-        along: Length up to each [m], shape [n].
-    """
+    """One run's axis: nodes [n, 3] [m], radii [n] [m], and the length ``along`` up to each [m]."""
 
     points: np.ndarray
     radius: np.ndarray
@@ -207,14 +189,8 @@ class RunAxis:
 
 @dataclass(frozen=True)
 class Patch:
-    """Side faces of a carrier's slice that a twig may start from.
-
-    Attributes:
-        slice: Which slice.
-        faces: Which of its sides.
-        loop: Nodes around them, shape [corners].
-        outward: Their mean normal, shape [3].
-    """
+    """Side faces of a carrier's slice that a twig may start from; ``loop`` are the nodes around
+    them, ``outward`` [3] is their mean normal."""
 
     slice: int
     faces: list[int]
@@ -224,15 +200,9 @@ class Patch:
 
 @dataclass(frozen=True)
 class Joint:
-    """A valid block between a patch and a twig's first ring.
-
-    Attributes:
-        start: Position of the ring along the twig [m].
-        tangent: Normal of the ring, shape [3].
-        turn: Direction of the ring's first corner, shape [3].
-        tets: Nodes of the mesh, or -1 - k for node k of the twig, shape [t, 4].
-        quality: Shape of its flattest tetrahedron.
-    """
+    """A valid block between a patch and a twig's first ring at ``start`` [m], with normal
+    ``tangent`` and its first corner towards ``turn`` [3]. In ``tets`` [t, 4], -1 - k is node k of
+    the twig; ``quality`` is the shape of the flattest one."""
 
     start: float
     tangent: np.ndarray
@@ -243,16 +213,8 @@ class Joint:
 
 def joints(axis: RunAxis, start: np.ndarray, lean: np.ndarray, patch: Patch, corner: np.ndarray,
            triangles: np.ndarray) -> list[Joint]:
-    """The valid blocks between a patch and a twig's first ring.
-
-    Args:
-        axis: Axis of the twig.
-        start: Candidate positions of the ring along it [m], shape [j].
-        lean: How far the ring leans towards the patch, shape [j].
-        patch: The patch that the twig grows out of.
-        corner: The patch's corners [m], shape [sides, 3].
-        triangles: The carrier's faces there, node indices, shape [2 or 4, 3].
-    """
+    """The valid blocks between a patch of ``corner`` [sides, 3] [m] and the carrier's ``triangles``
+    [2 or 4, 3], and a twig's ring at ``start`` [j] [m] that leans by ``lean`` [j] to the patch."""
     sides = len(corner)
     radius = axis.radius_at(start)
     ahead = axis.at(np.minimum(start + radius, axis.length)) - axis.at(
@@ -278,18 +240,9 @@ def joints(axis: RunAxis, start: np.ndarray, lean: np.ndarray, patch: Patch, cor
 
 
 def _matched(corner: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Orientation of a patch's corners about each twig, and the first normal of each twig's ring.
-
-    Ring corner k is then above patch corner k with the least twist.
-
-    Args:
-        corner: The patch's corners [m], shape [sides, 3].
-        tangent: Directions of the twigs, shape [j, 3].
-
-    Returns:
-        Whether the corners must be reversed to run counter-clockwise, shape [j]; normals, shape [j,
-        3].
-    """
+    """Whether a patch's corners [sides, 3] [m] must be reversed to run counter-clockwise about each
+    ``tangent`` [j, 3], shape [j], and the normals [j, 3] of the rings: ring corner k is then above
+    patch corner k with the least twist."""
     first = any_normal(tangent)
     second = np.cross(tangent, first)
     flat = corner - corner.mean(axis=0)
@@ -302,17 +255,9 @@ def _matched(corner: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _blocks(nodes: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra between a patch and each ring, and the worst shape among them.
-
-    Args:
-        nodes: The patch's corners, the ring's centre and its corners [m], shape
-            [j, 2 sides + 1, 3].
-        below: The carrier's triangles on the patch, shape [j, 2 or 4, 3].
-
-    Returns:
-        Indices into ``nodes``, shape [j, t, 4]; smallest shape (1 is regular, negative inverted),
-        shape [j].
-    """
+    """Tetrahedra [j, t, 4] between triangles ``below`` [j, 2 or 4, 3] and each ring, and the worst
+    shape [j]. ``nodes`` [j, 2 sides + 1, 3] [m] are the patch's, the ring's centre and the
+    ring's."""
     count, sides = len(nodes), (nodes.shape[1] - 1) // 2
     k = np.arange(sides)
     after, top = (k + 1) % sides, sides
@@ -342,13 +287,8 @@ _TAPERED, _THINNEST = 2.5, 0.06  # radius ratio above which rings are graded; sm
 
 @dataclass
 class Window:
-    """A slice of a carrier that a twig grows out of.
-
-    Attributes:
-        run: The twig.
-        low, high: Start and end of the slice along the carrier [m].
-        outward: Direction in which the twig leaves, a unit vector, shape [3].
-    """
+    """A slice from ``low`` to ``high`` [m] along a carrier that the twig ``run`` grows out of in
+    the direction ``outward`` [3]."""
 
     run: int
     low: float
@@ -357,8 +297,7 @@ class Window:
 
     @classmethod
     def of(cls, axis: RunAxis, twig: RunAxis, run: int) -> "Window | None":
-        """The slice of a carrier's ``axis`` that a ``twig`` leaves through; None: it stays inside.
-        """
+        """The slice of a carrier that a ``twig`` leaves through; None if it stays inside."""
         where = np.linspace(0, twig.length, 200)
         distance, foot = axis.nearest(twig.at(where))
         out = np.flatnonzero(distance > axis.radius_at(foot))
@@ -373,9 +312,7 @@ class Window:
 
 def without_overlap(windows: Iterable[Window], axis: RunAxis, start: float) -> list[Window]:
     """Move slices along an axis from ``start`` [m] so that none overlap, as little as possible.
-
-    Twigs that leave through different sides may share a slice, as those of a whorl do.
-    """
+    Twigs that leave through different sides may share a slice, as those of a whorl do."""
     end = axis.length + 1e-12
     slices: list[list[Window]] = []
     free = start + 0.3 * float(axis.radius_at(start))
@@ -398,8 +335,7 @@ def without_overlap(windows: Iterable[Window], axis: RunAxis, start: float) -> l
 
 def ring_positions(axis: RunAxis, start: float, windows: list[Window],
                    spacing: float) -> np.ndarray:
-    """Positions of rings along an axis from ``start`` [m], ``spacing`` radii apart, shape [r].
-    """
+    """Positions [r] [m] of rings along an axis from ``start`` [m], ``spacing`` radii apart."""
     fixed = sorted({round(v, 12) for w in windows for v in (w.low, w.high)})
     marks = [start, *[v for v in fixed if start < v < axis.length], axis.length]
     inside = {(round(w.low, 12), round(w.high, 12)) for w in windows}
@@ -429,10 +365,8 @@ def _is_tapered(axis: RunAxis, low: float, high: float) -> bool:
 
 
 def _graded(axis: RunAxis, low: float, high: float, spacing: float) -> np.ndarray:
-    """Positions of rings where the radius changes much: closer where it is thin.
-
-    Slices sized for the middle would be needles at a thin end, which look as if folded over.
-    """
+    """Positions [m] of rings where the radius changes much: closer where it is thin. Slices sized
+    for the middle would be needles at a thin end, which look as if folded over."""
     along = np.linspace(low, high, 400)
     radii = axis.radius_at(along)
     pitch = spacing * np.maximum(radii, _THINNEST * radii.max())
@@ -450,22 +384,9 @@ _SHIFTS = (1, -1, 2, -2, 3, -3)  # shifts tried for a twig's slice, in its own l
 def unfolded(axis: RunAxis, start: float, windows: list[Window], sides: int, spacing: float,
              first_normal: np.ndarray | None, first_tangent: np.ndarray | None,
              ) -> tuple[np.ndarray, TetMesh]:
-    """Rings along an axis whose prisms are not folded over, if possible.
-
-    Cross-sections cross in a sharp bend; with one fewer they may not. A twig's slice there moves
-    along the axis, and is given up (removed from ``windows``) if no position is left.
-
-    Args:
-        axis, start: Axis of the run, and position of its first ring along it [m].
-        windows: Slices of its twigs; changed in place.
-        sides: Corners of a ring.
-        spacing: Length of a slice in local radii.
-        first_normal: Direction of the first ring's first corner, shape [3]; None: any.
-        first_tangent: Normal of the first ring, shape [3]; None: along the axis.
-
-    Returns:
-        Positions of the rings along it [m], and the tetrahedra.
-    """
+    """Positions [m] of rings from ``start`` along an axis, and prisms that are not folded if
+    possible. In a sharp bend a ring goes, or a twig's slice in ``windows`` moves and at last goes.
+    The first ring has its corner at ``first_normal`` [3] (None: any)."""
     moves = dict.fromkeys((window.run for window in windows), 0)
     first_low = {window.run: window.low for window in windows}
     where, ends = ring_positions(axis, start, windows, spacing), [start, axis.length]
@@ -536,27 +457,15 @@ _THICK_TWIG = 0.5  # fraction of its carrier; such a twig uses two side faces an
 
 @dataclass(frozen=True)
 class SweptTree:
-    """A swept mesh.
-
-    Attributes:
-        mesh: Linear, positively oriented.
-        left_out: Runs of the skeleton that could not be joined to the mesh.
-    """
+    """A swept mesh, linear and positively oriented, and the runs that could not be joined to it."""
 
     mesh: TetMesh
     left_out: list[int] = field(default_factory=list)
 
 
 def sweep_tree(skeleton: Skeleton, *, spacing: float = 2.5) -> SweptTree:
-    """Sweep prisms along each run of a skeleton and join them at the forks.
-
-    Args:
-        skeleton: Axes and radii.
-        spacing: Length of a slice in local radii.
-
-    Raises:
-        MeshingError: the main run cannot be swept because its bend is too sharp for its thickness.
-    """
+    """Sweep prisms along each run, ``spacing`` local radii long, and join them at the forks.
+    MeshingError if the main run bends too sharply for its thickness."""
     sweep = _TreeSweep(skeleton, spacing)
     for run in range(skeleton.branch_count):
         sweep.add_run(run)
