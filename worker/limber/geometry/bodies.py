@@ -34,15 +34,8 @@ _SECONDS = 600.0  # of processor time for fTetWild; there are no axes to sweep a
 
 @dataclass(frozen=True)
 class MeshedBody:
-    """A solid in its own frame, filled with tetrahedra.
-
-    Attributes:
-        alignment: From the file's coordinates to the body's.
-        skeleton: Its axis.
-        surface: Closed.
-        mesh: Marked with material, base, control points and grasp.
-        numbers: The stage's result.
-    """
+    """A solid in its own frame, filled with tetrahedra. ``alignment`` leads there from the file's
+    coordinates; ``mesh`` has material, base, control points and grasp."""
 
     alignment: Alignment
     skeleton: Skeleton
@@ -94,15 +87,8 @@ def numbers_of(surface: Surface, skeleton: Skeleton, mesh: TetMesh, alignment: A
 
 
 def section_axis(surface: Surface, root: np.ndarray | None) -> Skeleton:
-    """Return the axis of a slender solid: centroids of its cross-sections along its length.
-
-    Radii are those of circles with the sections' areas. The body is one unforked run that starts at
-    ``root``, or at the thicker end.
-
-    Args:
-        surface: Closed.
-        root: A point near the end that is held [m], shape [3], or None.
-    """
+    """Return the axis of a slender solid, one run from ``root`` [3] [m] or the thicker end:
+    centroids of its cross-sections, with radii of circles of the same area."""
     axis = _long_axis(surface)
     along = surface.vertices @ axis
     low, high = float(along.min()), float(along.max())
@@ -202,14 +188,8 @@ _UPWARDS = 0.3  # sine of the angle between axis and vertical below which the ax
 
 @dataclass(frozen=True)
 class Sections:
-    """Ellipses across an axis, from the end that is held.
-
-    Attributes:
-        axis: Their centres [m], shape [n, 3].
-        width: Their thickness sideways [m], shape [n].
-        height: Their thickness upwards [m], shape [n].
-        mass: Mass attached at each in addition to the body itself [kg], shape [n].
-    """
+    """Ellipses across ``axis`` [n, 3] [m] from the held end: ``width`` (sideways) and ``height``
+    [m], and ``mass`` [kg] attached there beside the body itself, shape [n] each."""
 
     axis: np.ndarray
     width: np.ndarray
@@ -223,13 +203,9 @@ class Sections:
 
 
 def read_sections(path: Path, unit: str) -> Sections:
-    """Read a table with the columns x, y, z, width, height and optionally mass_kg.
-
-    Lengths are in ``unit``, or in that of a column's name (``width_mm``).
-
-    Raises:
-        InputError: a column is missing, a value is not a number, or a size is not positive.
-    """
+    """Read a table with the columns x, y, z, width, height and optionally mass_kg, in ``unit`` or
+    in that of a column's name (``width_mm``). InputError if a column is missing or a value
+    invalid."""
     rows = csv_records(path, "a table of sections", comment="#")
     titles = [title.strip() for title in rows[0] if title] if rows else []
     found = {}
@@ -271,14 +247,9 @@ SECTIONS = Format("sections", (".csv",), read_sections)
 def mesh_sections(sections: Sections, settings: MeshSurfaceSettings,
                   elements_across: float = ELEMENTS_ACROSS,
                   ) -> tuple[MeshedBody, list[dict[str, Any]]]:
-    """Sweep tetrahedra along drawn sections and mark base, control points and grasp.
-
-    Width is across axis and up, height across axis and width. If the axis starts upwards, width is
-    along x as far as possible. From there both follow the axis without a twist.
-
-    Returns:
-        The body, and the masses attached to it, as in ``point_masses.json``.
-    """
+    """Sweep tetrahedra along drawn sections: a marked body, and its masses as in
+    ``point_masses.json``. Width is across axis and up (along x if the axis starts upwards), height
+    across both. From there they follow the axis without a twist."""
     skeleton = Skeleton.from_edges(sections.axis, np.arange(len(sections.axis)) - 1,
                                    sections.radius)
     mesh = _swept(sections, settings, elements_across)
@@ -334,28 +305,14 @@ def _upper(tangent: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 def body_format(path: Path) -> Format:
     """Return the kind of a file given to `limber mesh`: a cylinder model, sections or a surface.
-
-    Raises:
-        InputError: the kind is not known.
-    """
+    InputError if it is none."""
     return known_format(path, "body", [*SKELETONS.readers(), SECTIONS, *SURFACES.readers()])
 
 
 def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = SILENT,
                ) -> tuple[MeshedBody, list[dict[str, Any]]]:
-    """Return the branch of a cylinder model, and the masses of the pruned twigs.
-
-    Args:
-        path: File in a format of :data:`~limber.geometry.io.skeletons.SKELETONS`.
-        settings: ``unit``, ``up``, ``upright`` and settings of the wood; the model has its own
-        root.
-        progress: Called during the work; receives warnings for the user.
-
-    Raises:
-        InputError: it cannot be read, a radius is 0, its size is not a branch's, or a root is
-        given.
-        MeshingError: it cannot be meshed.
-    """
+    """Return the branch of a cylinder model, and the masses of the pruned twigs. InputError for an
+    unusable model or a given root: the model has its own. MeshingError if it cannot be meshed."""
     if settings.root is not None:
         raise InputError("A root (--root) was given for a cylinder model.",
                          "The model defines its own root.", "Omit --root.")

@@ -23,18 +23,9 @@ _STEP = 0.004  # [m] between nodes of the true axes
 
 @dataclass(frozen=True)
 class GeneratedBranch:
-    """A branch of known ground truth, and its scan, in one frame (root at the origin, z up).
-
-    Attributes:
-        seed: Seed from which it was made, with ``spec``.
-        spec: Specification from which it was made.
-        skeleton: True axes and radii.
-        surface: True surface.
-        young: True Young's modulus [Pa] at ``control_points``, shape [K].
-        control_points: Positions [m], shape [K, 3], at ``fractions`` of the main path.
-        fractions: The fractions.
-        cloud: The scan; attribute ``normal`` holds the true outward normals.
-    """
+    """A branch of known truth, and its scan, in one frame (root at the origin, z up). ``young`` [K]
+    [Pa] is at ``control_points`` [K, 3] [m], at ``fractions`` of the main path. The scan has the
+    true outward normals."""
 
     seed: int
     spec: BranchSpec
@@ -223,11 +214,8 @@ class _Truth(BaseModel):
 
 
 def read_truth(path: Path) -> dict[str, Any]:
-    """Return the content of ``truth.json``: the description of a generated branch.
-
-    Raises:
-        InputError: the file cannot be read, or is not such a file.
-    """
+    """Return the content of ``truth.json``, which describes a generated branch; InputError if it is
+    no such file."""
     content = read_json(path, "a description of a generated branch")
     checked_as(path, _Truth, content, "a description of a generated branch")
     return content

@@ -33,16 +33,8 @@ _ARC = np.sin(np.pi / 3) / (np.pi / 3)
 
 def without_leaves(prepared: Prepared, least: float = _LEAST, found: SkeletonResult | None = None,
                    ) -> tuple[Prepared, list[Leaf]]:
-    """Remove the leaves from a prepared scan.
-
-    Args:
-        prepared: The scan.
-        least: Fraction of the points below which leaves are kept.
-        found: The skeleton of the whole scan: parts that its axes show to be round are not leaves.
-
-    Returns:
-        The wood, and the removed leaves.
-    """
+    """Return the wood of a scan, and the removed leaves: none if they have under ``least`` of the
+    points. Parts that are round by ``found``, the whole scan's skeleton, are no leaves."""
     points = prepared.cloud.points
     leaves = _leaves_of(points)
     if found is not None and leaves:
@@ -62,12 +54,9 @@ def cut_off(prepared: Prepared, leaves: list[Leaf]) -> tuple[Prepared, list[Leaf
 
 
 def _leaves_of(points: np.ndarray) -> list[Leaf]:
-    """Find the leaves of a scan, on at most as many of its points as a fit of axes uses.
-
-    Leaves are recognised by neighbourhoods a few spacings wide. If points are closer together than
-    a leaf needs, these neighbourhoods show the scan's noise, and pairs of neighbours take too much
-    memory. Each remaining point is assigned to the nearest of those examined.
-    """
+    """Find the leaves on at most as many points as a fit of axes uses; others go with the nearest.
+    Neighbourhoods a few spacings wide recognise them: closer points would show the scan's noise,
+    and their pairs take too much memory."""
     some = thinned(points, FIT_POINT_LIMIT)
     leaves = find_leaves(points[some])
     if len(some) == len(points) or not leaves:
@@ -87,16 +76,8 @@ def show_leaves(prepared: Prepared, off: np.ndarray) -> bool:
 
 
 def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
-    """Refuse to remove more than ``UNASKED`` of a scan without the user's consent.
-
-    Args:
-        prepared: The whole scan.
-        leaves: Points that look like leaves.
-        unit: Unit of the file, as the settings name it.
-
-    Raises:
-        InputError: the leaves are more than that.
-    """
+    """Raise InputError if removing the leaves takes more than ``UNASKED`` of the scan; ``unit`` is
+    that of the file."""
     share = float(leaf_mask(leaves, len(prepared.cloud)).mean())
     if share <= UNASKED:
         return
@@ -117,11 +98,8 @@ def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
 
 
 def _on_round_axes(found: SkeletonResult, points: np.ndarray) -> np.ndarray:
-    """Which points [n, 3] are on an axis whose points show that it is round, shape [n].
-
-    They must be on its surface and cover enough of its circumference: any narrow strip fits some
-    cylinder. A radius at its limit was not measured.
-    """
+    """Mask [n] of points [n, 3] on a surface whose points cover enough of its circumference. Any
+    narrow strip fits some cylinder, and a radius at its limit was not measured."""
     skeleton, node = found.skeleton, found.node_of_point
     axis = skeleton.nodes[node] - skeleton.nodes[skeleton.parent[node]]
     axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
@@ -145,17 +123,8 @@ def leaf_mask(leaves: list[Leaf], count: int) -> np.ndarray:
 
 def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton,
                 ) -> list[dict[str, Any]]:
-    """Return the masses and positions of leaves: sheets of even thickness on the nearest axes.
-
-    Args:
-        leaves: Leaves of the scan.
-        points: The scan [m], shape [n, 3], in the skeleton's frame.
-        skeleton: Skeleton of the wood.
-
-    Returns:
-        For each leaf ``kind`` ("leaf"), ``mass_kg``, ``area_m2``, ``centre_m``, ``attached_m``
-        (the node nearest to any of its points) and ``inertia_kg_m2`` about its centre.
-    """
+    """Return a row of ``point_masses.json`` for each leaf: an even sheet that hangs on the node
+    nearest to any of its points; points [m, 3] [m] are in the skeleton's frame."""
     tree, masses = cKDTree(skeleton.nodes), []
     for leaf in leaves:
         blade = points[leaf.points]

@@ -16,12 +16,8 @@ _LEFT_OUT_MOST = 0.03  # fraction of the mass that the mesh may omit without ask
 
 def leave_out_twigs(skeleton: Skeleton, settings: ReconstructSettings,
                     ) -> tuple[Skeleton, list[dict[str, Any]]]:
-    """Prune thin or high-order side twigs. Their mass remains at their position.
-
-    Returns:
-        The skeleton to mesh, and for each pruned twig ``mass_kg``, its ``centre_m`` and
-        ``attached_m``, the point on the kept axis that carries it.
-    """
+    """Prune thin side twigs and what they carry: the skeleton to mesh, and :func:`twig_mass` of
+    each, which remains at its position."""
     keep = np.ones(skeleton.node_count, bool)
     masses: list[dict[str, Any]] = []
     for run, members in enumerate(skeleton.runs()[1:], start=1):
@@ -37,11 +33,8 @@ def leave_out_twigs(skeleton: Skeleton, settings: ReconstructSettings,
 
 def twig_mass(skeleton: Skeleton, run: int, density: float, keep: np.ndarray | None = None,
               ) -> dict[str, Any]:
-    """Return the mass of a run that is not meshed, as a rod on the axis that carries it.
-
-    ``mass_kg``, ``length_m``, ``centre_m``, ``attached_m`` (the point on the kept axis),
-    ``inertia_kg_m2`` about the centre, shape [3, 3], and ``branch``, its run in the skeleton.
-    """
+    """Return the mass of a run that is not meshed, as a rod with ``inertia_kg_m2`` [3, 3] about its
+    centre. ``attached_m`` is on the axis that carries it, ``branch`` its run in the skeleton."""
     members = skeleton.runs()[run]
     own, base = members[1:], members[0]
     while keep is not None and not keep[base]:
@@ -63,17 +56,8 @@ def twig_mass(skeleton: Skeleton, run: int, density: float, keep: np.ndarray | N
 
 def report_pruned_twigs(masses: list[dict[str, Any]], meshed: float, settings: ReconstructSettings,
                         progress: Progress) -> None:
-    """Report the pruned twigs by branch, length and mass, heaviest first.
-
-    Args:
-        masses: The twigs that are not in the mesh.
-        meshed: Mass of the mesh [kg].
-        settings: Whether the user accepts it.
-        progress: Receives warnings for the user.
-
-    Raises:
-        MeshingError: they hold more than 3 % of the mass, and the user did not accept that.
-    """
+    """Report the pruned twigs, heaviest first, against the mass of the mesh ``meshed`` [kg].
+    MeshingError if they hold over 3 % of the mass and the user did not accept that."""
     if not masses:
         return
     total = sum(m["mass_kg"] for m in masses)
@@ -95,12 +79,8 @@ def report_pruned_twigs(masses: list[dict[str, Any]], meshed: float, settings: R
 
 
 def touching_runs(skeleton: Skeleton) -> list[dict[str, Any]]:
-    """Positions where two branches touch without a fork between them.
-
-    Returns:
-        For each pair of branches ``branches`` [2] and the position ``at_m`` [3] where they overlap
-        most.
-    """
+    """Pairs of ``branches`` [2] that touch without a fork between them, and where they overlap
+    most, ``at_m`` [3]."""
     tree = cKDTree(skeleton.nodes)
     reach = 2 * float(skeleton.radius.max())
     pairs = tree.query_pairs(reach, output_type="ndarray").reshape(-1, 2)

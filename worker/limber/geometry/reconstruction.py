@@ -86,15 +86,8 @@ Show = Callable[[Cloud], None]
 def shown_if_refused(show: Show | None, prepared: Prepared, leaves: list[Leaf],
                      supports: list[Support], off_axes: np.ndarray | None = None,
                      ) -> Iterator[None]:
-    """Show the points by class if what is done meanwhile refuses the scan.
-
-    Args:
-        show: Receives the cloud; None: nobody looks.
-        prepared: The whole scan.
-        leaves: Its leaves.
-        supports: Its pots, stakes, posts and wires.
-        off_axes: Which of the other points are on no round axis, shape [rest]; None: not known.
-    """
+    """Show the points by class if what is done meanwhile refuses the scan; None: nobody looks.
+    ``off_axes`` [rest] says which points of no leaf or support are on no round axis."""
     try:
         yield
     except InputError:
@@ -106,9 +99,7 @@ def shown_if_refused(show: Show | None, prepared: Prepared, leaves: list[Leaf],
 def classified(prepared: Prepared, leaves: list[Leaf], supports: list[Support],
                off_axes: np.ndarray | None = None, apart: np.ndarray | None = None) -> Cloud:
     """Return the points with columns ``class`` and ``color``, see :func:`shown_if_refused`.
-
-    ``apart``: which of the points belong to another plant, shape [n].
-    """
+    ``apart`` [n] says which of them belong to another plant."""
     kind = leaf_mask(leaves, len(prepared.cloud)).astype(np.uint8)
     if off_axes is not None:
         kind[np.flatnonzero(kind == 0)[off_axes]] = 2
@@ -134,15 +125,8 @@ _MOSTLY = 0.3
 
 @dataclass(frozen=True)
 class MeshedBranch:
-    """Surface and tetrahedra of an aligned skeleton.
-
-    Attributes:
-        skeleton: The whole skeleton, with the pruned twigs.
-        surface: Closed.
-        mesh: Marked with material, base, control points and grasp.
-        masses: Pruned twigs, see :func:`leave_out_twigs`.
-        numbers: Part of the stage's result about them.
-    """
+    """Surface and tetrahedra of an aligned skeleton, which has the pruned twigs too; ``masses`` are
+    theirs, see :func:`leave_out_twigs`. ``mesh`` has material, base, control points and grasp."""
 
     skeleton: Skeleton
     surface: Surface
@@ -325,13 +309,9 @@ def labelled(cloud: Cloud, skeleton: Skeleton) -> Cloud:
 
 
 def _may_be_leafy(found: SkeletonResult, prepared: Prepared, settings: ReconstructSettings) -> bool:
-    """Whether so many points are on no round axis that leaves are searched for.
-
-    Leaves can thicken the axes until half of the points on them count as wood. So a scan that would
-    be accepted is checked too, whatever fraction its user allows. A depth camera's scatter alone
-    has this effect without a leaf; 3 mm of noise on branches of 3 mm radius leaves 15 % off the
-    axes.
-    """
+    """Whether so many points are on no round axis that leaves are searched for, even in a scan that
+    would be accepted: leaves thicken axes until half of the points count as wood. Scatter of a
+    depth camera has this effect without a leaf; 3 mm of noise at 3 mm radius leaves 15 % off."""
     if found.leafy or (prepared.view is None and unexplained_share(found) > min(
             settings.unexplained, _LEAVES_ASKED)):
         return True
@@ -424,12 +404,8 @@ def peak_memory_mb() -> float:
 
 
 def seen_skeleton(found: SkeletonResult, prepared: Prepared) -> tuple[SkeletonResult, str]:
-    """Compare twigs and radii of a skeleton with the depth camera's image; return warnings.
-
-    Args:
-        found: The skeleton of the cloud.
-        prepared: The cloud, and the view from which it was seen.
-    """
+    """Drop twigs that do not extend beyond their parent in the depth camera's image; also return a
+    warning, empty if there are none."""
     view = present(prepared.view, "view")
     skeleton, dropped = without_hidden_twigs(found.skeleton, view, _SILHOUETTE_REACH)
     node, residual = nearest_cylinders(skeleton, prepared.cloud.points)

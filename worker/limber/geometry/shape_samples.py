@@ -37,16 +37,9 @@ _HALVINGS = 30
 
 def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
                      rng: np.random.Generator) -> list[Skeleton]:
-    """Draw ``count`` skeletons from the fit's covariance and the twigs' probabilities.
-
-    Nodes move only across their axis; a missing twig, and what it carries, is made thin.
-
-    Args:
-        skeleton: Fitted to the points.
-        points: The scan [m], shape [m, 3], in the skeleton's frame.
-        count: Number of skeletons.
-        rng: Random number generator.
-    """
+    """Draw skeletons from the covariance of the fit to points [m, 3] [m] and the twigs'
+    probabilities. Nodes move only across their axis; a missing twig, with all it carries, is made
+    thin."""
     chosen = points[::max(1, -(-len(points) // POINT_LIMIT))]
     # Fewer points of the same noise hold the axis less firmly than those of the fit.
     system, noise = fitted_system(skeleton, chosen)
@@ -72,14 +65,8 @@ def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
 
 def _beyond_noise(skeleton: Skeleton, covariance: np.ndarray, moves: np.ndarray,
                   rng: np.random.Generator) -> np.ndarray:
-    """What changes draws of the noise into draws of the stated deviations, [count, n, 4].
-
-    Args:
-        skeleton: Where a radius's deviation is 0, it is unknown, and nothing changes.
-        covariance: Of each node's position and radius by the noise [m^2], shape [n, 4, 4].
-        moves: Draws of the noise [m], shape [count, n, 4].
-        rng: Random number generator.
-    """
+    """What turns draws ``moves`` [count, n, 4] [m] of noise with ``covariance`` [n, 4, 4] [m^2]
+    into draws of the stated deviations. It is 0 where a deviation is 0, which means unknown."""
     own = np.sqrt(covariance[:, 3, 3])
     stated = np.where(skeleton.radius_sigma > 0, skeleton.radius_sigma, own)
     together = rng.standard_normal((len(moves), skeleton.branch_count))[:, skeleton.branch]
@@ -112,12 +99,9 @@ def _existing(skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.nd
 
 
 def reshaped(mesh: TetMesh, skeleton: Skeleton, other: Skeleton) -> TetMesh:
-    """Return a skeleton's mesh moved to another skeleton of the same tree.
-
-    Nodes move with the axis, and away from it as the radius grows; edges stay straight. Where a
-    tetrahedron would turn inside out or nearly vanish (uncertain twigs side by side at a fork), its
-    corners move less.
-    """
+    """Return a skeleton's mesh moved to another skeleton of the same tree: with the axis, and away
+    from it as the radius grows. Where a tetrahedron would turn inside out or nearly vanish (twigs
+    side by side at a fork), its corners move less. Edges stay straight."""
     low, high, share, offset = on_cylinders(skeleton, mesh.nodes)
     moves, growth = other.nodes - skeleton.nodes, other.radius / skeleton.radius - 1
 
