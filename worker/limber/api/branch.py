@@ -93,8 +93,8 @@ class Branch:
         """The most likely skeletons, the one in use first: ``probability``, ``length`` [m] and
         ``edits``, which make it of the one in use and are in the scan's coordinates.
 
-        ``branch.run("skeleton", alternative=2)`` applies those of the second. There are none in a
-        folder of an older version.
+        ``branch.run("skeleton", alternative=2)`` applies those of the second. There are none of a
+        skeleton that was not searched.
 
         >>> [other.length for other in limber.open("a.branch").alternatives]
         []

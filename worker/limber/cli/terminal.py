@@ -46,7 +46,7 @@ def found_lines(lines: Sequence[Line], values: Mapping[str, Any]) -> Iterator[st
         try:
             text = _FILLED.vformat(line, (), values) if isinstance(line, str) else line(values)
         except (_NotThere, KeyError):
-            # A result of an older version may lack it.
+            # A result may lack it: of a dry run, or without an uncertainty.
             continue
         if text:
             yield text

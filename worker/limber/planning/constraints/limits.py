@@ -243,7 +243,7 @@ class Limits:
             value = values.get(name)
             if value is None:
                 raise InputError(f"The energy field contains no {name.replace('_', ' ')}.",
-                                 "An older version of Limber sampled it.",
+                                 "It was sampled without it.",
                                  "Run `limber energy` again with --force.")
             size = np.abs(value)
             near = inner & (size > _NEAR[0] * limit) & (size < _NEAR[1] * limit)

@@ -239,7 +239,7 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     if made is None or early is None or not _belong(early, made):
         raise InputError(
             f"{branch.folder} has no mesh of this skeleton.",
-            "The last reconstruct failed, or an older Limber ran it. The scan is needed again.",
+            "The last reconstruct failed. The scan is needed again.",
             "Run `limber reconstruct CLOUD -o NAME.branch --edits FILE`.")
     settings = _settings(made)
     alignment = branch.manifest.alignment
