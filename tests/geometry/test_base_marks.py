@@ -4,17 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.grown import grown
 
-from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import base_nodes
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
 from limber.geometry.tets.tree_sweep import straight_beam, sweep_tree
 
 
 def rod(radius):
-    s = np.linspace(0, 0.3, 31)
-    nodes = np.column_stack([0 * s, 0 * s, s])
-    return Skeleton.from_edges(nodes, np.arange(-1, 30), np.interp(s, [0, 0.3], radius))
+    return grown((-1, (0, 0, 0), (0, 0, 0.3), 31, radius))
 
 
 @pytest.mark.parametrize("slice_length", [0.1, 0.5, 2.0])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.subjects.grown import grown
 
 from limber.core.errors import MeshingError
 from limber.core.progress import SILENT
@@ -19,13 +20,9 @@ from limber.geometry.surface.tubes import branch_surface
 
 def _tree(aside: float) -> Skeleton:
     """A stem, and two twigs of it whose ends come as near as ``aside`` [m]."""
-    z = np.linspace(0, 0.5, 51)
-    t = np.linspace(0, 1, 21)[1:]
-    low = np.stack([0.15 * t, 0 * t, 0.1 + 0 * t], axis=1)
-    high = np.stack([0.15 * t, 0 * t, 0.2 + (aside - 0.1) * t], axis=1)
-    nodes = np.vstack([np.stack([0 * z, 0 * z, z], axis=1), low, high])
-    parent = np.concatenate([np.arange(51) - 1, [10], 51 + np.arange(19), [20], 71 + np.arange(19)])
-    return Skeleton.from_edges(nodes, parent, np.repeat([0.008, 0.004, 0.004], [51, 20, 20]))
+    return grown((-1, (0, 0, 0), (0, 0, 0.5), 51, 0.008),
+                 (10, (0, 0, 0.1), (0.15, 0, 0.1), 21, 0.004),
+                 (20, (0, 0, 0.2), (0.15, 0, 0.1 + aside), 21, 0.004))
 
 
 def test_a_twig_is_a_rod() -> None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.grown import grown
 
 from limber.geometry.shape_samples import reshaped, sample_skeletons
 from limber.geometry.skeleton.radii.axis_fit import fit_axes, fitted_system
@@ -14,9 +15,7 @@ NOISE = 1e-3
 
 
 def _tube() -> Skeleton:
-    z = np.linspace(0, 0.4, 51)
-    return Skeleton.from_edges(np.column_stack([0 * z, 0 * z, z]), np.arange(-1, 50),
-                               np.full(51, 0.008))
+    return grown((-1, (0, 0, 0), (0, 0, 0.4), 51, 0.008))
 
 
 def _scan(rng: np.random.Generator, arc: float = 2 * np.pi) -> np.ndarray:

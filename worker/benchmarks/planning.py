@@ -36,7 +36,6 @@ from benchmarks.planning_trials import (
     forked,
     goal_rows,
     near_rows,
-    no_path_seconds,
     run_detour,
     run_near_limit,
     run_region_goal,
@@ -53,7 +52,6 @@ from limber.core.progress import Progress
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.grasp_model import GraspModel, LearntGraspModel, refusal
 from limber.planning.field.sampling import Sampled, sample_field, sample_positions
-from limber.planning.goals.goal_kinds import default_goal
 from limber.planning.settings import EnergySettings
 from limber.reduced.model_cache import ReducedCache
 
@@ -61,7 +59,6 @@ _ERRORS = (("energy", "energy", 100, (1, 5), "%"), ("force", "force", 100, (2, 8
            ("tip", "target position", 1e3, (1, 4), "mm"))
 """Errors of a field at fresh poses: name, description, scale, required median and 95 %, unit."""
 _SEEDS_APART = 101  # of a branch's starts
-_TIMED_STARTS = 3  # of each branch, where only times are asked
 _PACKAGES = ("planning", "mechanics")
 
 
@@ -246,12 +243,6 @@ def _trial_rows(setting: Setting) -> list[Row]:
             *_saved_rows(sound(trials))]
 
 
-def _plan_time(setting: Setting) -> list[Row]:
-    """The times of plans alone, of three starts per branch."""
-    return _time_rows(_Run(setting).trials("timed plans", partial(run_trial, limited=False),
-                                           _TIMED_STARTS))
-
-
 def _saved_rows(good: list[Trial]) -> list[Row]:
     table = []
     for asked, name in zip(_SAVED, AGAINST, strict=True):
@@ -359,17 +350,6 @@ def _full_rows(trials: list[Trial]) -> list[Row]:
             + (f"; {refused[0]}" if refused else ""), bool(accepted) and not broken, len(trials))]
 
 
-def _no_path_rows(setting: Setting) -> list[Row]:
-    found = {one.subject.name: no_path_seconds(one.known, default_goal(one.known, 0.01))
-             for one in _Run(setting).fielded}
-    slowest = max(seconds for cases in found.values() for seconds, _ in cases.values())
-    wrong = [f"{name}, {word}: {said}" for name, cases in found.items()
-             for word, (_, said) in cases.items() if said]
-    count = sum(len(cases) for cases in found.values())
-    return [Row(*_NO_PATH, f"{count - len(wrong)} of {count}, slowest {slowest:.1f} s" + "".join(
-        f"; {one}" for one in wrong), not wrong and slowest <= 10.0, count)]
-
-
 def _stated_errors(setting: Setting) -> list[Row]:
     return [covered_row([coverage(one.subject.model, one.known, setting.at_most(60, 20),
                                   setting.seed + 7) for one in _Run(setting).fielded])]
@@ -379,14 +359,6 @@ def _sure(setting: Setting) -> list[Row]:
     """Plan with confidence on each branch from rest, and test the plan on draws of the moduli."""
     draws = setting.at_most(100, 30)
     return sure_rows(_Run(setting).trials("sure", partial(run_sure, draws=draws), 1), draws)
-
-
-def _field_time(setting: Setting) -> list[Row]:
-    """The cost of a field alone: of the largest forked branch, on an idle machine."""
-    largest = _Run(setting).largest
-    _, known, seconds = _timed_field(largest.model, EnergySettings(seed=setting.seed, samples=300),
-                                     setting.progress)
-    return [_cost_row(_FIELD_ALONE, largest, known, seconds, 25.0)]
 
 
 def _reduced_time(setting: Setting) -> list[Row]:
@@ -432,17 +404,12 @@ _FULL_ROWS = (
     Asked("limits broken on the full model by an accepted plan with a force that binds", "none"),
     Asked("field's energy along planned paths (rms), median / worst", "-"))
 _FIELD_COST = Asked("field, slowest branch, fit included", "300 grasps, 2,500 tets: 25 s")
-_FIELD_ALONE = Asked("field of the largest forked branch alone, fit included",
-                     "300 grasps, 2,500 tets: 25 s")
 _REDUCED_COST = Asked("field of the largest forked branch on the reduced model, fit included",
                       "300 grasps, 2,500 tets: 5 s")
 _REST_INSIDE = Asked("rest pose inside the sampled region: least depth", "inside")
 _WITHOUT_FIELD = Asked("branches without a field", "none")
 _NOT_TRUSTED = Asked("of the samples' hull not trusted, mean / most; fresh trusted poses where the "
                      "motion does not come", "-")
-_NO_PATH = Asked("no path: force too low for the goal, goal outside the workspace",
-                 "said with its reason, in 10 s")
-
 _FIELD_ERRORS = tuple(_error_asked(what, asked, unit) for _, what, _, asked, unit in _ERRORS)
 _REDUCED_ERRORS = tuple(_error_asked(f"{what}, field on the reduced model", asked, unit)
                         for _, what, _, asked, unit in _ERRORS)
@@ -459,11 +426,6 @@ PARTS = {
     "goals": Part(lambda setting: goal_rows(_Run(setting).trials(
         "goals", run_region_goal, setting.at_most(12, 2))), 150, GOAL_ROWS, grows=True),
     "stated-errors": Part(_stated_errors, 60, (COVERED_ROW,), grows=True),
-    "no-path": Part(_no_path_rows, 80, (_NO_PATH,), grows=True),
     "sure": Part(_sure, 120, (SURE_ROW,), grows=True),
-    "reduced": Part(_reduced_time, 200, (_REDUCED_COST, *_REDUCED_ERRORS)),
-    "field-time": Part(_field_time, 60, (_FIELD_ALONE,), alone=True),
-    "plan-time": Part(_plan_time, 60, _TIME_ROWS, grows=True, alone=True)}
-"""The table, in order of importance; the last two only repeat timings of others, for an otherwise
-idle machine.
-"""
+    "reduced": Part(_reduced_time, 200, (_REDUCED_COST, *_REDUCED_ERRORS))}
+"""The table, in order of importance."""

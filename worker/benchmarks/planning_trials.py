@@ -25,7 +25,7 @@ from limber.geometry.tets.tet_mesh import TetMesh, mark
 from limber.geometry.tets.tetrahedra import mesh_branch
 from limber.mechanics import BranchModel, young_weights
 from limber.mechanics.loads.loaded_branch import hang
-from limber.planning.baseline_and_plan import plan_pair, plan_within
+from limber.planning.baseline_and_plan import plan_pair
 from limber.planning.constraints.chance import YoungUncertainty
 from limber.planning.constraints.limits import Limits, sampled_sizes
 from limber.planning.cost import CostWeights, arc_lengths, resample
@@ -34,7 +34,7 @@ from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.planning.field.radial import LocalError
 from limber.planning.field.sampling import SolverPool, solve_branch
 from limber.planning.field.stored_states import samples_of
-from limber.planning.goals.goal import CellPlace, GoalRequest, goal_points
+from limber.planning.goals.goal import CellPlace, GoalRequest
 from limber.planning.goals.goal_kinds import GraspGoal, default_goal, goal_of, near
 from limber.planning.make_plan import PlannedMotion, plan_motion
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses, resolve_path
@@ -141,14 +141,12 @@ _POINTS = 121  # of the quadrature; Simpson's rule
 _PENALTY = 3e3  # on squared height above the sampled region, relative to the path's length
 
 
-def run_trial(start: Start, limited: bool = True) -> dict[str, Any]:
-    """Plan without limits and, if ``limited``, with one that binds."""
+def run_trial(start: Start) -> dict[str, Any]:
+    """Plan without limits, and with one that binds."""
     settings = PlanSettings(seed=start.seed)
     place = start.place(settings)
     values, learnt, path = _measure(start, place, settings)
-    if limited:
-        values |= _with_binding_force(start.model, learnt, place, path, settings)
-    return values
+    return values | _with_binding_force(start.model, learnt, place, path, settings)
 
 
 def _measure(start: Start, place: np.ndarray, settings: PlanSettings,
@@ -267,30 +265,6 @@ def _cost(unknown: np.ndarray, problem: GentleProblem, centre: np.ndarray,
     to_bulge = shape.T @ to_point + slope.T @ to_velocity
     to_place = s @ to_point + to_velocity.sum(axis=0)
     return value, np.concatenate([to_bulge.ravel(), squash @ to_place])
-
-
-def no_path_seconds(known: EnergyField, goal: GraspGoal) -> dict[str, tuple[float, str]]:
-    """Return the time to report that no path exists under a force too low for any pose of the goal,
-    and behind a workspace that ends before it; and what was reported instead, if anything.
-    """
-    settings = PlanSettings(iterations=500)
-    reached = goal_points(goal, known, known.limited())
-    force = 0.5 * float(np.linalg.norm(known.force(reached), axis=1).min())
-    middle = 0.5 * (known.rest + goal.centre(known))
-    axis = int(np.argmax(np.abs(goal.centre(known) - known.rest)))
-    corners = np.array([np.full(3, -20.0), np.full(3, 20.0)])
-    corners[int((goal.centre(known) - known.rest)[axis] > 0.0), axis] = middle[axis]
-    found = {}
-    for word, limit in (("force", {"max_force": force}),
-                        ("workspace", {"workspace": tuple(map(float, corners.ravel()))})):
-        began, asked = time.perf_counter(), settings.model_copy(update=limit)
-        try:
-            plan_within(known, known.rest.copy(), goal, asked, Limits.of(asked))
-            said = "a path"
-        except NoPathError as error:
-            said = "" if word in str(error) else str(error)
-        found[word] = time.perf_counter() - began, said
-    return found
 
 
 # --- the paper's table: savings of a path at most 8.1 % longer than that of RRT* ---------------

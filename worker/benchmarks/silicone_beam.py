@@ -15,14 +15,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.table import Asked, Row, Setting
-from benchmarks.trials import column, sound
-from limber.core.errors import LimberError
+from benchmarks.trials import column
 from limber.estimation.settings import FitSpec, PredictSettings, SwingSettings
-from limber.geometry.bodies import Sections, mesh_sections, read_sections
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh, mark
-from limber.mechanics.added_masses import PointMass
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
@@ -58,8 +55,6 @@ _MESHES = (_SWING_MESH, (9, 3, 3), (12, 4, 4))
 """Bricks along and across the beam, each cut into six quadratic tetrahedra."""
 _OTHERS_PA = (264e3, 295e3, 283e3)
 """Moduli of the real beam by other programs."""
-_LEAST_SAG = 0.01
-"""Least sag over the length: a smaller one gives no modulus to 5 % with markers of 0.2 mm."""
 
 RECORDING_ROWS = (Asked("silicone_beam: E from the recording (CSV; C3D in brackets)",
                         "simulated static tip drop within 2 % of the measured"),
@@ -69,8 +64,6 @@ OTHER_LOADS = Asked("the same with simulated recordings, fitted at 0.51 N: worst
 BEAM_ROWS = (
     Asked("mesh refinement of clamp and grasp: E of one recording over three meshes", "0.7 %"),
     Asked("drops under other loads, simulated recordings", "3 % and inside their interval"))
-SAG_ROW = Asked("tapered beam with elliptic sections under its own weight (by 1 % of its length "
-                "and more)", "5 %, covered")
 REAL_ROW = Asked(
     "silicone beam: static and dynamic E of the given recording",
     "intervals overlap and hold what other programs found: 264, 264 to 295, 283 kPa, or it is "
@@ -322,79 +315,6 @@ def _imported(branch: Branch, recording: Path, name: str,
     import_pull(branch.folder, recording, name, ImportSettings(
         nominal=str(places), weight=LOAD_N, own_weight=True, motion=motion,
         grasp_point=tuple(LOAD_POINT_M.tolist()), grasp_radius=0.012))
-
-
-def sag_row(setting: Setting) -> list[Row]:
-    """Drawn beams of elliptic sections, thinner outwards, that sag under their own weight."""
-    trials = setting.trials("sag", setting.seeds(40, 4), _sag, "estimation", "mechanics",
-                            "geometry", workers=None, catch=LimberError)
-    count, fitted = len(trials), sound(trials)
-    refused = [trial.failure[:80] for trial in trials if trial.failure]
-    errors = column(fitted, "error") if fitted else np.array([np.inf])
-    held, worst = sum(trial["held"] for trial in fitted), 100 * errors.max()
-    return [Row(*SAG_ROW, f"worst {worst:.1f} %, median {100 * np.median(errors):.1f} %, "
-                f"{held} of {count} covered{'; '.join(['', *refused[:2]])}",
-                bool(worst <= 5 and held >= np.ceil(0.88 * count) and not refused), count)]
-
-
-def _sag(seed: int) -> dict[str, Any]:
-    """Relative error of E, and whether its interval contains the truth, of one drawn beam.
-
-    Density and hung masses are weighed to 1 %; Poisson's ratio is a textbook value.
-    """
-    rng = np.random.default_rng([seed, 42])
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        while (sag := _drawn_sag(folder, rng)) is None:
-            pass
-        young, told, places, moved = sag
-        mesh_surface(folder / "beam.csv", folder / "beam.branch", told)
-        times = np.arange(300) / 100
-        part = np.where(times > 0.5, 1 - np.exp(-12 * np.maximum(times - 0.5, 0)), 0.0)
-        seen = places + part[:, None, None] * moved
-        seen = seen + 2e-4 * rng.standard_normal(seen.shape)
-        write_stream(folder / "sag.csv", Stream(times, seen.reshape(len(times), -1), tuple(
-            f"m{k}_{axis}_m" for k in range(len(places)) for axis in "xyz")))
-        import_pull(folder / "beam.branch", folder / "sag.csv", "sag",
-                    ImportSettings(weight=0, own_weight=True))
-        found = estimate(folder / "beam.branch", FitSpec(fractions=(0.5,),
-                                                                  density_sigma=0.01))
-    low, high = found["young_interval_pa"][0]
-    return {"error": abs(found["young_pa"][0] / young - 1), "held": low <= young <= high}
-
-
-def _drawn_sag(folder: Path, rng: np.random.Generator,
-               ) -> tuple[float, MeshSurfaceSettings, np.ndarray, np.ndarray] | None:
-    """Modulus, known properties of the beam, markers, and their sag [m]; None: it hardly sags."""
-    young = float(np.exp(rng.uniform(*np.log([3e8, 4e9]))))
-    density, poisson = rng.uniform(500, 1100), float(np.clip(rng.normal(0.35, 0.05), 0.2, 0.47))
-    table = _drawn_table(folder / "beam.csv", rng)
-    told = MeshSurfaceSettings(unit="mm", density=density * rng.normal(1, 0.01), young=1e9)
-    fine, masses = mesh_sections(table, told, elements_across=4.0)
-    model = BranchModel(
-        fine.mesh, young=young, poisson=poisson, density=density,
-        gravity=fine.numbers["gravity_m_s2"], point_masses=[
-            PointMass(tuple(m["attached_m"]), m["mass_kg"] * rng.normal(1, 0.01)) for m in masses])
-    places = fine.skeleton.nodes[1:]
-    moved = (point_operator(fine.mesh, places) @ solve_static(
-        model).require().displacement.ravel()).reshape(-1, 3)
-    enough = np.linalg.norm(moved, axis=1).max() > _LEAST_SAG * fine.skeleton.length
-    return (young, told, places, moved) if enough else None
-
-
-def _drawn_table(path: Path, rng: np.random.Generator) -> Sections:
-    """A level axis that bends sideways a little, six sections, masses at two of them."""
-    share = np.linspace(0, 1, 6)
-    length, width = rng.uniform(400, 800), rng.uniform(12, 30)
-    height = width * rng.uniform(0.5, 1.6)
-    thinner = 1 - share * rng.uniform(0.2, 0.6)
-    aside = rng.uniform(-0.1, 0.1) * length * share**2
-    mass = np.zeros(6)
-    mass[rng.choice(np.arange(2, 6), 2, replace=False)] = rng.uniform(0.0, 0.05, 2)
-    rows = np.column_stack([length * share, aside, 0 * share, width * thinner, height * thinner,
-                            mass])
-    np.savetxt(path, rows, "%.9g", ",", header="x,y,z,width,height,mass_kg", comments="")
-    return read_sections(path, "mm")
 
 
 def real_row(_setting: Setting) -> list[Row]:

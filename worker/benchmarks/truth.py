@@ -268,7 +268,6 @@ PARTS = {
     "paper": Part(_paper_row, 60, (_PAPER,)),
     "beam": Part(silicone_beam.beam_rows, 60, silicone_beam.BEAM_ROWS),
     "real-beam": Part(silicone_beam.real_row, 60, (silicone_beam.REAL_ROW,)),
-    "sag": Part(silicone_beam.sag_row, 20, (silicone_beam.SAG_ROW,), grows=True),
     "second-pull": Part(lambda setting: estimation.speed_rows(setting)[3:], 120,
                         estimation.SECOND_PULL),
     "reduced": Part(reduced.flagged_rows, 60, reduced.FLAGGED_ROWS, grows=True)}

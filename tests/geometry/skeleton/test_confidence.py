@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.subjects.grown import grown
 
 from limber.geometry.io.skeletons import read_cylinders, write_cylinders
 from limber.geometry.skeleton.confidence import assessed, doubted, likely, shares
@@ -25,12 +26,8 @@ def _tube(low, high, radius, count, seed=0):
 
 def _stem(radius: float, twig: float) -> Skeleton:
     """A stem of 0.4 m along z, and a twig along x from its middle."""
-    z = np.linspace(0, 0.4, 41)
-    x = np.linspace(0, 0.1, 21)[1:]
-    nodes = np.vstack([np.stack([0 * z, 0 * z, z], axis=1),
-                       np.stack([x, 0 * x, 0 * x + 0.2], axis=1)])
-    parent = np.concatenate([np.arange(41) - 1, [20], 41 + np.arange(19)])
-    return Skeleton.from_edges(nodes, parent, np.repeat([radius, twig], [41, 20]))
+    return grown((-1, (0, 0, 0), (0, 0, 0.4), 41, radius),
+                 (20, (0, 0, 0.2), (0.1, 0, 0.2), 21, twig))
 
 
 def _twig_points(radius: float, count: int) -> np.ndarray:

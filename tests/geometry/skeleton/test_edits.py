@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.grown import grown
 
 from limber.core.alignment import Alignment
 from limber.core.errors import InputError
@@ -15,11 +16,8 @@ from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
 
 def _tree(count: int = 41) -> Skeleton:
     """A stem of 0.4 m along z with a twig along x at 0.2 m; as finely divided as asked."""
-    z, x = np.linspace(0, 0.4, count), np.linspace(0, 0.15, 16)[1:]
-    nodes = np.vstack([np.stack([0 * z, 0 * z, z], axis=1),
-                       np.stack([x, 0 * x, 0 * x + 0.2], axis=1)])
-    parent = np.concatenate([np.arange(count) - 1, [count // 2], count + np.arange(14)])
-    return Skeleton.from_edges(nodes, parent, np.repeat([0.008, 0.004], [count, 15]))
+    return grown((-1, (0, 0, 0), (0, 0, 0.4), count, 0.008),
+                 (count // 2, (0, 0, 0.2), (0.15, 0, 0.2), 16, 0.004))
 
 
 def _edits(*edits: dict):

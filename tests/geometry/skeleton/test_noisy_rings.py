@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.subjects.grown import grown
 
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
@@ -25,8 +26,7 @@ def _points(radius: float, noise: float, half: bool, count: int = 3000, seed: in
 
 
 def _axis(radius: float) -> Skeleton:
-    nodes = np.stack([np.zeros(40), np.zeros(40), np.linspace(0, 0.5, 40)], axis=1)
-    return Skeleton.from_edges(nodes, np.arange(40) - 1, np.full(40, radius))
+    return grown((-1, (0, 0, 0), (0, 0, 0.5), 40, radius))
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from tests.subjects.grown import tube
 
 from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
@@ -19,14 +20,7 @@ Z = np.array([0.0, 0.0, 1.0])
 
 
 def _tube(start, end, radius, count, seed=0):
-    rng = np.random.default_rng(seed)
-    start, end = np.array(start, float), np.array(end, float)
-    axis = (end - start) / np.linalg.norm(end - start)
-    side = np.cross(axis, [0.3, 0.5, 0.8])
-    side /= np.linalg.norm(side)
-    angle = rng.uniform(0, 2 * np.pi, count)[:, None]
-    return (start + rng.uniform(0, 1, count)[:, None] * (end - start) + radius * (
-        np.cos(angle) * side + np.sin(angle) * np.cross(axis, side)))
+    return tube(start, end, radius, count, np.random.default_rng(seed))
 
 
 def _plant(x, height=0.6, seed=0):

@@ -1,7 +1,10 @@
 """Tables of a cylinder model, against what a cone and a stem with a twig have."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from tests.subjects.grown import grown
 
 from limber.core.errors import InputError
 from limber.geometry.skeleton.qsm_tables import (
@@ -16,12 +19,9 @@ from limber.geometry.skeleton.skeleton import Skeleton
 
 def _tree() -> Skeleton:
     """A cone of 1 m from 20 to 10 mm radius, with a twig of 0.2 m and 5 mm at its middle."""
-    z, x = np.linspace(0, 1, 51), np.linspace(0, 0.2, 11)[1:]
-    nodes = np.vstack([np.stack([0 * z, 0 * z, z], axis=1),
-                       np.stack([x, 0 * x, 0 * x + 0.5], axis=1)])
-    parent = np.concatenate([np.arange(51) - 1, [25], 51 + np.arange(9)])
-    radius = np.concatenate([np.linspace(0.02, 0.01, 51), np.full(10, 0.005)])
-    return Skeleton.from_edges(nodes, parent, radius, radius_sigma=0.02 * radius)
+    tree = grown((-1, (0, 0, 0), (0, 0, 1), 51, (0.02, 0.01)),
+                 (25, (0, 0, 0.5), (0.2, 0, 0.5), 11, 0.005))
+    return replace(tree, radius_sigma=0.02 * tree.radius)
 
 
 def test_orders_and_heights() -> None:

@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+from tests.subjects.grown import tube
 
 from benchmarks.scan_cases import round_case
 from benchmarks.scan_scores import score
@@ -28,13 +29,7 @@ def _fresh_draws(monkeypatch):
 
 
 def _tube(start, end, radius, count):
-    start, end = np.array(start, float), np.array(end, float)
-    axis = (end - start) / np.linalg.norm(end - start)
-    side = np.cross(axis, [0.3, 0.5, 0.8])
-    side /= np.linalg.norm(side)
-    angle = RNG.uniform(0, 2 * np.pi, count)[:, None]
-    return (start + RNG.uniform(0, 1, count)[:, None] * (end - start) + radius * (
-        np.cos(angle) * side + np.sin(angle) * np.cross(axis, side)))
+    return tube(start, end, radius, count, RNG)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.grown import grown
 
 from limber.geometry.skeleton.alternatives import SearchDoubts
 from limber.geometry.skeleton.confidence import PLACED, likely
@@ -14,15 +15,9 @@ from limber.geometry.surface.tubes import branch_surface
 
 def _tree() -> Skeleton:
     """A stem of 1 m, a twig of 0.3 m with one of 0.15 m on it, in steps of a centimetre."""
-    z = np.linspace(0, 1, 101)
-    one, two = 0.01 * np.arange(1, 31), 0.01 * np.arange(1, 16)
-    stem = np.column_stack([0 * z, 0 * z, z])
-    side = np.column_stack([one, 0 * one, 0 * one + 0.5])
-    last = np.column_stack([0 * two + 0.1, two, 0 * two + 0.5])
-    parent = np.concatenate([np.arange(101) - 1, [50], 101 + np.arange(29), [110],
-                             131 + np.arange(14)])
-    radius = np.repeat([0.008, 0.004, 0.003], [101, 30, 15])
-    return Skeleton.from_edges(np.vstack([stem, side, last]), parent, radius)
+    return grown((-1, (0, 0, 0), (0, 0, 1), 101, 0.008),
+                 (50, (0, 0, 0.5), (0.3, 0, 0.5), 31, 0.004),
+                 (110, (0.1, 0, 0.5), (0.1, 0.15, 0.5), 16, 0.003))
 
 
 def _with_chances(tree: Skeleton, side: float, last: float) -> Skeleton:
