@@ -40,17 +40,17 @@ STAGES = {
     "virtual-pull": "virtual-pull a.branch --name other --seed 1 --cell-errors realistic "
                     "--frames 8",
     "export-pull": "export-pull a.branch --name pull-1 --mcap pull.mcap",
-    "estimate": "estimate a.branch --force --key-frames 6",
+    "estimate": "estimate a.branch --force",
     "swing": "import-pull a.branch swing.csv --name swing --swing --weight 0.02 "
              "--grasp-distance 0.3 && swing a.branch",
     "vibration": "vibration a.branch ring.csv",
     "predict": "predict a.branch --weight 0.5",
-    "suggest-pull": "suggest-pull a.branch --plan to-goal --fractions 0.6",
+    "suggest-pull": "suggest-pull a.branch --plan to-goal",
     "energy": "energy a.branch --force --samples 30 --workers 1",
     "plan": "plan a.branch --name new --iterations 200 --workers 1",
     "plan-limits": "plan a.branch --name new --iterations 200 --workers 1 --max-force 1.9 "
                    "--goal -0.056 0.046 0.266 --max-strain 0.02",
-    "compare": "compare a.branch --trials 1 --iterations 100 --workers 1 "
+    "compare": "compare a.branch --trials 1 --workers 1 "
                "--goal -0.056 0.046 0.266",
     "execute": "execute a.branch --name to-goal --cell cell.toml --unwatched "
                "--gripper-rotation 1.4096 -1.2795 -0.8176",
