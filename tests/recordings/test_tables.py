@@ -28,7 +28,8 @@ def written(tmp_path, text, name="table.csv", encoding="utf-8"):
     ("Time (s),Tip X (mm),Tip Y (mm),Tip Z (mm)", ",", ".", 1e-3),
     ("timestamp;tip.X;tip.Y;tip.Z", ";", ",", 1.0),
     ("Time\ttip_x_cm\ttip_y_cm\ttip_z_cm", "\t", ".", 1e-2),
-    ("time tip:x_mm tip:y_mm tip:z_mm", " ", ".", 1e-3),
+    ("time tip:x_mm tip:y_mm tip:z_mm", " ", ".", 1e-3), ("t|tip x|tip y|tip z", "|", ".", 1),
+    ("time tip:x_mm tip:y_mm tip:z_mm", " ", ",", 1e-3),
 ])
 def test_one_motion_in_many_dresses(tmp_path, header, separator, decimal, scale):
     """Separators, decimal commas, brackets and units make the same markers."""

@@ -16,7 +16,16 @@ import numpy as np
 from limber.core.constants import FORCE_UNITS_N, UNIT_METRES
 from limber.core.errors import InputError
 from limber.core.files import text_columns
-from limber.core.files.text_columns import LENGTHS, plain
+from limber.core.files.text_columns import (
+    DECIMAL_COMMA,
+    LENGTHS,
+    MISSING,
+    coding_of,
+    fields_of,
+    plain,
+    separator_of,
+    with_units,
+)
 from limber.recordings.time_series import (
     TIME_UNITS_S,
     Stream,
@@ -29,9 +38,8 @@ from limber.recordings.time_series import (
 
 # The lines of a table as text, split into fields, and the start of its numbers.
 
-_COLUMN = 20
-"""Rows that make single numbers a column."""
-_EMPTY = ("", "nan", "na", "n/a", "null", "none", "-")
+_COLUMN = _SAMPLE = 20
+"""Rows that make single numbers a column; last lines from which the separator is taken."""
 
 
 def section_of(lines: list[str]) -> list[str]:
@@ -51,11 +59,7 @@ def section_of(lines: list[str]) -> list[str]:
 
 def is_clock(part: str) -> bool:
     """Return whether a field is a date or a time of day."""
-    try:
-        float(part.replace(",", "."))
-    except ValueError:
-        return clock_seconds(part) is not None
-    return False
+    return text_columns.number_of(part, True) is None and clock_seconds(part) is not None
 
 
 def text_of(path: Path) -> str:
@@ -65,39 +69,14 @@ def text_of(path: Path) -> str:
         InputError: it cannot be read, or is not text.
     """
     try:
-        raw = path.read_bytes()
+        text = path.read_text(encoding=coding_of(path), errors="replace")
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
                          "Check the path and the file.") from error
-    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return raw.decode("utf-16", errors="replace")
-    try:
-        text = raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = raw.decode("latin-1")
     if "\x00" in text:
         raise InputError(f"{path} is not a text file.", "A table of numbers was expected.",
                          "Export it as CSV.")
     return text
-
-
-def separator_of(lines: list[str]) -> str | None:
-    """Return the separator of the fields; None is white space."""
-    sample = lines[-20:]
-    for sign in ("\t", ";", ","):
-        counts = [line.count(sign) for line in sample]
-        # The last line may be truncated.
-        if counts and np.median(counts) >= 1 and (
-                np.mean(np.array(counts[:-1] or counts) == np.median(counts)) > 0.6):
-            return sign
-    return None
-
-
-def fields_of(line: str, separator: str | None) -> list[str]:
-    """Return the fields of a line without quotes."""
-    # A unit in brackets belongs to the title before it.
-    parts = line.split(separator) if separator else re.sub(r"\s+(?=[\[(])", "", line).split()
-    return [part.strip().strip('"').strip() for part in parts]
 
 
 def number_of(text: str, comma: bool) -> float | None:
@@ -107,11 +86,8 @@ def number_of(text: str, comma: bool) -> float | None:
         text: The field.
         comma: Whether decimals may be commas.
     """
-    if text.lower() in _EMPTY:
-        return np.nan
-    try:
-        number = float(text.replace(",", ".") if comma else text)
-    except ValueError:
+    number = text_columns.number_of(text, comma)
+    if number is None:
         return clock_seconds(text)
     return None if np.isinf(number) else number
 
@@ -124,7 +100,7 @@ def first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:
     """
     for index, row in enumerate(rows):
         words = words_in(row)
-        known = [part for part in row if part.lower() not in _EMPTY]
+        known = [part for part in row if part.lower() not in MISSING]
         follows = rows[index + 1] if index + 1 < len(rows) else row
         # A preamble (NO_OF_FRAMES 600) also has numbers, but never two consecutive rows of several
         # numbers, nor words at the same positions twice.
@@ -310,7 +286,7 @@ def without_arrows(lines: list[str]) -> list[str]:
     if 2 * sum(one is not None for one in found) <= len(lines):
         return lines
     stamped = [(one[1], re.sub(r"\s*([:=])\s*", r"\1", one[2])) for one in found if one is not None]
-    separator = separator_of([rest for _, rest in stamped])
+    separator = separator_of([rest for _, rest in stamped[-_SAMPLE:]])
     rows = [(stamp, fields_of(rest, separator)) for stamp, rest in stamped]
     pairs = [[_PAIR.fullmatch(part) for part in row] for _, row in rows]
     titles = next(([pair[1] for pair in row if pair] for row in pairs if row and all(row)), [])
@@ -348,7 +324,6 @@ TORQUE_UNITS_NM = {"Nm": 1.0, "Nmm": 1e-3, "mNm": 1e-3}
 
 _UNITS = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_NAMES_N, *TIME_UNITS_S,
                                     *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _RATE_OFF = 0.02
 """Relative difference of a stated rate from that of the stamps that is reported."""
 _COUNTERS = r"frames?|samples?|index|framenumber"
@@ -403,7 +378,7 @@ def read_table(path: str | Path) -> Table:
     lines = without_arrows(section_of(text.splitlines()))
     bare = [line for line in lines if not line.lstrip().startswith(("#", "%"))]
     comments = [line.lstrip()[1:].strip() for line in lines if line not in bare]
-    separator = separator_of(bare)
+    separator = separator_of(bare[-_SAMPLE:])
     rows = [fields_of(line, separator) for line in bare]
     first, width = first_numbers(path, rows)
     capture = capture_preamble(rows[:first], width, comments)
@@ -647,8 +622,7 @@ def _titles(above: list[list[str]], comments: list[str], width: int, separator: 
     units = _units(fitting[-1]) if len(fitting) > 1 else None
     if units is None:
         return fitting[-1]
-    return [f"{name} ({unit})" if unit else name
-            for name, unit in zip(fitting[-2], units, strict=True)]
+    return with_units(fitting[-2], units)
 
 
 def _is_named(row: list[str]) -> bool:
@@ -664,7 +638,7 @@ def _units(row: list[str]) -> list[str] | None:
 def _numbers(table: Table, lines: list[str], rows: list[list[str]], complete: bool,
              words: list[int]) -> np.ndarray:
     name, width = table.path.name, len(table.titles)
-    comma = any(_DECIMAL_COMMA.fullmatch(part) for row in rows[:50] for part in row)
+    comma = any(DECIMAL_COMMA.fullmatch(part) for row in rows[:50] for part in row)
     kept, bad = [], []
     for index, row in enumerate(rows):
         numbers = [np.nan if k in words else number_of(part, comma) for k, part in enumerate(row)]

@@ -51,10 +51,10 @@ _COUNTED = 5
 _STATED = re.compile(r"\b(?:units?|einheit(?:en)?)\b\W{0,3}(?:(?:are|is|in|sind|ist)\b\W{1,2})?"
                      r"([^\W\d_]+)", re.IGNORECASE)
 _COUNTERS = ("id", "index", "idx", "nr", "no", "number", "row", "point", "pointid", "pointnumber")
-_MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
+MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
 _COLMAP, _HEAD = "POINT3D_ID", 1000  # characters in which COLMAP's column name is searched
 _COLMAP_TITLES = ["point3d_id", "x", "y", "z", "red", "green", "blue", "error"]
-_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 LINES_AT_ONCE = 20_000
 """Lines read at a time: numpy holds the interpreter lock meanwhile."""
 _BLOCK = 1 << 20
@@ -239,7 +239,7 @@ class Table:
             raise ColumnsError(f"{path} has no lines with numbers.", "A point cloud was expected.",
                                "Export it again.")
         # The lines above do not show how numbers are written.
-        self._separator = None if self._is_colmap else _separator(sample[len(sample) // 2])
+        self._separator = None if self._is_colmap else separator_of(sample[len(sample) // 2:][:1])
         self._first = _first_row(sample, self._separator)
         self._head, rows = sample[:self._first], sample[self._first:]
         if not rows:
@@ -325,7 +325,7 @@ class Table:
 
     def _with_words(self, lines: list[str]) -> np.ndarray:
         """The numbers of lines with missing values, or with columns of words beside named ones."""
-        rows = [[_number(part, self._separator != ",") for part in _parts(line, self._separator)]
+        rows = [[number_of(part, self._separator != ",") for part in _parts(line, self._separator)]
                 for line in lines]
         if not self._width:
             self._width = len(rows[0])
@@ -391,28 +391,34 @@ def _is_comment(line: str) -> bool:
     return start.startswith(("#", "%")) or (start.startswith("//") and not start[2:3].isalpha())
 
 
-def _separator(line: str) -> str | None:
-    for mark in (";", "\t", "|"):
-        if mark in line:
-            return mark
-    blanks = line.split()
-    if len(blanks) > 2 and all(_DECIMAL_COMMA.fullmatch(part) for part in blanks):
+def separator_of(lines: Sequence[str]) -> str | None:
+    """Return the separator of the fields of consecutive lines; None is white space."""
+    counts = {mark: np.array([line.count(mark) for line in lines]) for mark in ";\t|,"}
+    # The last line may be truncated.
+    typical = {mark: float(np.median(count)) for mark, count in counts.items() if len(lines)
+               and np.mean((count[:-1] if len(lines) > 1 else count) == np.median(count)) > 0.6}
+    best = max(";\t|", key=lambda mark: typical.get(mark, 0.0))
+    if typical.get(best, 0.0) >= 1:
+        return best
+    blanks = lines[len(lines) // 2].split() if lines else []
+    if len(blanks) > 2 and all(DECIMAL_COMMA.fullmatch(part) for part in blanks):
         return None
-    return "," if "," in line else None
+    return "," if typical.get(",", 0.0) >= 1 else None
 
 
-def _parts(line: str, separator: str | None) -> list[str]:
+def fields_of(line: str, separator: str | None) -> list[str]:
+    """Return the fields of a line, without quotes."""
     if separator is None:
         # A unit in brackets belongs to the title before it.
         line = re.sub(r"\s+(?=[\[(])", "", line)
-    parts = [part.strip() for part in line.split(separator)]
-    # Some programs end each line with a separator.
-    return parts[:-1] if len(parts) > 3 and parts[-1] == "" else parts
+    return [part.strip().strip('"').strip() for part in line.split(separator)]
 
 
-def _number(part: str, commas: bool) -> float | None:
-    """A number of a table; NaN for a missing-value word, None for any other word."""
-    if part.lower() in _MISSING:
+def number_of(part: str, commas: bool) -> float | None:
+    """Return the number of a field, whose decimals may be commas; NaN for a word that means that
+    it is missing, None for any other word.
+    """
+    if part.lower() in MISSING:
         return float("nan")
     try:
         return float(part.replace(",", ".") if commas else part)
@@ -420,11 +426,23 @@ def _number(part: str, commas: bool) -> float | None:
         return None
 
 
+def with_units(titles: Sequence[str], units: Sequence[str]) -> list[str]:
+    """Return titles with the units of the line below them."""
+    return [f"{title} ({unit})" if unit else title
+            for title, unit in zip(titles, units, strict=True)]
+
+
+def _parts(line: str, separator: str | None) -> list[str]:
+    parts = fields_of(line, separator)
+    # Some programs end each line with a separator.
+    return parts[:-1] if len(parts) > 3 and parts[-1] == "" else parts
+
+
 def _first_row(lines: list[str], separator: str | None) -> int:
     """Index of the first line of numbers."""
     for index, line in enumerate(lines[:_MOST_HEAD]):
         parts = _parts(line, separator)
-        numbers = [_number(part, separator != ",") for part in parts]
+        numbers = [number_of(part, separator != ",") for part in parts]
         known = [number for number in numbers if number is not None]
         # A row of a table may contain words besides numbers, but they are never the majority.
         # A line of separators alone belongs to what stands above the titles.
@@ -438,15 +456,14 @@ def _titles(path: Path, head: list[str], lines: list[str], separator: str | None
     """Titles of the columns; none if no line above the numbers names coordinates."""
     for index in reversed(range(len(head))):
         line = head[index]
-        other = separator if separator is None or separator in line else _separator(line)
+        other = separator if separator is None or separator in line else separator_of([line])
         titles = _parts(line, other)
         if three_of("position", _bare(titles)) is None:
             continue
         units = [part.strip("()[] ") for part in _parts(head[index + 1], other)] if (
             index + 1 < len(head)) else []
         if len(units) == len(titles) and any(unit.lower() in LENGTHS for unit in units):
-            return [f"{title} ({unit})" if unit else title
-                    for title, unit in zip(titles, units, strict=True)]
+            return with_units(titles, units)
         return titles
     last = _parts(head[-1], separator) if head else []
     if last and len(last) == len(_parts(lines[0], separator)):
@@ -458,7 +475,7 @@ def _titles(path: Path, head: list[str], lines: list[str], separator: str | None
 def _commented(comments: list[str], separator: str | None, values: np.ndarray) -> list[str]:
     """Titles in a comment that names coordinates and the right number of columns."""
     for comment in reversed(comments):
-        for mark in (separator, _separator(comment)):
+        for mark in (separator, separator_of([comment])):
             titles = _parts(comment, mark)
             counts = [k for k, title in enumerate(titles) if plain(title) in _COUNTERS]
             if len(titles) == values.shape[1] and three_of("position", _bare(titles)) and (
