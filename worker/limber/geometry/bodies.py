@@ -203,9 +203,8 @@ class Sections:
 
 
 def read_sections(path: Path, unit: str) -> Sections:
-    """Read a table with the columns x, y, z, width, height and optionally mass_kg, in ``unit`` or
-    in that of a column's name (``width_mm``). InputError if a column is missing or a value
-    invalid."""
+    """Read a table with x, y, z, width, height and optionally mass_kg, in ``unit`` or the unit of a
+    column's name (``width_mm``). InputError if a column is missing or a value is invalid."""
     rows = csv_records(path, "a table of sections", comment="#")
     titles = [title.strip() for title in rows[0] if title] if rows else []
     found = {}

@@ -23,9 +23,8 @@ _STEP = 0.004  # [m] between nodes of the true axes
 
 @dataclass(frozen=True)
 class GeneratedBranch:
-    """A branch of known truth, and its scan, in one frame (root at the origin, z up). ``young`` [K]
-    [Pa] is at ``control_points`` [K, 3] [m], at ``fractions`` of the main path. The scan has the
-    true outward normals."""
+    """A branch of known truth and its scan in one frame (root at the origin, z up): ``young`` [K]
+    [Pa] at ``control_points`` [K, 3] [m]. The scan has the true outward normals."""
 
     seed: int
     spec: BranchSpec

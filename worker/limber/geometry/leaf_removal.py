@@ -54,9 +54,8 @@ def cut_off(prepared: Prepared, leaves: list[Leaf]) -> tuple[Prepared, list[Leaf
 
 
 def _leaves_of(points: np.ndarray) -> list[Leaf]:
-    """Find the leaves on at most as many points as a fit of axes uses; others go with the nearest.
-    Neighbourhoods a few spacings wide recognise them: closer points would show the scan's noise,
-    and their pairs take too much memory."""
+    """Find leaves on as many points as a fit of axes uses; others go with the nearest. On closer
+    points neighbourhoods a few spacings wide show the scan's noise, and take too much memory."""
     some = thinned(points, FIT_POINT_LIMIT)
     leaves = find_leaves(points[some])
     if len(some) == len(points) or not leaves:

@@ -37,8 +37,8 @@ _HALVINGS = 30
 
 def sample_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
                      rng: np.random.Generator) -> list[Skeleton]:
-    """Draw skeletons from the covariance of the fit to points [m, 3] [m] and the twigs'
-    probabilities. Nodes move only across their axis; a missing twig, with all it carries, is made
+    """Draw skeletons from the fit to points [m, 3] [m], its covariance and the twigs'
+    probabilities. Nodes move only across their axis; a missing twig, and all on it, is made
     thin."""
     chosen = points[::max(1, -(-len(points) // POINT_LIMIT))]
     # Fewer points of the same noise hold the axis less firmly than those of the fit.

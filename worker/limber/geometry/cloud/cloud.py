@@ -45,9 +45,8 @@ def property_names(titles: Iterable[str], taken: Collection[str] = ()) -> list[s
 
 def valid_columns(attributes: dict[str, np.ndarray], titles: dict[str, str], count: int,
                   taken: Collection[str] = ()) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return attributes that every writer accepts, and the file's names of those renamed.
-    ``normal`` and ``color`` (0..255) have shape [n, 3]; all others are columns of numbers. What is
-    not a number for each of the ``count`` points is dropped."""
+    """Return attributes that every writer accepts, and the file's names of those renamed:
+    ``normal`` and ``color`` (0..255) [n, 3], and columns with a number for each point."""
     kept: dict[str, np.ndarray] = {}
     columns: list[tuple[str, str, np.ndarray]] = []
     for name, values in attributes.items():
@@ -210,9 +209,8 @@ _STEP = 1e-6  # fraction of the cloud's size: finer than any scanner resolves, c
 
 @dataclass(frozen=True)
 class OwnFrame:
-    """Points [n, 3] [m] in the cloud's own ``order`` [n] and ``axes`` [3, 3] (columns) from its
-    ``middle``. A moved, rotated or scaled file is rounded differently, and choices would differ. So
-    coordinates are on a grid coarse enough to hide rounding."""
+    """Points [n, 3] [m] in the cloud's own ``order`` and ``axes`` [3, 3] (columns) from ``middle``,
+    on a grid that hides rounding: a moved, rotated or scaled file is rounded differently."""
 
     coordinates: np.ndarray
     order: np.ndarray

@@ -32,8 +32,7 @@ _COARSEST_STEP = 5e-3  # fraction of the cloud's size: the thickness of its twig
 @dataclass(frozen=True)
 class Prepared:
     """A cleaned cloud [m] near the origin: ``origin`` [3] [m] in the file's axes was subtracted. It
-    has the dropped points by reason in ``counts``, and its ``view`` if there was one depth
-    camera."""
+    counts dropped points by reason, and has a ``view`` if there was one depth camera."""
 
     cloud: Cloud
     origin: np.ndarray

@@ -41,9 +41,8 @@ class _Field:
 
 
 def read_e57(path: Path) -> Cloud:
-    """Return the points of all scans [m] in their common frame, with colour and scalars, thinned by
-    :func:`gathered`. InputError if damaged, without points, or of a compression that the standard
-    leaves open."""
+    """Return the points of all scans [m] in their common frame, thinned by :func:`gathered`.
+    InputError if damaged, empty, or of a compression that the standard leaves open."""
     pages = _Pages(path)
     pages.check()
     start, length = struct.unpack("<QQ", pages.read(24, 16))

@@ -49,9 +49,8 @@ class _Vertex:
 
 
 def read_mtg(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read an MTG: vertices with positions, each attached to its parent; one without radius or
-    diameter has that of the node before it. ``scale`` is metres per unit (None: 1), which an MTG
-    does not state. InputError if it is not one tree with positions and radii."""
+    """Read an MTG; nodes without radius or diameter have that of the node before. ``scale`` is
+    metres per unit (None: 1). InputError if it is not one tree with positions and radii."""
     lines = read_text(path, _WHAT).splitlines()
     scales, body = _sections(path, lines)
     reader = _Reader(path, scales, *_header(path, body))

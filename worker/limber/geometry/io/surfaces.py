@@ -18,8 +18,7 @@ _ROUNDED = 1e-5
 
 def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
     """Return a surface [m] that encloses a solid, and warnings about changes. InputError says where
-    it has holes, edges of over two faces, faces that point in and out, several bodies, cavities or
-    crossings; also if it has no volume."""
+    it has holes, edges of over two faces, turned faces, cavities, crossings or several bodies."""
     warnings = []
     corner = surface.faces
     flat = ((corner[:, 0] == corner[:, 1]) | (corner[:, 1] == corner[:, 2])

@@ -67,9 +67,8 @@ _CORNER = np.deg2rad(30.0)
 
 def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: float = SPACING,
                    ) -> Surface:
-    """Sweep a tube along each run and join them: watertight, rounded tips, a flat base. Sections
-    are orthogonal to the tangent, as in the paper's tetrahedral plant model; a polygon has the
-    circle's area. MeshingError if the union is empty."""
+    """Sweep a tube along each run and join them: watertight, rounded tips, a flat base; sections
+    across the tangent, as in the paper's plant model. MeshingError if the union is empty."""
     tubes = {run: tubes_of_run(skeleton, run, spacing) for run in range(skeleton.branch_count)}
     count = sides_of_runs(skeleton, sides)
     in_pieces: set[int] = set()

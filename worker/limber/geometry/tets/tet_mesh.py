@@ -225,9 +225,8 @@ CLAMP_BAND = 0.2
 def mark(mesh: TetMesh, skeleton: Skeleton, *, young: float, poisson: float, density: float,
          fractions: tuple[float, ...] = FRACTIONS, grasp_fraction: float = GRASP_FRACTION,
          ) -> TetMesh:
-    """Return a quadratic mesh with material (``young`` [Pa], ``density`` [kg/m^3]), base, and
-    control points and grasp patch at fractions of the main path. MeshingError if under three nodes
-    are in one."""
+    """Return a quadratic mesh with material (Pa, kg/m^3), base, and control points and grasp patch
+    at fractions of the main path. MeshingError if base or patch has under three nodes."""
     tree = cKDTree(mesh.nodes)
     control = np.full(mesh.node_count, -1, np.int64)
     # Last first: where two are at the same node, the earlier one keeps it.

@@ -240,9 +240,8 @@ def joints(axis: RunAxis, start: np.ndarray, lean: np.ndarray, patch: Patch, cor
 
 
 def _matched(corner: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Whether a patch's corners [sides, 3] [m] must be reversed to run counter-clockwise about each
-    ``tangent`` [j, 3], shape [j], and the normals [j, 3] of the rings: ring corner k is then above
-    patch corner k with the least twist."""
+    """Whether a patch's corners [sides, 3] [m] must be reversed about each ``tangent`` [j, 3], and
+    normals [j, 3] of rings whose corner k is above patch corner k with the least twist."""
     first = any_normal(tangent)
     second = np.cross(tangent, first)
     flat = corner - corner.mean(axis=0)
@@ -256,8 +255,7 @@ def _matched(corner: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _blocks(nodes: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tetrahedra [j, t, 4] between triangles ``below`` [j, 2 or 4, 3] and each ring, and the worst
-    shape [j]. ``nodes`` [j, 2 sides + 1, 3] [m] are the patch's, the ring's centre and the
-    ring's."""
+    shape [j]. ``nodes`` [j, 2 sides + 1, 3] [m]: the patch, the ring's centre, the ring."""
     count, sides = len(nodes), (nodes.shape[1] - 1) // 2
     k = np.arange(sides)
     after, top = (k + 1) % sides, sides
@@ -384,9 +382,8 @@ _SHIFTS = (1, -1, 2, -2, 3, -3)  # shifts tried for a twig's slice, in its own l
 def unfolded(axis: RunAxis, start: float, windows: list[Window], sides: int, spacing: float,
              first_normal: np.ndarray | None, first_tangent: np.ndarray | None,
              ) -> tuple[np.ndarray, TetMesh]:
-    """Positions [m] of rings from ``start`` along an axis, and prisms that are not folded if
-    possible. In a sharp bend a ring goes, or a twig's slice in ``windows`` moves and at last goes.
-    The first ring has its corner at ``first_normal`` [3] (None: any)."""
+    """Positions [m] of rings along an axis from ``start``, and prisms that are not folded if
+    possible: in a sharp bend a ring goes, or a twig's slice in ``windows`` moves or goes."""
     moves = dict.fromkeys((window.run for window in windows), 0)
     first_low = {window.run: window.low for window in windows}
     where, ends = ring_positions(axis, start, windows, spacing), [start, axis.length]
