@@ -98,6 +98,11 @@ class Job:
             reader.start()
 
     @property
+    def outcome(self) -> dict[str, Any]:
+        """Its result with ``status`` and ``error``, also of a worker that ended without one."""
+        return {**self.result, "status": self.state.value, "error": self.error}
+
+    @property
     def pid(self) -> int:
         return self._process.pid
 

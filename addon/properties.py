@@ -341,7 +341,8 @@ def keep_outcome(scene: bpy.types.Scene, stage: Stage, folder: str, outcome: dic
 
     If the branch folder keeps no result (of loads, of an export, of a dry run), keep that too.
     """
-    common = ("status", "error", "warnings", "seconds", "arguments", "choices", "code", "place")
+    common = ("status", "error", "warnings", "seconds", "arguments", "code", "place", "remedies",
+              "parts", "warning_parts")
     kept = {name: outcome[name] for name in common if name in outcome}
     if not stage.keeps_entry(values_of(group_of(scene, stage), stage, {"name"})):
         kept["result"] = {name: value for name, value in outcome.items()

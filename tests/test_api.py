@@ -27,7 +27,7 @@ from limber.stages import result
 from limber.store import Branch as Folder
 
 EXAMPLE = Path(__file__).parents[1] / "blend_files" / "bending_branch"
-PROCESS = ("command", "status", "seconds", "error")
+PROCESS = ("command", "status", "seconds", "error", "warning_parts")
 RESULTS = [getattr(limber, name) for name in limber.__all__
            if isinstance(getattr(limber, name), type)
            and issubclass(getattr(limber, name), limber.Result)]
@@ -242,9 +242,12 @@ def test_what_is_wrong_is_said_in_a_python_users_words(example, wrong, told):
 def test_a_command_in_a_message_stays_whole(tmp_path):
     """An option becomes a keyword argument, a command that is to be typed stays one."""
     from limber.api.running import in_python_words
+    from limber.core.errors import Command, Option, Text
 
     with pytest.raises(WorkError) as told, in_python_words():
-        raise WorkError("--no-gravity is given.", "--max-force is not.", "Run `limber x --force`.")
+        raise WorkError(Text(Option("gravity", False), " is given."),
+                        Text(Option("max_force"), " is not."),
+                        "Run ", Command("x", Option("force", True)), ".")
     assert str(told.value) == "gravity=False is given. max_force is not. Run `limber x --force`."
 
 

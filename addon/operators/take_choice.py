@@ -38,7 +38,7 @@ class LIMBER_OT_take_choice(bpy.types.Operator):
         stage, value = stages()[self.stage], json.loads(self.value)
         field, group = stage.fields[self.option], properties.group_of(context.scene, stage)
         properties.put(group, field, value)
-        self.report({"INFO"}, plain_words.choice_title(stage, self.option, value))
+        self.report({"INFO"}, plain_words.choice_title(field, value))
         try:
             return getattr(bpy.ops.limber, properties.attribute_name(stage.name))(
                 how, branch_uuid=self.branch_uuid) & {"FINISHED", "CANCELLED"} or {"FINISHED"}

@@ -4,7 +4,7 @@ import bpy
 
 from .. import jobs, preferences
 from ..lines import wrapped
-from ..plain_words import plain
+from ..plain_words import error_texts, warning_text
 from ..worker import WorkerNotFound
 
 _INTERVAL_SECONDS = 0.1
@@ -100,14 +100,14 @@ class WorkerOperator:
         job = self._job
         if job.state is jobs.JobState.DONE and "status" not in job.result:
             job.state, job.error = jobs.JobState.FAILED, _no_result(job)
-        self.ended(context, {**job.result, "status": job.state.value, "error": job.error})
+        self.ended(context, job.outcome)
         for warning in job.result.get("warnings", []):
-            self.report({"WARNING"}, plain(warning))
+            self.report({"WARNING"}, warning_text(job.result, warning))
         if job.state is jobs.JobState.CANCELLED:
             self.report({"INFO"}, f"{self.title}: {job.message or 'cancelled'}")
             return {"CANCELLED"}
         if job.state is jobs.JobState.FAILED:
-            self._complain(context, plain(job.error))
+            self._complain(context, " ".join(error_texts(job.outcome)))
             return {"CANCELLED"}
         try:
             self.finish(context, job.result)

@@ -4,7 +4,7 @@ import bpy
 
 from .. import guide, jobs
 from ..lines import draw_text
-from ..plain_words import plain
+from ..plain_words import error_texts
 from .sidebar import SidebarPanel
 
 _LOG_LINES = 12
@@ -33,7 +33,7 @@ class LIMBER_PT_job(SidebarPanel, bpy.types.Panel):
             _draw_running(self.layout, context, job)
         elif job is not None and job.error:
             draw_text(self.layout, context, f"{job.title} failed", "ERROR")
-            draw_text(self.layout, context, plain(job.error))
+            draw_text(self.layout, context, " ".join(error_texts(job.outcome)))
         if job is not None:
             _draw_log(self.layout, context, job)
         for number, waiting in enumerate(jobs.waiting()):

@@ -9,7 +9,7 @@ from .. import branch_folder, branches, guide, jobs, preferences, properties, tr
 from ..branch_folder import BranchRecord, StageRecord
 from ..lines import draw_text, has_room_beside
 from ..operators.presets import sensor_menu
-from ..plain_words import choice_title, first_sentence, plain, settings_in, stages_in
+from ..plain_words import choice_title, error_texts, warning_text
 from ..stages import Field, Stage, stages
 from ..steps import (
     FIRST,
@@ -202,7 +202,7 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
     if outcome.get("error"):
         draw_error(layout, context, stage, outcome)
     for warning in outcome.get("warnings", []):
-        draw_text(layout, context, plain(warning, stage), "INFO")
+        draw_text(layout, context, warning_text(outcome, warning, stage), "INFO")
     result = outcome.get("result", {}) if entry is None else entry.result
     if view.stage == "plan":
         draw_paths(layout, context, result, branch_folder.read_record(folder) if folder else None,
@@ -292,30 +292,33 @@ def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: S
 
 def draw_error(layout: bpy.types.UILayout, context: bpy.types.Context, stage: Stage,
                outcome: dict[str, Any]) -> None:
-    """Draw what was seen, a button for each choice, the settings named, and the text on demand."""
-    text = plain(outcome["error"], stage)
-    short = first_sentence(text)
-    draw_text(layout, context, short, "ERROR")
+    """Draw what was seen, what would help, and why and what to do on demand."""
+    texts = error_texts(outcome, stage)
+    draw_text(layout, context, texts[0], "ERROR")
     if trouble_mark.of(context.scene, stage) is not None:
         layout.label(text="The place is marked in the view", icon="EMPTY_AXIS")
-    for choice in outcome.get("choices") or []:
-        title = choice_title(stage, choice["option"], choice["value"])
-        if title:
-            button = layout.operator("limber.take_choice", text=title, icon="FILE_REFRESH")
-            button.stage, button.option = stage.name, choice["option"]
-            button.value = json.dumps(choice["value"])
+    for name in dict.fromkeys(each["command"] for each in outcome.get("remedies") or []):
+        other = stages().get(name)
+        # One that makes a branch replaces it; one that moves a robot has its own panel.
+        if other is not None and other.step and not (other.makes_branch or other.moves_robot):
+            button = layout.operator(f"limber.{properties.attribute_name(other.name)}",
+                                     text=other.label, icon="PLAY")
             button.branch_uuid = branches.current_uuid(context.scene)
-    for field in settings_in(outcome["error"], stage):
-        _draw_field(layout, context, stage, field)
-    for other in stages_in(outcome["error"]):
-        button = layout.operator(f"limber.{properties.attribute_name(other.name)}",
-                                 text=other.label, icon="PLAY")
-        button.branch_uuid = branches.current_uuid(context.scene)
-    if text != short:
+    for remedy in outcome.get("remedies") or []:
+        field = None if remedy["command"] else stage.fields.get(remedy["option"])
+        if field is not None and remedy["value"] is not None:
+            button = layout.operator("limber.take_choice", icon="FILE_REFRESH",
+                                     text=choice_title(field, remedy["value"]))
+            button.stage, button.option = stage.name, field.name
+            button.value = json.dumps(remedy["value"])
+            button.branch_uuid = branches.current_uuid(context.scene)
+        elif field in stage.own_fields and field.kind != "boolean":
+            _draw_field(layout, context, stage, field)
+    if len(texts) > 1:
         header, body = layout.panel(f"limber_error_{stage.name}", default_closed=True)
         header.label(text="Why, and what to do")
         if body is not None:
-            draw_text(body, context, text)
+            draw_text(body, context, " ".join(texts))
 
 
 def register() -> None:

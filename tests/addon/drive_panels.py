@@ -151,26 +151,26 @@ def errors():
         steps, stages = part("panels.steps"), part("stages").stages()
         # As the panels of the steps have it.
         layout.use_property_split, layout.use_property_decorate = True, False
-        for number, (stage, text) in enumerate(told[:DRAWN_ERRORS]):
-            choices = [{"option": field.name, "value": field.choices[0]}
-                       for field in stages[stage].fields.values() if field.choices][:1]
+        for number, (stage, parts) in enumerate(told[:DRAWN_ERRORS]):
+            remedies = [{"option": field.name, "value": field.choices[0], "command": None}
+                        for field in stages[stage].fields.values() if field.choices][:1]
             steps.draw_error(Open(layout._given[0], f"error{number}"), context, stages[stage],
-                             {"error": text, "choices": choices})
+                             {"parts": [parts], "remedies": remedies})
     return [show("errors", draw), picture("errors")]
 
 
 def measure_errors():
     """Write down the errors of which a line is wider than there is room for in the sidebar."""
-    lines, plain = part("lines"), part("plain_words").plain
+    lines, words = part("lines"), part("plain_words")
     told = json.loads((FOLDER / "errors.json").read_text())
     stages = part("stages").stages()
     window, area, region = view("UI")
     with bpy.context.temp_override(window=window, area=area, region=region):
         room = lines.room(bpy.context)
     seen["room"], seen["error_count"] = room, len(told)
-    seen["too_wide"] = [line for stage, text in told
-                        for line in lines.wrapped(plain(text, stages[stage]), room)
-                        if lines.width(line) > room]
+    seen["too_wide"] = [line for stage, parts in told
+                        for text in words.error_texts({"parts": [parts]}, stages[stage])
+                        for line in lines.wrapped(text, room) if lines.width(line) > room]
     return True
 
 

@@ -1,26 +1,27 @@
 """An error of the worker in the panel: a short sentence, a button for each choice, a mark."""
 
-import ast
 import importlib
 import json
 import re
 import sys
-from pathlib import Path
 
 import pytest
+from tests.addon.catalogue import told
 from tests.addon.test_panels import Layout, _draw_step
 
-WORKER = Path(__file__).parents[2] / "worker" / "limber"
+from limber.core.errors import Command, InputError, Option, Text
 
 
 def part(name):
     return importlib.import_module(f"limber_addon.{name}")
 
 
-TOLD = {"status": "failed", "code": "InputError", "place": [1200.0, 2000.0, 300.0],
-        "choices": [{"option": "plants", "value": "largest"}, {"option": "unknown", "value": 1}],
-        "error": "The scan contains two plants. A branch belongs to one plant. Crop the scan "
-                 "(--crop-low, --crop-high). Or use the larger plant (--plants largest)."}
+ERROR = InputError(
+    "The scan contains two plants.", "A branch belongs to one plant.", "Crop the scan (",
+    Option("crop_low"), ", ", Option("crop_high"), "). Or use the larger plant (",
+    Option("plants", "largest"), ").").at([1200.0, 2000.0, 300.0])
+TOLD = json.loads(json.dumps(ERROR.as_json()))
+TOLD["remedies"].append(Option("unknown", 1).as_json())
 
 
 @pytest.fixture()
@@ -72,20 +73,24 @@ def test_a_choice_is_a_button_that_runs_the_step_again(bpy, failing):
     assert "Why, and what to do" not in _draw_step(bpy, "skeleton").names("label")
 
 
-@pytest.mark.parametrize(("stage", "text", "wanted"), [
-    ("reconstruct", "Crop it (--crop-low, --crop-high).", "Crop it (Crop low, Crop high)."),
-    ("reconstruct", "Join them (--plants joined).", "Join them (Plants: joined)."),
-    ("plan", "Run `limber energy b.branch` first.", "Run Sample the Energy first."),
-    ("plan", "Or use --goal with a tip.", "Or use Goal with a tip."),
-    ("energy", "Switch it off (--no-gravity).", "Switch it off (Gravity: off)."),
-    ("energy", "`limber cache --clear` and --such-a-thing 3", None)])
-def test_options_are_told_by_their_titles(addon, stage, text, wanted):
-    """As the panels call them; what no panel has stays as it is."""
-    words = part("plain_words").plain(text, part("stages").stages()[stage])
-    assert words == (text if wanted is None else wanted)
+@pytest.mark.parametrize(("stage", "named", "wanted"), [
+    ("reconstruct", Option("crop_low"), "Crop low"),
+    ("reconstruct", Option("plants", "joined"), "Plants: joined"),
+    ("reconstruct", Option("root", (1.0, -2.0, 0.5)), "Root: 1 -2 0.5"),
+    ("plan", Command("energy", "b.branch"), "Sample the Energy"),
+    ("energy", Option("gravity", False), "Gravity: off"),
+    ("energy", Command("cache", Option("clear", True)), "`limber cache --clear`"),
+    ("energy", Option("such_a_thing", 3), "--such-a-thing 3")])
+def test_options_are_told_by_their_titles(addon, stage, named, wanted):
+    """As the panels call them; what no panel has stays as it is. In warnings too."""
+    text, words = Text("Or (", named, ")."), part("plain_words")
+    outcome = {"warning_parts": [{"text": text, "parts": json.loads(json.dumps(text.as_json()))}]}
+    assert words.warning_text(outcome, text, part("stages").stages()[stage]) == f"Or ({wanted})."
+    assert words.warning_text(outcome, "Another.") == "Another."
+    assert words.error_texts({"error": "No result."}) == ["No result."]
 
 
-def test_settings_without_a_value_are_shown(addon):
+def test_settings_without_a_value_are_shown(bpy, registered, whole_texts):
     """Each once, in the text's order: not those with a value, switches, or what no panel keeps."""
     stage = part("stages").stages()["reconstruct"]
     found = part("plain_words").settings_in(
@@ -97,9 +102,9 @@ def test_settings_without_a_value_are_shown(addon):
 def test_a_step_that_an_error_names_is_a_button(bpy, registered, whole_texts):
     """Each once; not one that would replace the branch or move a robot, nor what is no step."""
     layout, steps = Layout(), part("panels.steps")
-    steps.draw_error(layout, bpy.context, part("stages").stages()["plan"], {"error": (
-        "There is no field. Run `limber energy b.branch` first, then `limber energy` with `limber "
-        "reconstruct`, `limber execute` or `limber doctor`.")})
+    error = InputError("There is no field.", "", *map(Command, (
+        "energy", "reconstruct", "execute", "doctor")), Command("energy", Option("samples")))
+    steps.draw_error(layout, bpy.context, part("stages").stages()["plan"], error.as_json())
     assert layout.names("operator") == ["limber.energy"]
 
 
@@ -107,21 +112,15 @@ def test_a_step_that_an_error_names_is_a_button(bpy, registered, whole_texts):
 def test_every_error_of_a_stage_is_told_without_the_command_line(addon):
     """Each text that the worker raises, as far as a step of the tab can meet it. Slow: reads all of
     the worker's source."""
-    plain = part("plain_words").plain
+    words, stages = part("plain_words"), part("stages").stages()
     known = {"`limber cache --clear`": "no panel has the cache",
              "`limber scene`": "what runs Blender by itself",
-             "--no-reduced": "of `limber session`, which the grab runs without it"}
-    left = {}
-    for room in ("geometry", "mechanics", "reduced", "recordings", "perception", "estimation",
-                 "planning", "store", "session", "results", "stages"):
-        for path in (WORKER / room).rglob("*.py"):
-            raised = (node.exc for node in ast.walk(ast.parse(path.read_text()))
-                      if isinstance(node, ast.Raise) and node.exc is not None)
-            for text in (each.value for one in raised for each in ast.walk(one)
-                         if isinstance(each, ast.Constant) and isinstance(each.value, str)):
-                for hit in re.findall(r"--[a-z][a-z-]+|`limber [^`]*`", plain(text)):
-                    left.setdefault(hit, path.name)
-    assert not {hit: name for hit, name in left.items() if hit not in known}
+             "`limber 0.1234 0.1234`": "what makes a file that is missing",
+             "--reduced": "of `limber session`, which the grab runs with it"}
+    left = {hit for stage, parts in told()
+            for hit in re.findall(r"--[a-z][a-z-]+|`limber [^`]*`", " ".join(
+                words.error_texts({"parts": [parts]}, stages[stage])))}
+    assert not left - {*known}
 
 
 def test_the_root_that_an_error_asks_for_is_set_by_a_button_or_the_cursor(bpy, failing):
@@ -140,7 +139,6 @@ def test_the_root_that_an_error_asks_for_is_set_by_a_button_or_the_cursor(bpy, f
         typed = json.loads(failing.read_text().splitlines()[-1])
         given = typed[typed.index("--root") + 1:]
         assert given[0] == "auto" if value == "auto" else [*map(float, given[:3])] == value
-    assert part("plain_words").choice_title(stage, "root", [1.0, -2.0, 0.5]) == "Root: 1 -2 0.5"
     bpy.context.view_layer.update()
     bpy.context.scene.cursor.location = (1.0, 2.0, 0.5)
     cloud = next(thing for thing in bpy.context.scene.objects if "limber_scan_sha256" in thing)

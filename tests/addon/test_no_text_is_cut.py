@@ -59,7 +59,7 @@ def test_no_text_is_cut(run, blender, environment, tmp_path):
     errors, the longest drawn, all of them measured. That a cut is seen at all, a panel shows."""
     require_screen()
     write_font(tmp_path / "cut.ttf")
-    errors = sorted(told(), key=lambda one: -len(one[1]))
+    errors = sorted(told(), key=lambda one: -len(json.dumps(one[1])))
     (tmp_path / "errors.json").write_text(json.dumps(errors))
     seen = driven("drive_panels.py", blender, environment, tmp_path, SIZE)
     assert cuts(tmp_path / "cut.png"), "a text that is too wide is seen to be cut"

@@ -10,7 +10,7 @@ import pytest
 
 from limber.cli import main
 from limber.cli.commands import demo
-from limber.core.errors import NoPathError, WorkError
+from limber.core.errors import NoPathError, Option, Text, WorkError
 from limber.stages.command_line import options_of, without_foreign_options
 from limber.store import Branch
 
@@ -30,8 +30,9 @@ def stages(monkeypatch):
         seen[arguments[0]] = arguments
         seen.setdefault("order", []).append(arguments[0])
         if arguments[0] in seen["fail"]:
-            raise NoPathError("There is no path (--max-strain 0.01).", "Walls.",
-                              "Raise --max-force or --max-strain. Or move the goal (--goal).")
+            raise NoPathError(Text("There is no path (", Option("max_strain", 0.01), ")."),
+                              "Walls.", "Raise ", Option("max_force"), " or ",
+                              Option("max_strain"), ". Or move the goal (", Option("goal"), ").")
         return results.get(arguments[0], {})
     monkeypatch.setattr(demo, "run_stage", run)
     monkeypatch.setattr(demo, "_tip_goal", lambda _branch: ["--tip-goal", 1.0, 0.0, 0.5])
@@ -177,8 +178,8 @@ def test_refusals_of_a_scan_name_only_options_that_the_demo_has() -> None:
     folder = Path(demo.__file__).parents[2] / "geometry"
     files = [*folder.glob("skeleton/**/*.py"), *folder.glob("cloud/*.py"), *folder.glob("io/*.py"),
              folder / "reconstruction.py", folder / "pruned_twigs.py"]
-    named = {option for path in files
-             for option in OPTION.findall(path.read_text(encoding="utf-8"))}
+    named = {"--" + option.replace("_", "-") for path in files for option in re.findall(
+        r'Option\("(\w+)"', path.read_text(encoding="utf-8"))}
     assert {"--plants", "--crop-low", "--skeleton", "--unexplained"} <= named
     assert named <= options_of(demo.command)
 
@@ -196,7 +197,8 @@ def test_what_a_stage_alone_can_take_is_not_proposed(stages, tmp_path, failing, 
 
 def test_sentences_and_brackets_with_other_options_are_left_out() -> None:
     """Numbers with a point and dashes within words end and name nothing."""
-    text = "At 0.5 m (--voxel 0.1) well-known. Give --b-c 1.5, or --a. Or --b."
+    text = Text("At 0.5 m (", Option("voxel", 0.1), ") well-known. Give ", Option("b_c", 1.5),
+                ", or ", Option("a"), ". Or ", Option("b"), ".")
     assert without_foreign_options(text, {"--b", "--a"}) == "At 0.5 m well-known. Or --b."
     assert without_foreign_options(text, {"--b", "--a", "--b-c", "--voxel"}) == text
 

@@ -68,8 +68,8 @@ def test_the_unit_of_a_scan_is_asked_for(tmp_path, capsys):
     assert call(given) == 2
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert "40 m long" in told["error"]
-    assert {"option": "unit", "value": "mm"} in told["choices"]
-    assert {"option": "unit", "value": "m"} in told["choices"]
+    assert {("unit", "mm"), ("unit", "m")} <= {
+        (one["option"], one["value"]) for one in told["remedies"]}
     assert not (tmp_path / "twig.branch").exists()
     for scale, text in ((3.0, "No plant"), (1.0, "unit")):
         cloud = Cloud(np.loadtxt(scan) * scale)
@@ -92,7 +92,8 @@ def test_an_open_root_is_asked_for_and_leaves_an_earlier_result_whole(tmp_path, 
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert call(given) == 2
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    ends = sorted(one["value"][0] for one in told["choices"] if one["value"] != "auto")
+    ends = sorted(one["value"][0] for one in told["remedies"]
+                  if isinstance(one["value"], list))
     assert ends == pytest.approx([0, 400], abs=40)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 

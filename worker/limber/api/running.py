@@ -1,7 +1,6 @@
 """Running a stage for a Python user: progress, warnings, and messages with Python names."""
 
 import contextlib
-import re
 import sys
 import threading
 import types
@@ -11,15 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError, LimberError
+from limber.core.errors import Command, InputError, LimberError, Option, Text
 from limber.core.json_values import plain
 from limber.core.progress import BarSink, LineSink, Progress, Sink
 from limber.core.settings import Settings
 from limber.stages.registry import StageDescription, stage_description
 
 _STAGES = {"add_pull": "import-pull", "energy_field": "energy"}
-_OPTION = re.compile(r"`limber [^`]*`|(?<![\w-])--(no-)?([a-z][a-z0-9]*(?:-[a-z0-9]+)*)")
-"""An option in a message, or a whole command line, which stays unchanged."""
 _lock = threading.Lock()
 _hidden: list[types.ModuleType] = []
 """The user's script, once for each stage that runs."""
@@ -46,7 +43,7 @@ def run_stage(name: str, arguments: Mapping[str, Any], *, quiet: bool) -> tuple[
     Raises:
         InputError: a name is not known, or a value is refused. LimberError: as for the stage.
     """
-    caught: list[str] = []
+    caught: list[Text] = []
     stage = stage_description(name)
     try:
         with in_python_words(), script_run_once(), _sink(name, quiet) as sink:
@@ -54,7 +51,7 @@ def run_stage(name: str, arguments: Mapping[str, Any], *, quiet: bool) -> tuple[
             result = stage.run(inputs, settings, options, Progress(sink, caught.append))
     finally:
         for text in caught:
-            warnings.warn(_with_python_names(text), stacklevel=_users_level())
+            warnings.warn(text.shown(_in_python), stacklevel=_users_level())
     return stage.entry(inputs, settings), {"warnings": caught} | plain(result)
 
 
@@ -65,7 +62,7 @@ def _models(stage: StageDescription, arguments: Mapping[str, Any],
             {key: plain(value) if isinstance(value, np.ndarray | np.generic | list | tuple)
              else value for key, value in arguments.items()})
     except InputError as error:
-        error.fix = f"limber.settings({stage.name!r}) lists what it takes."
+        error.fix = Text(f"limber.settings({stage.name!r}) lists what it takes.")
         raise
 
 
@@ -115,14 +112,12 @@ def in_python_words() -> Iterator[None]:
     try:
         yield
     except LimberError as error:
-        error.seen, error.why, error.fix = map(
-            _with_python_names, (error.seen, error.why, error.fix))
-        error.args = (" ".join(part for part in (error.seen, error.why, error.fix) if part),)
+        error.seen, error.why, error.fix = (
+            Text(text.shown(_in_python)) for text in (error.seen, error.why, error.fix))
         raise
 
 
-def _with_python_names(text: str) -> str:
-    def named(found: re.Match[str]) -> str:
-        name = (found[2] or "").replace("-", "_")
-        return name + ("=False" if found[1] else "") if name else found[0]
-    return _OPTION.sub(named, text)
+def _in_python(part: Option | Command) -> str:
+    if isinstance(part, Command):
+        return str(part)
+    return part.name if part.value is None else f"{part.name}={part.value!r}"

@@ -16,7 +16,7 @@ from typing import Any
 from limber.batch.job_file import JobFile, StageTask
 from limber.batch.scheduler_scripts import line_of_task
 from limber.batch.stage_task import run_line, stop_lines, unfit
-from limber.core.errors import Cancelled, InputError, WorkError
+from limber.core.errors import Cancelled, InputError, Option, WorkError
 from limber.core.not_none import present
 from limber.core.optional import require_extra
 from limber.core.processes import worker_count
@@ -171,13 +171,13 @@ class Cluster:
         if self._requested is None:
             raise InputError(f"The number of jobs to request from {kind} is not given.",
                              "Each job waits in the queue and uses its allocation.",
-                             "Give --workers N, or `workers = N` in the job file.")
+                             "Give ", Option("workers"), " N, or `workers = N` in the job file.")
         made = getattr(dask_jobqueue, _QUEUES[kind])
         submitter = made.job_cls.submit_command
         if shutil.which(submitter) is None:
-            raise InputError(f"The program {submitter} is not on this computer.",
-                             f"It is needed to submit jobs to {kind}.",
-                             "Run the batch on a login node of the cluster, or with --emit.")
+            raise InputError(f"The program {submitter} is not on this computer.", "It is needed to "
+                             f"submit jobs to {kind}.", "Run the batch on a login node of the "
+                             "cluster, or with ", Option("emit"), ".")
         own = dask.config.get(f"jobqueue.{kind}", {})
         cores = int(own.get("cores") or 1)
         prologue = [*(own.get("job-script-prologue") or ()),

@@ -20,7 +20,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from limber.batch.remote_files import checked_address, is_address, matching, plain_name
-from limber.core.errors import BranchFolderError, InputError, LimberError
+from limber.core.errors import BranchFolderError, Command, InputError, LimberError, Option
 from limber.core.files.atomic import require_file
 from limber.core.files.reading import read_text, read_toml
 from limber.core.files.safe_names import same_named
@@ -529,7 +529,8 @@ def read_jobs(path: Path) -> JobFile:
         content, text = read_toml(path, "a job file"), read_text(path, "a job file")
     except InputError as error:
         raise InputError(error.seen, "A job file is TOML with finite numbers.",
-                         "`limber batch --help` shows what a job file looks like.") from error
+                         Command("batch", Option("help")), " shows what a job file looks "
+                         "like.") from error
     return _Reader(path, content, Problems(path, toml_lines(text))).read()
 
 

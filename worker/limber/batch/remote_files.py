@@ -15,7 +15,7 @@ from typing import Any
 
 from filelock import FileLock
 
-from limber.core.errors import InputError, LimberError, MissingDependencyError, WorkError
+from limber.core.errors import InputError, LimberError, MissingDependencyError, Option, WorkError
 from limber.core.files.atomic import owned_name, sweep_beside, write_atomically
 from limber.core.optional import require_extra
 from limber.store.disk_errors import LEAST_FREE_BYTES
@@ -228,10 +228,10 @@ def _explained(address: str, what: str) -> Iterator[None]:
     except FileNotFoundError as error:
         raise WorkError(f"{address} does not exist.", "", "Check the address.") from error
     except Exception as error:  # each file system's client raises its own
-        raise WorkError(f"{address} could not be {what} ({type(error).__name__}: {error}).",
-                        "The server does not respond, or access is denied.",
-                        "Check the network and the credentials, and run this with --retry-failed.",
-                        ) from error
+        raise WorkError(f"{address} could not be {what} ({type(error).__name__}: {error}).", "The "
+                        "server does not respond, or access is denied.", "Check the network and "
+                        "the credentials, and run this with ", Option("retry_failed", True),
+                        ".") from error
 
 
 def _digest(found: dict[str, dict[str, Any]]) -> str:

@@ -21,7 +21,7 @@ from limber.batch.cluster import Cluster, ClusterLostError
 from limber.batch.job_file import BranchJob, JobFile, StageTask
 from limber.batch.stage_task import is_shown, run_task
 from limber.batch.staging import AT_ONCE, Staging
-from limber.core.errors import Cancelled, LimberError, WorkError
+from limber.core.errors import Cancelled, Command, LimberError, WorkError
 from limber.core.processes import Pool, worker_count
 from limber.core.progress import SILENT, Progress
 from limber.version import VERSION
@@ -250,8 +250,9 @@ class _Course:
         except Exception as error:
             # A bug in a stage of Limber: it costs this branch, not the whole batch.
             notes = " ".join(getattr(error, "__notes__", ()))
-            return Record(FAILED, f"internal error: {error!r}; please report it (`limber "
-                          f"bug-report {branch.folder}`). {notes}", round(seconds, 3))
+            report = Command("bug-report", str(branch.folder))
+            return Record(FAILED, f"internal error: {error!r}; please report it ({report}). "
+                          f"{notes}", round(seconds, 3))
         status = FAILED if outcome["error"] else KEPT if outcome["is_kept"] else DONE
         return Record(status, outcome["error"], outcome["seconds"], outcome["memory_mb"],
                       tuple(outcome["warnings"]), numbers_of(outcome["result"]),

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from limber.batch.job_file import BranchJob, JobFile, StageTask
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.files.atomic import write_atomically
 from limber.stages.command_line import command_line, stage_options
 from limber.stages.registry import stage_description
@@ -62,7 +62,7 @@ def write_script(jobs: JobFile, kind: str) -> Path:
     if jobs.home or any(branch.is_moved for branch in jobs.branches):
         raise InputError(f"{jobs.path} contains addresses.", "A script runs stages on local "
                          "files. Only the batch itself fetches and uploads remote files.",
-                         "Run it without --emit, or fetch the files first.")
+                         "Run it without ", Option("emit"), ", or fetch the files first.")
     jobs.out.mkdir(parents=True, exist_ok=True)
     path = jobs.out / f"{jobs.path.stem}.{'slurm' if kind == 'slurm' else 'smk'}"
     write_atomically(path, emitted(jobs, kind))

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from limber.cell.arm import MOST_SPEED, MOST_TURN_SPEED, Arm, greatest_force, greatest_torque
 from limber.cell.known_arms import arm_named
 from limber.cell.urdf_arm import ENDING
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_toml
 from limber.core.json_values import plain, validated
@@ -349,8 +349,8 @@ def read_cell(path: str | Path) -> Cell:
             (the field is named).
     """
     path = Path(path)
-    content = read_toml(path, "the description of a robot's cell (TOML; `limber "
-                              "robot calibrate` makes one)", finite=False)
+    content = read_toml(path, Text("the description of a robot's cell (TOML; ",
+                                   Command("robot calibrate"), " makes one)"), finite=False)
     for entry in (content.get("robot"), content.get("second_arm")):
         # An arm's file is relative to the cell file, as those of obstacles are.
         if isinstance(entry, dict) and str(entry.get("model", "")).lower().endswith(ENDING):
@@ -682,8 +682,8 @@ def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
         InputError: it was made for another robot, another branch or another pose of the base.
     """
     if not made_for:
-        return ("The plan was made without a cell (`limber plan --cell`), so obstacles and the "
-                "gripper's shape were not checked.")
+        return Text("The plan was made without a cell (", Command("plan", Option("cell")), "), so "
+                    "obstacles and the gripper's shape were not checked.")
     if made_for.get("model") != cell.arm.name:
         raise InputError(f"The plan was made for a {made_for.get('model')}, but the cell has a "
                          f"{cell.arm.name}.", "The two arms differ in reach.",
@@ -713,8 +713,8 @@ def check_branch(cell: Cell, uuid: str, folder: object) -> str | None:
         InputError: the cell was calibrated for another branch.
     """
     if cell.branch is None:
-        return ("The cell file names no branch, so it is assumed that base.pose was calibrated "
-                "for this one. `limber robot calibrate` writes the name.")
+        return Text("The cell file names no branch, so it is assumed that base.pose was calibrated "
+                    "for this one. ", Command("robot calibrate"), " writes the name.")
     if cell.branch != uuid:
         raise InputError(f"The cell was calibrated for branch {cell.branch}, but {folder} is "
                          f"branch {uuid}.",

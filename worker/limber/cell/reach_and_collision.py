@@ -235,7 +235,7 @@ def _obstructing(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray
         "This is the gripper direction farthest from singularities. Every other direction that "
         "was tried is blocked as well.",
         "Choose another path or another position of the robot's base, or correct the obstacle in "
-        "the cell file.")
+        "the cell file.").at(where)
 
 
 def _distances(points: np.ndarray) -> np.ndarray:

@@ -31,7 +31,7 @@ from limber.cli.terminal import (
     result_lines,
     table_lines,
 )
-from limber.core.errors import LimberError, PartlyFailedError, SafetyStop
+from limber.core.errors import LimberError, PartlyFailedError, SafetyStop, Text, WorkError
 from limber.core.machine_errors import machine_error
 from limber.core.processes.heartbeat import Heartbeat
 from limber.core.progress import BarSink, JsonSink, LogSink, Progress, Sink, report_damage_to
@@ -120,14 +120,14 @@ class Run:
     def __init__(self, sink: Sink | None, say: Callable[[str], None]):
         self.progress = Progress(sink, self._warned)
         self.say = say
-        self.warnings: list[str] = []
+        self.warnings: list[Text] = []
         self.closing: list[str] = []
 
     def close(self, *found: str, where: object = "", then: str = "") -> None:
         """Print what was found, where it is and what to type next."""
         self.closing = closing_lines(found, where, then)
 
-    def _warned(self, message: str) -> None:
+    def _warned(self, message: Text) -> None:
         self.warnings.append(message)
         self.say(f"warning: {message}")
 
@@ -288,45 +288,33 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
                 around.enter_context(Heartbeat(lines.say))
             around.enter_context(report_damage_to(state.progress.warn))
             result = function(state, **options)
-    except LimberError as error:
-        code = error.exit_code
-        if isinstance(error, SafetyStop | PartlyFailedError):
-            result = error.result
-        outcome |= {"status": error.status, "error": str(error), "fix": error.fix,
-                    "code": type(error).__name__, "choices": _choices(name, error),
-                    "place": _position(name, error)}
     except KeyboardInterrupt:
         code = 130
         outcome |= {"status": "cancelled", "error": "Cancelled; earlier results are untouched."}
-    except Exception as error:
-        translated = machine_error(error)
-        code = translated.exit_code if translated else 3
-        if translated is None:
+    except Exception as caught:
+        error = caught if isinstance(caught, LimberError) else machine_error(caught)
+        if error is None:
             # A bug: the traceback goes to standard error, and the last line is JSON all the same.
             traceback.print_exc()
-            translated = f"internal error: {error!r}; please report it"
-        outcome |= {"status": "failed", "error": str(translated)}
+            error = WorkError(f"internal error: {caught!r}; please report it")
+        code = error.exit_code
+        if isinstance(error, SafetyStop | PartlyFailedError):
+            result = error.result
+        outcome |= error.as_json() | {"remedies": _remedies(error)}
     outcome |= {"seconds": round(time.perf_counter() - started, 3), "warnings": state.warnings}
+    if told := [text for text in state.warnings if text.named or text.place]:
+        outcome["warning_parts"] = [{"text": text, "parts": text.as_json(), "place": text.place}
+                                    for text in told]
     _print_outcome(outcome, result or {}, style, state.closing)
     return code
 
 
-def _choices(name: str, error: LimberError) -> list[dict[str, Any]]:
-    """Return the remedies that the error offers, as options of the stage; see ``offers``."""
-    if name not in stage_summaries():
-        return []
-    from limber.stages.error_suggestions import offers
+def _remedies(error: LimberError) -> list[dict[str, Any]]:
+    """The error's remedies, without options that the command at hand lacks."""
+    from limber.stages.command_line import is_own, options_of
 
-    return offers(stage_schema(name), f"{error.why} {error.fix}")
-
-
-def _position(name: str, error: LimberError) -> list[float] | None:
-    """Return the position of the problem: as the error has it, else as its text names it."""
-    if error.place or name not in stage_summaries():
-        return list(error.place) if error.place else None
-    from limber.stages.error_suggestions import position_in
-
-    return position_in(stage_schema(name), error.seen)
+    own = options_of(click.get_current_context().command)
+    return [part.as_json() for part in error.remedies if is_own(part, own)]
 
 
 def _say(text: str) -> None:

@@ -6,7 +6,14 @@ import re
 import sys
 from pathlib import Path
 
-from limber.core.errors import InputError, LimberError, MissingDependencyError, WorkError
+from limber.core.errors import (
+    Command,
+    InputError,
+    LimberError,
+    MissingDependencyError,
+    Option,
+    WorkError,
+)
 
 
 def _codes(*names: str) -> frozenset[int]:
@@ -47,8 +54,8 @@ def machine_error(error: BaseException, path: Path | None = None) -> LimberError
     if error.errno in _FULL or (error.errno is None and _FULL_IN_WORDS.search(seen)):
         return WorkError(f"{name} cannot be written ({seen}).",
                          "The disk is full, or your quota is used up.",
-                         "Free some space (`limber cache --clear` helps), and run this again. "
-                         "Earlier results are kept.")
+                         "Free some space (", Command("cache", Option("clear", True)), " helps), "
+                         "and run this again. Earlier results are kept.")
     if (error.errno in _LOST or (error.filename and error.errno in _UNREACHABLE)
             or getattr(error, "winerror", None) in _LOST_ON_WINDOWS):
         return WorkError(f"{name} does not answer ({seen}).",

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from typing import Any, TextIO
 
-from limber.core.errors import Cancelled, DamagedCacheWarning
+from limber.core.errors import Cancelled, DamagedCacheWarning, Part, Text
 
 Sink = Callable[[float, str, dict[str, Any]], None]
 
@@ -31,7 +31,7 @@ class Progress:
         on_warning: Gets each warning.
     """
 
-    def __init__(self, sink: Sink | None = None, on_warning: Callable[[str], None] | None = None,
+    def __init__(self, sink: Sink | None = None, on_warning: Callable[[Text], None] | None = None,
                  *, _span: tuple[float, float] = (0.0, 1.0),
                  _stop: threading.Event | None = None):
         self._sink = sink
@@ -48,10 +48,10 @@ class Progress:
             clipped = min(max(float(fraction), 0.0), 1.0)
             self._sink(start + (stop - start) * clipped, message, numbers)
 
-    def warn(self, message: str) -> None:
-        """Warn the user of something that does not stop the work."""
+    def warn(self, *message: Part) -> None:
+        """Warn the user of something that does not stop the work, in the parts of a ``Text``."""
         if self._on_warning is not None:
-            self._on_warning(message)
+            self._on_warning(Text(*message))
 
     def part(self, start: float, stop: float) -> "Progress":
         """Return a progress whose 0..1 is ``start..stop`` of this one."""
@@ -61,20 +61,20 @@ class Progress:
 
     def named(self, name: str) -> "Progress":
         """Return the same progress, its warnings prefixed with ``name``."""
-        return self._with_warnings(lambda message: self.warn(f"{name}: {message}"))
+        return self._with_warnings(lambda message: self.warn(f"{name}: ", message))
 
     def keeping(self, warnings: list[str], *, silently: bool = False) -> "Progress":
         """Return the same progress, each of its warnings also appended to ``warnings``.
 
         ``silently``: the user does not hear them until they are passed on.
         """
-        def keep(message: str) -> None:
+        def keep(message: Text) -> None:
             warnings.append(message)
             if not silently:
                 self.warn(message)
         return self._with_warnings(keep)
 
-    def _with_warnings(self, on_warning: Callable[[str], None]) -> "Progress":
+    def _with_warnings(self, on_warning: Callable[[Text], None]) -> "Progress":
         return Progress(self._sink, on_warning, _span=self._span, _stop=self._stop)
 
     def to_the_end(self) -> "Progress":

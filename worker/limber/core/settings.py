@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import core_schema
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.json_values import validated
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -186,12 +186,13 @@ def _refusal(model: type[BaseModel], values: dict[str, Any], error: ValidationEr
     if missing:
         return _missing(model, values, missing)
     first = error.errors()[0]
-    message = first["msg"].removeprefix("Value error, ")
+    cause = first.get("ctx", {}).get("error")
+    message = Text(*cause.args) if isinstance(cause, ValueError) else first["msg"]
     if not first["loc"]:
         # It concerns several values, and names them.
-        return InputError(f"{message}.", "", "See the options' help.")
-    return InputError(f"{_flag(str(first['loc'][0]))} {first.get('input')!r}: {message}.",
-                      "The stage cannot use this value.",
+        return InputError(Text(message, "."), "", "See the options' help.")
+    return InputError(Text(Option(str(first["loc"][0])), f" {first.get('input')!r}: ", message,
+                           "."), "The stage cannot use this value.",
                       "See the option's help for its range.")
 
 
@@ -201,18 +202,15 @@ def _missing(model: type[BaseModel], values: dict[str, Any], names: list[str]) -
                 "NAME")
     seen, meant, proposed = [], [], []
     for name in names:
-        field, flag = model.model_fields[name], _flag(name)
+        field = model.model_fields[name]
         declared = field.json_schema_extra
         extra = declared if isinstance(declared, dict) else {}
-        short = str(extra.get("short", flag))
-        seen.append(flag if short == flag else f"{short} ({flag})")
-        meant.append(f"{short}: {field.description}" if len(names) > 1 else field.description or "")
-        proposed.append(f"{short} " + shlex.quote(
-            str(extra.get("example", name.upper())).format(stem=stem)))
+        short = str(extra["short"]) if "short" in extra else Option(name)
+        seen.append(Text(short, " (", Option(name), ")") if "short" in extra else short)
+        meant.append(Text(short, f": {field.description}") if len(names) > 1
+                     else field.description or "")
+        proposed.append(Text(short, " ", shlex.quote(
+            str(extra.get("example", name.upper())).format(stem=stem))))
     what = "option" if len(names) == 1 else "options"
-    return InputError(f"Missing {what} {' and '.join(seen)}.", " ".join(meant),
-                      f"Add, for example: {' '.join(proposed)}")
-
-
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
+    return InputError(Text(f"Missing {what} ", Text.joined(" and ", seen), "."),
+                      Text.joined(" ", meant), "Add, for example: ", Text.joined(" ", proposed))

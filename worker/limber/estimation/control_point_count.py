@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.estimation.fit_assessment import Estimate
 from limber.estimation.parameters import LINK_DEVIATION, Values, bump_deviations, hats, stations_of
 from limber.estimation.settings import FitSpec
@@ -106,7 +106,7 @@ class _Problem:
         if evaluation.jacobian is None or field is None or field.straight is None:
             raise InputError("The evidence of control points needs derivatives and an open field.",
                              "Only a Gauss-Newton fit with the full model has both.",
-                             "Give the control points (--fractions).")
+                             "Give the control points (", Option("fractions"), ").")
         noise = evaluation.mean_square * repeated(found.objective.standardised(evaluation))
         residual, slopes = (scaled_rows(rows, space.own_row_count, noise) for rows in (
             evaluation.residual[:, None], evaluation.slopes))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option
 from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.forward_model import Forward, PointDirections, under_its_weight
 from limber.estimation.forward.observed_path import ObservedPathForward
@@ -77,10 +77,9 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     points = control_points(skeleton, settings.initial_fractions)
     wrong = np.flatnonzero(~(mesh.cell_data["young"] > 0))
     if len(wrong) and settings.young is None:
-        raise InputError(
-            f"Young's modulus is {mesh.cell_data['young'][wrong[0]]:g} Pa in tetrahedron "
-            f"{wrong[0]} of mesh.vtu.", "The initial modulus must be positive.",
-            "Give --young, or correct the mesh.")
+        raise InputError(f"Young's modulus is {mesh.cell_data['young'][wrong[0]]:g} Pa in "
+                         f"tetrahedron {wrong[0]} of mesh.vtu.", "The initial modulus must be "
+                         "positive.", "Give ", Option("young"), ", or correct the mesh.")
     young = settings.young or float(np.exp(np.mean(np.log(mesh.cell_data["young"]))))
     poisson = _or_mean(settings.poisson, mesh.cell_data["poisson"])
     density = _or_mean(settings.density, mesh.cell_data["density"])
@@ -137,7 +136,7 @@ def tell_doubts(pulls: list[Pull], subject: Subject, progress: Progress) -> None
                 "markers.")
     for sentence in neck(subject.skeleton):
         progress.warn(f"{sentence} If the branch is not so thin there, the moduli come out wrong. "
-                      "Correct the skeleton (`limber skeleton`), or scan from more sides.")
+                      "Correct the skeleton (", Command("skeleton"), "), or scan from more sides.")
 
 
 def neck(skeleton: Skeleton) -> list[str]:
@@ -170,17 +169,15 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: FitSpec,
         entry = _with_overrides(pull.entry, frames, settings)
         rest = _rest_points(entry, subject)
         if frames.positions.shape[1] not in (0, len(rest)):
-            raise InputError(
-                f"{pull.name} observes {frames.positions.shape[1]} points, but {len(rest)} rest "
-                "positions are known.",
-                "Each observed point needs a rest position.",
-                "Give rest_points_m in pull.toml, or one value of --fractions for each marker.")
+            raise InputError(f"{pull.name} observes {frames.positions.shape[1]} points, but "
+                             f"{len(rest)} rest positions are known.", "Each observed point needs "
+                             "a rest position.", "Give rest_points_m in pull.toml, or one value "
+                             "of ", Option("fractions"), " for each marker.")
         if not frames.positions.shape[1]:
-            raise InputError(
-                f"{pull.name} has nothing that was seen of the branch, only what the gripper did.",
-                "An estimate compares how points of the branch moved.",
-                "Import it with the markers, depth images or clouds of the same time, or name "
-                "other pulls with --pull.")
+            raise InputError(f"{pull.name} has nothing that was seen of the branch, only what the "
+                             "gripper did.", "An estimate compares how points of the branch moved.",
+                             "Import it with the markers, depth images or clouds of the same time, "
+                             "or name other pulls with ", Option("pull"), ".")
         _off_at_rest(pull, frames, rest)
         moved = (shifts or {}).get(pull.name)
         if moved is not None:
@@ -217,7 +214,8 @@ def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subj
     if entry.motion == "swing":
         raise InputError(f"{name} is a free swing: no gripper holds the branch.",
                          "Its release, load and damping are fitted together over time.",
-                         f"Use `limber swing --pull {name}`, or name other pulls with --pull.")
+                         "Use ", Command("swing", Option("pull", name)), ", or name other pulls "
+                         "with ", Option("pull"), ".")
     if entry.motion == "dynamic":
         from limber.estimation.forward.dynamic_pull import DynamicForward
 
@@ -309,11 +307,10 @@ def _off_at_rest(pull: Pull, frames: Frames, rest: np.ndarray) -> np.ndarray | N
     off = np.linalg.norm(np.nanmedian(seen, axis=0) - rest, axis=1)
     size = float(np.linalg.norm(np.ptp(np.vstack([rest, pull.entry.grasp.point_m]), axis=0)))
     if np.nanmin(off) > max(2 * size, 0.1):
-        raise InputError(
-            f"{pull.name}: at rest, the observed points are {np.nanmin(off):.3g} to "
-            f"{np.nanmax(off):.3g} m away from their positions on this branch, which is about "
-            f"{size:.2g} m long.",
-            "The recording uses another unit or another frame of reference.",
-            "Import it with --unit, or with --nominal (the positions of the markers on the "
-            "branch).")
+        raise InputError(f"{pull.name}: at rest, the observed points are {np.nanmin(off):.3g} to "
+                         f"{np.nanmax(off):.3g} m away from their positions on this branch, which "
+                         f"is about {size:.2g} m long.", "The recording uses another unit or "
+                         "another frame of reference.", "Import it with ", Option("unit"), ", or "
+                         "with ", Option("nominal"), " (the positions of the markers on the "
+                         "branch).")
     return off

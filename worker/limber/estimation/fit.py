@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import InputError, Option, WorkError
 from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
@@ -311,10 +311,10 @@ def _without_equilibrium(objective: Objective) -> WorkError:
     return _ForceLeadsNowhereError(
         seen, f"The measured force drives the simulation. It is at most {peak:.2g} N. Its zero is "
         f"known to {known.force_bias_sigma_n:g} N and drifts by {known.force_drift_sigma_n:g} N. "
-        "With such an error, the force may fold a branch with a soft end.",
-        "Tare the sensor before the pull and state it ([calibration] in pull.toml). Or pull "
-        "farther. Or prescribe the gripper's pose if its frame is known well (--drive pose). "
-        "Otherwise check the grasp point, the frame of reference and the units.")
+        "With such an error, the force may fold a branch with a soft end.", "Tare the sensor "
+        "before the pull and state it ([calibration] in pull.toml). Or pull farther. Or prescribe "
+        "the gripper's pose if its frame is known well (", Option("drive", "pose"), "). Otherwise "
+        "check the grasp point, the frame of reference and the units.")
 
 
 def _fitted(objective: Objective, start: np.ndarray, settings: FitSpec,
@@ -365,9 +365,8 @@ def _refined(fit: Fit, objective: Objective, settings: FitSpec,
                 coarse.append(forward)
         if not coarse or settings.method == "nelder-mead":
             if coarse:
-                progress.warn(
-                    "The error of the interpolated frames exceeds a third of the noise. --method "
-                    "gauss-newton simulates more frames.")
+                progress.warn("The error of the interpolated frames exceeds a third of the noise. ",
+                              Option("method", "gauss-newton"), " simulates more frames.")
             return fit
         for forward in coarse:
             forward.refine()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import WorkError
+from limber.core.errors import Command, Option, WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, forwards_of, neck
@@ -305,8 +305,8 @@ def require_result(found: Estimate, skeleton: Skeleton) -> None:
     reason = " ".join([reason, *_force_off(found)])
     seen = [*_points_off(found.objective.forwards), *neck(skeleton)]
     if seen:
-        raise WorkError("The pulls give no estimate.", " ".join([reason, *seen]),
-                        f"{ended} Correct the reconstruction (`limber skeleton`, or a scan from "
+        raise WorkError("The pulls give no estimate.", " ".join([reason, *seen]), f"{ended} "
+                        "Correct the reconstruction (", Command("skeleton"), ", or a scan from "
                         "more sides), and check that the points are where they should be on it.")
     raise WorkError("The pulls give no estimate.", reason,
                     f"{ended} Check units, grasp point and mode, frame of reference, the order of "
@@ -364,9 +364,9 @@ def require_one_explanation(free: Estimate, as_stated: Estimate) -> None:
             "The pulls do not tell a shift of the frame from a shift of the points.",
             f"With a free frame they give {_listed(free.values.young)} MPa, with the frame as "
             f"stated and points off along the branch {_listed(young)} MPa. Both fit as well.",
-            "Register the camera (camera_sigma_m) and omit --free-frame. Or mark the points on "
-            "the branch, give their positions (--nominal of import-pull), and state that under "
-            "[calibration] (point_sigma_m).")
+            "Register the camera (camera_sigma_m) and omit ", Option("free_frame"), ". Or mark the "
+            "points on the branch, give their positions (", Option("nominal"), " of import-pull), "
+            "and state that under [calibration] (point_sigma_m).")
 
 
 def _listed(young: np.ndarray) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from limber.core.errors import LimberError, WorkError
+from limber.core.errors import LimberError, Option, Text, WorkError
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, forwards_of, parameter_space
@@ -226,23 +226,22 @@ def _none_kept(made: list[ExpectedPull], count: int, max_strain: float, max_forc
                ) -> WorkError:
     """Why no pull is left, with the limits that would leave the gentlest one."""
     if not made:
-        return WorkError(f"None of {count} pulls can be simulated.",
-                         "Each of their simulations on this branch ended without a result.",
-                         "Check the moduli and the mesh, or hold it elsewhere (--fractions).")
+        return WorkError(f"None of {count} pulls can be simulated.", "Each of their simulations on "
+                         "this branch ended without a result.", "Check the moduli and the mesh, or "
+                         "hold it elsewhere (", Option("fractions"), ").")
     least = min(made, key=lambda one: one.peak_strain)
     limits, enough = [f"a strain of {100 * max_strain:.3g} %"], []
     if least.peak_strain > max_strain:
-        enough.append(f"--max-strain {1.05 * least.peak_strain:.3g}")
+        enough.append(Option("max_strain", float(f"{1.05 * least.peak_strain:.3g}")))
     if np.isfinite(max_force):
         limits.append(f"a force of {max_force:.3g} N")
     if least.peak_force > max_force:
-        enough.append(f"--max-force {1.05 * least.peak_force:.3g}")
-    return WorkError(
-        f"No pull keeps the limits: {count - len(made)} of {count} are impossible, and the "
-        f"gentlest one strains the branch by {100 * least.peak_strain:.2g} % and takes "
-        f"{least.peak_force:.2g} N.", f"Allowed: {' and '.join(limits)}.",
-        f"For that pull, {' and '.join(enough)} would do if the branch bears it. Or hold the "
-        "branch elsewhere (--fractions).")
+        enough.append(Option("max_force", float(f"{1.05 * least.peak_force:.3g}")))
+    return WorkError(f"No pull keeps the limits: {count - len(made)} of {count} are impossible, "
+                     f"and the gentlest one strains the branch by {100 * least.peak_strain:.2g} % "
+                     f"and takes {least.peak_force:.2g} N.", f"Allowed: {' and '.join(limits)}.",
+                     "For that pull, ", Text.joined(" and ", enough), " would do if the branch "
+                     "bears it. Or hold the branch elsewhere (", Option("fractions"), ").")
 
 
 def _all(choices: list[PullChoice], subject: Subject, values: Values, known: Known, cell: Cell,

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import InputError, Option, WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
@@ -25,7 +25,7 @@ def require_one_load(settings: PredictSettings) -> None:
     if (settings.weight is None) == (settings.load is None):
         raise InputError("A prediction needs exactly one load.",
                          "The prediction differs from the recording by this load.",
-                         "Give --weight NEWTONS or --load X Y Z.")
+                         "Give ", Option("weight"), " NEWTONS or ", Option("load"), " X Y Z.")
 
 
 def predict_rest(known: dict[str, Any], subject: Subject, entry: PullEntry, down: np.ndarray,

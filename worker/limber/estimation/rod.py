@@ -23,7 +23,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from limber.core.errors import WorkError
+from limber.core.errors import Option, WorkError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.gripper_path import TURNED_PART, MotionWanted, sideways_forces
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -200,8 +200,8 @@ class Rod:
                 size *= min(travel / moved, 2.0)
             else:
                 size = last + (size - last) * travel / moved
-        raise WorkError(f"No sideways force moves the grasp by {travel:.3g} m.",
-                        "The rod is too short or too stiff at the grasp.", "Reduce --reach.")
+        raise WorkError(f"No sideways force moves the grasp by {travel:.3g} m.", "The rod is too "
+                        "short or too stiff at the grasp.", "Reduce ", Option("reach"), ".")
 
     def _rest(self) -> _State:
         """The state that no gripper holds."""
@@ -260,9 +260,9 @@ class Rod:
             near.along, near.values, near.force if force is None else None, tol=TOLERANCE,
             max_nodes=MOST_NODES)
         if found.status or not np.isfinite(found.y).all():
-            raise WorkError("The simulated rod finds no equilibrium.",
-                            "It is pulled too far, or cannot carry its own weight.",
-                            "Reduce --reach, or give --model tetrahedra.")
+            raise WorkError("The simulated rod finds no equilibrium.", "It is pulled too far, or "
+                            "cannot carry its own weight.", "Reduce ", Option("reach"), ", or "
+                            "give ", Option("model", "tetrahedra"), ".")
         return _State(found.x, found.y, found.p if force is None else force)
 
     @cached_property

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from limber.core.errors import Option, Text
 from limber.core.settings import (
     GraspMode,
     Groups,
@@ -98,8 +99,9 @@ class EstimateSettings(Settings):
     @model_validator(mode="after")
     def _of_the_simplex(self) -> Self:
         if self.delta_m2 is not None and self.method != "nelder-mead":
-            raise ValueError("--delta-m2 ends only --method nelder-mead; gauss-newton ends at the "
-                             "least loss")
+            raise ValueError(Text(Option("delta_m2"), " ends only ",
+                                  Option("method", "nelder-mead"), "; gauss-newton ends at the "
+                                  "least loss"))
         return self
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 
 from limber.core.constants import GRAVITY
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import InputError, Option, Text, WorkError
 from limber.core.not_none import present
 from limber.core.numerics.rigid import composed, rotated
 from limber.core.progress import SILENT, Progress
@@ -198,7 +198,8 @@ def true_branch(skeleton: Skeleton, settings: PullSpec, *,
         young = settings.young
         if len(young) != len(fractions):
             raise InputError(f"{len(young)} moduli for {len(fractions)} control points.",
-                             "Each control point needs one modulus.", "Give --young A,B,C,D.")
+                             "Each control point needs one modulus.",
+                             "Give ", Option("young"), " A,B,C,D.")
     if body is not None:
         mesh = refined(body) if 8 * body.tet_count <= BODY_LIMIT and body.is_quadratic else body
     else:
@@ -221,7 +222,7 @@ def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random
             return shape, moved
     raise WorkError(f"None of {SHAPE_TRIES} posterior samples of the shape can be pulled.",
                     "The scan is so uncertain that their tetrahedra are inverted.",
-                    "Scan with less noise, or give --shape fitted.")
+                    "Scan with less noise, or give ", Option("shape", "fitted"), ".")
 
 
 def simulate_pull(truth: TrueBranch, name: str, settings: PullSpec, *,
@@ -289,10 +290,12 @@ def _rod(truth: TrueBranch, settings: PullSpec, is_weightless: bool) -> Rod:
         InputError: a rod cannot move as requested.
     """
     if settings.motion == "dynamic" or settings.camera or truth.is_meshed:
-        raise InputError("--model rod was given with " + (
-            "a fast motion." if settings.motion == "dynamic" else
-            "--camera." if settings.camera else "a branch that was meshed directly."),
-            "The rod is a round branch at rest, without a surface.", "Omit --model rod.")
+        raise InputError(
+            Text(Option("model", "rod"), " was given with ", "a fast motion"
+                 if settings.motion == "dynamic" else Option("camera") if settings.camera
+                 else "a branch that was meshed directly", "."),
+            "The rod is a round branch at rest, without a surface.",
+            "Omit ", Option("model"), " rod.")
 
     gravity = np.zeros(3) if is_weightless else np.array(truth.gravity)
     return Rod.of(truth.skeleton, truth.young_at, settings.poisson, settings.density, gravity,
@@ -314,9 +317,9 @@ def _misread(exact: Pull, shifts: np.ndarray, settings: PullSpec,
              ) -> tuple[PullEntry, np.ndarray, np.ndarray, np.ndarray]:
     """Return entry, poses, wrenches and positions as a cell with errors records them."""
     if settings.camera:
-        raise InputError("--camera cannot be combined with errors of the cell.",
+        raise InputError(Text(Option("camera"), " cannot be combined with errors of the cell."),
                          "Depth images are rendered by a camera whose position is known.",
-                         "Omit --camera, or the errors of the cell.")
+                         "Omit ", Option("camera"), ", or the errors of the cell.")
     rng = np.random.default_rng([settings.seed, 3])
     errors = CellErrors.drawn(settings.calibration, rng)
     seen = errors.recorded(exact, rng)
@@ -343,7 +346,7 @@ def _kind(settings: PullSpec,
         if settings.motion == "dynamic":
             raise InputError("A hung weight cannot be combined with a dynamic motion.",
                              "A hung weight is a slow, force-driven pull.",
-                             "Omit --weight or --motion dynamic.")
+                             "Omit ", Option("weight"), " or ", Option("motion"), " dynamic.")
         return "weight"
     if settings.motion == "dynamic":
         return "release" if settings.drive == "force" else "shake"

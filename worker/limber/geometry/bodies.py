@@ -8,7 +8,7 @@ import numpy as np
 
 from limber.core.alignment import Alignment
 from limber.core.constants import UNIT_METRES
-from limber.core.errors import InputError, MeshingError
+from limber.core.errors import InputError, MeshingError, Option, Text
 from limber.core.files.tables import csv_records
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.preparation import size_doubts
@@ -313,8 +313,8 @@ def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = S
     """Return the branch of a cylinder model, and the masses of the pruned twigs. InputError for an
     unusable model or a given root: the model has its own. MeshingError if it cannot be meshed."""
     if settings.root is not None:
-        raise InputError("A root (--root) was given for a cylinder model.",
-                         "The model defines its own root.", "Omit --root.")
+        raise InputError(Text("A root (", Option("root"), ") was given for a cylinder model."),
+                         "The model defines its own root.", "Omit ", Option("root"), ".")
     scale = UNIT_METRES[settings.unit]
     read = read_skeleton(path, scale=scale)
     if (read.radius <= 0).any():

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.core.constants import UNIT_METRES
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.geometry.cloud.cloud import thinned
 from limber.geometry.cloud.leaves import Leaf, find_leaves, leaf_like
 from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
@@ -86,14 +86,13 @@ def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
     nearest = blade[np.argmin(np.linalg.norm(blade - np.median(blade, axis=0), axis=1))]
     point = (nearest + prepared.origin) / UNIT_METRES[unit]
     count = f"{len(leaves)} {'leaf' if len(leaves) == 1 else 'leaves'}"
-    raise InputError(f"{100 * share:.0f} % of the points look like {count}: they are flat and not "
-                     "round. The largest leaf is at "
-                     f"({', '.join(f'{value:.6g}' for value in point)}) and has "
-                     f"{1e4 * largest.area:.3g} cm2.",
-                     "Flat wood may look like a leaf, so Limber removes more than "
-                     f"{100 * UNASKED:.0f} % of a scan only on request.",
-                     "If these are leaves, remove them and keep their mass (--leaves cut). If they "
-                     "are wood, keep all points (--leaves keep).").at(point)
+    raise InputError(
+        f"{100 * share:.0f} % of the points look like {count}: they are flat and not round. The "
+        f"largest leaf is at ({', '.join(f'{value:.6g}' for value in point)}) and has "
+        f"{1e4 * largest.area:.3g} cm2.", "Flat wood may look like a leaf, so Limber removes more "
+        f"than {100 * UNASKED:.0f} % of a scan only on request.", "If these are leaves, remove "
+        "them and keep their mass (", Option("leaves", "cut"), "). If they are wood, keep all "
+        "points (", Option("leaves", "keep"), ").").at(point)
 
 
 def _on_round_axes(found: SkeletonResult, points: np.ndarray) -> np.ndarray:
@@ -141,7 +140,8 @@ def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton,
 def leaves_text(masses: list[dict[str, Any]], share: float) -> str:
     """Warning about removed leaves, the fraction ``share`` of the points."""
     count = f"{len(masses)} {'leaf' if len(masses) == 1 else 'leaves'}"
-    return (f"Limber detected and removed {count} ({100 * share:.0f} % of the points, "
-            f"{1e4 * sum(m['area_m2'] for m in masses):.0f} cm2). Their mass of "
-            f"{1e3 * sum(m['mass_kg'] for m in masses):.3g} g is attached to the stems "
-            f"({LEAF_DENSITY:g} kg/m^2). --leaves keep treats all points as wood.")
+    return Text(f"Limber detected and removed {count} ({100 * share:.0f} % of the points, "
+                f"{1e4 * sum(m['area_m2'] for m in masses):.0f} cm2). Their mass of "
+                f"{1e3 * sum(m['mass_kg'] for m in masses):.3g} g is attached to the stems "
+                f"({LEAF_DENSITY:g} kg/m^2). ", Option("leaves", "keep"), " treats all points as "
+                "wood.")

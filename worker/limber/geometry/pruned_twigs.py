@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.core.errors import MeshingError
+from limber.core.errors import MeshingError, Option
 from limber.core.progress import Progress
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -70,11 +70,10 @@ def report_pruned_twigs(masses: list[dict[str, Any]], meshed: float, settings: R
             f"and {100 * share:.1f} % of the mass are not in the mesh: {named}{more}.")
     asked = settings.leave_out or settings.twig_radius > 0
     if share > _LEFT_OUT_MOST and not asked:
-        raise MeshingError(text,
-                           "Their weight would act on the branch, but they could neither bend nor "
-                           "be grasped.",
-                           "Accept this (--leave-out), mesh with fTetWild (--mesher ftetwild), or "
-                           "correct the skeleton there.")
+        raise MeshingError(text, "Their weight would act on the branch, but they could neither "
+                           "bend nor be grasped.", "Accept this (", Option("leave_out", True), "), "
+                           "mesh with fTetWild (", Option("mesher", "ftetwild"), "), or correct "
+                           "the skeleton there.")
     progress.warn(f"{text} Their mass is kept.")
 
 

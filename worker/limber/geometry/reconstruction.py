@@ -9,7 +9,7 @@ import numpy as np
 
 from limber.core.alignment import Alignment
 from limber.core.constants import STANDARD_GRAVITY, UNIT_METRES
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.not_none import present
 from limber.core.optional import loaded
 from limber.core.progress import SILENT, Progress
@@ -432,8 +432,8 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
         if size > 10 * extent:
             raise InputError(f"The skeleton is {size:.3g} m wide, but the cloud is {extent:.3g} m "
                              "wide.", "They do not belong together, or have different units.",
-                             "Give the skeleton in the coordinates and the unit of the cloud "
-                             "(--unit applies to both).")
+                             "Give the skeleton in the coordinates and the unit of the cloud (",
+                             Option("unit"), " applies to both).")
         return result_of_skeleton(own.moved(own.nodes - prepared.origin), prepared.cloud.points)
     scale = UNIT_METRES[settings.unit]
     root = None if settings.root in (None, "auto") else (

@@ -4,6 +4,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from limber.core.errors import Option, Text
 from limber.core.settings import (
     Direction,
     Groups,
@@ -73,8 +74,8 @@ class SkeletonSettings(Settings):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.radius_low >= self.radius_high:
-            raise ValueError(f"--radius-low {self.radius_low:g} is not below --radius-high "
-                             f"{self.radius_high:g}")
+            raise ValueError(Text(Option("radius_low"), f" {self.radius_low:g} is not below ",
+                                  Option("radius_high"), f" {self.radius_high:g}"))
         return self
 
     def radius_limits(self, diagonal: float) -> tuple[float, float]:

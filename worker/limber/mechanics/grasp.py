@@ -158,7 +158,8 @@ class Grasp:
                 f"No node lies within {radius:g} m of ({', '.join(f'{x:.4g}' for x in point)}) m;"
                 f" the nearest is {distance.min():.4g} m away.",
                 "The gripper would not hold any node.",
-                "Move the point onto the branch or widen the radius; check the units (metres).")
+                "Move the point onto the branch or widen the radius; check the units (metres)."
+            ).at(point)
         grasp = cls.of_nodes(mesh, nodes, mode, point if radius > 0 else None)
         wider = radius
         while mode == "point" and wider < _WIDEST * radius and (

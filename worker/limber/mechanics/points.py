@@ -81,10 +81,11 @@ def _slopes(mesh: TetMesh, tets: np.ndarray) -> np.ndarray:
 
 def _located(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tetrahedron, barycentric coordinates [m, 4] and offset from the mesh [m, 3] of points."""
-    if not (np.abs(points) < _FARTHEST).all():
-        raise InputError(f"A point at {points[~(np.abs(points) < _FARTHEST).all(axis=1)][0]} m is "
-                         f"farther than {_FARTHEST:g} m from the origin.",
-                         "No branch is that large.", "Check its coordinates and their unit.")
+    if not (near := (np.abs(points) < _FARTHEST).all(axis=1)).all():
+        raise InputError(
+            f"A point at {points[~near][0]} m is farther than {_FARTHEST:g} m from the origin.",
+            "No branch is that large.", "Check its coordinates and their unit."
+        ).at(points[~near][0])
     count = min(_CANDIDATES, mesh.tet_count)
     near = cKDTree(mesh.centroids).query(points, k=count)[1].reshape(len(points), count)
     tets, local, outside = [], [], []

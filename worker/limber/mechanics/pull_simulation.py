@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.not_none import present
 from limber.core.numerics.rigid import any_normal, composed
 from limber.core.progress import SILENT, Progress
@@ -245,7 +245,8 @@ def require_one_drive(settings: SimulateSettings, along: PoseTable | None) -> No
     if (settings.grasp_force is not None) + moves + (along is not None) > 1:
         raise InputError("More than one of a motion, a path and a force is given.",
                          "A grasp follows poses or exerts a force.",
-                         "Give --move and --turn, or --along, or --grasp-force.")
+                         "Give ", Option("move"), " and ", Option("turn"), ", or ", Option("along"),
+                         ", or ", Option("grasp_force"), ".")
 
 
 def motion_of(case: LoadCase, settings: SimulateSettings,

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
+from limber.core.errors import Text
 from limber.mechanics.materials.laws import MULTIPLICITY, hooke_stress
 from limber.mechanics.model import BranchModel
 
@@ -22,9 +23,9 @@ class Place:
     position: tuple[float, float, float]
 
     @property
-    def at(self) -> str:
+    def at(self) -> Text:
         """Text with the location."""
-        return "at ({:.3f}, {:.3f}, {:.3f}) m".format(*self.position)
+        return Text("at ({:.3f}, {:.3f}, {:.3f}) m".format(*self.position)).at(self.position)
 
 
 @dataclass(frozen=True)

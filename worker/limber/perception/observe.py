@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option
 from limber.core.numerics.rigid import poses_at, rotation_angle, rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, SeenCloud, depth_to_cloud, read_camera, read_mask
@@ -94,7 +94,8 @@ def list_frames(folder: Path, kind: str) -> list[tuple[float, Path]]:
         frames = sorted((float(path.stem), path) for path in files)
     except ValueError as error:
         raise InputError(f"{folder}/{sub}: {error}.", "File names must be time stamps in seconds.",
-                         "Import the frames with `limber import-pull --rate-hz ...`.") from error
+                         "Import the frames with ",
+                         Command("import-pull", Option("rate_hz"), "..."), ".") from error
     if len(frames) < 2:
         raise InputError(f"{folder}/{sub} has {len(frames)} frames.", "At least two are needed.",
                          "Import the recording again.")

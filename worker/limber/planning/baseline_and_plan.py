@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError, NoPathError
+from limber.core.errors import InputError, NoPathError, Option, Text
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import judge
 from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
@@ -281,10 +281,9 @@ def _chosen(problem: GentleProblem, gentle: GentlePath, trees: dict[str, FoundPa
             {"iteration": number + 1, "cost": level["upper"]}
             for number, level in enumerate(certificate.levels)], engine="eikonal"), certificate
     if "D-RRT*" not in trees:
-        raise NoPathError(
-            f"D-RRT* found no path in {settings.iterations} iterations, but a path exists.",
-            "The eikonal planner found it.",
-            "Allow more --iterations, or omit --planner.")
+        raise NoPathError(f"D-RRT* found no path in {settings.iterations} iterations, but a path "
+                          "exists.", "The eikonal planner found it.", "Allow more ",
+                          Option("iterations"), ", or omit ", Option("planner"), ".")
     plan = trees["D-RRT*"]
     return plan, replace(certificate, upper=problem.cost(plan.points))
 
@@ -317,9 +316,9 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], tree: np.ndarray | 
     [n, 3], or the shortest one if it has none.
     """
     if settings.planner != "eikonal":
-        raise InputError("--max-detour is given with --planner d-rrt-star.",
-                         "D-RRT* cannot limit the length of its path.",
-                         "Omit --planner.")
+        raise InputError(
+            Text(Option("max_detour"), " is given with ", Option("planner", "d-rrt-star"), "."),
+            "D-RRT* cannot limit the length of its path.", "Omit ", Option("planner"), ".")
     rough = known or [plan_gentle(problem, progress=progress.part(0.0, 0.3)).points]
     paths = [_shortest(problem, path) for path in rough]
     shortest = min((path for path in paths if np.isfinite(path.cost)),

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import Cancelled, NoPathError
+from limber.core.errors import Cancelled, Command, NoPathError, Option, Text
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.baseline_and_plan import PathPair, plan_within, with_bound
@@ -402,8 +402,7 @@ class _Rounds:
 
 def _refused(broken: list[str]) -> NoPathError:
     return NoPathError(
-        f"No plan keeps the limits on the full model: {'; '.join(broken)}.",
-        f"The path was planned {_REPLANS + 1} times. After each plan, the states found on "
-        "the full model were added to the energy field.",
-        "Raise the limit, choose a gentler goal, or sample more poses with `limber energy "
-        "--samples`.")
+        Text("No plan keeps the limits on the full model: ", Text.joined("; ", broken), "."), "The "
+        f"path was planned {_REPLANS + 1} times. After each plan, the states found on the full "
+        "model were added to the energy field.", "Raise the limit, choose a gentler goal, or "
+        "sample more poses with ", Command("energy", Option("samples")), ".")

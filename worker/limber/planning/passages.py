@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from limber.core.errors import Command, Option
 from limber.core.progress import SILENT, Progress
 from limber.planning.constraints.limits import Limits, sampled_sizes, sizes
 from limber.planning.constraints.motion_check import learnt
@@ -142,11 +143,11 @@ def not_confirmed(limits: Limits, easiest: LeastViolation | None) -> BlockedErro
     least = "" if easiest is None or easiest.worst <= 1.0 else (
         f" By the field the easiest way takes {100.0 * easiest.worst:.0f} % of a limit, within its "
         "error.")
-    return BlockedError(
-        f"No path to the goal with{limits.in_words() or ' known poses'} was found, {UNPROVEN}.",
-        "The energy field, its error counted, leaves no path, but the full model does not confirm "
-        f"that where the way is closed.{least}",
-        "Relax the limits slightly, or sample more poses with `limber energy --samples`.")
+    return BlockedError(f"No path to the goal with{limits.in_words() or ' known poses'} was found, "
+                        f"{UNPROVEN}.", "The energy field, its error counted, leaves no path, but "
+                        f"the full model does not confirm that where the way is closed.{least}",
+                        "Relax the limits slightly, or sample more poses with ",
+                        Command("energy", Option("samples")), ".")
 
 
 # Poses sampled where the field's error leaves it undecided whether a path exists.

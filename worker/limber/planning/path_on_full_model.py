@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.core.errors import ConvergenceError
+from limber.core.errors import Command, ConvergenceError, Option
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.mechanics import StaticResult
@@ -133,10 +133,10 @@ class ResolvedPath:
             return self
         kinds = ", ".join(f"{self.reasons.count(kind)} {kind}"
                           for kind in sorted(set(self.reasons)))
-        raise ConvergenceError(
-            f"{len(self.reasons)} poses along a path have no acceptable solution ({kinds}).",
-            "The energy field allows motion that the branch cannot follow.",
-            "Sample more poses with `limber energy --samples`, or choose a gentler goal.")
+        raise ConvergenceError(f"{len(self.reasons)} poses along a path have no acceptable "
+                               f"solution ({kinds}).", "The energy field allows motion that the "
+                               "branch cannot follow.", "Sample more poses with ",
+                               Command("energy", Option("samples")), ", or choose a gentler goal.")
 
 
 def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from limber.core.errors import InputError, NoPathError
+from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import EdgeWeights, arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays, limited
@@ -134,19 +134,17 @@ def no_path_error(problem: GentleProblem, proof: str) -> BlockedError:
     if counted:
         proof += (" The proof includes the largest cross-validation error of the energy field: no "
                   f"path exists with{counted} on the field either.")
-    return BlockedError(
-        "No path exists in the sampled region: no path "
-        f"with{problem.limits_in_words() or ' accepted poses'} leads from the start to the "
-        "goal.", proof,
-        "Raise the limit, choose another goal, or sample farther (`limber energy --deflection`).")
+    return BlockedError("No path exists in the sampled region: no path "
+                        f"with{problem.limits_in_words() or ' accepted poses'} leads from the "
+                        "start to the goal.", proof, "Raise the limit, choose another goal, or "
+                        "sample farther (", Command("energy", Option("deflection")), ").")
 
 
 def not_found(problem: GentleProblem, why: str) -> BlockedError:
     """Return the error for a path that was not found, with ``why``, which proves nothing."""
-    return BlockedError(
-        f"No path to the goal with{problem.limits_in_words() or ' known poses'} was found, "
-        f"{UNPROVEN}.", why,
-        "Relax the limits slightly, or sample more poses with `limber energy --samples`.")
+    return BlockedError(f"No path to the goal with{problem.limits_in_words() or ' known poses'} "
+                        f"was found, {UNPROVEN}.", why, "Relax the limits slightly, or sample more "
+                        "poses with ", Command("energy", Option("samples")), ".")
 
 
 # The start of a path: at rest, at a given position, or drawn.
@@ -159,7 +157,8 @@ def start_of(field: EnergyField, goal: Goal, settings: PlanSettings) -> np.ndarr
         InputError: two are requested. NoPathError: none could be drawn.
     """
     if settings.start is not None and settings.start_seed is not None:
-        raise InputError("Both --start and --start-seed are given.",
+        raise InputError(Text("Both ", Option("start"), " and ", Option("start_seed"), " are "
+                              "given."),
                          "A path has only one start.", "Give only one of them.")
     if settings.start is not None:
         return np.array(settings.start, float)
@@ -188,7 +187,7 @@ def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: i
     if not fit.any():
         raise NoPathError("No allowed deformed start is far from rest and far from the goal.",
                           f"The distance must be at least {half:.3f} m.",
-                          "Give a --start, or relax the limits.")
+                          "Give a ", Option("start"), ", or relax the limits.")
     return points[np.flatnonzero(fit)[0]]
 
 
@@ -199,10 +198,10 @@ def check_start(field: EnergyField, start: np.ndarray, limits: FieldArrays) -> N
     position = ", ".join(f"{value:.3f}" for value in start)
     if not field.region.contains(start)[0]:
         away = float(np.linalg.norm(start - field.rest))
-        raise InputError(f"The start ({position}) m lies outside the sampled region"
-                         f"{unit_hint(away, field)}.",
-                         "The branch's energy is not known there.",
-                         "Choose a start nearer to rest, or sample farther (`limber energy "
-                         "--deflection`).")
+        raise InputError(f"The start ({position}) m lies outside the sampled "
+                         f"region{unit_hint(away, field)}.", "The branch's energy is not known "
+                         "there.", "Choose a start nearer to rest, or sample farther (",
+                         Command("energy", Option("deflection")), ").").at(start)
     raise InputError(f"The start breaks a limit: {over_limits(field, start[None], limits)}.",
-                     "A start must keep the limits.", "Raise the limit, or choose another start.")
+                     "A start must keep the limits.", "Raise the limit, or choose another start."
+                     ).at(start)

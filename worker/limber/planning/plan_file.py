@@ -5,6 +5,7 @@ and ``plan`` between start and goal, and ``motion``, the whole motion of a gripp
 branch to the start (``approach``), along the plan (``path``) and back along the same path
 (``return``). Each is a table of columns of equal length:
 
+from limber.core.errors import Command, Option, Text
 ``times_s``, ``poses`` [m, rad] [n][6], ``energies_j``, ``forces_n`` and ``torques_nm`` [n][3] (of
 the gripper on the branch, the torque about the pose's position), ``axial_forces_n`` (along the
 branch, outward), ``strains`` and ``stresses_pa`` (largest in the branch), ``tips_m`` [n][3],
@@ -35,7 +36,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.reading import checked_as, read_json
 from limber.core.json_values import number_array, plain
 from limber.core.not_none import present
@@ -381,8 +382,8 @@ def _path_from(content: dict[str, Any]) -> PlanPath:
 
 def _not_a_plan(path: Path, why: str) -> InputError:
     return InputError(f"{path} is not a plan ({why}).",
-                      "It was not written by `limber plan`, or is damaged.",
-                      "Run `limber plan` again with --force.")
+                      Text("It was not written by ", Command("plan"), ", or is damaged."),
+                      "Run ", Command("plan"), " again with ", Option("force", True), ".")
 
 
 # The summary of a plan: its measures and the shortest path's, its bound, and warnings.
@@ -471,19 +472,20 @@ def doubts_of(summary: dict[str, Any], field_error: float, *paths: ResolvedPath)
     if summary["plan"]["length_m"] <= _STILL:
         return ["The start already lies in the goal. The path has no length, and there is no "
                 "energy to save."]
-    doubts = [
-        f"Along the {label} path the energy field has an error of {error:.2g} % of the full "
-        f"model's energy, which exceeds the limit of {most:g} %. Sample more poses with `limber "
-        "energy --samples`."
+    doubts: list[str] = [
+        Text(f"Along the {label} path the energy field has an error of {error:.2g} % of the full "
+             f"model's energy, which exceeds the limit of {most:g} %. Sample more poses with ",
+             Command("energy", Option("samples")), ".")
         for key, label, most in (("baseline", "shortest", 15.0), ("plan", "gentle", field_error))
         if (error := 100.0 * summary[key]["field_energy_error"]) > most]
     gap = summary["certificate"]["gap_percent"]
     if gap is not None and gap > _WIDE_GAP:
         takes = "cost" if summary["certificate"].get("quantity", COST) == COST else "take"
         energy = "" if takes == "cost" else "energy "
-        doubts.append(f"The path may {takes} up to {gap:.1f} % more {energy}than the best "
-                      "possible one" + ("." if summary["planner"] == "eikonal" else
-                                        "; `--planner eikonal` comes closest."))
+        doubts.append(Text(
+            f"The path may {takes} up to {gap:.1f} % more {energy}than the best possible one",
+            *(".",) if summary["planner"] == "eikonal" else (
+                "; `", Option("planner", "eikonal"), "` comes closest.")))
     unsolved = sum(path.unsolved_count for path in paths)
     if unsolved:
         doubts.append(f"{unsolved} poses along the shortest path had no acceptable solution. Its "

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import BranchFolderError
+from limber.core.errors import BranchFolderError, Command, Option
 from limber.core.files.reading import read_arrays, require_shapes
 from limber.core.files.tables import csv_records
 
@@ -145,4 +145,4 @@ def read_trees(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 def _damaged(path: Path, why: str) -> BranchFolderError:
     return BranchFolderError(f"{path} does not contain search trees ({why}).",
                              "The file is damaged.",
-                             "Run `limber plan` again with --force.")
+                             "Run ", Command("plan"), " again with ", Option("force", True), ".")

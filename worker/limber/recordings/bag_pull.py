@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.optional import require_extra
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
@@ -66,7 +66,7 @@ def pull_of_bag(bag: Bag, folder: Path, settings: ImportSettings,
     warnings: list[str] = []
     bag = stamped(bag, clock, warnings)
     frames = Frames(bag.of("transform"), clock)
-    wrench = _chosen(bag, "wrench", settings.wrench_topic, "--wrench-topic",
+    wrench = _chosen(bag, "wrench", settings.wrench_topic, "wrench_topic",
                      "Stiffness cannot be estimated without a measured force.")
     if bag.broken:
         warnings.append(f"{bag.path.name}: {bag.broken} messages could not be decoded and were "
@@ -96,11 +96,10 @@ def _chosen(bag: Bag, kind: str, named: str | None, option: str, why: str) -> To
         present = ", ".join((*(topic.name for every in bag.kinds.values() for topic in every),
                              *bag.others)) or "no messages"
         missing = f"no {kind}" if named is None else f"no {kind} on {named}"
-        raise InputError(f"{bag.path} has {missing}.", f"{why} Its topics: {present[:400]}.",
-                         f"Name a topic with {option} (known: {known}).")
-    raise InputError(f"{bag.path} has {len(topics)} {kind} topics: {known}.",
-                     "A pull uses one gripper and one topic of each kind.",
-                     f"Select one with {option}.")
+        raise InputError(f"{bag.path} has {missing}.", Text(why, f" Its topics: {present[:400]}."),
+                         "Name a topic with ", Option(option), f" (known: {known}).")
+    raise InputError(f"{bag.path} has {len(topics)} {kind} topics: {known}.", "A pull uses one "
+                     "gripper and one topic of each kind.", "Select one with ", Option(option), ".")
 
 
 def _gripper(bag: Bag, frames: Frames, settings: ImportSettings, clock: str,
@@ -113,7 +112,7 @@ def _gripper(bag: Bag, frames: Frames, settings: ImportSettings, clock: str,
                  or _by_joints(bag, name, clock, joint_poses))
         if found is not None:
             return found
-    topic = _chosen(bag, "pose", name, "--pose-topic", "The gripper's pose is needed.")
+    topic = _chosen(bag, "pose", name, "pose_topic", "The gripper's pose is needed.")
     motion = Motion.of(getattr(topic, clock), topic.values)
     if len(motion.times) < 2:
         raise InputError(f"{bag.path}: {topic.name} has {len(motion.times)} poses.",
@@ -151,11 +150,10 @@ def _by_joints(bag: Bag, name: str | None, clock: str, joint_poses: JointPoses |
     if not bag.of("joints"):
         return None
     if joint_poses is None:
-        raise InputError(f"{bag.path} contains only joint angles.",
-                         "The gripper's pose must be computed from the arm's model and tool.",
-                         "Give the robot's cell file with --cell cell.toml, or record poses or "
-                         "TF.")
-    topic = _chosen(bag, "joints", name, "--pose-topic", "The gripper's pose is needed.")
+        raise InputError(f"{bag.path} contains only joint angles.", "The gripper's pose must be "
+                         "computed from the arm's model and tool.", "Give the robot's cell file "
+                         "with ", Option("cell"), " cell.toml, or record poses or TF.")
+    topic = _chosen(bag, "joints", name, "pose_topic", "The gripper's pose is needed.")
     times, first = np.unique(getattr(topic, clock), return_index=True)
     return times, joint_poses(topic.labels, topic.values[first]), "base"
 
@@ -178,12 +176,12 @@ def _require_one_clock(bag: Bag, streams: tuple[tuple[str, np.ndarray], ...],
     if first[0] <= second[-1] and second[0] <= first[-1]:
         return
     hint = "log" if settings.bag_clock == "header" else "header"
-    raise InputError(
-        f"{bag.path}: the {one} time stamps run from {first[0]:.1f} to {first[-1]:.1f} s, the "
-        f"{other} time stamps from {second[0]:.1f} to {second[-1]:.1f} s. They start "
-        f"{abs(first[0] - second[0]):.0f} s apart.",
-        "They do not overlap, so they come from different clocks.",
-        f"Synchronise the clocks (NTP), or use the other time stamps with --bag-clock {hint}.")
+    raise InputError(f"{bag.path}: the {one} time stamps run from {first[0]:.1f} to "
+                     f"{first[-1]:.1f} s, the {other} time stamps from {second[0]:.1f} to "
+                     f"{second[-1]:.1f} s. They start {abs(first[0] - second[0]):.0f} s apart.",
+                     "They do not overlap, so they come from different clocks.", "Synchronise the "
+                     "clocks (NTP), or use the other time stamps with ", Option("bag_clock", hint),
+                     ".")
 
 
 def _on_branch(topic: Topic, clock: np.ndarray, times: np.ndarray, poses: np.ndarray, base: str,
@@ -239,8 +237,8 @@ def _placed(base: str, frames: Frames, settings: ImportSettings, warnings: list[
     if found is not None:
         return found[0][0], found[1][0]
     if base != BRANCH_FRAME:
-        warnings.append(f"Poses are in frame {base or '(none)'}, which is assumed to be the "
-                        "branch's frame. If it is not, give --frame-pose.")
+        warnings.append(Text(f"Poses are in frame {base or '(none)'}, which is assumed to be the "
+                             "branch's frame. If it is not, give ", Option("frame_pose"), "."))
     return np.zeros(3), Rotation.identity()
 
 
@@ -254,15 +252,17 @@ def _seen(bag: Bag, folder: Path, settings: ImportSettings, clock: str, begin: f
     images = [topic for topic in bag.of("image") if named in (None, topic.name)]
     points = [topic for topic in bag.of("points") if named in (None, topic.name)]
     if named is not None and not images and not points:
-        _chosen(bag, "points", named, "--points-topic", "The option --points-topic requests it.")
+        _chosen(bag, "points", named, "points_topic", Text("The option ", Option("points_topic"),
+                                                             " requests it."))
     if len(images) + len(points) > 1:
         if named is None and len(points) == 1:
             images = []
         else:
             known = ", ".join(topic.name for topic in (*images, *points))
             raise InputError(f"{bag.path} has more than one topic that shows the branch: {known}.",
-                             "The model is compared with only one of them.",
-                             "Select one with --points-topic, or give --points-topic none.")
+                             "The model is compared with only one of them.", "Select one with ",
+                             Option("points_topic"), ", or give ",
+                             Option("points_topic", "none"), ".")
     if points:
         topic = points[0]
         times = getattr(topic, clock) - begin

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.optional import require_extra
 from limber.geometry.io.isolated_readers import read_apart
 
@@ -296,9 +296,8 @@ def _of_topic(bag: Bag, topic: Topic, clock: str, warnings: list[str]) -> Topic:
         other = "log" if clock == "stamps" else "header"
         raise InputError(
             f"{bag.path}: {int((~known).sum())} of {len(times)} messages of {topic.name} have no "
-            f"time in their {'headers' if clock == 'stamps' else 'log'}.",
-            "Their order in time is not known from there.",
-            f"Use the other times: --bag-clock {other}.")
+            f"time in their {'headers' if clock == 'stamps' else 'log'}.", "Their order in time is "
+            "not known from there.", "Use the other times: ", Option("bag_clock", other), ".")
     # The other clock continues while a driver's is set.
     lead = topic.stamps - topic.logged
     good = known & (np.abs(lead - np.median(lead[known])) < _OFF_S)

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 from limber.core.constants import FORCE_UNITS_N
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.recordings.tables import (
     FORCE_NAMES_N,
     LENGTH_UNITS_M,
@@ -210,12 +210,10 @@ def _column(table: Table, name: str, units: dict[str, float], requested: str | N
         if requested is not None:
             return index, units[requested]
         if title.unit is None:
-            raise InputError(
-                f"{table.path}: the column {text!r} does not state a unit. Known units: "
-                f"{', '.join(units)}.",
-                "A number without a unit cannot be used.",
-                "Add the unit to the title, for example 'Force (N)', or give --unit and "
-                "--force-unit.")
+            raise InputError(f"{table.path}: the column {text!r} does not state a unit. Known "
+                             f"units: {', '.join(units)}.", "A number without a unit cannot be "
+                             "used.", "Add the unit to the title, for example 'Force (N)', or "
+                             "give ", Option("unit"), " and ", Option("force_unit"), ".")
         return index, scale_of(title, units, "", table.path)
     raise InputError(f"{table.path} has the columns {', '.join(table.titles)}.",
                      f"No column name contains {name.replace('|', ' or ')}.", "Rename the column.")

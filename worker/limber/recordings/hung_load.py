@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option
 from limber.recordings.recording import Observations
 
 FRAMES = 4
@@ -105,8 +105,8 @@ def settled(seen: Observations, name: str) -> Settled:
         raise InputError(
             f"{name}: the recording ends before the branch is at rest (it still moves by "
             f"{swing * 1e3:.2g} mm).", "A static fit needs the branch at rest under the load.",
-            "Record until the branch has settled, or import the recording with --motion swing and "
-            "fit the swing (`limber swing`).")
+            "Record until the branch has settled, or import the recording with ",
+            Option("motion", "swing"), " and fit the swing (", Command("swing"), ").")
     blocks = np.array_split(np.arange(first, len(times)), FRAMES)
     means = np.array([_mean(positions[block]) for block in blocks])
     middle = np.array([times[block].mean() for block in blocks])

@@ -9,7 +9,7 @@ import scipy
 from scipy.spatial.transform import Rotation
 
 from limber.core.constants import UNIT_METRES
-from limber.core.errors import InputError, MissingDependencyError, WorkError
+from limber.core.errors import InputError, MissingDependencyError, Option, WorkError
 from limber.core.files.reading import checked_as, read_json, read_text
 from limber.core.files.safe_names import inside
 from limber.core.json_values import number_array, validated
@@ -297,7 +297,7 @@ def _yolo_masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
     if not images:
         raise InputError(f"{source} has no colour images.", "YOLO segments the branch in colour "
                                                             "images.",
-                         "Record rgb/ (and rgb.txt), or omit --yolo-weights.")
+                         "Record rgb/ (and rgb.txt), or omit ", Option("yolo_weights"), ".")
     segment = YoloSegmenter(settings.yolo_weights, prompt=settings.yolo_prompt)
     masks: list[np.ndarray | None] = []
     for stamp in stamps:
@@ -330,7 +330,7 @@ def _stamp(file: Path, index: int, settings: Any) -> float:
         return stamp
     except ValueError as error:
         raise InputError(f"The file name {file.name} is not a time stamp.",
-                         "Every frame needs a time.", "Give --rate-hz.") from error
+                         "Every frame needs a time.", "Give ", Option("rate_hz"), ".") from error
 
 
 # Pixels that show the branch: from a file, from depth alone, or from the user's YOLO model.

@@ -11,7 +11,7 @@ import numpy as np
 
 from limber.core.alignment import Alignment
 from limber.core.constants import GRAVITY
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.files.reading import read_toml
 from limber.core.not_none import present
 from limber.core.numerics.rigid import rotation_matrix
@@ -97,8 +97,9 @@ def likely_slip(points: np.ndarray, nodes: np.ndarray, alignment: Alignment, nea
         if fits(factor * points):
             return f"They fit as {unit}: name the unit in the titles, such as x_{unit[0]}m."
     if fits(alignment.apply_metres(points)):
-        return ("They fit in the frame of the scan: state it with --coordinates scan and "
-                "--frame-pose 0 0 0 0 0 0 for the gripper, --marker-frame 0 0 0 0 0 0 for markers.")
+        return Text("They fit in the frame of the scan: state it with ",
+                    Option("coordinates", "scan"), " and ", Option("frame_pose", (0,) * 6),
+                    " for the gripper, ", Option("marker_frame", (0,) * 6), " for markers.")
     for order in permutations(range(3)):
         if order != (0, 1, 2) and fits(points[:, order]):
             return (f"They fit with the titles x, y, z exchanged: the columns titled x, y, z are "
@@ -134,13 +135,13 @@ class BranchFrame:
         if self.path is None:
             raise InputError("The branch has no skeleton.",
                              "A distance is measured along the main path.",
-                             "Give --grasp-point, or reconstruct the branch first.")
+                             "Give ", Option("grasp_point"), ", or reconstruct the branch first.")
         along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(self.path, axis=0), axis=1))]
         if distance > along[-1]:
             raise InputError(f"The position of the grasp is {distance:g} m from the base, but the "
-                             f"main path is {along[-1]:.3g} m long.",
-                             "There is no branch to hold at that distance.",
-                             "Check the distance and its unit, or give --grasp-point.")
+                             f"main path is {along[-1]:.3g} m long.", "There is no branch to hold "
+                             "at that distance.", "Check the distance and its unit, or give ",
+                             Option("grasp_point"), ".")
         return np.array([np.interp(distance, along, axis) for axis in self.path.T])
 
 
@@ -203,10 +204,11 @@ class ImportRequest:
         if pose is None:
             return points
         if self.settings.nominal is not None:
-            raise InputError("Both --marker-frame and --nominal are given.",
+            raise InputError(Text("Both ", Option("marker_frame"), " and ", Option("nominal"),
+                                  " are given."),
                              "Each determines where the markers are on the branch.",
-                             "Give --marker-frame if the pose of their frame was measured; else "
-                             "--nominal.")
+                             "Give ", Option("marker_frame"), " if the pose of their frame was "
+                             "measured; else ", Option("nominal"), ".")
         return points @ rotation_matrix(np.array(pose[3:])).T + pose[:3]
 
     def own_markers(self, seen: np.ndarray) -> bool:
@@ -284,8 +286,8 @@ def require_on_branch(grasp: GraspEntry, name: str, branch: BranchFrame) -> None
             f"{name}: the grasp point ({point}) m is {off * 1e3:.0f} mm away from the branch.",
             "The gripper would not hold the branch. The point, or the whole recording, has "
             f"another frame of reference or unit. {slip}".rstrip(),
-            "Give a --grasp-point on the branch, in the frame set by --coordinates, and check "
-            "--unit.")
+            "Give a ", Option("grasp_point"), " on the branch, in the frame set by ",
+            Option("coordinates"), ", and check ", Option("unit"), ".").at(grasp.point_m)
 
 
 def require_near(rest: np.ndarray, name: str, branch: BranchFrame) -> None:
@@ -304,8 +306,8 @@ def require_near(rest: np.ndarray, name: str, branch: BranchFrame) -> None:
             f"{name}: at rest a marker is {off.max() * 1e3:.0f} mm away from the branch, which is "
             f"{extent * 1e3:.0f} mm long.",
             f"The recording has another frame of reference or another unit. {slip}".rstrip(),
-            "Give the markers' positions on the branch with --nominal, or the pose of their frame "
-            "with --marker-frame, and check --unit.")
+            "Give the markers' positions on the branch with ", Option("nominal"), ", or the pose "
+            "of their frame with ", Option("marker_frame"), ", and check ", Option("unit"), ".")
 
 
 def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
@@ -318,14 +320,14 @@ def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
         return pull
     if robot is None:
         taken = CalibrationEntry()
-        return pull.warned(
+        return pull.warned(Text(
             f"{pull.name}: the calibration errors of gripper and force sensor are not stated. "
             f"Assumed standard deviations: gripper frame {1e3 * taken.pose_sigma_m:g} mm and "
             f"{np.degrees(taken.pose_sigma_rad):.1g} degrees, force "
-            f"{100 * taken.force_gain_sigma:g} %, force zero {taken.force_bias_sigma_n:g} N, "
-            f"force drift {taken.force_drift_sigma_n:g} N. They widen the interval of an "
-            "estimate. Give the robot's cell file with --cell, or "
-            "[calibration] in --pull-toml.")
+            f"{100 * taken.force_gain_sigma:g} %, force zero {taken.force_bias_sigma_n:g} N, force "
+            f"drift {taken.force_drift_sigma_n:g} N. They widen the interval of an estimate. Give "
+            "the robot's cell file with ", Option("cell"), ", or [calibration] in ",
+            Option("pull_toml"), "."))
     sensor = pull.entry.sensor.model_copy(update={
         "force_range_n": robot.noise.force_range_n,
         **({} if "force_sigma" in request.stated else {

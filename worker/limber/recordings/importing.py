@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.files.safe_names import refuse_links
 from limber.core.files.tables import write_table
 from limber.recordings.bag_pull import pull_of_bag
@@ -219,7 +219,7 @@ def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEn
     if np.isin(np.round(seen, 6), np.round(pull.times, 6)).all():
         request.progress.warn(
             f"{pull.name}: gripper and observations have the same time stamps, so one clock is "
-            "assumed. If there were two, state --time-offset.")
+            "assumed. If there were two, state ", Option("time_offset"), ".")
         return pull.entry
     if seen[-1] < pull.times[0] or seen[0] > pull.times[-1]:
         offset = float(pull.times[0] - seen[0])
@@ -230,9 +230,9 @@ def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEn
     found, sigma = estimate_offset(replace(pull, entry=entry))
     if sigma < DETERMINED_S:
         request.progress.warn(
-            f"{pull.name}: the clocks' offset was found from the motion: {found:.4f} s "
-            f"(standard deviation {1e3 * sigma:.1f} ms) is added to the observations' times. If "
-            "the clocks are one, state --time-offset 0.")
+            f"{pull.name}: the clocks' offset was found from the motion: {found:.4f} s (standard "
+            f"deviation {1e3 * sigma:.1f} ms) is added to the observations' times. If the clocks "
+            "are one, state ", Option("time_offset", 0), ".")
         known = calibration_of(entry)
         is_wider = sigma > known.clock_sigma_s > 0
         return entry.model_copy(update={"time_offset_s": found} | ({
@@ -247,9 +247,9 @@ def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
     """The pull of the branch's observations, or of the robot's log, and the robot's table."""
     if chosen.holds == "robot" and request.settings.robot is not None:
         raise InputError(
-            f"{request.source.name} holds a gripper's positions and forces, and --robot was given "
-            "as well.", "The two tables are likely exchanged.",
-            f"Give the markers as SOURCE, and --robot {request.source.name}.")
+            Text(f"{request.source.name} holds a gripper's positions and forces, and ",
+                 Option("robot"), " was given as well."), "The two tables are likely exchanged.",
+            "Give the markers as SOURCE, and ", Option("robot", request.source.name), ".")
     found, settings = _read(chosen, request), request.settings
     observations: Observations | None = None
     rest: np.ndarray | None = None
@@ -274,9 +274,9 @@ def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
 
 def _gripper(request: ImportRequest) -> Stream:
     if request.settings.robot is None:
-        raise InputError("No robot table was given.",
-                         "A pull needs the gripper's pose, and its force where measured.",
-                         "Give the table with --robot ROBOT.csv, or a hung weight with --weight.")
+        raise InputError("No robot table was given.", "A pull needs the gripper's pose, and its "
+                         "force where measured.", "Give the table with ", Option("robot"),
+                         " ROBOT.csv, or a hung weight with ", Option("weight"), ".")
     return read_robot(Path(request.settings.robot), request)
 
 
@@ -287,7 +287,7 @@ def _at_rest_first(seen: Observations, labels: list[str], stream: Stream, name: 
     if not there.any():
         raise InputError(f"{name}: no marker is visible in the first frame.",
                          "The markers' positions at rest are not known.",
-                         "Start the recording before the pull, or give --nominal.")
+                         "Start the recording before the pull, or give ", Option("nominal"), ".")
     unseen = [label for label, here in zip(labels, there, strict=True) if not here]
     messages = [f"{name}: {label} is not visible in the first frame, where the branch is at rest, "
                 "and was discarded." for label in unseen]
@@ -394,7 +394,7 @@ def _markers(seen: Observations, recorded: PullEntry | None, request: ImportRequ
     if not len(used):
         raise InputError(f"{request.name}: no marker is visible in the first frame.",
                          "The markers' positions at rest are not known.",
-                         "Start the recording before the pull, or give --nominal.")
+                         "Start the recording before the pull, or give ", Option("nominal"), ".")
     positions = seen.positions[:, used]
     seen = replace(seen, positions=placed.apply(positions) if placed else positions)
     rest = np.array(at_rest) if known else seen.positions[0]

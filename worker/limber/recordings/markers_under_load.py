@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option, Text
 from limber.core.not_none import present
 from limber.recordings.force_slope import ForceTable
 from limber.recordings.hung_load import settled, swung
@@ -43,18 +43,18 @@ def require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
             "The rest position is determined from marker tracks.",
             "Give a CSV or C3D file of markers.")
     if settings.weight is not None and settings.load is not None:
-        raise InputError("Both --weight and --load were given.", "The branch carries one load.",
-                         "Give only one of them.")
+        raise InputError(Text("Both ", Option("weight"), " and ", Option("load"), " were given."),
+                         "The branch carries one load.", "Give only one of them.")
     sags = settings.weight == 0 and settings.own_weight
     if settings.grasp_point is None and settings.grasp_distance is None and not sags:
         raise InputError("A load was given without its position.",
                          "The deflection of the branch depends on that position.",
-                         "Give --grasp-point or --grasp-distance.")
+                         "Give ", Option("grasp_point"), " or ", Option("grasp_distance"), ".")
     if settings.motion == "dynamic":
         raise InputError("A steady load was given for a dynamic pull.",
                          "A branch under a steady load either swings after release or is at rest.",
-                         "For a swing, give --motion swing and run `limber swing`. For the rest "
-                         "position, omit --motion.")
+                         "For a swing, give ", Option("motion", "swing"), " and run ",
+                         Command("swing"), ". For the rest position, omit ", Option("motion"), ".")
 
 
 def import_load(read: tuple[Stream, list[str]], request: ImportRequest) -> dict[str, Any]:
@@ -218,8 +218,9 @@ def against_load(moved: np.ndarray, load: np.ndarray) -> str:
         mean @ load / max(np.linalg.norm(mean) * np.linalg.norm(load), 1e-12), -1, 1)))
     if turn < 100:
         return ""
-    return (f"the markers move at {turn:.0f} degrees to the load. Check that the recording is in "
-            "the branch's frame (--nominal), and check the direction of the load.")
+    return Text(f"the markers move at {turn:.0f} degrees to the load. Check that the recording is "
+                "in the branch's frame (", Option("nominal"), "), and check the direction of the "
+                "load.")
 
 
 def _load(request: ImportRequest) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.reading import checked_as, read_toml, toml_content
 from limber.core.json_values import plain, validated
 from limber.core.numerics.rigid import rotation_matrix
@@ -296,7 +296,8 @@ def read_entry(path: Path) -> PullEntry:
         InputError: it is missing, not TOML, or an entry makes no sense; the message names the
         entry.
     """
-    content = read_toml(path, "the description of a pull (`limber import-pull` makes one)")
+    content = read_toml(path, Text("the description of a pull (", Command("import-pull"), " makes "
+                                   "one)"))
     return _checked(content, str(path))
 
 
@@ -363,9 +364,9 @@ def _columns(path: Path, stream: Stream, names: tuple[str, ...], missing: float 
 
 def _marker_observations(path: Path, stream: Stream) -> Observations:
     if len(stream.columns) % 3 or not all(name.endswith("_m") for name in stream.columns):
-        raise InputError(f"{path} has the columns {', '.join(stream.columns)}.",
-                         "Three columns per marker, m0_x_m, m0_y_m, m0_z_m, ..., were expected.",
-                         "Import the file with `limber import-pull --unit ...`.")
+        raise InputError(f"{path} has the columns {', '.join(stream.columns)}.", "Three columns "
+                         "per marker, m0_x_m, m0_y_m, m0_z_m, ..., were expected.", "Import the "
+                         "file with ", Command("import-pull", Option("unit"), "..."), ".")
     positions = stream.values.reshape(len(stream), -1, 3)
     partly = np.isfinite(positions).any(axis=2) & ~np.isfinite(positions).all(axis=2)
     positions = np.where(partly[..., None], np.nan, positions)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from limber.core.constants import FORCE_UNITS_N
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS
 from limber.recordings.tables import (
     ANGLE_UNITS_RAD,
@@ -130,8 +130,9 @@ def _add_rotation(values: dict[str, np.ndarray], titles: list[Title], stream: St
         turns = _of_angles({name: stream.values[:, at[name]] * scale_of(
             titles[at[name]], ANGLE_UNITS_RAD, "rad", path) for name in angles}, path)
     else:
-        warnings.append("The robot's table has no rotation, so the gripper is assumed not to "
-                        "rotate. This is correct for a point grasp (--grasp-mode point).")
+        warnings.append(Text("The robot's table has no rotation, so the gripper is assumed not to "
+                             "rotate. This is correct for a point grasp (",
+                             Option("grasp_mode", "point"), ")."))
         turns = np.zeros((len(stream), 3))
     values |= dict(zip(POSE_COLUMNS[3:], turns.T, strict=True))
 

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from limber.core.constants import FORCE_UNITS_N
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.recordings.recording import Observations, Pull
 from limber.recordings.time_series import gaps, saturated, spikes
 
@@ -85,9 +85,9 @@ def force_unit_suspicion(young_pa: float) -> str | None:
     fitting = [name for name, newtons in FORCE_UNITS_N.items()
                if name != "N" and low <= young_pa * newtons <= high]
     hint = f"It may be in {' or '.join(fitting)}. " if fitting else ""
-    return (f"The measured force implies a Young's modulus of {young_pa:.2g} Pa, outside the "
-            f"range of plants, {low:.0e}-{high:.0e} Pa. The force may be in another unit than "
-            f"newtons. {hint}Import the recording with --force-unit.")
+    return Text(f"The measured force implies a Young's modulus of {young_pa:.2g} Pa, outside the "
+                f"range of plants, {low:.0e}-{high:.0e} Pa. The force may be in another unit than "
+                f"newtons. {hint}Import the recording with ", Option("force_unit"), ".")
 
 
 def unswapped(observations: Observations) -> tuple[Observations, list[int]]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.numerics.rigid import poses_at
 from limber.recordings.recording import Pull
 from limber.recordings.time_series import gaps, inside_gap
@@ -80,7 +80,7 @@ def frames_of(pull: Pull) -> Frames:
             f"{pull.name}: the robot's recording covers {pull.times[0]:.2f} to "
             f"{pull.times[-1]:.2f} s, the observations {times[0]:.2f} to {times[-1]:.2f} s.",
             "Fewer than two observations lie within the robot's recording.",
-            "Import it again with the right --time-offset.")
+            "Import it again with the right ", Option("time_offset"), ".")
     warnings = () if usable.all() else (
         f"{pull.name}: {np.sum(~usable)} of {len(times)} observed frames lie outside the robot's "
         "recording or in a gap in it. They are not used.",)
@@ -184,7 +184,7 @@ def _not_found(name: str, start: float, low: float, high: float) -> InputError:
         f"Offsets of {start - SEARCH_S:.4g} to {start + SEARCH_S:.4g} s were tried.",
         f"{several}, so the pull does not determine the offset between the clocks.",
         "Check that both tables are of the same pull and that their times are in the stated unit; "
-        "then state the offset with --time-offset.")
+        "then state the offset with ", Option("time_offset"), ".")
 
 
 @dataclass(frozen=True)

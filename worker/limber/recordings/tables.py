@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.core.constants import FORCE_UNITS_N, UNIT_METRES
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.files import text_columns
 from limber.core.files.text_columns import (
     DECIMAL_COMMA,
@@ -465,10 +465,9 @@ def time_stream(table: Table, rate_hz: float | None = None, *, keep_repeated: bo
         count = np.arange(float(len(table.values))) if at is None else table.values[:, at]
         times = (count - np.nanmin(count, initial=np.inf)) / rate_hz
     else:
-        raise InputError(
-            f"{table.path} has the columns {', '.join(table.titles)}.",
-            "No column is named time (t_s, Time (ms), timestamp, ...).",
-            "Rename the column of time stamps, or give --rate-hz.")
+        raise InputError(f"{table.path} has the columns {', '.join(table.titles)}.", "No column is "
+                         "named time (t_s, Time (ms), timestamp, ...).", "Rename the column of "
+                         "time stamps, or give ", Option("rate_hz"), ".")
     kept = [k for k in range(len(titles)) if k not in used]
     times, values = in_order(table.path, times, table.values[:, kept], warnings,
                              keep_repeated=keep_repeated)

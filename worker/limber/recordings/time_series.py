@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option
 from limber.core.files.reading import read_text
 from limber.core.files.tables import write_table
 from limber.core.files.text_columns import plain
@@ -63,7 +63,7 @@ def read_stream(path: str | Path) -> Stream:
     if "t_s" not in rows.header:
         raise InputError(f"{path} has the columns {', '.join(rows.header)}.",
                          "A column t_s with time stamps in seconds was expected.",
-                         "Rename the column, or import the file with `limber import-pull`.")
+                         "Rename the column, or import the file with ", Command("import-pull"), ".")
     table = np.array(rows.numbers, float).reshape(-1, len(rows.header))
     at = rows.header.index("t_s")
     times, values = table[:, at], np.delete(table, at, axis=1)
@@ -197,9 +197,9 @@ def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[s
     if backward and backward >= 0.1 * len(times):
         raise InputError(f"{path}: {backward} of {len(times)} time stamps run backwards.",
                          "The order of the rows is not reliable.",
-                         "Check the recorder's clock and the column used as time"
-                         + (", or state the readings per second with --rate-hz."
-                            if keep_repeated else "."))
+                         "Check the recorder's clock and the column used as time",
+                         *((", or state the readings per second with ", Option("rate_hz"), ".")
+                           if keep_repeated else (".",)))
     if backward:
         warnings.append(f"{path.name}: {backward} time stamps are out of order. The rows were "
                         "sorted.")

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.cell.cell_file import Cell
-from limber.core.errors import InputError, LimberError
+from limber.core.errors import Command, InputError, LimberError, Option
 from limber.core.numerics.rigid import inverted, matrices
 from limber.geometry.cloud.camera import Camera, depth_to_cloud, write_camera
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -114,9 +114,9 @@ def fixed_camera(cell: Cell, camera: RealSense) -> Camera:
         InputError: the cell has no camera, or one on the flange.
     """
     if cell.camera is None or cell.camera.mount != "branch":
-        raise InputError("The cell file has no [camera] with mount = \"branch\".",
-                         "During a pull the camera has to stand still beside the branch.",
-                         "Calibrate a fixed camera: limber robot calibrate --images.")
+        raise InputError("The cell file has no [camera] with mount = \"branch\".", "During a pull "
+                         "the camera has to stand still beside the branch.", "Calibrate a fixed "
+                         "camera: ", Command("robot calibrate", Option("images")), ".")
     return camera.camera.model_copy(update={"pose": tuple(cell.camera.pose),
                                             "depth_scale": _DEPTH_SCALE})
 

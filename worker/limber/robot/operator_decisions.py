@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from limber.core.errors import InputError, LimberError, SafetyStop
+from limber.core.errors import InputError, LimberError, Option, SafetyStop
 from limber.robot.driver.link import COLUMNS, RobotLink
 from limber.robot.grippers import drive_gripper, holds, is_driven
 from limber.robot.robot_state import show_before_motion
@@ -40,8 +40,8 @@ def require_confirmation(name: str, typed: str | None, cell: Cell, progress: Pro
         typed = input(f"The robot will move. Type {name} to continue: ").strip()
     if typed != name:
         raise InputError("Nobody confirmed that the robot may move.", "",
-                         f"Give --confirm {name}, with the workspace free and a hand at the "
-                         "emergency stop.")
+                         "Give ", Option("confirm", name), ", with the workspace free and a hand "
+                         "at the emergency stop.")
 
 
 def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: Progress,

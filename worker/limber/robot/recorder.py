@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from limber.cell.cell_file import Cell
-from limber.core.errors import WorkError
+from limber.core.errors import Option, WorkError
 from limber.core.files.tables import table_line
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, CalibrationEntry, SensorEntry
@@ -134,9 +134,9 @@ class MarkerStream:
         try:
             self._socket = socket.create_connection((address, port), timeout)
         except OSError as error:
-            raise WorkError(f"No markers arrive from {address} port {port} ({error}).",
-                            "The pull would be recorded without observations.",
-                            "Start the tracker, or record without --markers.") from error
+            raise WorkError(f"No markers arrive from {address} port {port} ({error}).", "The pull "
+                            "would be recorded without observations.", "Start the tracker, or "
+                            "record without ", Option("markers"), ".") from error
         self._data = b""
         self._count: int | None = None
         self.rejected_count = 0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from limber.cell.cell_file import Cell
-from limber.core.errors import SafetyStop
+from limber.core.errors import Command, SafetyStop
 from limber.core.numerics.rigid import matrices
 from limber.robot.cell.controller_settings import Difference, differences
 from limber.robot.driver.controls import calibration_of, control_of
@@ -142,10 +142,9 @@ def show_before_motion(cell: Cell, warn: Callable[[str], None]) -> None:
                          "Limber's own program would end it, wherever it is.",
                          "Stop it on the pendant.")
     if warnings := seen.implausible(cell):
-        raise SafetyStop(f"The force sensor cannot be right: {'; '.join(warnings)}.",
-                         "The guard would not feel the branch.",
-                         "Check the sensor and the cell's [sensor] entries with `limber robot "
-                         "check`.")
+        raise SafetyStop(f"The force sensor cannot be right: {'; '.join(warnings)}.", "The guard "
+                         "would not feel the branch.", "Check the sensor and the cell's [sensor] "
+                         "entries with ", Command("robot check"), ".")
     for each in seen.differences:
         warn(f"{each}.")
     if untested := unweighed(cell):

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from limber.core.errors import InputError, LimberError
+from limber.core.errors import InputError, LimberError, Option
 from limber.core.numerics.rigid import pose_between
 from limber.core.processes.child import Child
 from limber.mechanics.dynamics.integration import NewmarkSettings
@@ -249,9 +249,8 @@ class Answering:
     def set_dynamics(self, on: bool) -> None:
         """Switch between motion over time and equilibria."""
         if on and not self._settings.reduced:
-            raise InputError("Motion needs a reduced model.",
-                             "This session was started without one.",
-                             "Start it without --no-reduced.")
+            raise InputError("Motion needs a reduced model.", "This session was started without "
+                             "one.", "Start it with ", Option("reduced", True), ".")
         self._wants_motion = on
         self._choose()
 

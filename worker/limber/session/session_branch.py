@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.numerics.rigid import pose_between
 from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -167,7 +167,7 @@ class HeldBranch:
         """
         if on and self.model.prestress is None:
             raise InputError("The branch has no weight.", "The session was started without it.",
-                             "Start it without --no-gravity.")
+                             "Start it with ", Option("gravity", True), ".")
         self.gravity_on = on
 
     def set_young(self, young: np.ndarray) -> None:

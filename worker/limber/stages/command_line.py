@@ -17,6 +17,7 @@ from typing import Any, Literal
 import click
 from pydantic import BaseModel
 
+from limber.core.errors import Command, Option, Text
 from limber.core.settings import OneOf, Settings, checked_settings
 from limber.stages.registry import StageDescription
 
@@ -126,21 +127,19 @@ def options_of(command: click.Command) -> frozenset[str]:
                      for flag in (*param.opts, *param.secondary_opts))
 
 
-def without_foreign_options(text: str, own: Collection[str]) -> str:
-    """Return a message without the parts that name options not among ``own``.
+def without_foreign_options(message: Text, own: Collection[str]) -> str:
+    """Return a message without the brackets and sentences that name options not among ``own``.
 
-    For a command that runs others: its user cannot give their options. Brackets and sentences that
-    name such an option are removed.
+    For a command that runs others: its user cannot give their options.
     """
-    def is_foreign(part: str) -> bool:
-        return not {*_OPTION.findall(part)} <= {*own}
-    text = _BRACKETS.sub(lambda found: "" if is_foreign(found[0]) else found[0], text)
-    return " ".join(part for part in _SENTENCE_END.split(text) if not is_foreign(part))
+    text = message.shown(lambda part: str(part) if is_own(part, own) else "\0")
+    return " ".join(part for part in re.split(r"(?<=[.?!])\s+", re.sub(
+        r"\s*\([^()]*\0[^()]*\)", "", text)) if "\0" not in part)
 
 
-_OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
-_BRACKETS = re.compile(r"\s*\([^()]*\)")
-_SENTENCE_END = re.compile(r"(?<=[.?!])\s+")
+def is_own(part: Option | Command, own: Collection[str]) -> bool:
+    """Whether a command with the options ``own`` can be given an option; any command can be run."""
+    return isinstance(part, Command) or str(Option(part.name)) in own
 
 
 def settings_options(model: type[BaseModel], name: str = "settings", *,

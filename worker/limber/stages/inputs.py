@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.progress import Progress
 from limber.core.settings import Groups, Settings
 
@@ -88,7 +88,7 @@ class PlacedInputs(BranchInputs):
             if kind == "branch axes" and value is not None:
                 raise InputError(f"--{name.replace('_', '-')} is given in the scan's coordinates.",
                                  "Its box has the axes of the branch's frame, which are others.",
-                                 "Give all positions with --coordinates branch.")
+                                 "Give all positions with ", Option("coordinates", "branch"), ".")
             if kind == "branch" and value is not None:
                 moved[name] = tuple(alignment.apply_metres(value).tolist())
         return settings.model_copy(update=moved)

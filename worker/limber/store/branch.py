@@ -26,7 +26,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from limber.core.constants import GRAVITY
-from limber.core.errors import BranchFolderError
+from limber.core.errors import BranchFolderError, Command, Option
 from limber.core.files.atomic import file_digest, owned_name, sweep
 from limber.core.json_values import plain
 from limber.store import journal
@@ -208,16 +208,15 @@ class Branch:
     def has(self, name: str) -> bool:
         return name in self.manifest.files and (self.folder / checked_name(name)).is_file()
 
-    def require(self, name: str, made_by: str) -> Path:
+    def require(self, name: str, made_by: str, *options: Option) -> Path:
         """Return the path of file ``name``; ``made_by`` is the command that would make it.
 
         Raises:
             BranchFolderError: the file is not there.
         """
         if not self.has(name):
-            raise BranchFolderError(
-                f"{self.folder} has no {name}.", "The stage that writes it has not been run.",
-                f"Run `limber {made_by}` first.")
+            raise BranchFolderError(f"{self.folder} has no {name}.", "The stage that writes it has "
+                                    "not been run.", "Run ", Command(made_by, *options), " first.")
         return self.path(name)
 
     def names(self, folder: str) -> list[str]:

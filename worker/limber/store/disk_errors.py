@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from limber.core.errors import BranchFolderError, WorkError
+from limber.core.errors import BranchFolderError, Command, Option, WorkError
 from limber.core.machine_errors import machine_error
 from limber.store import journal
 from limber.store.manifest import MANIFEST
@@ -95,7 +95,7 @@ def limits_paths() -> bool:
 def require_room(folder: Path, purpose: str) -> None:
     free = shutil.disk_usage(folder).free
     if free < LEAST_FREE_BYTES:
-        raise WorkError(f"The disk of {folder} has {free / 1e6:.0f} MB left.",
-                        f"{purpose} needs {LEAST_FREE_BYTES / 1e6:.0f} MB; otherwise its results "
-                        "would be lost.",
-                        "Make room (`limber cache --clear` frees some), or move the folder.")
+        raise WorkError(f"The disk of {folder} has {free / 1e6:.0f} MB left.", f"{purpose} needs "
+                        f"{LEAST_FREE_BYTES / 1e6:.0f} MB; otherwise its results would be lost.",
+                        "Make room (", Command("cache", Option("clear", True)), " frees some), or "
+                        "move the folder.")

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from limber.core.errors import BranchFolderError, InputError
+from limber.core.errors import BranchFolderError, Command, InputError, Option
 from limber.core.files import safe_names
 from limber.core.files.atomic import (
     file_digest,
@@ -86,7 +86,7 @@ def opening(folder: Path, *, only_reads: bool = False) -> Iterator[None]:
         if not folder.is_dir():
             raise BranchFolderError(
                 f"There is no folder {folder}.", "A branch folder was expected.",
-                "Make one with `limber reconstruct CLOUD -o NAME.branch`.")
+                "Make one with ", Command("reconstruct", "CLOUD -o NAME.branch"), ".")
         refuse_links(folder)
         yield
 
@@ -193,10 +193,9 @@ def damage_error(folder: Path, damages: list[Damage], shown_count: int = 4) -> B
     listed = ", ".join(f"{d.name} ({d.trouble})" for d in damages[:shown_count])
     more = f" and {len(damages) - shown_count} more" if len(damages) > shown_count else ""
     stages = sorted({d.stage for d in damages})
-    return BranchFolderError(
-        f"Damaged files in {folder}: {listed}{more}.",
-        "They differ from the checksums written when they were made.",
-        f"Restore them from a copy, or run again with --force: {', '.join(stages)}.")
+    return BranchFolderError(f"Damaged files in {folder}: {listed}{more}.", "They differ from the "
+                             "checksums written when they were made.", "Restore them from a copy, "
+                             "or run again with ", Option("force", True), f": {', '.join(stages)}.")
 
 
 def unlisted(folder: Path, manifest: Manifest) -> list[str]:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from limber.core.errors import BranchFolderError, InputError, WorkError
+from limber.core.errors import BranchFolderError, Command, InputError, Option, WorkError
 from limber.core.files.atomic import flush_folder, flush_tree, write_atomically
 from limber.core.files.safe_names import has_other_names, inside
 from limber.core.machine_errors import machine_error
@@ -49,8 +49,8 @@ def unfinished_error(folder: Path) -> BranchFolderError:
     return BranchFolderError(
         f"{folder} has results of an interrupted command that are not in place yet "
         f"({_COMMIT}).", "This command only reads, and changes nothing in the folder.",
-        f"Run `limber verify {shlex.quote(str(folder))} --finish`, or any stage that writes to "
-        "the folder. It puts the results in place. Then run this again.")
+        "Run ", Command("verify", shlex.quote(str(folder)), Option("finish", True)), ", or any "
+        "stage that writes to the folder. It puts the results in place. Then run this again.")
 
 
 def commit(folder: Path, work: Path, manifest: Manifest) -> None:

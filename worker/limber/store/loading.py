@@ -15,7 +15,7 @@ from pydantic import Field
 
 from limber.core.alignment import Alignment
 from limber.core.constants import FOUND_SKELETON, UNIT_METRES
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError
 from limber.core.files.reading import FileContent, read_json_as
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, observed, subject_of
@@ -316,7 +316,8 @@ def pull_names(branch: Branch, settings: EstimateSettings) -> list[str]:
             f"{branch.folder} has no pull {', '.join(missing)}." if missing
             else f"{branch.folder} has no pulls.",
             f"It has {', '.join(known)}." if known else "There is nothing to estimate from.",
-            "Import one with `limber import-pull`, or simulate one with `limber virtual-pull`.")
+            "Import one with ", Command("import-pull"), ", or simulate one with ",
+            Command("virtual-pull"), ".")
     return list(settings.pull) or known
 
 

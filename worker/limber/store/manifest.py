@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from limber.core.alignment import Alignment
-from limber.core.errors import BranchFolderError, InputError
+from limber.core.errors import BranchFolderError, Command, InputError
 from limber.core.files.reading import read_json
 from limber.core.files.safe_names import relative_name
 from limber.core.json_values import plain, validated
@@ -95,7 +95,7 @@ def read_manifest(folder: Path) -> Manifest:
     if not path.is_file():
         raise BranchFolderError(
             f"{folder} has no {MANIFEST}.", "It is not a branch folder.",
-            "Name a folder that `limber reconstruct` or `limber mesh` made.")
+            "Name a folder that ", Command("reconstruct"), " or ", Command("mesh"), " made.")
     try:
         content = read_json(path, "a manifest")
     except InputError as error:

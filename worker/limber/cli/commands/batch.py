@@ -8,6 +8,7 @@ import click
 
 from limber.batch.job_file import CLUSTERS
 from limber.cli.main import Run, stage_command
+from limber.core.errors import Option, Text
 
 _NAMED = 10
 """Failed branches that the error names; the page has all."""
@@ -73,9 +74,9 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     from limber.core.errors import InputError, WorkError
 
     if cluster is not None and scheduler is not None:
-        raise InputError("Both --cluster and --scheduler were given.",
-                         "One starts a cluster, the other uses an existing "
-                         "one.", "Omit one of them.")
+        raise InputError(
+            Text("Both ", Option("cluster"), " and ", Option("scheduler"), " were given."), "One "
+            "starts a cluster, the other uses an existing one.", "Omit one of them.")
     jobs = read_jobs(job_file)
     if emit is not None:
         from limber.batch.scheduler_scripts import write_script
@@ -112,10 +113,9 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
         names = ", ".join(name for name, _stage, _why in failed[:_NAMED]) + (
             f" and {len(failed) - _NAMED} more" if len(failed) > _NAMED else "")
         raise WorkError(f"{len(failed)} of {len(jobs.branches)} branches failed: {names}; "
-                        f"{': '.join(failed[0])}",
-                        "The others are done.",
-                        f"See {path_of_page(jobs)}, correct the cause, and run this with "
-                        "--retry-failed.")
+                        f"{': '.join(failed[0])}", "The others are done.", "See "
+                        f"{path_of_page(jobs)}, correct the cause, and run this with ",
+                        Option("retry_failed", True), ".")
     run.close(f"All {len(jobs.branches)} branches are done. Open the page in a browser.",
               where=path_of_page(jobs))
     return {"branch_count": len(jobs.branches), **counts(jobs, records),

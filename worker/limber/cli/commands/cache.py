@@ -5,6 +5,7 @@ from typing import Any
 import click
 
 from limber.cli.main import Run, stage_command
+from limber.core.errors import Option, Text
 
 
 @stage_command("cache")
@@ -25,11 +26,11 @@ def command(run: Run, limit: str | None, clear: bool) -> dict[str, Any]:
     if limit is not None:
         try:
             most = 1e6 * float(in_unit(limit, "MB"))
+            if not 0 <= most < float("inf"):
+                raise ValueError(limit)
         except (TypeError, ValueError) as error:
-            raise InputError(f"--limit {limit!r} is not a size.", "", "Write 500 MB or 2 GB.",
-                             ) from error
-        if not 0 <= most < float("inf"):
-            raise InputError(f"--limit {limit!r} is not a size.", "", "Write 500 MB or 2 GB.")
+            raise InputError(Text(Option("limit"), f" {limit!r} is not a size."), "",
+                             "Write 500 MB or 2 GB.") from error
     if clear:
         freed = clear_folder(cache_folder())
     else:

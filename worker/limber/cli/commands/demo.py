@@ -12,7 +12,15 @@ from typing import Any
 import click
 
 from limber.cli.main import Run, stage_command
-from limber.core.errors import Cancelled, InputError, LimberError, MissingDependencyError
+from limber.core.errors import (
+    Cancelled,
+    Command,
+    InputError,
+    LimberError,
+    MissingDependencyError,
+    Option,
+    Text,
+)
 from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_json
 from limber.core.optional import require_extra
@@ -78,7 +86,7 @@ class _Demo:
             self.kept.add(name)
         self._tell(title, name)
         for warning in result.get("warnings", []):
-            if text := without_foreign_options(warning, self.own):
+            if text := without_foreign_options(Text(warning), self.own):
                 self.run.progress.warn(f"{name}: {text}")
 
     def show(self) -> None:
@@ -141,9 +149,9 @@ class _Demo:
                           for part in (error.seen, error.why, error.fix))
         if (seen, why, fix) == (error.seen, error.why, error.fix):
             return error
-        return type(error)(seen or f"{name} failed.", why, " ".join(filter(None, [
-            fix, f"`limber {name}` has more options than the demo. Run it on the results in "
-                 f"{self.folder}."])))
+        return type(error)(seen or f"{name} failed.", why, fix + " " * bool(fix), Command(name),
+                           " has more options than the demo. Run it on the results in "
+                           f"{self.folder}.")
 
 
 _option = functools.partial(click.option, cls=GroupedOption, group="demo")
@@ -217,9 +225,8 @@ def _has_report(run: Run) -> bool:
 
 def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[str, Any]:
     if cloud is not None:
-        raise InputError(f"--robot was given with the scan {cloud}.",
-                         "The virtual robot scans a generated branch.",
-                         "Omit one of them.")
+        raise InputError(Text(Option("robot"), f" was given with the scan {cloud}."), "The virtual "
+                         "robot scans a generated branch.", "Omit one of them.")
     require_extra("robot", ("rtde_control", "rtde_io"), "The virtual robot's client")
     reports = _has_report(run)
     from limber.cli.closed_loop.comparison import comparison

@@ -12,6 +12,7 @@ import click
 import numpy as np
 
 from limber.cli.main import Run, stage_command
+from limber.core.errors import Option, Text
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell
@@ -113,7 +114,8 @@ def scan(run: Run, cell_file: Path, topic: str, output: Path, views: int, url: s
 
     cell = read_cell(cell_file)
     if views > 1 and not sys.stdin.isatty():
-        raise InputError(f"--views {views} needs a terminal, and standard input is none.", "",
+        raise InputError(Text(Option("views", views), " needs a terminal, and standard input is "
+                              "none."), "",
                          "Run it in a terminal, or take one view at a time.")
     found = []
     bridge = Bridge(url)
@@ -178,8 +180,8 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
         return result
     if confirm != name:
         raise InputError("Nobody confirmed that the robot may move.", "",
-                         f"Give --confirm {name}, with the workspace free and a hand at the "
-                         "emergency stop.")
+                         "Give ", Option("confirm", name), ", with the workspace free and a hand "
+                         "at the emergency stop.")
     began = time.monotonic()
     event = _followed(run, cell, trajectory, url, is_held=leg in ("path", "return"),
                       goes_on=leg == "return", across=planned.across if leg == "path" else None)
@@ -217,8 +219,8 @@ def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: st
     if not armed:
         return result
     if confirm != "retreat":
-        raise InputError("Nobody confirmed that the robot may move.", "",
-                         "Give --confirm retreat, with a hand at the emergency stop.")
+        raise InputError("Nobody confirmed that the robot may move.", "", "Give ",
+                         Option("confirm", "retreat"), ", with a hand at the emergency stop.")
     event = _followed(run, cell, None, url, is_held=True)
     result |= {"retreated": event["event"] == "reached", "stop_reason": event.get("reason"),
                "force_n": event["force_n"]}
@@ -254,7 +256,8 @@ def serve(run: Run, cell_file: Path, service: str, armed: bool, confirm: str | N
     wrench_topic(cell)
     if armed and confirm != "retreat":
         raise InputError("Nobody confirmed that the robot may move.", "Whoever calls the service "
-                         "moves it.", "Give --confirm retreat, with a hand at the emergency stop.")
+                         "moves it.", "Give ", Option("confirm", "retreat"), ", with a hand at the "
+                         "emergency stop.")
     bridge, count = Bridge(url), 0
     try:
         with TriggerService(bridge, service, lambda: _answered(run, cell, armed, url)) as offered:
@@ -313,8 +316,8 @@ def gripper(run: Run, cell_file: Path, position: float, effort: float, action: s
     if not armed:
         return result
     if confirm != "gripper":
-        raise InputError("Nobody confirmed that the gripper may move.",
-                         "A bent branch springs back where it opens.", "Give --confirm gripper.")
+        raise InputError("Nobody confirmed that the gripper may move.", "A bent branch springs "
+                         "back where it opens.", "Give ", Option("confirm", "gripper"), ".")
     bridge = Bridge(url)
     try:
         result |= drive(bridge, action, position, effort, cell.tool.grip_seconds + SECONDS)

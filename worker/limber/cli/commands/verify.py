@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from limber.cli.main import Run, stage_command
+from limber.core.errors import Option
 from limber.store import Branch, damage_error, unlisted
 
 
@@ -23,10 +24,9 @@ def command(run: Run, branch_folder: Path, finish: bool) -> dict[str, Any]:
     branch = (Branch.open(branch_folder) if finish
               else Branch.read(branch_folder, unfinished=True))
     if branch.is_unfinished:
-        run.progress.warn(
-            "An interrupted command left results that are not in place yet. They are compared as "
-            "they will be. --finish, or the next command that writes to the folder, puts them in "
-            "place.")
+        run.progress.warn("An interrupted command left results that are not in place yet. They are "
+                          "compared as they will be. ", Option("finish", True), ", or the next "
+                          "command that writes to the folder, puts them in place.")
     run.progress(0.0, "comparing with checksums")
     damages = branch.damages()
     if damages:

@@ -8,6 +8,7 @@ import click
 import numpy as np
 
 from limber.cli.main import Run, stage_command
+from limber.core.errors import Option
 
 
 @stage_command("virtual-robot")
@@ -70,10 +71,8 @@ def _setting(branch_folder: Path, cell: Any, young: str | None, folder: Path) ->
     from limber.store import Branch
 
     if cell is None:
-        raise InputError("A branch was given without a cell "
-                         "file.", "The cell file states where the branch "
-                                                          "is.",
-                         "Give --cell cell.toml.")
+        raise InputError("A branch was given without a cell file.", "The cell file states where "
+                         "the branch is.", "Give ", Option("cell"), " cell.toml.")
     branch = Branch.read(branch_folder)
     moduli = tuple(float(part) for part in young.split(",")) if young else ()
     return BranchSetting.of_truth(load_truth(branch, PullSpec(young=moduli)), cell,

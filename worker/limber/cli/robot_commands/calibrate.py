@@ -12,6 +12,7 @@ import click
 import numpy as np
 
 from limber.cli.main import Run, stage_command
+from limber.core.errors import Option, Text
 
 if TYPE_CHECKING:
     from limber.robot.cell.hand_eye import CameraFit
@@ -71,15 +72,16 @@ def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path 
 
     cell, branch = read_cell(cell_file), Branch.read(branch_folder)
     if sum(file is not None for file in (points_file, views_file, images_file)) != 1:
-        raise InputError("Exactly one of --points, --views and --images must be given.",
+        raise InputError(Text("Exactly one of ", Option("points"), ", ", Option("views"), " and ",
+                              Option("images"), " must be given."),
                          "The base is found from touched points or from a camera's views.",
                          "Give one of them.")
     if points_file is not None:
         return _by_touching(run, cell_file, cell, branch, points_file, largest_residual)
     if scan_pose is not None and camera_on == "stand":
-        raise InputError("--scan-pose was given, but the camera is fixed.",
+        raise InputError(Text(Option("scan_pose"), " was given, but the camera is fixed."),
                          "The position of a fixed camera does not follow from a pose of the arm.",
-                         "Omit it, or give --camera-on gripper.")
+                         "Omit it, or give ", Option("camera_on", "gripper"), ".")
     found = (_views_of(views_file, camera_on, largest_residual) if views_file is not None else
              _pictures_of(run, cell, images_file, camera_on, largest_residual, **printed))
     return _by_seeing(run, cell_file, cell, branch, found, camera_on, scan_pose)
@@ -124,8 +126,9 @@ def _pictures_of(run: Run, cell: Any, images_file: Path | None, camera_on: Camer
             run.progress.warn(f"The board is not seen in {name}, which is omitted.")
     views = [view for view in found if view is not None]
     if not views:
-        raise InputError("The board is seen in no picture.", "", "Check --board, --squares and "
-                         "--dictionary against what was printed.")
+        raise InputError("The board is seen in no picture.", "", "Check ", Option("board"), ", ",
+                         Option("squares"), " and ", Option("dictionary"), " against what was "
+                         "printed.")
     robot = poses[[view is not None for view in found]]
     fit, pixels = fit_pictures(robot, views, cell.camera, camera_on, largest_residual)
     return fit, {"residual_px": float(np.sqrt(np.mean(pixels**2))), "pictures": [

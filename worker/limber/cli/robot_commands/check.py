@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from limber.cli.main import Run, stage_command
+from limber.core.errors import Option, Text
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell
@@ -39,8 +40,10 @@ def check(run: Run, cell_file: Path, offline: bool, folder: Path | None, plan: s
     from limber.robot.weighing import unweighed
 
     if ((folder or plan) and not offline) or (plan and folder is None):
-        raise InputError("--branch and --plan are checked from files.", "A plan belongs to a "
-                         "branch.", "Give --offline --branch FOLDER, and --plan NAME if you want.")
+        raise InputError(
+            Text(Option("branch"), " and ", Option("plan"), " are checked from files."), "A plan "
+            "belongs to a branch.", "Give ", Option("offline", True), " ", Option("branch"),
+            " FOLDER, and ", Option("plan"), " NAME if you want.")
     cell = read_cell(cell_file)
     if reason := unweighed(cell):
         run.progress.warn(f"{reason}. Weigh it before the arm moves a branch (limber robot weigh).")
@@ -119,8 +122,8 @@ def _from_robot(run: Run, cell: Cell) -> dict[str, Any]:
     try:
         seen = observe(cell, _SECONDS)
     except WorkError as error:
-        raise WorkError(error.seen, error.why, f"{error.fix} With --offline the files are checked "
-                        "without a robot.") from error
+        raise WorkError(error.seen, error.why, error.fix, " With ", Option("offline", True),
+                        " the files are checked without a robot.") from error
     version = seen.facts.get("version")
     if cell.robot.version and version and cell.robot.version != version:
         run.progress.warn(f"The cell was calibrated with controller version {cell.robot.version}; "

@@ -9,6 +9,7 @@ import click
 import numpy as np
 
 from limber.cli.main import Run, stage_command
+from limber.core.errors import Option, Text
 
 
 @stage_command("draw")
@@ -42,11 +43,12 @@ def draw(run: Run, cell_file: Path, folder: Path | None, output: Path, joints: s
         try:
             angles = np.array([float(part) for part in joints.split(",")])
         except ValueError as error:
-            raise InputError(f"--joints {joints} are no angles.", "", "Give numbers in rad, "
-                             "separated by commas.") from error
+            raise InputError(Text(Option("joints", joints), " are no angles."), "",
+                             "Give numbers in rad, separated by commas.") from error
     if angles.shape != (len(cell.arm.joint_names),) or not np.isfinite(angles).all():
-        raise InputError(f"--joints has {len(angles)} values.", f"A {cell.arm.name} has "
-                         f"{len(cell.arm.joint_names)} joints.", "Give one finite angle per joint.")
+        raise InputError(Text(Option("joints"), f" has {len(angles)} values."),
+                         f"A {cell.arm.name} has {len(cell.arm.joint_names)} joints.",
+                         "Give one finite angle per joint.")
     skeleton = None if folder is None else load_skeleton(Branch.read(folder))
     figure = cell_picture(cell, angles, cell_obstacles(cell, cell_file.parent), skeleton)
     try:

@@ -15,6 +15,7 @@ import click
 import numpy as np
 
 from limber.cli.main import Run, stage_command
+from limber.core.errors import Command, Option
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell
@@ -107,8 +108,8 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
     force = outcome["force_n"]
     if not (outcome["retreated"] or outcome["gripper_opened"]) or (
             force is not None and force > cell.limits.soft_force_n):
-        raise SafetyStop(outcome["outcome"], "", "Free the branch by hand, or `limber robot "
-                         "release`.", result=result)
+        raise SafetyStop(outcome["outcome"], "", "Free the branch by hand, or ",
+                         Command("robot release"), ".", result=result)
     return result
 
 
@@ -154,7 +155,7 @@ def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) ->
         return result
     if confirm != "open":
         raise InputError("Nobody confirmed that the gripper may open.",
-                         "A bent branch springs back.", "Give --confirm open.")
+                         "A bent branch springs back.", "Give ", Option("confirm", "open"), ".")
     drive_gripper(cell, False)
     time.sleep(cell.tool.grip_seconds)
     kept = FollowedPathFile(cell)
@@ -179,7 +180,7 @@ def _to(run: Run, cell_file: Path, cell: Cell, folder: Path | None, goal: np.nda
     skeleton = None if folder is None else load_skeleton(Branch.read(folder))
     if skeleton is None:
         run.progress.warn("No branch was given, so the arm keeps away from the cell's obstacles "
-                          "alone (--branch).")
+                          "alone (", Option("branch"), ").")
     around = ArmSurroundings(cell, cell_obstacles(cell, cell_file.parent), skeleton)
     sample, _ = stands(cell)
     if is_at(sample.joints, goal):
@@ -213,7 +214,7 @@ def _followed(run: Run, cell_file: Path, word: str, link: RobotLink, motion: Tra
     log_move(cell_file, word, result)
     if not result["reached"]:
         raise SafetyStop(f"The robot was stopped: {event['reason']}.", "The arm holds where it "
-                         "stopped.", "Check what it met, then `limber robot retreat`.",
+                         "stopped.", "Check what it met, then ", Command("robot retreat"), ".",
                          result=result)
     return result
 
@@ -240,9 +241,9 @@ def require_empty(cell: Cell, run: Run) -> None:
 
     followed = read_followed_path(cell)
     if followed is not None and followed.gripper_closed:
-        raise SafetyStop("The gripper was closed last, and may hold the branch.",
-                         "The arm would pull at it.",
-                         "Use `limber robot retreat` or `limber robot release` first.")
+        raise SafetyStop("The gripper was closed last, and may hold the branch.", "The arm would "
+                         "pull at it.", "Use ", Command("robot retreat"), " or ",
+                         Command("robot release"), " first.")
     if cell.tool.gripper == "by_hand":
         run.progress.warn("The gripper is opened by hand: check that it is open.")
 

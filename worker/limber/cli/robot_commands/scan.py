@@ -11,6 +11,7 @@ import click
 import numpy as np
 
 from limber.cli.main import Run, stage_command
+from limber.core.errors import Option, Text
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell
@@ -50,7 +51,8 @@ def scan(run: Run, address: str, cell_file: Path | None, output: Path,
     elif middle is not None:
         points = scanned(address, views_around(np.array(middle), distance, count))
     else:
-        raise InputError("Neither --middle nor --realsense is given.", "The virtual cameras look "
+        raise InputError(Text("Neither ", Option("middle"), " nor ", Option("realsense"), " is "
+                              "given."), "The virtual cameras look "
                          "at a point; a real one is described by a cell file.", "Give one.")
     Cloud(points, {}).write_ply(output)
     run.close(f"{len(points):,} points from {count} positions.", where=output,
@@ -70,7 +72,8 @@ def _seen(cell: Cell, count: int) -> np.ndarray:
         raise InputError("The cell file has no [camera].", "The cloud would be in an unknown "
                          "frame.", "Add [camera] with pose and mount.")
     if count > 1 and not sys.stdin.isatty():
-        raise InputError(f"--views {count} needs a terminal, and standard input is none.", "",
+        raise InputError(Text(Option("views", count), " needs a terminal, and standard input is "
+                              "none."), "",
                          "Run it in a terminal, or take one view at a time.")
     found = []
     with RealSense() as camera:

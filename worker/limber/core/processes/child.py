@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from limber.core.errors import Cancelled, InputError, LimberError, SafetyStop, WorkError
+from limber.core.errors import Cancelled, InputError, LimberError, SafetyStop, Text, WorkError
 from limber.core.json_values import json_objects
 from limber.core.processes.end_with_parent import PARENT_PIPE
 from limber.core.processes.process_limits import CORES, UNLIMITED, Limits, LimitWatch, kill_tree
@@ -261,6 +261,9 @@ def run_json_process(name: str, command: Sequence[str], progress: Progress = SIL
             raise
         if child.process.returncode != 0:
             raise _failure(name, child, result, fix)
+    if told := {each["text"]: Text.from_json(each["parts"])
+                for each in result.pop("warning_parts", ())}:
+        result["warnings"] = [told.get(text, text) for text in result["warnings"]]
     return result
 
 
@@ -298,7 +301,6 @@ def _failure(name: str, child: Child, result: dict[str, Any], fix: str) -> Limbe
     code = child.process.returncode
     kind = _ERRORS.get(code, WorkError)
     if result.get("error"):
-        # The fix is kept separate: a command that runs others has other options.
-        advice = str(result.get("fix") or "")
-        return kind(f"{name}: {str(result['error']).removesuffix(advice).rstrip()}", "", advice)
+        seen, why, fix = map(Text.from_json, result.get("parts") or ([result["error"]], [], []))
+        return kind(Text(f"{name}: ", seen), why, fix)
     return kind(f"{name} ended with exit code {code} and no result.", child.tail(), fix)

@@ -7,7 +7,7 @@ from enum import StrEnum
 import numpy as np
 import scipy
 
-from limber.core.errors import Cancelled, WorkError
+from limber.core.errors import Cancelled, Option, Text, WorkError
 from limber.estimation.fitting.objective import Evaluation, Objective
 
 EVALUATION_LIMIT = 400
@@ -329,13 +329,13 @@ class _Settling:
             return FitStatus.converged, f"{error} fell below {self._delta:.3g} m2"
         if not is_settled:
             return FitStatus.out_of_evaluations, (
-                f"{limit} simulations were not enough: {error} is still falling. "
-                f"{self._outlook()} Use --method gauss-newton")
+                Text(f"{limit} simulations were not enough: {error} is still falling. "
+                     f"{self._outlook()} Use ", Option("method", "gauss-newton")))
         if self._delta is None:
             return FitStatus.converged, f"{error} settled"
         return FitStatus.misfit, (
-            f"{error} settled above the requested {self._delta:.3g} m2 (--delta-m2). The noise or "
-            "the error of the model is larger")
+            Text(f"{error} settled above the requested {self._delta:.3g} m2 (", Option("delta_m2"),
+                 "). The noise or the error of the model is larger"))
 
     def _outlook(self) -> str:
         """After how many simulations it would settle if its fall went on shrinking as it does."""
@@ -354,10 +354,9 @@ def _required(objective: Objective, free: np.ndarray) -> Evaluation:
     if found is None:
         values = objective.space.unpack(free)
         young = ", ".join(f"{value:.3g}" for value in values.young)
-        raise WorkError(f"The simulation finds no equilibrium with E = {young} Pa.",
-                        "This branch may not be able to reach the recorded poses.",
-                        "Check the grasp point and the poses, or give another --young to start "
-                        "from.")
+        raise WorkError(f"The simulation finds no equilibrium with E = {young} Pa.", "This branch "
+                        "may not be able to reach the recorded poses.", "Check the grasp point and "
+                        "the poses, or give another ", Option("young"), " to start from.")
     return found
 
 

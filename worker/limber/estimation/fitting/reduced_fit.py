@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import InputError, Option, WorkError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import Fit, FitStatus
@@ -170,7 +170,7 @@ def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, progres
                    for forward in corrected.forwards if isinstance(forward, CorrectedForward)):
             progress.warn(
                 "The full model finds no equilibrium at the solution of the reduced model. The "
-                "solution is therefore not confirmed. Use --forward full.")
+                "solution is therefore not confirmed. Use ", Option("forward", "full"), ".")
             return replace(fit, status=FitStatus.unconfirmed)
         # Earlier evaluations belong to another correction.
         corrected.forget()
@@ -192,7 +192,7 @@ def _required(forward: Forward) -> QuasiStaticForward:
         entry = forward.entry
         raise InputError(f"{forward.name} is {entry.drive}-driven and {entry.motion}.",
                          "The reduced model supports only slow pulls with prescribed poses.",
-                         "Use the full model for this pull (--forward full).")
+                         "Use the full model for this pull (", Option("forward", "full"), ").")
     return forward
 
 

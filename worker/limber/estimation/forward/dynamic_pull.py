@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.not_none import present
 from limber.estimation.forward.forward_model import (
     Forward,
@@ -42,14 +42,14 @@ class DynamicForward(Forward):
         if entry.drive == "force" and not measured.all():
             raise InputError(f"{name}: {np.sum(~measured)} frames have no force.",
                              "A force-driven motion needs the force in every frame.",
-                             "Use --drive pose.")
+                             "Use ", Option("drive", "pose"), ".")
         if self.drive == "force" and entry.grasp.mode == "rigid":
             raise InputError(
                 f"{name}: the force of a clamped gripper drives a dynamic simulation.",
                 "A clamped gripper also bends the branch by a torque, but only a force can drive "
                 "a dynamic simulation.",
-                'Use --drive pose. If the branch could turn in the gripper, set mode = "point" '
-                "under [grasp] in pull.toml.")
+                "Use ", Option("drive", "pose"), ". If the branch could turn in the gripper, set "
+                'mode = "point" under [grasp] in pull.toml.')
         self._forces = frames.wrenches[:, :3]
         self._arguments = (name, model, weights, entry)
         self.weights = weights

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import InputError, Option, WorkError
 from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.estimation.forward.forward_model import (
@@ -58,9 +58,9 @@ def require_torque(name: str, entry: PullEntry, frames: Frames) -> None:
             "known.",
             "A clamped gripper also bends the branch by a torque. A simulation with the force "
             "alone would not reproduce the pull.",
-            "Use --drive pose, or record the torque and give torque_sigma_nm under [sensor] in "
-            'pull.toml. If the branch could turn in the gripper, set mode = "point" under '
-            "[grasp].")
+            "Use ", Option("drive", "pose"), ", or record the torque and give torque_sigma_nm "
+            'under [sensor] in pull.toml. If the branch could turn in the gripper, set mode = '
+            '"point" under [grasp].')
 
 
 def torque_slopes(model: BranchModel, grasp: Grasp, parameters: ParameterSet,
@@ -136,7 +136,7 @@ class QuasiStaticForward(Forward):
         if self.drive == "force" and measured.sum() < 2:
             raise InputError(f"{name} has no measured force for a force-driven simulation.",
                              "Nothing would pull the branch.",
-                             "Use --drive pose, or record the force.")
+                             "Use ", Option("drive", "pose"), ", or record the force.")
         if self.drive == "force" and entry.grasp.mode == "rigid":
             require_torque(name, entry, frames)
         self.weights = weights
@@ -419,8 +419,8 @@ class QuasiStaticForward(Forward):
         if known is None:
             raise WorkError(f"{self.name}: the simulation finds no equilibrium at the end of the "
                             "fit.", "It was found from another state during the fit.",
-                            "Omit --quick, or use fewer control points "
-                            "(--fractions).")
+                            "Omit ", Option("quick"), ", or use fewer control points (",
+                            Option("fractions"), ").")
         model, worst = self.model_with(values), 0.0
         states = [state.displacement for state in self.states()]
         for first, second in zip(self.keys[:-1], self.keys[1:], strict=True):

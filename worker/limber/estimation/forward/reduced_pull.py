@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.not_none import present
 from limber.estimation.forward.forward_model import Forward, Simulated, key_frames, travel
 from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
@@ -42,7 +42,7 @@ class ReducedForward(Forward):
         if entry.drive != "pose" or entry.motion != "quasi_static":
             raise InputError(f"{name} is {entry.drive}-driven and {entry.motion}.",
                              "The reduced model supports only slow pulls with prescribed poses.",
-                             "Use the full model for this pull (--forward full).")
+                             "Use the full model for this pull (", Option("forward", "full"), ").")
         super().__init__(name, entry, frames, rest_points)
         self.uses_torque = uses_torque(entry, frames)
         self.keys, self.spread = key_frames(travel(frames.poses), key_count)

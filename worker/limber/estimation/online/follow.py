@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import Cancelled, InputError
+from limber.core.errors import Cancelled, Command, InputError, Option, Text
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, forwards_of
 from limber.estimation.fitting.initial_modulus import scaled_start
@@ -30,9 +30,9 @@ from limber.reduced.training import TrainingSettings
 
 SAID = {
     "enough": "every modulus is known to 2 %. Another pull would hardly improve the estimate.",
-    "quiet": "noise adds less than 2 % to every modulus. Stop pulling: more frames do not reduce "
-    "the constant errors of the cell. `limber estimate` states the intervals with these errors, "
-    "and what reduces them most.",
+    "quiet": Text("noise adds less than 2 % to every modulus. Stop pulling: more frames do not "
+                  "reduce the constant errors of the cell. ", Command("estimate"), " states the "
+                  "intervals with these errors, and what reduces them most."),
     "idle": "continuing this pull adds nothing: the last tenth of the frames narrowed no interval "
     "by 1 %. Pull farther, at another point or in another direction."}
 QUIET_SECONDS = 3.0
@@ -69,7 +69,7 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Fit
     first = read_pull(where())
     if first.observations is None:
         raise InputError(f"{name} has images.", "Images can be tracked only after the pull.",
-                         "Follow a pull with markers, or run `limber estimate` afterwards.")
+                         "Follow a pull with markers, or run ", Command("estimate"), " afterwards.")
     begun = begin(first, subject, settings, progress.part(0.0, 0.5), training_count)
     if _size(where()) != size:
         # It is being recorded now: missed frames are caught up.
@@ -118,10 +118,9 @@ def begun_sentences(pull: Pull, progress: Progress) -> set[str]:
                 known.force_bias_sigma_n, known.force_drift_sigma_n, known.camera_sigma_m,
                 known.camera_sigma_rad, known.point_sigma_m)):
         return {"quiet"}
-    progress.warn(
-        f"{pull.name}: live intervals include the noise of the sensors alone. Constant errors of "
-        "the cell ([calibration]: gripper frame, zero and gain of the force, camera) may be "
-        "larger. `limber estimate` includes them.")
+    progress.warn(f"{pull.name}: live intervals include the noise of the sensors alone. Constant "
+                  "errors of the cell ([calibration]: gripper frame, zero and gain of the force, "
+                  "camera) may be larger. ", Command("estimate"), " includes them.")
     return {"enough"}
 
 
@@ -193,8 +192,8 @@ def begin(pull: Pull, subject: Subject, settings: FitSpec, progress: Progress,
         if rough is None:
             deviation, spread = BLIND_DEVIATION, 4.0
             progress.warn(
-                f"{pull.name}: nothing has moved yet. The reduced model is built for a uniform E "
-                f"= {start.young[0] / 1e6:.3g} MPa (use --young for another value).")
+                f"{pull.name}: nothing has moved yet. The reduced model is built for a uniform E = "
+                f"{start.young[0] / 1e6:.3g} MPa (use ", Option("young"), " for another value).")
         else:
             start = rough
     grasp = grasp_on(subject.mesh, pull.entry.grasp)

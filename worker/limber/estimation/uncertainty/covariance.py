@@ -6,6 +6,7 @@ from typing import TypedDict
 import numpy as np
 import scipy
 
+from limber.core.errors import Command, Option, Text
 from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.fitting.optimise import OUTLYING, Fit
@@ -270,24 +271,26 @@ ADVICE = {
     "zero of the force sensor": "tare the sensor before each pull, and state it under "
                                 "[calibration]",
     "camera frame": "register the camera to the branch (fixed markers), or add a second view",
-    "places of the points": "mark the points on the branch before the scan, and give their "
-                            "positions (--nominal of import-pull)",
+    "places of the points": Text("mark the points on the branch before the scan, and give their "
+                                 "positions (", Option("nominal"), " of import-pull)"),
     "clock": "record all sensors with one clock",
     "slip of the grasp": "grasp without slip, or put a marker at the grasp",
     "modulus between the control points": "add markers along the branch, or pull at another point",
-    "Poisson's ratio": "give it (--poisson, --poisson-sigma); pulls do not determine it",
-    "density": "weigh a piece of the branch (--density, --density-sigma)",
+    "Poisson's ratio": Text("give it (", Option("poisson"), ", ", Option("poisson_sigma"), "); "
+                            "pulls do not determine it"),
+    "density": Text("weigh a piece of the branch (", Option("density"), ", ",
+                    Option("density_sigma"), ")"),
     "moduli that the pulls do not determine": "pull at a point farther out",
     "shape of the scan": "scan from more sides, or with less noise",
-    "skeleton of the scan": "look at the alternatives (`limber skeleton`), and confirm or edit the "
-                            "doubtful parts",
-    "mass of twigs and leaves": "weigh the twigs and leaves, and state the uncertainty "
-                                "(--hung-sigma); or mesh more twigs (--twig-radius of "
-                                "reconstruct)",
+    "skeleton of the scan": Text("look at the alternatives (", Command("skeleton"), "), and "
+                                 "confirm or edit the doubtful parts"),
+    "mass of twigs and leaves": Text("weigh the twigs and leaves, and state the uncertainty (",
+                                     Option("hung_sigma"), "); or mesh more twigs (",
+                                     Option("twig_radius"), " of reconstruct)"),
     "length in the gripper": "measure it, and state it under [grasp] (radius_m: half of it) and "
                              "[calibration] (held_length_sigma_m) in pull.toml",
     "creep of the branch": "hold the branch at the end of the pull, or pull there and back",
-    "mesh": "use a finer mesh (--mesh-spacing of reconstruct)",
+    "mesh": Text("use a finer mesh (", Option("mesh_spacing"), " of reconstruct)"),
     "clamp": "scan farther down, so that the clamped position is known",
 }
 """Advice to narrow an interval, by cause."""

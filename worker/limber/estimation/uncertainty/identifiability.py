@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.forward_model import Forward
@@ -62,8 +62,8 @@ def too_little_said(objective: Objective, evaluation: Evaluation, limit: float) 
         return InputError(
             seen, f"It is small against its assumed errors (standard deviations: {errors}). If you "
             f"know {' and '.join(better)}, the scale is known to {100 * deviation:.0f} %.{hint}",
-            f"State the true ones in pulls/{forward.name}/pull.toml, or import the recording with "
-            "--force-sigma and --pull-toml. Or pull farther.")
+            f"State the true ones in pulls/{forward.name}/pull.toml, or import the recording with ",
+            Option("force_sigma"), " and ", Option("pull_toml"), ". Or pull farther.")
     return InputError(
         seen, "Even with a hundredth of its assumed errors it would not: in the simulation the "
         f"force hardly depends on the modulus.{hint}",
@@ -89,8 +89,8 @@ def require_own_frame(objective: Objective, values: Values) -> None:
             raise InputError(
                 f"{forward.name}: the force does not belong to the motion.", turned,
                 "Give force and torque in the same frame as the gripper's poses and import the "
-                "recording again. If both are in another frame than the branch, state its pose "
-                "(--frame-pose, or --cell).")
+                "recording again. If both are in another frame than the branch, state its pose (",
+                Option("frame_pose"), ", or ", Option("cell"), ").")
 
 
 def other_frame(forward: Forward, values: Values) -> str | None:
@@ -209,14 +209,13 @@ def require_scale(found: Identifiability, objective: Objective, evaluation: Eval
         return
     if any(forward.uses_force for forward in objective.forwards):
         raise too_little_said(objective, evaluation, SCALE_DEVIATION)
-    raise InputError(
-        "These pulls do not determine the overall scale of Young's modulus: twice as large moduli "
-        f"would change the measurements by only {0.7 / found.scale_deviation:.1g} standard "
-        "deviations.",
-        "Without measured force, weight or inertia, a branch that moves slowly takes the same "
-        "shape whether it is soft or stiff. A fit would look perfect with every modulus wrong.",
-        "Record the gripper's force, or let gravity or inertia act (gravity_m_s2 in pull.toml, "
-        "--motion dynamic).")
+    raise InputError("These pulls do not determine the overall scale of Young's modulus: twice as "
+                     "large moduli would change the measurements by only "
+                     f"{0.7 / found.scale_deviation:.1g} standard deviations.", "Without measured "
+                     "force, weight or inertia, a branch that moves slowly takes the same shape "
+                     "whether it is soft or stiff. A fit would look perfect with every modulus "
+                     "wrong.", "Record the gripper's force, or let gravity or inertia act "
+                     "(gravity_m_s2 in pull.toml, ", Option("motion", "dynamic"), ").")
 
 
 def link_unresolved(evaluation: Evaluation, space: ParameterSpace,

@@ -14,6 +14,7 @@ from typing import TypedDict
 
 import numpy as np
 
+from limber.core.errors import Command, Option, Text
 from limber.core.not_none import present
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.quasi_static import QuasiStaticForward
@@ -64,9 +65,11 @@ _MEASUREMENTS = (
                  {"force gain": 5e-3}),
     _Measurement(REGISTER, "to 1 mm and 0.06 degrees (camera_sigma_m, camera_sigma_rad)",
                  {"camera position": 1e-3, "camera rotation": 1e-3}),
-    _Measurement("mark the points", "on the branch before the scan, to 0.5 mm (--nominal of "
-                 "import-pull, point_sigma_m)", {"position of point": 5e-4}),
-    _Measurement("weigh a piece of the branch", "to 2 % (--density, --density-sigma 0.02)",
+    _Measurement("mark the points", Text("on the branch before the scan, to 0.5 mm (",
+                                         Option("nominal"), " of import-pull, point_sigma_m)"),
+                 {"position of point": 5e-4}),
+    _Measurement("weigh a piece of the branch", Text("to 2 % (", Option("density"), ", ",
+                                                     Option("density_sigma", 0.02), ")"),
                  {"density": 0.02}))
 
 
@@ -119,8 +122,9 @@ class Prospects:
         found.append(self._result("add a second camera", "that sees the points from another side",
                                   self._deviation(self._seen_twice())))
         last = self._objective.forwards[-1].name
-        found.append(self._result(ANOTHER_PULL, f"like {last}. `limber suggest-pull` finds one "
-                                  "that says more", self.after_another_pull()))
+        found.append(self._result(ANOTHER_PULL, Text(f"like {last}. ", Command("suggest-pull"),
+                                                     " finds one that says "
+                                                     "more"), self.after_another_pull()))
         worth = [each for each in found if each["width_share"] < WORTHWHILE]
         return sorted(worth, key=lambda each: each["width_share"])[:count]
 

@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 from scipy import sparse
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import InputError, Option, WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.uncertainty.creep import LIKELIER, TIME_SHARES, creep_sentence
@@ -291,9 +291,9 @@ def first_guess(seen: SwingSeen) -> tuple[float, float]:
     away, times = away[:large[-1] + 1], times[:large[-1] + 1]
     turns = np.flatnonzero((away[:-1] < 0) != (away[1:] < 0))
     if len(turns) < 3:
-        raise InputError("The branch does not oscillate.",
-                         f"It passes its rest position only {len(turns)} times.",
-                         "Release it abruptly, or fit the rest position: --motion quasi_static.")
+        raise InputError("The branch does not oscillate.", "It passes its rest position only "
+                         f"{len(turns)} times.", "Release it abruptly, or fit the rest position: ",
+                         Option("motion", "quasi_static"), ".")
     cross = times[turns] - away[turns] * (times[turns + 1] - times[turns]) / (
         away[turns + 1] - away[turns])
     # Over whole periods: the equilibrium may be slightly offset, as for a branch that creeps.
@@ -531,7 +531,7 @@ class _Swing:
         if not result.converged:
             raise WorkError(f"The simulation of the swing failed: {result.message}.",
                             "The load, mass or modulus does not suit the branch.",
-                            "Check --weight, the units and the density.")
+                            "Check ", Option("weight"), ", the units and the density.")
         count = len(times)
         return (self.operator @ result.displacement.reshape(count, -1).T).T.reshape(count, -1, 3)
 

@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 import scipy
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.not_none import present
 from limber.recordings.import_request import ImportRequest
 from limber.recordings.recording_formats import RECORDINGS
@@ -387,15 +387,14 @@ def _stamped(path: Path, record: Record) -> Record:
     if 2 * doubled >= len(record):
         raise InputError(f"{path}: {doubled} of {len(record)} readings have the time of another.",
                          "The clock is too coarse to tell how often the sensor reads.",
-                         "State the sensor's readings per second with --rate-hz.")
+                         "State the sensor's readings per second with ", Option("rate_hz"), ".")
     warnings = list(record.warnings)
     times, values = in_order(path, record.times, record.values, warnings)
     steps = (times[-1] - times[0]) / np.median(np.diff(times))
     if not steps < min(_MOST_STEPS, _MOST_GAPS * len(times)):
-        raise InputError(f"{path} has gaps that are far longer than its time steps.",
-                         "The analysis needs uniform time steps.",
-                         "Give a part of the record without gaps, or the sensor's readings per "
-                         "second with --rate-hz.")
+        raise InputError(f"{path} has gaps that are far longer than its time steps.", "The "
+                         "analysis needs uniform time steps.", "Give a part of the record without "
+                         "gaps, or the sensor's readings per second with ", Option("rate_hz"), ".")
     return ringing_columns(replace(record, times=times, values=values, warnings=tuple(warnings)))
 
 
@@ -411,8 +410,8 @@ def _of_packets(path: Path, record: Record, packets: Packets) -> Record:
     counted = ringing_columns(replace(
         record, times=packets.times, rate_deviation=packets.deviation, warnings=(
             *record.warnings,
-            f"{seen} Their times are counted: {packets.rate_hz:.5g} readings per second. If the "
-            "sensor has another rate, state it with --rate-hz.")))
+            Text(f"{seen} Their times are counted: {packets.rate_hz:.5g} readings per second. If "
+                 "the sensor has another rate, state it with ", Option("rate_hz"), "."))))
     try:
         stamped = _stamped(path, record)
     except InputError:
@@ -427,7 +426,7 @@ def _of_packets(path: Path, record: Record, packets: Packets) -> Record:
             f"{seen} They ring at {by_stamps.frequencies[0]:.4g} Hz by their stamps, and at "
             f"{by_count.frequencies[0]:.4g} Hz if they are {packets.rate_hz:.5g} a second.",
             "The record does not show which is right.",
-            "State the sensor's readings per second with --rate-hz.")
+            "State the sensor's readings per second with ", Option("rate_hz"), ".")
     return counted if ratio < 1 else stamped
 
 
@@ -487,7 +486,7 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
 def _too_short(count: int) -> InputError:
     return InputError(f"The record has {count} readings of a free decay.",
                       f"At least {_LEAST_READINGS} are needed.",
-                      "Record longer, or state the start of the decay with --start.")
+                      "Record longer, or state the start of the decay with ", Option("start"), ".")
 
 
 def _cut_record(found: Ringing, count: int, used: int, cut: int) -> Ringing:
@@ -554,10 +553,9 @@ def _decay(times: np.ndarray, channels: np.ndarray, step: float) -> Ringing:
                          "record.",
                          "A frequency needs several oscillations.", "Record longer.")
     if found.left_over > 0.9:
-        raise InputError("The record shows no free vibration.",
-                         f"Decaying vibrations explain only {100 * (1 - found.left_over**2):.0f} "
-                         "% of it.",
-                         "Release the branch abruptly, and state the time of release with --start.")
+        raise InputError("The record shows no free vibration.", "Decaying vibrations explain only "
+                         f"{100 * (1 - found.left_over**2):.0f} % of it.", "Release the branch "
+                         "abruptly, and state the time of release with ", Option("start"), ".")
     return replace(found, start=float(times[0]), duration=float(times[-1] - times[0]))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.core.constants import UNIT_METRES
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.geometry.cloud.cloud import Cloud, own_axes
 from limber.geometry.cloud.single_view import Sight, View, find_sight, flying_pixels, scan_line_view
 from limber.geometry.cloud.surroundings import find_ground, find_sheet
@@ -97,9 +97,9 @@ def voxel_thinned(points: np.ndarray, size: float) -> np.ndarray:
     cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
     extent = cell.max(axis=0) + 1
     if float(extent[0]) * float(extent[1]) * float(extent[2]) > 2.0**62:
-        raise InputError(f"Cells of {size:g} m are too small for this cloud.",
-                         "There would be too many of them to count.",
-                         "Check the unit (--unit), or crop stray points (--crop-low, --crop-high).")
+        raise InputError(f"Cells of {size:g} m are too small for this cloud.", "There would be too "
+                         "many of them to count.", "Check the unit (", Option("unit"), "), or crop "
+                         "stray points (", Option("crop_low"), ", ", Option("crop_high"), ").")
     key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
     return np.sort(np.unique(key, return_index=True)[1])
 
@@ -169,8 +169,8 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
     flying = flying_pixels(sight, _FLYING_ANGLE, _FLYING_SPECK)
     counts["flying"] = int(flying.sum())
     rest = cloud.subset(~flying)
-    _enough(rest, "Without flying pixels (--keep flying keeps them), the depth camera's "
-                  "cloud")
+    _enough(rest, Text("Without flying pixels (", Option("keep"), " flying keeps them), the depth "
+                       "camera's cloud"))
     return rest, view
 
 
@@ -277,19 +277,20 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
                      "make the axes better. Crop the scan before the export if finer twigs are "
                      "missing.")
     if counts.get("sheets"):
-        texts.append(f"{counts['sheets']} of {counts['read']} points lie on a wide flat sheet (a "
-                     "wall or the ground?) and were removed (--keep sheets keeps them).")
+        texts.append(Text(f"{counts['sheets']} of {counts['read']} points lie on a wide flat sheet "
+                          "(a wall or the ground?) and were removed (", Option("keep"), " sheets "
+                          "keeps them)."))
     if counts.get("ground"):
-        texts.append(f"{counts['ground']} of {counts['read']} points lie on rough ground and were "
-                     "removed (--keep sheets keeps them).")
+        texts.append(Text(f"{counts['ground']} of {counts['read']} points lie on rough ground and "
+                          "were removed (", Option("keep"), " sheets keeps them)."))
     step = _rounding(points)
     if step > 0:
         texts.append(f"The coordinates are rounded to {1000 * step:.4g} mm, which limits the "
                      "accuracy of the radii. Export with more digits.")
     flying = counts.get("flying", 0)
     if flying > 0.02 * counts["read"]:
-        texts.append(f"{flying} of {counts['read']} points were discarded as flying pixels of a "
-                     "depth camera (--keep flying keeps them).")
+        texts.append(Text(f"{flying} of {counts['read']} points were discarded as flying pixels of "
+                          "a depth camera (", Option("keep"), " flying keeps them)."))
     lost = counts.get("outliers", 0)
     if lost > 0.1 * len(points):
         texts.append(f"{lost} points were discarded as outliers.")
@@ -381,14 +382,16 @@ def size_doubts(points: np.ndarray, what: str, unit: str, *, is_stated: bool) ->
     if is_possible and (is_stated or SHORTEST <= extent <= _UNUSUAL):
         return []
     number = extent / UNIT_METRES[unit]
-    other = [f"--unit {name} ({size:.3g} m)" for name in ("m", "cm", "mm", "in")
+    other = [Text(Option("unit", name), f" ({size:.3g} m)") for name in ("m", "cm", "mm", "in")
              if name != unit and SHORTEST <= (size := number * UNIT_METRES[name]) <= _UNUSUAL]
     seen = f"The {what} is {extent:.4g} m long, read in {unit}."
     if SHORTEST <= extent <= LONGEST:
-        return [f"{seen} Is its unit another: {' or '.join(other)}?"]
+        return [Text(f"{seen} Is its unit another: ", Text.joined(" or ", other), "?")]
     if is_possible:
-        raise InputError(seen, "Neither the file nor --unit states the unit, and this would be an "
-                         "unusual size.", f"State it: {', '.join([*other, f'--unit {unit}'])}.")
+        raise InputError(seen, Text("Neither the file nor ", Option("unit"), " states the unit, "
+                                    "and this would be an unusual size."),
+                         "State it: ", Text.joined(", ", [*other, Option("unit", unit)]), ".")
     raise InputError(seen, f"No plant that a robot moves has this size ({_POSSIBLE[0]:g} to "
-                     f"{_POSSIBLE[1]:g} m).", f"State the unit of its numbers: {', '.join(other)}."
-                     if other else "Check its numbers and its unit (--unit).")
+                     f"{_POSSIBLE[1]:g} m).",
+                     *(("State the unit of its numbers: ", Text.joined(", ", other), ".") if other
+                       else ("Check its numbers and its unit (", Option("unit"), ").")))

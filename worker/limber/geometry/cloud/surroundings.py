@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from scipy.spatial import cKDTree
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.numerics.rigid import principal_axes
 from limber.geometry.cloud.cloud import own_order
 
@@ -76,8 +76,9 @@ def supports_text(supports: list[Support], count: int, where: Callable[[np.ndarr
     ``where`` takes a position to the user's coordinates."""
     named = [f"a {each.kind} ({100 * len(each.points) / count:.0f} % of the points) at ("
              + ", ".join(f"{value:.3f}" for value in where(each.at)) + ")" for each in supports]
-    return (f"The scan shows {' and '.join(named)}: remove such points from the scan "
-            "(--crop-low, --crop-high, or in another program), or they count as the plant's.")
+    return Text(f"The scan shows {' and '.join(named)}: remove such points from the scan (",
+                Option("crop_low"), ", ", Option("crop_high"), ", or in another program), or they "
+                "count as the plant's.")
 
 
 @contextmanager

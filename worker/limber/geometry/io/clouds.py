@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from limber.core.constants import UNIT_METRES
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.reading import (
     check_las,
     check_pcd,
@@ -59,14 +59,14 @@ def mesh_notes(path: Path, vertices: np.ndarray, faces: np.ndarray) -> list[str]
     extent = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
     large = longest > _LONG * extent
     if areas[large].sum() > 0.5 * areas.sum():
-        raise InputError(
-            f"{path} is a mesh of {len(vertices)} vertices and {len(faces)} faces.",
-            "A point cloud was expected. Most of this surface lies in large faces, where a mesh "
-            "has no points.",
-            "If it is the closed surface of a branch, use `limber mesh`. Otherwise sample points "
-            "on it (CloudCompare: Edit, Mesh, Sample points) and export those.")
-    return [f"{path.name} is a mesh of {len(faces)} faces. Its {len(vertices)} vertices were read "
-            "as a cloud. If it is the closed surface of a branch, `limber mesh` uses it as it is."]
+        raise InputError(f"{path} is a mesh of {len(vertices)} vertices and {len(faces)} faces.",
+                         "A point cloud was expected. Most of this surface lies in large faces, "
+                         "where a mesh has no points.", "If it is the closed surface of a branch, "
+                         "use ", Command("mesh"), ". Otherwise sample points on it (CloudCompare: "
+                         "Edit, Mesh, Sample points) and export those.")
+    return [Text(f"{path.name} is a mesh of {len(faces)} faces. Its {len(vertices)} vertices were "
+                 "read as a cloud. If it is the closed surface of a branch, ", Command("mesh"),
+                 " uses it as it is.")]
 
 
 # Clouds as PLY files, whose headers may also contain letters other than ASCII.
@@ -456,8 +456,8 @@ def read_points(path: Path) -> Cloud:
         raise InputError(f"There is no file {path}.", "A point cloud was expected.",
                          "Check the path.")
     if path.is_dir():
-        raise InputError(f"{path} is a folder.", "A point cloud file was expected.",
-                         "Give one of its files, or give the folder to `limber reconstruct`.")
+        raise InputError(f"{path} is a folder.", "A point cloud file was expected.", "Give one of "
+                         "its files, or give the folder to ", Command("reconstruct"), ".")
     chosen = CLOUDS.of(path)
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty.", "A point cloud was expected.", "Export it again.")
@@ -493,9 +493,8 @@ def unit_of(cloud: Cloud, requested: str | None) -> tuple[str, list[str]]:
         return requested or "m", []
     if requested in (None, "m"):
         return cloud.unit, [f"The file states that its coordinates are in {cloud.unit}."]
-    return requested, [f"The file states that its coordinates are in {cloud.unit}, but --unit "
-                       f"{requested} "
-                       "was used."]
+    return requested, [Text(f"The file states that its coordinates are in {cloud.unit}, but ",
+                            Option("unit", requested), " was used.")]
 
 
 def _read_text(path: Path) -> Cloud:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial import cKDTree
 
 from limber.core.alignment import Alignment
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError
 from limber.core.files.reading import read_json
 from limber.core.json_values import validated
 from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, Skeleton
@@ -212,8 +212,8 @@ def _nearest(skeleton: Skeleton, at: Place) -> int:
         raise InputError(f"({', '.join(f'{value:.3f}' for value in at)}) m in the branch's frame "
                          f"is {1000 * distance[node]:.0f} mm from the nearest node.",
                          "The position does not belong to any branch.",
-                         "Give a position on an axis in the coordinates of the scan file, as "
-                         "`limber skeleton` lists them.")
+                         "Give a position on an axis in the coordinates of the scan file, as ",
+                         Command("skeleton"), " lists them.")
     return node
 
 

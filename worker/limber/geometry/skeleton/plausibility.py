@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.geometry.skeleton.contraction import ContractionStatus
 from limber.geometry.skeleton.curve_graph import CurveGraph
 from limber.geometry.skeleton.qsm_tables import cylinders
@@ -21,8 +21,8 @@ _MOST_OFF = 0.5  # fraction of points off all axes above which these do not desc
 OPEN = 0.8
 """Probability below which a decision is an open question."""
 _NAMED = 3  # gaps and loops named one by one
-_FIX = ("Crop the scan to one branch (--crop-low, --crop-high), or provide a skeleton "
-        "(--skeleton).")
+_FIX = Text("Crop the scan to one branch (", Option("crop_low"), ", ", Option("crop_high"), "), or "
+            "provide a skeleton (", Option("skeleton"), ").")
 
 
 def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
@@ -59,16 +59,16 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
             f"{_position_text(where(plant['at']))} in the scan's coordinates. "
             f"{100 * plant['points'] / count:.0f} % of the points have a base of their own.",
             "A branch belongs to one plant, and the scan does not show which one is meant.",
-            f"{_FIX} Or use the larger plant (--plants largest), or join them (--plants joined)."
-        ).at(where(plant["at"]))
+            _FIX, " Or use the larger plant (", Option("plants", "largest"), "), or join them (",
+            Option("plants", "joined"), ").").at(where(plant["at"]))
     for piece in graph.split_off:
         share = piece["points"] / count
         if share > 0.2 and piece["distance"] > 0.25 * diagonal:
-            raise InputError(
-                f"The scan contains two distant clusters. {100 * share:.0f} % of the points lie "
-                f"{piece['distance']:.3g} m from the rest, at {_position_text(where(piece['at']))} "
-                "in the scan's coordinates.", "A branch must be connected.",
-                f"{_FIX} Or use the larger cluster (--plants largest).").at(where(piece["at"]))
+            raise InputError(f"The scan contains two distant clusters. {100 * share:.0f} % of the "
+                             f"points lie {piece['distance']:.3g} m from the rest, at "
+                             f"{_position_text(where(piece['at']))} in the scan's coordinates.",
+                             "A branch must be connected.", _FIX, " Or use the larger cluster (",
+                             Option("plants", "largest"), ").").at(where(piece["at"]))
 
 
 def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
@@ -123,10 +123,10 @@ def warnings(result: Any, where: Where) -> list[str]:
     misfit = unexplained_share(result)
     if misfit > 0.15:
         most = int(np.argmax(np.bincount(result.node_of_point[_unexplained(result)])))
-        texts.append(f"{100 * misfit:.0f} % of the points do not belong to any round axis "
-                     "(leaves, flying pixels or a second plant?), most of them around "
-                     f"{_position_text(where(result.skeleton.nodes[most]))}. The radii there are "
-                     "unreliable.")
+        place = where(result.skeleton.nodes[most])
+        texts.append(Text(f"{100 * misfit:.0f} % of the points do not belong to any round axis "
+                          "(leaves, flying pixels or a second plant?), most of them around "
+                          f"{_position_text(place)}. The radii there are unreliable.").at(place))
     elif not shows_round(result):
         texts.append(f"The points scatter by {1000 * result.noise:.2g} mm, more than {_ROUND:.0%} "
                      "of the radius of their axes. Leaves among them would therefore not be "
@@ -136,11 +136,12 @@ def warnings(result: Any, where: Where) -> list[str]:
 
 def _joining_texts(result: Any, where: Where) -> list[str]:
     """Warnings about bridges, discarded pieces and loops."""
-    texts = []
+    texts: list[str] = []
     longest = sorted(result.bridges, key=lambda bridge: -bridge["length"])
     for bridge in longest[:_NAMED]:
-        texts.append(f"A gap of {1000 * bridge['length']:.0f} mm was bridged at "
-                     f"{_position_text(where(bridge['to']))}.")
+        place = where(bridge["to"])
+        texts.append(Text(f"A gap of {1000 * bridge['length']:.0f} mm was bridged at "
+                          f"{_position_text(place)}.").at(place))
     if len(longest) > _NAMED:
         texts.append(f"{len(longest) - _NAMED} shorter gaps were bridged "
                      f"(up to {1000 * longest[_NAMED]['length']:.0f} mm).")
@@ -148,10 +149,11 @@ def _joining_texts(result: Any, where: Where) -> list[str]:
     if lost:
         share = 100 * lost / len(result.contraction.points)
         largest = max(result.split_off, key=lambda piece: piece["points"])
-        texts.append(
+        place = where(largest["at"])
+        texts.append(Text(
             f"{len(result.split_off)} pieces ({share:.1f} % of the points) were discarded, "
             "because they are too far from the rest for their size. The largest is "
-            f"{1000 * largest['distance']:.0f} mm away, at {_position_text(where(largest['at']))}.")
+            f"{1000 * largest['distance']:.0f} mm away, at {_position_text(place)}.").at(place))
     for loop in sorted(result.loops)[::-1][:_NAMED]:
         texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened where branches touch.")
     if len(result.loops) > _NAMED:
@@ -161,18 +163,20 @@ def _joining_texts(result: Any, where: Where) -> list[str]:
 
 def _doubt_texts(result: Any, where: Where) -> list[str]:
     """Warnings about dropped twigs, and about the root."""
-    texts = []
+    texts: list[str] = []
     if result.unlikely:
         longest = max(twig["length"] for twig in result.unlikely)
         texts.append(f"{len(result.unlikely)} twigs (up to {1000 * longest:.0f} mm) were "
                      "discarded, because they probably do not exist.")
     if result.second_base is not None:
-        texts.append(f"The plant has a second base at {_position_text(where(result.second_base))}. "
-                     "Do two "
-                     "plants touch? Then crop the scan to one of them (--crop-low, --crop-high).")
+        texts.append(Text("The plant has a second base at "
+                          f"{_position_text(where(result.second_base))}. Do two plants touch? Then "
+                          "crop the scan to one of them (", Option("crop_low"), ", ",
+                          Option("crop_high"), ").").at(where(result.second_base)))
     if len(result.root_ends) > 1:
-        texts.append(f"Which end is the root is uncertain: {_ends_text(result.root_ends, where)}. "
-                     "The first was taken. If it is another, state it with --root.")
+        texts.append(Text("Which end is the root is uncertain: "
+                          f"{_ends_text(result.root_ends, where)}. The first was taken. If it is "
+                          "another, state it with ", Option("root"), "."))
     return texts
 
 
@@ -188,11 +192,10 @@ def check_surface(share: float, count: int, length: float) -> None:
         InputError: they show none.
     """
     if share == 0:
-        raise InputError(
-            f"The {count} points show no surface along {length:.3g} m of axes.",
-            "Around every axis they scatter as points all through its section would, so they show "
-            "neither a radius nor a volume.",
-            "Scan more densely or with less noise, or give a skeleton with radii (--skeleton).")
+        raise InputError(f"The {count} points show no surface along {length:.3g} m of axes.",
+                         "Around every axis they scatter as points all through its section would, "
+                         "so they show neither a radius nor a volume.", "Scan more densely or with "
+                         "less noise, or give a skeleton with radii (", Option("skeleton"), ").")
 
 
 def surface_text(share: float) -> str:
@@ -204,14 +207,14 @@ def surface_text(share: float) -> str:
 
 def root_question(ends: list[dict], where: Where) -> InputError:
     """Return the error that asks which of the likeliest ends is the root."""
-    ways = ", ".join("--root " + " ".join(f"{v:.3f}" for v in where(end["at"]))
-                     + f" (probability {end['probability']:.2f})" for end in ends)
+    ways = [Text(Option("root", tuple(round(float(v), 3) for v in where(end["at"]))),
+                 f" (probability {end['probability']:.2f})") for end in ends]
     return InputError(
         f"The scan does not show which of {len(ends)} ends is the root.",
         "Their thickness and height, the taper of the axes and the directions of side branches do "
         "not decide between them. The fixed end and the radii depend on it.",
-        f"State a place near the root, in the scan's coordinates: {ways}. Or take the likeliest "
-        "end (--root auto).").at(where(ends[0]["at"]))
+        "State a place near the root, in the scan's coordinates: ", Text.joined(", ", ways),
+        ". Or take the likeliest end (", Option("root", "auto"), ").").at(where(ends[0]["at"]))
 
 
 def _ends_text(ends: list[dict], where: Where) -> str:
@@ -266,14 +269,13 @@ def check_explained(result: Any, limit: float, points: np.ndarray, where: Where,
     # The point nearest to the middle of these: the middle itself may be empty.
     stray = points[off]
     place = where(stray[np.argmin(np.linalg.norm(stray - np.median(stray, axis=0), axis=1))])
-    raise InputError(
-        f"{100 * share:.0f} % of the points do not belong to any round axis (allowed: "
-        f"{100 * limit:.0f} %), among them those at {_position_text(place)} in the scan's "
-        "coordinates.",
-        "Leaves or a second plant would become rods, and the radii there are unreliable. A pot, a "
-        "stake or a wire counts too.", "Remove these points from the scan (--crop-low, "
-        "--crop-high, or in another program), remove leaves (--leaves cut), or accept the axes as "
-        "they are (--unexplained 1).").at(place)
+    raise InputError(f"{100 * share:.0f} % of the points do not belong to any round axis (allowed: "
+                     f"{100 * limit:.0f} %), among them those at {_position_text(place)} in the "
+                     "scan's coordinates.", "Leaves or a second plant would become rods, and the "
+                     "radii there are unreliable. A pot, a stake or a wire counts too.", "Remove "
+                     "these points from the scan (", Option("crop_low"), ", ", Option("crop_high"),
+                     ", or in another program), remove leaves (", Option("leaves", "cut"), "), or "
+                     "accept the axes as they are (", Option("unexplained", 1), ").").at(place)
 
 
 def _unexplained(result: Any) -> np.ndarray:

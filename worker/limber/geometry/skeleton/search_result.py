@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.files.reading import (
     checked_as,
     json_content,
@@ -330,4 +330,5 @@ def _position_array(position: _Place | None) -> np.ndarray | None:
 
 
 def _damaged(path: Path, why: str) -> InputError:
-    return InputError(f"{path} cannot be used.", why, "Reconstruct again with --force.")
+    return InputError(f"{path} cannot be used.", why, "Reconstruct again with ",
+                      Option("force", True), ".")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.core.errors import InputError, MeshingError
+from limber.core.errors import Command, InputError, MeshingError
 from limber.core.files.reading import check_ply
 from limber.core.numerics.compiled import compiled_exactly
 
@@ -83,7 +83,7 @@ class Surface:
                              "STL, PLY, OBJ or OFF was expected.", "Export it again.") from error
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             raise InputError(f"{path} has no triangles.", "A closed surface was expected.",
-                             "For a point cloud, use `limber reconstruct`.")
+                             "For a point cloud, use ", Command("reconstruct"), ".")
         vertices = np.asarray(mesh.vertices, float) * scale
         if not np.isfinite(vertices).all():
             raise InputError(f"{path} has vertices that are not finite.",

@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from limber.core.errors import InputError, MeshingError
+from limber.core.errors import Command, InputError, MeshingError
 from limber.geometry.settings import GRASP_FRACTION
 from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, control_points
 from limber.geometry.surface.surface import Surface
@@ -201,7 +201,7 @@ class TetMesh:
                 return found
         kinds = ", ".join(sorted({block.type for block in mesh.cells})) or "no cells"
         raise InputError(f"{path} holds {kinds}.", "Tetrahedra were expected.",
-                         "Use `limber mesh` to fill a closed surface with tetrahedra.")
+                         "Use ", Command("mesh"), " to fill a closed surface with tetrahedra.")
 
 
 def _on_edges(name: str, values: np.ndarray, edges: np.ndarray) -> np.ndarray:

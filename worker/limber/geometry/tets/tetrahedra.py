@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import InputError, MeshingError, MissingDependencyError
+from limber.core.errors import InputError, MeshingError, MissingDependencyError, Option
 from limber.core.files.caches import TETRAHEDRA_BYTES, cache_folder, trim
 from limber.core.files.reading import read_arrays, require_shapes
 from limber.core.progress import SILENT, Progress
@@ -134,10 +134,10 @@ def _checked(nodes: np.ndarray, tets: np.ndarray, surface: Surface) -> TetMesh:
     if not 0.95 < ratio < 1.05:
         raise MeshingError(f"fTetWild's mesh has {100 * ratio:.1f} % of the surface's volume.",
                            "The bending stiffness changes with the square of this ratio.",
-                           "Use a smaller tolerance, or choose --mesher sweep.")
+                           "Use a smaller tolerance, or choose ", Option("mesher", "sweep"), ".")
     if mesh.volumes.min() <= 1e-7 * np.median(mesh.volumes):
-        raise MeshingError("fTetWild's mesh has flat tetrahedra.",
-                           "A solver cannot use flat tetrahedra.", "Choose --mesher sweep.")
+        raise MeshingError("fTetWild's mesh has flat tetrahedra.", "A solver cannot use flat "
+                           "tetrahedra.", "Choose ", Option("mesher", "sweep"), ".")
     return mesh.quadratic()
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.core.errors import MeshingError, MissingDependencyError, WorkError
+from limber.core.errors import MeshingError, MissingDependencyError, Option, WorkError
 from limber.core.not_none import present
 from limber.core.processes.child import run_module
 from limber.core.processes.end_with_parent import end_by_kernel
@@ -31,7 +31,7 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
     MeshingError also over ``time_limit`` [s] of processor time or ``_MEMORY_MB``."""
     if importlib.util.find_spec("pytetwild") is None:
         raise MissingDependencyError("pytetwild (fTetWild) is not installed.", "",
-                                     "Install it, or choose --mesher sweep.")
+                                     "Install it, or choose ", Option("mesher", "sweep"), ".")
 
     def waiting(seconds: float) -> None:
         progress(min(seconds / time_limit, 0.99), "fTetWild", seconds=round(seconds, 1))
@@ -47,12 +47,12 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
                                            memory_mb=_MEMORY_MB), folder=Path(folder),
                                     waiting=waiting)
         except WorkError as error:
-            raise MeshingError(error.seen, error.why, "Choose --mesher sweep, or a coarser "
-                               "mesh.") from error
+            raise MeshingError(error.seen, error.why, "Choose ", Option("mesher", "sweep"), ", or "
+                               "a coarser mesh.") from error
         if code != 0 or not target.exists():
             raise MeshingError(f"fTetWild ended with code {code} ({last or 'no message'}).",
                                "The surface may be too fine, or may be damaged.",
-                               "Choose --mesher sweep, or a coarser mesh.")
+                               "Choose ", Option("mesher", "sweep"), ", or a coarser mesh.")
         with np.load(target) as result:
             return result["nodes"], result["tets"]
 

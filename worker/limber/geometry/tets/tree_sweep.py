@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.core.errors import InputError, MeshingError
+from limber.core.errors import InputError, MeshingError, Option
 from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import (
@@ -536,9 +536,9 @@ class _TreeSweep:
                                first_tangent)
         if shapes(mesh.nodes[mesh.tets]).min() < 0.1 * FLAT:
             if run == 0:
-                raise MeshingError("The main axis bends too sharply for its thickness.",
-                                   "Prisms swept along it would overlap.",
-                                   "Smooth the skeleton, or choose --mesher ftetwild.")
+                raise MeshingError("The main axis bends too sharply for its thickness.", "Prisms "
+                                   "swept along it would overlap.", "Smooth the skeleton, or "
+                                   "choose ", Option("mesher", "ftetwild"), ".")
             return False
         slices = {w.run: int(np.argmin(np.abs(where - w.low))) for w in windows
                   if np.abs(where - w.low).min() < 1e-9}

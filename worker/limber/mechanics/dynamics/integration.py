@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Text
 from limber.core.not_none import present
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
@@ -518,7 +518,7 @@ class _Run:
         stretch = principal_stretch(self.model, new.displacement)
         if stretch.value > self.settings.stretch_limit:
             stepper.status = Status.torn
-            stepper.trouble = f"stretched to {100 * stretch.value:.0f} % {stretch.at}"
+            stepper.trouble = Text(f"stretched to {100 * stretch.value:.0f} % ", stretch.at)
             return False
         if viscous is not None:
             new.strain, new.strain_before = self.model.strains(new.displacement), old.strain
@@ -580,8 +580,8 @@ class _Run:
 
         complete = len(frames) == len(self.drive.times)
         stretch = principal_stretch(self.model, self.state.displacement)
-        message = "" if complete else (f"{self.stepper.trouble}; the largest stretch is "
-                                       f"{stretch.at}")
+        message = "" if complete else Text(self.stepper.trouble, "; the largest stretch is ",
+                                           stretch.at)
         derivatives = None
         if self.tangents:
             change = stacked("reaction_change")

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from limber.core.errors import ConvergenceError, InputError
+from limber.core.errors import ConvergenceError, InputError, Text
 from limber.mechanics.statics.result import Status
 
 # One instant of a motion: the state for time steps and derivatives.
@@ -167,7 +167,7 @@ class DynamicResult:
         """
         if not self.converged:
             raise ConvergenceError(
-                f"The motion stopped at {self.last.time:.4g} s: {self.message}",
+                Text(f"The motion stopped at {self.last.time:.4g} s: ", self.message),
                 f"The {len(self.times)} frames before it are valid.",
                 "Use a slower or smaller motion, or check units and Young's modulus.", result=self)
         return self

@@ -115,4 +115,5 @@ def _check_orientation(mesh: TetMesh, determinant: np.ndarray) -> None:
         raise InputError(
             f"{len(bad)} tetrahedra are inverted or have no volume; the first is number {bad[0]} "
             f"at ({centroid}) m.", "Their stiffness is not defined.",
-            "Orient the mesh (TetMesh.oriented) or mesh the surface again.")
+            "Orient the mesh (TetMesh.oriented) or mesh the surface again."
+        ).at(mesh.centroids[bad[0]])

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import InputError, Option, Text, WorkError
 from limber.core.files.tables import read_columns
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.loads.outdoor import Bent, LoadedOutdoors, recorded, turbulent
@@ -41,10 +41,10 @@ def required_rest(outdoors: LoadedOutdoors) -> StaticResult:
     """
     found = outdoors.rest()
     if not found.converged:
-        raise WorkError(f"The branch has no equilibrium under these loads ({found.message}).",
-                        f"It could carry {100 * found.reached:.0f} % of them.",
-                        "The loads may exceed what it can carry. Use --limit-load with smaller "
-                        "loads.")
+        raise WorkError(Text("The branch has no equilibrium under these loads (", found.message,
+                             ")."), f"It could carry {100 * found.reached:.0f} % of them.",
+                        "The loads may exceed what it can carry. Use ", Option("limit_load", True),
+                        " with smaller loads.")
     return found
 
 
@@ -197,9 +197,10 @@ class WindRecord:
                 np.diff(times) >= _LEAST_STEP).all() or not speeds.mean() >= _CALM or (
                 not np.abs(speeds).max() < FASTEST):
             raise InputError(
-                f"{what} is not a wind record.", f"A wind record has at least {LEAST_RECORD} "
-                f"rows, ascending times at least {_LEAST_STEP:g} s apart, and a wind below "
-                f"{FASTEST:g} m/s that blows along --wind with {_CALM:g} m/s or more on average.",
+                f"{what} is not a wind record.",
+                Text(f"A wind record has at least {LEAST_RECORD} rows, ascending times at least "
+                     f"{_LEAST_STEP:g} s apart, and a wind below {FASTEST:g} m/s that blows along ",
+                     Option("wind"), f" with {_CALM:g} m/s or more on average."),
                 "Give another record.")
         if not (times[-1] - times[0]) / np.median(np.diff(times)) < _MOST_STEPS:
             raise InputError(f"{what} has gaps that are much longer than its time steps.",
@@ -218,8 +219,9 @@ class WindRecord:
         """
         push = float((self.speeds * np.abs(self.speeds)).mean())
         if not push > 0:
-            raise InputError("On average the recorded wind blows against --wind.", "",
-                             "Reverse --wind.")
+            raise InputError(
+                Text("On average the recorded wind blows against ", Option("wind"), "."), "",
+                "Reverse ", Option("wind"), ".")
         x, y, z = map(float, np.sqrt(push) * np.array(direction) / np.linalg.norm(direction))
         return x, y, z
 
@@ -251,9 +253,8 @@ def blown(direction: tuple[float, float, float], gusts: Gusts | None,
         InputError: gusts without a wind, or a record against it.
     """
     if gusts is not None and not np.any(direction):
-        raise InputError("Gusts are given without a wind.",
-                         "Gusts need a wind with a direction.",
-                         "Give --wind X Y Z.")
+        raise InputError("Gusts are given without a wind.", "Gusts need a wind with a direction.",
+                         "Give ", Option("wind"), " X Y Z.")
     return gusts.even_wind(direction) if isinstance(gusts, WindRecord) else direction
 
 

@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 import scipy.sparse as sp
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -150,8 +150,9 @@ def _too_soft(model: BranchModel, targets: tuple[NamedTarget, ...]) -> tuple[str
     named = f", with {', '.join(heavy)} among it" if heavy else ""
     return (f"The branch is too soft to carry the {hung:.3g} kg that hang on it in the scanned "
             f"shape{named}. It can carry its own wood.",
-            "A target's mass hung there when the branch was scanned. If it did not, remove it from "
-            "the target and give it as a load (--fruit). Else check Young's modulus.")
+            Text("A target's mass hung there when the branch was scanned. If it did not, remove it "
+                 "from the target and give it as a load (", Option("fruit"), "). Else check "
+                 "Young's modulus."))
 
 
 def is_stable(model: BranchModel) -> bool:

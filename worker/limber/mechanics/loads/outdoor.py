@@ -400,7 +400,7 @@ def _beyond(skeleton: Skeleton, cuts: Sequence[tuple[float, float, float]]) -> n
             raise InputError(f"The cut at {cut} m is invalid.",
                              f"It is {1e3 * distance:.0f} mm away from the branch." if is_away
                              else "It lies at the base.",
-                             "Give a position on the branch, in its frame [m].")
+                             "Give a position on the branch, in its frame [m].").at(cut)
         gone[node] = True
     for node in range(1, skeleton.node_count):
         gone[node] |= gone[skeleton.parent[node]]

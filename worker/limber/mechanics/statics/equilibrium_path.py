@@ -7,7 +7,7 @@ from typing import Required, TypedDict, Unpack
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Text
 from limber.core.numerics.rigid import pose_between
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
@@ -105,8 +105,8 @@ def strain_warnings(stretch: Place) -> list[str]:
     """Return a warning if the largest stretch exceeds the strength of wood, else an empty tuple."""
     if stretch.value <= 1.5:
         return []
-    return [f"The strain reaches {100 * (stretch.value - 1):.0f} % {stretch.at}, far more than "
-            "wood withstands. Check the units of the loads and of Young's modulus."]
+    return [Text(f"The strain reaches {100 * (stretch.value - 1):.0f} % ", stretch.at, ", far more "
+                 "than wood withstands. Check the units of the loads and of Young's modulus.")]
 
 
 class HowFound(TypedDict, total=False):
@@ -601,7 +601,8 @@ class Path:
             return None
         if (stretch := principal_stretch(self.model, trial)).value > self.settings.stretch_limit:
             self.status = Status.torn
-            self.trouble = f"stretched to {100 * stretch.value:.0f} % of its length {stretch.at}"
+            self.trouble = Text(f"stretched to {100 * stretch.value:.0f} % of its length ",
+                                stretch.at)
             return None
         self.displacement, self.state = trial, state
         taken = part - self.reached
@@ -628,10 +629,10 @@ class Path:
 
     def _result(self) -> StaticResult:
         stretch = principal_stretch(self.model, self.displacement)
-        message = "" if self.status is Status.converged else (
-            f"{self.trouble}; stopped at {100 * self.reached:.1f} % of the path, where the "
-            f"largest stretch of the branch is {stretch.at} ({100 * (stretch.value - 1):.1f} %)"
-            + self._softening())
+        message = "" if self.status is Status.converged else Text(
+            self.trouble, f"; stopped at {100 * self.reached:.1f} % of the path, where the "
+            "largest stretch of the branch is ", stretch.at,
+            f" ({100 * (stretch.value - 1):.1f} %)", self._softening())
         warnings = strain_warnings(stretch) + buckling_warnings(self.snaps)
         load = self.load_at(self.reached)
         return make_result(self.problem, self.displacement, self.state, load,

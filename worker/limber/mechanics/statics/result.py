@@ -5,7 +5,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from limber.core.errors import ConvergenceError
+from limber.core.errors import ConvergenceError, Text
 
 # Status at the end of a static or dynamic solve.
 
@@ -125,9 +125,8 @@ class StaticResult:
             ConvergenceError: the result has not converged.
         """
         if not self.converged:
-            raise ConvergenceError(
-                f"No equilibrium: {self.message}",
-                f"The last valid state is at {100 * self.reached:.0f} % of the path.",
-                "Use a smaller motion or load, or check units and Young's modulus.",
-                result=self)
+            raise ConvergenceError(Text("No equilibrium: ", self.message), "The last valid state "
+                                   f"is at {100 * self.reached:.0f} % of the path.", "Use a "
+                                   "smaller motion or load, or check units and Young's modulus.",
+                                   result=self)
         return self

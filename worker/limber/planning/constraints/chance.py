@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from limber.core.errors import ConvergenceError
+from limber.core.errors import ConvergenceError, Option
 from limber.core.progress import SILENT, Progress
 from limber.planning.constraints.limits import Limits, sizes
 from limber.planning.field.grasp_model import GraspModel, refusal
@@ -226,11 +226,10 @@ class YoungUncertainty:
             result = other.follow(pose[None, :3], displacement)[0]
             if reason := refusal(result):
                 position = ", ".join(f"{x:.3f}" for x in pose[:3])
-                raise ConvergenceError(
-                    f"With another Young's modulus the branch has no acceptable solution "
-                    f"({reason}) at ({position}) m.",
-                    "It is therefore unknown whether the limits hold.",
-                    "Choose a gentler goal, or omit --confidence.")
+                raise ConvergenceError("With another Young's modulus the branch has no acceptable "
+                                       f"solution ({reason}) at ({position}) m.", "It is therefore "
+                                       "unknown whether the limits hold.", "Choose a gentler goal, "
+                                       "or omit ", Option("confidence"), ".").at(pose[:3])
             results.append(result)
         return SolvedPoses.of(other, results)
 

@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 from scipy.spatial import cKDTree
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.tables import csv_records, read_columns, table_text
 from limber.core.numerics.compiled import compiled
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -69,7 +69,7 @@ class Strength:
         if len(strains) < _FEWEST:
             raise InputError(f"{source} has {len(strains)} break tests.",
                              "The scatter of the strength cannot be told from so few.",
-                             f"Break at least {_FEWEST} shoots, or give --wood.")
+                             f"Break at least {_FEWEST} shoots, or give ", Option("wood"), ".")
         if np.ptp(strains) <= 1e-6 * strains.max():
             raise InputError(f"All {len(strains)} break tests of {source} have the same strain.",
                              "Strengths scatter, so these are no measurements.",
@@ -239,7 +239,7 @@ class DamageAlong:
         parents = table["parent"].astype(int)
         if (parents >= np.arange(len(parents))).any() or (parents < -1).any():
             raise InputError(f"A parent in {path} does not come before its node.",
-                             "It was not written by `limber plan`, or is damaged.",
-                             "Run `limber plan` again with --force.")
+                             Text("It was not written by ", Command("plan"), ", or is damaged."),
+                             "Run ", Command("plan"), " again with ", Option("force", True), ".")
         return cls(np.column_stack([table[name] for name in _COLUMNS[:3]]), parents,
                    table["strain"], table.get(_PROBABILITY))

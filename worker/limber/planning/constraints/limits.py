@@ -12,7 +12,15 @@ from typing import Protocol
 import numpy as np
 
 from limber.cell.obstacles import Obstacle, closest
-from limber.core.errors import InputError
+
+# Obstacles to branch and gripper: boxes and closed surfaces.
+# Constraints on a plan in addition to the limits on energy, force and loads.
+#
+# A constraint returns its limited quantity for a state of the full model. The energy field learns
+# it at its samples (:func:`~limber.planning.field.energy_field.knowing`), and with it the gradient
+# and the error that margins and proofs use. An external constraint is made from settings by a
+# function in :data:`~limber.planning.constraints.limits.CONSTRAINTS`.
+from limber.core.errors import Command, InputError, Option, Text
 from limber.mechanics.materials.materials import strain_limit
 from limber.planning.field.energy_field import UNITS, EnergyField, FieldArrays
 from limber.planning.field.radial import LocalError, slack_of
@@ -20,15 +28,6 @@ from limber.planning.field.stored_states import GraspSamples
 from limber.planning.goals.goal import empty_along
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.settings import PlanSettings
-
-# Obstacles to branch and gripper: boxes and closed surfaces.
-
-# Constraints on a plan in addition to the limits on energy, force and loads.
-#
-# A constraint returns its limited quantity for a state of the full model. The energy field learns
-# it at its samples (:func:`~limber.planning.field.energy_field.knowing`), and with it the gradient
-# and the error that margins and proofs use. An external constraint is made from settings by a
-# function in :data:`~limber.planning.constraints.limits.CONSTRAINTS`.
 
 
 @dataclass(frozen=True)
@@ -46,9 +45,11 @@ class Broken:
     limit: float
     position: np.ndarray
 
-    def __str__(self) -> str:
+    @property
+    def text(self) -> Text:
         position = ", ".join(f"{x:.3f}" for x in self.position)
-        return f"{self.name} {self.value:.4g} exceeds the limit {self.limit:.4g} at ({position}) m"
+        return Text(f"{self.name} {self.value:.4g} exceeds the limit {self.limit:.4g} at "
+                    f"({position}) m").at(self.position)
 
 
 class Constraint(Protocol):
@@ -118,10 +119,10 @@ class Obstacles(Constraint):
             return None
         name, depth, where = hit
         position = ", ".join(f"{x:.3f}" for x in where)
-        if depth < kept:
-            return (f"the branch is {1e3 * (kept - depth):.1f} mm away from {name} at ({position}) "
-                    f"m, less than the clearance of {1e3 * kept:.1f} mm")
-        return f"the branch is {1e3 * (depth - kept):.1f} mm inside {name} at ({position}) m"
+        how, more = ("inside", "") if depth >= kept else (
+            "away from", f", less than the clearance of {1e3 * kept:.1f} mm")
+        return Text(f"the branch is {1e3 * abs(kept - depth):.1f} mm {how} {name} at ({position}) "
+                    f"m{more}").at(where)
 
 
 _COVERED = 0.95  # fraction of the samples near a limit
@@ -174,7 +175,7 @@ class Limits:
         if not (both.low < both.high).all():
             raise InputError("The given workspace and the cell's workspace do not overlap.",
                              f"Their intersection is empty {empty_along(both.low, both.high)}.",
-                             "Correct --workspace, or the cell file.")
+                             "Correct ", Option("workspace"), ", or the cell file.")
         return both
 
     def values(self, grasps: np.ndarray, nodes: np.ndarray) -> dict[str, np.ndarray]:
@@ -200,15 +201,15 @@ class Limits:
         strain = settings.max_strain or np.inf
         if settings.wood is not None and settings.max_damage is None:
             if settings.max_strain is not None:
-                raise InputError("Both --max-strain and --wood are given.",
-                                 "Both limit the strain.",
-                                 "Give only one of them.")
+                raise InputError(
+                    Text("Both ", Option("max_strain"), " and ", Option("wood"), " are given."),
+                    "Both limit the strain.", "Give only one of them.")
             strain = strain_limit(settings.wood)
         low, high = np.array(settings.workspace or [-np.inf] * 3 + [np.inf] * 3).reshape(2, 3)
         if not (low < high).all():
             raise InputError(f"The workspace is empty {empty_along(low, high)}.",
                              "Its lower corner must be below the upper one in x, y and z.",
-                             "Correct --workspace.")
+                             "Correct ", Option("workspace"), ".")
         return cls(settings.max_energy or np.inf, settings.max_force or np.inf,
                    strain, (settings.max_stress or np.inf) / stiffer,
                    settings.max_axial_force or np.inf, settings.max_torque or np.inf, low=low,
@@ -242,9 +243,9 @@ class Limits:
         for name, limit in self.asked().items():
             value = values.get(name)
             if value is None:
-                raise InputError(f"The energy field contains no {name.replace('_', ' ')}.",
-                                 "It was sampled without it.",
-                                 "Run `limber energy` again with --force.")
+                raise InputError(f"The energy field contains no {name.replace('_', ' ')}.", "It "
+                                 "was sampled without it.", "Run ", Command("energy"), " again "
+                                 "with ", Option("force", True), ".")
             size = np.abs(value)
             near = inner & (size > _NEAR[0] * limit) & (size < _NEAR[1] * limit)
             near = near if near.sum() >= _FEWEST else inner

@@ -12,7 +12,7 @@ from time import perf_counter
 
 import numpy as np
 
-from limber.core.errors import NoPathError
+from limber.core.errors import NoPathError, Text
 from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.mechanics import simulate_dynamics
@@ -117,15 +117,17 @@ def _moved(grasp_model: GraspModel, poses: np.ndarray, start: np.ndarray, pace: 
         poses=np.hstack([grasps, np.zeros_like(grasps)]),
         settings=NewmarkSettings(max_step=float(np.diff(times).max())), progress=progress)
     values = _sizes(grasp_model, found, limits)
-    broken = [str(Broken(f"{name.replace('_', ' ')} in motion [{UNITS[name]}]".replace(" []", ""),
-                         float(size.max()), getattr(limits, name), grasps[size.argmax()]))
-              for name, size in values.items() if size.max() > getattr(limits, name)]
-    broken += [f"in motion {words}" for words in limits.met(
+    broken: list[str] = [
+        Broken(f"{name.replace('_', ' ')} in motion [{UNITS[name]}]".replace(" []", ""),
+               float(size.max()), getattr(limits, name), grasps[size.argmax()]).text
+        for name, size in values.items() if size.max() > getattr(limits, name)]
+    broken += [Text("in motion ", words) for words in limits.met(
         grasps[:len(found.displacement)], grasp_model.mesh.nodes + found.displacement)]
     if not found.converged:
-        where = ", ".join(f"{x:.3f}" for x in grasps[len(found.times) - 1])
-        broken.append(f"in motion the branch cannot follow the gripper ({found.message}) at "
-                      f"({where}) m")
+        last = grasps[len(found.times) - 1]
+        where = ", ".join(f"{x:.3f}" for x in last)
+        broken.append(Text(f"in motion the branch cannot follow the gripper ({found.message}) at "
+                           f"({where}) m").at(last))
     return _Moved({name: float(size.max()) for name, size in values.items()}, broken,
                   found.converged, found.step_count)
 
@@ -203,13 +205,13 @@ def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: 
         goal: Where it must end.
         nodes: Nodes of the mesh at rest [m], shape [n, 3].
     """
-    faults = []
+    faults: list[str] = []
     for position, reason in zip(path.unsolved, path.reasons, strict=True):
         point_text = ", ".join(f"{x:.3f}" for x in position)
-        faults.append(f"no acceptable solution ({reason}) at ({point_text}) m")
+        faults.append(Text(f"no acceptable solution ({reason}) at ({point_text}) m").at(position))
     faults = faults[:1] + ([f"and at {len(faults) - 1} more poses"] if len(faults) > 1 else [])
     whole = path.approach.joined(path.solved)
-    faults += [str(broken) for broken in limits.broken(whole)]
+    faults += [broken.text for broken in limits.broken(whole)]
     if path.is_whole:
         off = goal.missed_by(path.solved)
         if off > goal.tolerance * _SLACK:
@@ -275,8 +277,8 @@ def with_constraints(field: EnergyField, grasp_model: GraspModel, limits: Limits
     """
     nodes, rest = grasp_model.mesh.nodes, grasp_model.rest.displacement
     if met := limits.met(field.rest[None], nodes + rest[None]):
-        raise NoPathError(f"The branch breaks a limit at its rest pose: {'; '.join(met)}.",
-                          "No path can start there.",
+        raise NoPathError(Text("The branch breaks a limit at its rest pose: ",
+                               Text.joined("; ", met), "."), "No path can start there.",
                           "Correct the obstacles in the cell file, or the limit.")
     grasps = field.samples.positions
     displacements = displacements_at(grasp_model, grasps, workers=workers,

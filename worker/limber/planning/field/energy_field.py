@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import Command, InputError, Option, Text, WorkError
 from limber.core.files.reading import read_arrays, require_shapes
 from limber.core.numerics.compiled import compiled
 from limber.core.progress import SILENT, Progress
@@ -46,7 +46,7 @@ from limber.planning.field.valid_region import TrustRegion, trusted_at
 _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
              "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n", "reduced": "reduced"}
-_WHAT = "an energy field (`limber energy --force` creates one)"
+_WHAT = Text("an energy field (", Command("energy", Option("force", True)), " creates one)")
 _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
            "min_det_f": ("m",), "rejected_poses": ("q", 6)}
 _OPTIONAL_SHAPES = {
@@ -264,8 +264,9 @@ class EnergyField:
                               strict=True))
         except (KeyError, ValueError, OSError, TypeError) as error:
             raise InputError(f"{path} is not an energy field ({error}).",
-                             "It was not written by `limber energy`, or is damaged.",
-                             "Run `limber energy` again with --force.") from error
+                             Text("It was not written by ", Command("energy"), ", or is damaged."),
+                             "Run ", Command("energy"), " again with ", Option("force", True),
+                             ".") from error
         return cls(samples, *charts, *fits, region, errors, missed, misplaced)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from scipy.spatial import Delaunay
 
-from limber.core.errors import ConvergenceError, WorkError
+from limber.core.errors import Command, ConvergenceError, Option, WorkError
 from limber.core.processes import Pool, core_budget, run_tasks, worker_count
 from limber.core.processes.pool_process import Task
 from limber.core.progress import SILENT, Progress
@@ -500,7 +500,7 @@ def sample_positions(
     raise WorkError("The grasp can hardly move.",
                     f"The branch is held {reach.arc_length:.3f} m from its base and reaches "
                     f"little more than the {radius:.3f} m around its rest position.",
-                    "Grasp the branch farther from its base, or raise --deflection.")
+                    "Grasp the branch farther from its base, or raise ", Option("deflection"), ".")
 
 
 def _alternating(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -596,10 +596,10 @@ def displacements_at(grasp_model: GraspModel, positions: np.ndarray, *,
         good, bad = solve_branch(solvers, positions, progress=progress)
     if bad:
         position = ", ".join(f"{x:.3f}" for x in positions[bad[0].target])
-        raise ConvergenceError(
-            f"No acceptable solution ({bad[0].trouble}) with the grasp at ({position}) m.",
-            "This pose is a sample of the energy field and had a solution before.",
-            "Run `limber energy` again with --force.")
+        raise ConvergenceError(f"No acceptable solution ({bad[0].trouble}) with the grasp at "
+                               f"({position}) m.", "This pose is a sample of the energy field and "
+                               "had a solution before.", "Run ", Command("energy"), " again with ",
+                               Option("force", True), ".").at(positions[bad[0].target])
     return np.array([one.displacement for one in good[1:]])
 
 

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from limber.core.errors import NoPathError
+from limber.core.errors import Command, NoPathError, Option, Text
 from limber.core.numerics.compiled import compiled
 from limber.planning.field.energy_field import (
     EnergyField,
@@ -156,7 +156,7 @@ def ball(count: int, generator: np.random.Generator) -> np.ndarray:
     return direction * generator.uniform(size=(count, 1)) ** (1 / 3)
 
 
-NEARER = "Choose a goal nearer to this region, raise --goal-tolerance"
+NEARER = Text("Choose a goal nearer to this region, raise ", Option("goal_tolerance"))
 """Advice for a ball that nothing reaches."""
 
 
@@ -249,7 +249,7 @@ class CellPlace:
             raise NoPathError(
                 f"{self.refusal.format(what=what)} at the end of the path: {cause}.",
                 f"{what[0].upper()}{what[1:]} is at {position_text(position)} m there.",
-                f"{self.advice}.")
+                self.advice, ".").at(position)
 
 
 @dataclass(frozen=True)
@@ -329,8 +329,8 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
         raise GoalOverLimitsError(
             f"No pose in the goal region keeps the limits: {over_limits(field, trusted, limits)}.",
             f"{len(trusted)} poses in the region were checked.",
-            "Raise the limit (--max-energy, --max-force and others, the workspace), or choose a "
-            "goal nearer to the rest pose.")
+            "Raise the limit (", Option("max_energy"), ", ", Option("max_force"), " and others, "
+            "the workspace), or choose a goal nearer to the rest pose.")
     return np.ascontiguousarray(allowed)
 
 
@@ -396,13 +396,12 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
     distance = goal.distance(field, points)
     nearest = points[np.argmin(distance)]
     missed = max(float(distance.min()) - goal.tolerance, 0.0)
-    return NoPathError(
-        f"No sampled pose brings {goal.what} {goal.where}; the nearest misses it by "
-        f"{missed:.3f} m, with the grasp at {position_text(nearest)} m"
-        f"{unit_hint(missed, field)}.",
-        "The branch was sampled with its grasp from "
-        f"{position_text(field.region.low)} to {position_text(field.region.high)} m.",
-        f"{goal.advice}, or sample farther (`limber energy --deflection`).")
+    return NoPathError(f"No sampled pose brings {goal.what} {goal.where}; the nearest misses it by "
+                       f"{missed:.3f} m, with the grasp at {position_text(nearest)} "
+                       f"m{unit_hint(missed, field)}.", "The branch was sampled with its grasp "
+                       f"from {position_text(field.region.low)} to "
+                       f"{position_text(field.region.high)} m.", goal.advice, ", or sample farther "
+                       "(", Command("energy", Option("deflection")), ").").at(nearest)
 
 
 def unit_hint(off: float, field: EnergyField) -> str:

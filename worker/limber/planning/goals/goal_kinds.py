@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from limber.core.errors import InputError, NoPathError
+from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import SolverPool, solve_branch
@@ -262,7 +262,7 @@ def target_of(asked: GoalRequest) -> tuple[int | None, str]:
     if name not in names:
         raise InputError(f"The branch has no target named {name}.",
                          f"Its targets are: {', '.join(names) or 'none'}.",
-                         "Define one with `limber target`.")
+                         "Define one with ", Command("target"), ".")
     return names.index(name), name
 
 
@@ -276,9 +276,10 @@ def _in_box(asked: GoalRequest, corners: tuple[float, ...]) -> TargetGoal:
     if not np.all(np.less(low, high)):
         raise InputError(f"The target's box is empty {empty_along(low, high)}.",
                          "Its lower corner must be below the upper one in x, y and z.",
-                         "Correct --target-box.")
+                         "Correct ", Option("target_box"), ".")
     return TargetGoal(BoxRegion(low, high), *target_of(asked),
-                      advice="Choose a larger --target-box, or one nearer to this region")
+                      advice=Text("Choose a larger ", Option("target_box"), ", or one nearer to "
+                                  "this region"))
 
 
 IN_BALL = GoalKind("tip_goal", _in_ball, is_of_target=True, is_place=True)
@@ -319,7 +320,8 @@ def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
                 return near(position, tolerance)
     raise NoPathError("No distant pose lies well inside the sampled region.",
                       f"Too few of the {len(away)} accepted samples are far from the rest pose.",
-                      "Sample more poses with `limber energy --samples`, or give a --goal.")
+                      "Sample more poses with ", Command("energy", Option("samples")), ", or give "
+                      "a ", Option("goal"), ".")
 
 
 def second_arm_goal(field: EnergyField) -> TargetGoal:
@@ -369,7 +371,7 @@ def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits:
         raise NoPathError("No pose in the hemisphere is far from rest and keeps the limits.",
                           f"A distant pose is at least {half:.3f} m from rest; the hemisphere's "
                           f"radius is {length:.3f} m.",
-                          "Give a --goal, or relax the limits.")
+                          "Give a ", Option("goal"), ", or relax the limits.")
     return near(points[np.flatnonzero(fit)[0]], tolerance)
 
 
@@ -540,11 +542,10 @@ class CellGoal(TargetGoal):
         count, causes = len(self.refused), Counter(self.causes).most_common()
         counted = (f"{causes[0][0]} at each" if len(causes) == 1 else
                    ", ".join(f"{cause} at {number}" for cause, number in causes))
-        return NoPathError(
-            f"{self.cell_place.refusal.format(what=self.what)} at any of the {count} poses that "
-            f"were checked: {counted}.",
-            f"At these poses {self.what} lies {self.where}.",
-            f"{self.advice}, or sample farther (`limber energy --deflection`).")
+        return NoPathError(f"{self.cell_place.refusal.format(what=self.what)} at any of the "
+                           f"{count} poses that were checked: {counted}.", "At these poses "
+                           f"{self.what} lies {self.where}.", self.advice, ", or sample farther (",
+                           Command("energy", Option("deflection")), ").")
 
 
 def _far_apart(points: np.ndarray, count: int) -> np.ndarray:
@@ -561,9 +562,8 @@ def _kind(name: str, entry: str) -> GoalKind:
     def made(asked: GoalRequest, _value: bool) -> CellGoal:
         if name not in asked.cell:
             raise InputError(f"--{name.replace('_', '-')} is given without a cell that has a "
-                             f"{entry}.",
-                             "The cell file states its position.",
-                             "Give --cell with such a file.")
+                             f"{entry}.", "The cell file states its position.", "Give ",
+                             Option("cell"), " with such a file.")
         place = asked.cell[name]
         return CellGoal(place.region, *target_of(asked), advice=place.advice, cell_place=place,
                         grasp_model=asked.grasp_model).learnt(asked.field)
@@ -597,9 +597,9 @@ def goal_of(request: GoalRequest) -> Goal:
                          "A path has only one goal.", "Give only one of them.")
     if settings.target is not None and not any(kind.is_of_target for kind in asked):
         *others, last = [kind.option for kind in KINDS if kind.is_of_target]
-        raise InputError(f"--target {settings.target} is given without a goal for it.",
-                         "A target alone does not state where it must move.",
-                         f"Also give {', '.join(others)} or {last}.")
+        raise InputError(
+            Text(Option("target", settings.target), " is given without a goal for it."), "A target "
+            "alone does not state where it must move.", f"Also give {', '.join(others)} or {last}.")
     if not asked:
         return default_goal(request.field, settings.goal_tolerance)
     return asked[0].make(request, getattr(settings, asked[0].name))

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from limber.core.errors import NoPathError
+from limber.core.errors import Command, NoPathError, Option
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.lower_bound import ENERGY
 from limber.planning.cost import arc_lengths, resample
@@ -138,7 +138,7 @@ class _Search:
         if not np.isfinite(limited.cost(self.path)):
             raise NoPathError("No allowed path was found as a starting point.",
                               "Refinement of the known paths ended outside the limits.",
-                              "Sample more poses with `limber energy --samples`.")
+                              "Sample more poses with ", Command("energy", Option("samples")), ".")
         for path in free:
             self._note(_LIGHT, *_measured(path, self.problem))
         if self.length < _BINDS * self.longest:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from limber.core.errors import MissingDependencyError, NoPathError
+from limber.core.errors import MissingDependencyError, NoPathError, Option
 from limber.core.optional import how_to_install
 from limber.core.progress import SILENT, Progress
 from limber.planning.cost import edge_cost, path_cost
@@ -49,9 +49,9 @@ class OmplRrtStar:
 
     def search(self, problem: PathProblem, search: Search, progress: Progress) -> Searched:
         if reason := self.missing():
-            raise MissingDependencyError(
-                "OMPL is not installed.", f"The import failed with: {reason}.",
-                f"{how_to_install('planning')} Or use --engine own, which needs no other package.")
+            raise MissingDependencyError("OMPL is not installed.", "The import failed with: "
+                                         f"{reason}.", f"{how_to_install('planning')} Or use ",
+                                         Option("engine", "own"), ", which needs no other package.")
         from ompl import base, geometric
         from ompl import util as ompl_util
 
@@ -222,11 +222,11 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
     found = PLANNERS[engine].search(problem, search, progress)
     raw, reached = found.path, len(found.tree.nodes) if found.tree else 1
     if raw is None:
-        raise NoPathError(
-            f"{search.iterations} iterations found no allowed path to the goal region.",
-            f"{reached} poses were reached from the start. The limits or rejected poses may "
-            "separate the start from the goal.",
-            "Allow more --iterations, or raise --max-energy or --max-force.")
+        raise NoPathError(f"{search.iterations} iterations found no allowed path to the goal "
+                          "region.", f"{reached} poses were reached from the start. The limits or "
+                          "rejected poses may separate the start from the goal.", "Allow more ",
+                          Option("iterations"), ", or raise ", Option("max_energy"), " or ",
+                          Option("max_force"), ".")
     tree_cost = float(path_cost(raw, problem.limits, problem.weights))
     points = shortcut(raw, problem.limits, problem.weights, attempts=search.shortcuts,
                       seed=search.seed)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option
 
 
 @dataclass
@@ -28,9 +28,9 @@ def read_png(path: Path) -> bytes:
     try:
         data = Path(path).read_bytes()
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}).",
-                         "It should be shown at the top of the report.",
-                         "Omit --picture, or name the PNG that `limber scene` rendered.") from error
+        raise InputError(f"{path} cannot be read ({error.strerror}).", "It should be shown at the "
+                         "top of the report.", "Omit ", Option("picture"), ", or name the PNG "
+                         "that ", Command("scene"), " rendered.") from error
     if not data.startswith(b"\x89PNG"):
         raise InputError(f"{path} is not a PNG file.", "The report shows only PNG.", "Name a PNG.")
     return data

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import BranchFolderError, InputError
+from limber.core.errors import BranchFolderError, Command, InputError, Option
 from limber.core.files.reading import read_arrays, require_shapes
 from limber.core.files.tables import read_columns
 from limber.estimation.estimate_file import read_estimate
@@ -51,7 +51,7 @@ def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | 
     if motion is not None and motion not in names:
         raise BranchFolderError(f"The branch has no frames named {motion!r}.",
                                 f"Its frames are: {', '.join(names) or 'none'}.",
-                                "Name one of them, or run `limber simulate`.")
+                                "Name one of them, or run ", Command("simulate"), ".")
     name = motion or (plan if plan in names else None)
     if name is None and plan is None and names:
         name = max(names, key=lambda each: _finished(branch, each))
@@ -399,7 +399,7 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
             return None
         plan = max(plans, key=lambda name: branch.manifest.stages[f"plan:{name}"].finished)
     summary = read_plan_summary(
-        branch.require(f"plans/{plan}.json", f"plan --name {plan}"))
+        branch.require(f"plans/{plan}.json", "plan", Option("name", plan)))
     for key, name in (("plan", plan), ("baseline", f"{plan}-baseline")):
         if not branch.has(f"plans/{name}.csv"):
             continue

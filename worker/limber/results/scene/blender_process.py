@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from limber.core.errors import MissingDependencyError, WorkError
+from limber.core.errors import Command, MissingDependencyError, Text, WorkError
 from limber.core.optional import how_to_install
 from limber.core.progress import Progress
 
@@ -38,7 +38,7 @@ def make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
     command = blender_command()
     try:
         result = run_json_process("scene", [*command, "--", *map(str, arguments)], progress,
-                                  fix="`limber doctor` states which Blender was used.")
+                                  fix=Text(Command("doctor"), " states which Blender was used."))
     except WorkError as error:
         if command[0] != sys.executable or (reason := _why_bpy_does_not_load()) is None:
             raise
@@ -111,6 +111,6 @@ def scene_script() -> Path:
     for path in candidates:
         if path.is_file():
             return path
-    raise MissingDependencyError(
-        f"The add-on's {candidates[0].name} is not installed.", "`limber scene` needs it.",
-        "Install Limber from its wheel, or run it from a checkout of the project.")
+    raise MissingDependencyError(f"The add-on's {candidates[0].name} is not installed.",
+                                 Text(Command("scene"), " needs it."), "Install Limber from its "
+                                 "wheel, or run it from a checkout of the project.")

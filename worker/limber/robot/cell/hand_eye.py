@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from scipy.spatial.transform import Rotation
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotation_vector, spreads
 from limber.robot.cell.base_calibration import least_depth
 
@@ -195,9 +195,8 @@ def base_from_camera(fit: CameraFit, scan: np.ndarray, camera_on: CameraOn,
     """
     if camera_on == "gripper" and scan_pose is None and len(fit.covariance) < 12:
         raise InputError("The scan is in the board's frame, but only the position of a marker was "
-                         "seen.",
-                         "A position has no axes.", "Also give the board's rotations (seen_rx_rad "
-                         "and so on), or --scan-pose.")
+                         "seen.", "A position has no axes.", "Also give the board's rotations "
+                         "(seen_rx_rad and so on), or ", Option("scan_pose"), ".")
 
     def scanned(camera: np.ndarray, board: np.ndarray) -> np.ndarray:
         """The scan's frame in the robot's base."""

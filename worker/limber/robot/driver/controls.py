@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from limber.cell.cell_file import Cell
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import Command, InputError, WorkError
 from limber.robot.interface import ArmControl
 from limber.robot.ur.factory_calibration import FactoryCalibration, read_calibration
 from limber.robot.ur.samples import Dashboard
@@ -80,7 +80,7 @@ def control_of(cell: Cell) -> ArmControl:
                          "Register a driver with limber.robot.driver.controls.register_control. "
                          f"Drivers exist for {', '.join(_CONTROLS)}.")
     if len(cell.arm.joint_names) != _JOINTS:
-        raise InputError(f"A {cell.arm.name} has {len(cell.arm.joint_names)} joints.",
-                         f"Samples and recordings of a motion hold exactly {_JOINTS} joints.",
-                         "Use it only for planning and for the dry run of `limber execute`.")
+        raise InputError(f"A {cell.arm.name} has {len(cell.arm.joint_names)} joints.", "Samples "
+                         f"and recordings of a motion hold exactly {_JOINTS} joints.", "Use it "
+                         "only for planning and for the dry run of ", Command("execute"), ".")
     return opened(cell)

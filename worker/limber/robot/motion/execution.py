@@ -6,7 +6,7 @@ import numpy as np
 
 from limber.cell.cell_file import Cell
 from limber.cell.reach_and_collision import Blocked
-from limber.core.errors import InputError, NoPathError
+from limber.core.errors import InputError, NoPathError, Option
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotated, rotation_vector
 from limber.robot.motion.contact_speed import speed_within
 from limber.robot.motion.expected_wrench import ExpectedWrench, Predicted, interpolated
@@ -80,10 +80,10 @@ def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
             states where and why.
     """
     if speed > cell.limits.speed_m_s:
-        raise InputError(f"{speed:g} m/s exceeds the cell's {cell.limits.speed_m_s:g} m/s.",
-                         "The guard would slow the motion down, and the predicted forces would "
-                         "not match.",
-                         "Reduce --speed, or raise limits.speed_m_s in the cell file.")
+        raise InputError(f"{speed:g} m/s exceeds the cell's {cell.limits.speed_m_s:g} m/s.", "The "
+                         "guard would slow the motion down, and the predicted forces would not "
+                         "match.", "Reduce ", Option("speed"), ", or raise limits.speed_m_s in the "
+                         "cell file.")
     speed = speed_within(cell, speed)
     rotations = across(axis) if rotation is None else [np.asarray(rotation, float)]
     segments: list[_PathSegment] = []

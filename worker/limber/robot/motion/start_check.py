@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from limber.core.errors import SafetyStop
+from limber.core.errors import Command, SafetyStop, Text
 from limber.core.numerics.rigid_kernels import length, turn_between
 
 POSITION_M = 0.005
@@ -53,8 +53,8 @@ def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
             f"{'; '.join(problems)}.",
             "Its links, joints and cables would move where nothing was checked.",
             "Rotate the gripper to the path's start." if start_joints is None else
-            f"Move the joints to {in_degrees(start_joints)} degrees. A dry run of `limber "
-            "execute` states them as start_joints_rad.")
+            Text(f"Move the joints to {in_degrees(start_joints)} degrees. A dry run of ",
+                 Command("execute"), " states them as start_joints_rad."))
 
 
 def different_joints(joints: np.ndarray, expected: np.ndarray, names: Sequence[str]) -> list[str]:

@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import Command, InputError, Option, WorkError
 from limber.geometry.cloud.camera import D455, Camera, depth_to_cloud
 from limber.robot.virtual.server import CAMERA_PORT
 
@@ -28,9 +28,9 @@ class VirtualCamera:
         try:
             self._socket = socket.create_connection((address, CAMERA_PORT), _SECONDS)
         except OSError as error:
-            raise WorkError(f"No camera answers at {address} port {CAMERA_PORT} ({error}).",
-                            "Only the virtual robot with a branch has one.",
-                            "Start `limber virtual-robot` with the branch's folder.") from error
+            raise WorkError(f"No camera answers at {address} port {CAMERA_PORT} ({error}).", "Only "
+                            "the virtual robot with a branch has one.", "Start ",
+                            Command("virtual-robot"), " with the branch's folder.") from error
         self._stream = self._socket.makefile("rb")
 
     def __enter__(self) -> "VirtualCamera":
@@ -91,7 +91,7 @@ def scanned(address: str, cameras: list[Camera]) -> np.ndarray:
     if not len(points):
         raise WorkError(f"The {len(cameras)} views are empty.", "The cameras do not see the "
                                                                "branch.",
-                        "Give another --middle or --distance.")
+                        "Give another ", Option("middle"), " or ", Option("distance"), ".")
     return points
 
 

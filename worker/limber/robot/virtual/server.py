@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import InputError, Option, WorkError
 from limber.geometry.cloud.camera import Camera
 from limber.robot.ur import rtde
 from limber.robot.ur.factory_calibration import PRIMARY_PORT, kinematics_message
@@ -95,9 +95,8 @@ class Server:
             await self.close()
             raise WorkError(f"Port {port} of {self.address} cannot be opened ({error}).",
                             "Another virtual robot or program uses it, and the client library "
-                            "supports no other "
-                            "port.", "End that program, or give --address 127.0.0.2 "
-                            "(Linux, Windows).") from error
+                            "supports no other port.", "End that program, or give ",
+                            Option("address", "127.0.0.2"), " (Linux, Windows).") from error
 
     async def close(self) -> None:
         """Close ports and connections."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import Cancelled, InputError, LimberError, WorkError
+from limber.core.errors import Cancelled, InputError, LimberError, Option, Text, WorkError
 from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
@@ -208,7 +208,7 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
         raise Cancelled("The estimate was stopped.",
                         f"Its best so far (loss {found.fit.evaluation.loss:.3g} m2) is in "
                         "estimate.json, not in the mesh.",
-                        "Run it again with --resume to start from there.")
+                        "Run it again with ", Option("resume", True), " to start from there.")
     log.forget()
     return stage.result
 
@@ -356,8 +356,9 @@ def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptio
     if options.bag is not None:
         settings = _with_bag(inputs.branch_folder, options.bag, options.cell, settings, progress)
     elif options.cell is not None:
-        raise InputError("--cell was given without --bag.", "A pull in the branch folder already "
-                         "states how well its robot is known.", "Omit --cell.")
+        raise InputError(Text(Option("cell"), " was given without ", Option("bag"), "."),
+                         "A pull in the branch folder already states how well its robot is known.",
+                         "Omit ", Option("cell"), ".")
     if options.follow:
         return follow(inputs.branch_folder, settings, pace=options.pace, progress=progress)
     return estimate(inputs.branch_folder, settings, force=options.force, resume=options.resume,

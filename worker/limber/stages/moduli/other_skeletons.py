@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from limber.core.errors import Cancelled, LimberError
+from limber.core.errors import Cancelled, Command, LimberError, Text
 from limber.core.json_values import validated
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import FitSpec
@@ -55,8 +55,9 @@ def add_other_skeletons(found: Estimate, branch: Branch, pulls: Sequence[Pull],
     """
     changes, weights = [], [1.0]
     for graph in _graphs(branch):
-        named = (f"The skeleton may be another one: alternative {graph.number} of `limber "
-                 f"skeleton` has {graph.odds:.2g} times the probability of the one in use.")
+        named = Text(f"The skeleton may be another one: alternative {graph.number} of ",
+                     Command("skeleton"), f" has {graph.odds:.2g} times the probability of the one "
+                     "in use.")
         try:
             other = _fitted(graph, found, branch, pulls, settings, progress)
         except Cancelled:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import PredictSettings
@@ -51,7 +51,7 @@ def _entry(branch: Branch, name: str | None) -> PullEntry:
     if not names or (name is not None and name not in names):
         raise InputError(f"{branch.folder} has no pull {name or ''}.",
                          f"It has {', '.join(names)}." if names else "It has none.",
-                         "Import one with `limber import-pull`.")
+                         "Import one with ", Command("import-pull"), ".")
     return read_entry(branch.path(f"pulls/{name or names[0]}/pull.toml"))
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import Command, InputError, Option, Text, WorkError
 from limber.core.files.reading import read_json
 from limber.core.json_values import number_array, plain
 from limber.core.not_none import present
@@ -67,7 +67,8 @@ class Swing(Result):
         super().illustrate(section, branch, key)
 
 
-_DAMAGED = "The result of a swing was expected.", "The file is damaged. Run `limber swing` again."
+_DAMAGED = "The result of a swing was expected.", Text("The file is damaged. Run ",
+                                                       Command("swing"), " again.")
 
 def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
           progress: Progress = SILENT) -> dict[str, Any]:
@@ -134,16 +135,15 @@ def _pull(branch: Branch, name: str | None) -> Pull:
     if name is None and len(swings) == 1:
         name = swings[0]
     if name not in swings:
-        raise InputError(
-            f"{branch.folder} has no swing {name or ''}.",
-            f"It has {', '.join(swings)}." if swings else "It has none.",
-            "Name one with --pull, or import one with `limber import-pull --motion swing "
-            "--weight`.")
+        raise InputError(f"{branch.folder} has no swing {name or ''}.",
+                         f"It has {', '.join(swings)}." if swings else "It has none.", "Name one "
+                         "with ", Option("pull"), ", or import one with ",
+                         Command("import-pull", Option("motion", "swing"), Option("weight")), ".")
     pull = read_pull(branch.path(f"pulls/{name}"))
     if pull.entry.swing is None or pull.observations is None or pull.entry.rest_points_m is None:
         raise InputError(f"{name}: pull.toml lacks [swing] or rest_points_m, or no markers.",
                          "The release and the markers' rest positions must be known.",
-                         "Import it with `limber import-pull --motion swing`.")
+                         "Import it with ", Command("import-pull", Option("motion", "swing")), ".")
     return pull
 
 

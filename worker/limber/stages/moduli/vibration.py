@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import InputError, Option, WorkError
 from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
@@ -172,7 +172,7 @@ def young_of(model: BranchModel, seen: Ringing, settings: VibrationSettings) -> 
     else:
         raise WorkError(f"No modulus gives the branch a first frequency of {target:.3g} Hz.",
                         "The branch's mass, or what hangs on it, does not match the record.",
-                        "Check density, --sensor and the record's unit of time.")
+                        "Check density, ", Option("sensor"), " and the record's unit of time.")
     slope = 0.5 if last is None else slope
     near = found[found < _CLOSE * found[0]]
     # The observed plane of bending is unknown if the record does not separate the two.
@@ -194,7 +194,7 @@ def _with_sensor(model: BranchModel, settings: VibrationSettings) -> BranchModel
     if not (mass > 0 and away < 0.1):
         raise InputError(f"A sensor of {mass:g} kg lies {1e3 * away:.0f} mm off the branch.",
                          "A sensor needs a mass and a position on the "
-                         "branch.", "Check --sensor X Y Z KG.")
+                         "branch.", "Check ", Option("sensor"), " X Y Z KG.")
     return model.with_point_masses([*model.point_masses, PointMass((x, y, z), mass)])
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, field_validator
 
 from limber.core.constants import STANDARD_GRAVITY
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.files.atomic import file_digest
 from limber.core.files.reading import read_json
 from limber.core.json_values import number_array
@@ -207,10 +207,10 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
     wind = blown(settings.wind or (0.0, 0.0, 0.0), gusts)
     if not (settings.wind or settings.snow or settings.fruit or settings.cut):
         raise InputError("No load is given.", "The scanned shape already carries the branch's own "
-                                              "weight.",
-                         "Give --wind, --snow, --fruit or --cut.")
+                         "weight.", "Give ", Option("wind"), ", ", Option("snow"), ", ",
+                         Option("fruit"), " or ", Option("cut"), ".")
     if any(not one[3] > 0 for one in settings.fruit):
-        raise InputError("A fruit without mass.", "", "Give --fruit X Y Z KG.")
+        raise InputError("A fruit without mass.", "", "Give ", Option("fruit"), " X Y Z KG.")
     # Without a name nothing is stored.
     branch = (Branch.read if settings.name is None else Branch.open)(folder)
     inputs = _inputs(branch, settings)
@@ -280,9 +280,9 @@ def _gusts(settings: LoadSettings) -> Gusts | None:
     from limber.mechanics.loads.load_effects import Turbulence, WindRecord
 
     if settings.gust is not None and settings.gust_record is not None:
-        raise InputError("Both --gust and --gust-record were given.", "The record already contains "
-                                                                     "the gusts.",
-                         "Omit one of them.")
+        raise InputError(
+            Text("Both ", Option("gust"), " and ", Option("gust_record"), " were given."), "The "
+            "record already contains the gusts.", "Omit one of them.")
     if settings.gust_record is not None:
         return WindRecord.read(settings.gust_record)
     return None if settings.gust is None else Turbulence(settings.gust)
@@ -293,7 +293,7 @@ def _require_near(nodes: np.ndarray, points: list[_Place]) -> None:
         distance = float(np.linalg.norm(nodes - np.array(point), axis=1).min())
         if not distance < 0.1:
             raise InputError(f"A fruit at {point} m is {distance:.3g} m away from the branch.",
-                             "A fruit must hang on the branch.", "Check frame and unit.")
+                             "A fruit must hang on the branch.", "Check frame and unit.").at(point)
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import ConvergenceError, InputError
+from limber.core.errors import Command, ConvergenceError, InputError, Option, Text
 from limber.core.files.atomic import write_atomically
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
@@ -159,7 +159,7 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     progress(1.0, "done")
     if not motion.converged:
         raise ConvergenceError(
-            f"The branch could not follow the motion: {motion.message}",
+            Text("The branch could not follow the motion: ", motion.message),
             f"{result['frame_count']} frames up to the last valid state are in "
             f"frames/{settings.name}.pc2. The grasp force there is {result['grasp_force_n']} N.",
             "Pull less far, or check units and Young's modulus.")
@@ -253,9 +253,8 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
     from limber.store.loading import known_pulls
 
     if inputs.along is not None:
-        raise InputError("Both --along and --pull were given.", "Each states a path of the "
-                                                                "gripper.",
-                         "Give one of them.")
+        raise InputError(Text("Both ", Option("along"), " and ", Option("pull"), " were given."),
+                         "Each states a path of the gripper.", "Give one of them.")
     if inputs.pull not in known_pulls(branch):
         raise InputError(f"There is no pull {inputs.pull!r}.",
                          f"There are: {', '.join(known_pulls(branch)) or 'none'}.",
@@ -263,7 +262,7 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
     pull = read_pull(branch.path(f"pulls/{inputs.pull}"))
     if pull.entry.motion == "swing":
         raise InputError(f"{inputs.pull} is a free swing.", "A free swing has no gripper.",
-                         "`limber swing` fits it.")
+                         Command("swing"), " fits it.")
     grasp, path = pull.entry.grasp, PoseTable(pull.times, pull.poses)
     kind = "static" if pull.entry.motion == "quasi_static" else "dynamic"
     return settings.model_copy(update={

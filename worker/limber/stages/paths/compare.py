@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import InputError, NoPathError
+from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.core.files.tables import table_text
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import POSITION, Groups, Settings
@@ -70,9 +70,8 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
     from limber.results.report.planner_figure import planner_figure
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
-        raise InputError(f"--name {name!r} cannot name a comparison.",
-                         "It becomes part of file names.",
-                         "Use letters, digits, dash, dot and underscore.")
+        raise InputError(Text(Option("name"), f" {name!r} cannot name a comparison."), "It becomes "
+                         "part of file names.", "Use letters, digits, dash, dot and underscore.")
     branch = Branch.open(folder)
     field = EnergyField.read(branch.require("energy.npz", "energy"))
     key, reads = f"compare:{name}", ["energy.npz"]
@@ -87,8 +86,8 @@ def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
         good = [trial for trial in trials if trial.scores]
         if not good:
             raise NoPathError(f"None of {len(trials)} trials has a path.", trials[0].trouble,
-                              "Choose another --goal, or sample more poses with `limber energy "
-                              "--samples`.")
+                              "Choose another ", Option("goal"), ", or sample more poses with ",
+                              Command("energy", Option("samples")), ".")
         for trial in trials:
             if trial.trouble:
                 progress.warn(f"Trial {trial.number + 1} has no path: {trial.trouble}")

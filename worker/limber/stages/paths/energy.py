@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from limber.core.errors import Option
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.settings import EnergySettings
@@ -99,9 +100,9 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
             off = 100.0 * field.errors["energy_error"]
             if off > settings.field_error:
                 progress.warn(
-                    f"The error of the energy field is {off:.2g} % with "
-                    f"{len(field.samples.poses)} poses, more than the {settings.field_error:g} % "
-                    "of --field-error. Increase --samples, or reduce --deflection.")
+                    f"The error of the energy field is {off:.2g} % with {len(field.samples.poses)} "
+                    f"poses, more than the {settings.field_error:g} % of ", Option("field_error"),
+                    ". Increase ", Option("samples"), ", or reduce ", Option("deflection"), ".")
         samples, reasons = sampled.samples, sampled.reasons
         rejected = len(samples.rejected_poses)
         if rejected > 0.2 * settings.samples:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import InputError, SafetyStop
+from limber.core.errors import InputError, Option, SafetyStop, Text
 from limber.core.files.tables import table_line
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
@@ -247,7 +247,8 @@ def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSet
     if warning := check_branch(cell, branch.uuid, folder):
         progress.warn(warning)
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
-        raise InputError(f"--name {name!r} names no plan.", "", "See plans/ in the branch folder.")
+        raise InputError(Text(Option("name"), f" {name!r} names no plan."), "",
+                         "See plans/ in the branch folder.")
     stated = _stated_by_plan(branch, name)
     if warning := check_plan(stated.get("robot"), cell):
         progress.warn(warning)
@@ -289,9 +290,9 @@ def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSetting
     speed, acceleration = checked["speed_m_s"], checked["acceleration_m_s2"]
     asked = present(settings.speed, "speed")
     if asked > speed:
-        progress.warn(f"The plan keeps its limits in motion up to {1e3 * speed:.1f} mm/s, so it "
-                      "is followed at that speed at most. Plan with a higher --speed to go "
-                      "faster.")
+        progress.warn(f"The plan keeps its limits in motion up to {1e3 * speed:.1f} mm/s, so it is "
+                      "followed at that speed at most. Plan with a higher ", Option("speed"), " to "
+                      "go faster.")
     limits = cell.limits.model_copy(update={
         # The plan's motion law uses that fraction of it along the path, the robot's all of it.
         "acceleration_m_s2": min(cell.limits.acceleration_m_s2, np.sqrt(0.5) * acceleration)})

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import Akima1DInterpolator
 
 from limber.cell.cell_file import Cell
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import Command, InputError, Option, Text, WorkError
 from limber.core.files.tables import csv_records, read_columns
 from limber.core.numerics.rigid import composed, matrices, pose_vectors
 from limber.core.progress import Progress
@@ -145,10 +145,10 @@ def require_within_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> 
     """
     peak = float(np.linalg.norm(forces, axis=1).max())
     if peak >= cell.limits.soft_force_n:
-        raise InputError(
-            f"The path needs {peak:.3g} N, the soft limit is {cell.limits.soft_force_n:.3g} N.",
-            "The guard would pause the motion.",
-            "Plan with a lower --max-force, or raise limits.soft_force_n in the cell file.")
+        raise InputError(f"The path needs {peak:.3g} N, the soft limit is "
+                         f"{cell.limits.soft_force_n:.3g} N.", "The guard would pause the motion.",
+                         "Plan with a lower ", Option("max_force"), ", or raise "
+                         "limits.soft_force_n in the cell file.")
     box = cell.workspace
     if box is not None:
         outside = np.any((poses[:, :3] < box.low_m) | (poses[:, :3] > box.high_m), axis=1)
@@ -159,7 +159,7 @@ def require_within_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> 
                                                             "file.")
 
 
-def require_watched(cell: Cell, path: Trajectory, is_unwatched: bool, warn: Callable[[str], None],
+def require_watched(cell: Cell, path: Trajectory, is_unwatched: bool, warn: Callable[[Text], None],
                     noise: float | None = None) -> None:
     """Refuse a path with forces so small that the guard cannot see that the branch is lost.
 
@@ -188,13 +188,14 @@ def require_watched(cell: Cell, path: Trajectory, is_unwatched: bool, warn: Call
             + (f"From about {from_force:.2g} N on they would be seen" if np.isfinite(from_force)
                else "No force is predicted at all"))
     if is_unwatched:
-        warn(f"{told}. `limber execute` follows it only with --unwatched.")
+        warn(Text(f"{told}. ", Command("execute"), " follows it only with ",
+                  Option("unwatched", True), "."))
         return
     raise InputError(
         f"{told}.", "The arm would go on with nothing in the gripper, or with a broken branch.",
         "Plan a path that bends the branch further or hold it nearer to its root; state the sensor "
-        "as it is (sensor.force_sigma_n, sensor.drift_n_per_minute); or give --unwatched, and "
-        "watch the branch yourself.")
+        "as it is (sensor.force_sigma_n, sensor.drift_n_per_minute); or give ",
+        Option("unwatched", True), ", and watch the branch yourself.")
 
 
 def force_sigma(cell: Cell, samples: np.ndarray) -> float:

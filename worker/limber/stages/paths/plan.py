@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import BranchFolderError, Cancelled, InputError, NoPathError
+from limber.core.errors import (
+    BranchFolderError,
+    Cancelled,
+    Command,
+    InputError,
+    NoPathError,
+    Option,
+    Text,
+)
 from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
@@ -178,10 +186,9 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
             ("-baseline", "-bound", "-damage", "-motion", "-setpoints", "-trees")):
-        raise InputError(f"--name {name!r} cannot name a plan.",
-                         "It becomes part of file names, and -baseline, -bound, -damage, "
-                         "-motion, -setpoints and -trees are reserved.",
-                         "Use letters, digits, dash, dot and underscore.")
+        raise InputError(Text(Option("name"), f" {name!r} cannot name a plan."), "It becomes part "
+                         "of file names, and -baseline, -bound, -damage, -motion, -setpoints and "
+                         "-trees are reserved.", "Use letters, digits, dash, dot and underscore.")
     branch = Branch.open(folder)
     field_path = branch.require("energy.npz", "energy")
     energy_stage = branch.manifest.stages["energy"]
@@ -192,9 +199,9 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     if any(energy_stage.reads.get(name) != digest for name, digest in digests.items()):
         raise BranchFolderError(
             "The energy field belongs to another mesh, material, weight or set of targets.",
-            "The branch was meshed or estimated again, or its targets changed, after `limber "
-            "energy` ran.",
-            "Run `limber energy` again.")
+            Text("The branch was meshed or estimated again, or its targets changed, after ",
+                 Command("energy"), " ran."),
+            "Run ", Command("energy"), " again.")
     grasp_model = grasp_model.damped(known_damping(branch))
     digests = digests | {"damping": repr(grasp_model.model.damping)}
     stiffer = _stiffer(branch) if settings.max_stress else 1.0
@@ -210,9 +217,10 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         None if settings.confidence is None else young_uncertainty(branch, grasp_model, asked)
     )
     if settings.turn_slack is not None and cell_file is None:
-        raise InputError("--turn-slack is given without --cell.",
+        raise InputError(Text(Option("turn_slack"), " is given without ", Option("cell"), "."),
                          "It is the arm in the cell that may not let the gripper turn with the "
-                         "branch.", "Give --cell, or omit --turn-slack.")
+                         "branch.",
+                         "Give ", Option("cell"), ", or omit ", Option("turn_slack"), ".")
     in_cell = None
     if cell_file is not None:
         in_cell = _InCell.of(branch, cell_file, asked, progress, settings, grasp_model)
@@ -387,9 +395,10 @@ def _stiffer(branch: Branch) -> float:
     highest = np.array(result["young_interval_pa"], float)[:, 1]
     share = highest / np.array(result["young_pa"], float)
     if not np.isfinite(share).all():
-        raise InputError("--max-stress was given, but the estimate has no upper limit for the "
-                         "stiffness.", "A stiffer branch has more stress at the same pose.",
-                         "Record another pull, or limit --max-strain instead.")
+        raise InputError(Text(Option("max_stress"), " was given, but the estimate has no upper "
+                              "limit for the stiffness."),
+                         "A stiffer branch has more stress at the same pose.",
+                         "Record another pull, or limit ", Option("max_strain"), " instead.")
     return float(np.max(share, initial=1.0))
 
 

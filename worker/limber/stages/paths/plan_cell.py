@@ -162,7 +162,7 @@ class KeptClear:
                    f"of {1e3 * self.clearance:.1f} mm." if away > 0.0 else
                    f"{-1e3 * away:.1f} mm inside {obstacle.name}."),
                 "The obstacle, the branch or its Young's modulus has changed since the plan was "
-                "made.", "Plan again with this cell.")
+                "made.", "Plan again with this cell.").at(grasp)
 
     def describe(self) -> dict[str, Any]:
         """Return the clearance, and the least distance of the branch, as plain data."""

@@ -7,6 +7,7 @@ import numpy as np
 from limber.cell.cell_file import Cell
 from limber.cell.obstacles import Obstacle
 from limber.cell.reach_and_collision import ArmSurroundings
+from limber.core.errors import Command
 from limber.core.not_none import present
 from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -68,8 +69,8 @@ def legs_in_cell(cell: Cell, obstacles: tuple[Obstacle, ...], motion: RobotMotio
             if (row[key] or 0.0) < 0.0:
                 progress.warn(
                     f"During {row['name']} a link of the arm would be {-1e3 * row[key]:.1f} mm "
-                    f"inside {what}, by its rough shape. Look at the motion in a scene "
-                    "(`limber scene`) before the arm moves.")
+                    f"inside {what}, by its rough shape. Look at the motion in a scene (",
+                    Command("scene"), ") before the arm moves.")
     return found
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.progress import Progress
 from limber.mechanics.materials.materials import SAFETY
 from limber.planning.constraints.damage import (
@@ -35,9 +35,10 @@ def strength_for(branch: Branch, settings: PlanSettings, break_tests: Path | Non
     if settings.wood is not None:
         return Strength.of_species(settings.wood, deviation)
     if settings.max_damage is not None:
-        raise InputError("--max-damage is given, but the branch's strength is not known.",
-                         "It is the probability that the largest strain breaks the branch.",
-                         "Also give --break-tests, a CSV of strains at break, or --wood.")
+        raise InputError(
+            Text(Option("max_damage"), " is given, but the branch's strength is not known."), "It "
+            "is the probability that the largest strain breaks the branch.", "Also give ",
+            Option("break_tests"), ", a CSV of strains at break, or ", Option("wood"), ".")
     return None
 
 
@@ -63,8 +64,9 @@ def default_limit(limits: Limits, settings: PlanSettings, strength: Strength | N
             settings.wood):
         return ""
     source = ASSUMED_SOURCE if strength is None else strength.source
-    return (f"The strain is limited to {100 * limits.strain:.2g} %, half of that at which half of "
-            f"such branches break ({source}). --max-strain sets another limit.")
+    return Text(f"The strain is limited to {100 * limits.strain:.2g} %, half of that at which half "
+                f"of such branches break ({source}). ", Option("max_strain"), " sets another "
+                "limit.")
 
 
 def strength_of_plan(strength: Strength | None, plan: ResolvedPath,
@@ -81,12 +83,10 @@ def strength_of_plan(strength: Strength | None, plan: ResolvedPath,
     assessment |= {"place_m": states.strain_places[at], "grasp_m": states.poses[at, :3],
                    "over": peak > assessment["median_strain"]}
     if assessment["over"] and strength is not None:
-        progress.warn(
-            f"The largest strain along the plan is {peak:.2g}, "
-            f"{peak / assessment['median_strain']:.1f} times that at which half of such branches "
-            "break "
-            f"({assessment['median_strain']:.2g}, {assessment['source']}). Lower it with "
-            "--max-damage.")
+        progress.warn(f"The largest strain along the plan is {peak:.2g}, "
+                      f"{peak / assessment['median_strain']:.1f} times that at which half of such "
+                      f"branches break ({assessment['median_strain']:.2g}, "
+                      f"{assessment['source']}). Lower it with ", Option("max_damage"), ".")
     return assessment
 
 

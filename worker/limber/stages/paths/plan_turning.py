@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from limber.cell.cell_file import Cell
-from limber.core.errors import NoPathError
+from limber.core.errors import NoPathError, Option
 from limber.mechanics import BranchModel, Grasp, StaticResult, follow_poses
 from limber.mechanics.sensitivities import grasp_slopes
 from limber.planning.constraints.limits import Limits
@@ -78,7 +78,7 @@ class Clamped:
                     f"With the gripper turned beyond the branch's own rotation the {what} is "
                     f"{size.max():.3g} on the full model, and the limit is {limit:.3g}.",
                     "The arm cannot follow the branch without that rotation.",
-                    "Move the robot's base, raise the limit, or reduce --turn-slack.")
+                    "Move the robot's base, raise the limit, or reduce ", Option("turn_slack"), ".")
         off = np.linalg.norm((found - self.cost.wrench(offsets))[:, 3:], axis=1)
         return {"peak_torque_nm": float(torque.max()), "peak_force_n": float(force.max()),
                 "torque_error_nm": float(off.max())}
@@ -90,7 +90,7 @@ def _solved(firm: BranchModel, grasp: Grasp, pose: np.ndarray, begin: np.ndarray
         place = ", ".join(f"{x:.3f}" for x in pose[:3])
         raise NoPathError(f"The branch has no reliable state with the gripper turned at ({place}) "
                           f"m ({reason}).", "The arm cannot follow it without turning it.",
-                          "Move the robot's base, or reduce --turn-slack.")
+                          "Move the robot's base, or reduce ", Option("turn_slack"), ".")
     return found
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, Option, Text
 from limber.estimation.estimate_file import read_estimate
 from limber.mechanics.materials.materials import young_weights
 from limber.planning.constraints.chance import YoungUncertainty
@@ -20,14 +20,15 @@ def young_uncertainty(branch: Branch, grasp_model: GraspModel, limits: Limits) -
         InputError: there is no limit, no estimate, or one without intervals.
     """
     if not limits.asked():
-        raise InputError("--confidence was given without a limit.",
-                         "It is the probability that the limits hold.",
-                         "Give --max-force, --max-strain or another limit as well.")
+        raise InputError(Text(Option("confidence"), " was given without a limit."), "It is the "
+                         "probability that the limits hold.", "Give ", Option("max_force"), ", ",
+                         Option("max_strain"), " or another limit as well.")
     uncertainty = estimated_uncertainty(branch, grasp_model)
     if uncertainty is None:
-        raise InputError("--confidence was given, but there is no estimate.",
-                         "The uncertainty of Young's modulus comes from `limber estimate`.",
-                         "Import a pull and estimate, or omit --confidence.")
+        raise InputError(Text(Option("confidence"), " was given, but there is no estimate."),
+                         Text("The uncertainty of Young's modulus comes from ", Command("estimate"),
+                              "."),
+                         "Import a pull and estimate, or omit ", Option("confidence"), ".")
     return uncertainty
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.core.errors import InputError, LimberError, Option, SafetyStop, Text, WorkError
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
@@ -126,7 +126,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
     from limber.robot.weighing import require_weighed
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
-        raise InputError(f"--name {name!r} cannot name a recording.",
+        raise InputError(Text(Option("name"), f" {name!r} cannot name a recording."),
                          "The name becomes a folder's name.", "Use letters, digits, dash and dot.")
     branch, cell = Branch.open(folder), read_cell(cell_file)
     if warning := check_branch(cell, branch.uuid, folder):
@@ -138,10 +138,11 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
         return _finish(branch, name, settings, {"ended": "recovered after an interruption"})
     if branch.has(f"pulls/{name}/pull.toml"):
         raise InputError(f"{folder} already has a recording {name}.",
-                         "A recording is never overwritten.", "Give another --name.")
+                         "A recording is never overwritten.", "Give another ", Option("name"), ".")
     if _left_samples(branch, name):
         raise InputError(f"A recording {name} was interrupted.", "It would be lost.",
-                         "Recover it with --recover, or give another --name.")
+                         "Recover it with ", Option("recover", True), ", or give another ",
+                         Option("name"), ".")
     require_payload(cell)
     require_weighed(cell)
     blocked = blocked_by(cell, cell_obstacles(cell, cell_file.parent))
@@ -309,11 +310,13 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
         direction, distance = suggested_pull(branch, point)
     length = np.linalg.norm(direction)
     if length < 1e-9 and settings.waypoints is None:
-        raise InputError("--direction is 0 0 0.", "It has no direction.", "Give a direction.")
+        raise InputError(Text(Option("direction"), " is 0 0 0."), "It has no direction.",
+                         "Give a direction.")
     if settings.speed > cell.limits.speed_m_s:
-        raise InputError(f"--speed {settings.speed:g} exceeds the cell's "
-                         f"{cell.limits.speed_m_s:g} m/s.", "The guard would slow it down.",
-                         "Reduce --speed, or raise limits.speed_m_s in the cell file.")
+        raise InputError(Text(Option("speed"), f" {settings.speed:g} exceeds the cell's "
+                              f"{cell.limits.speed_m_s:g} m/s."), "The guard would slow it down.",
+                         "Reduce ", Option("speed"), ", or raise limits.speed_m_s in the cell "
+                         "file.")
     speed = speed_within(cell, settings.speed, progress.warn)
     gripper, joints = sample[1:7], sample[19:25]
     here = matrices(gripper)

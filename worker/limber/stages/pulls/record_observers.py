@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.files.tables import table_line
 from limber.core.progress import Progress
 from limber.robot.recorder import MarkerStream, PullRecorder
@@ -51,7 +51,8 @@ class Observers:
 
     def __enter__(self) -> Observers:
         if self._port and self._realsense:
-            raise InputError("Both --markers and --realsense are given.", "A pull has one kind of "
+            raise InputError(Text("Both ", Option("markers"), " and ", Option("realsense"), " are "
+                                  "given."), "A pull has one kind of "
                              "observation.", "Give one.")
         with ExitStack() as around:
             if self._port:

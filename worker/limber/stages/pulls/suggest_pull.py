@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from limber.core.errors import Option, Text
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
@@ -206,8 +207,8 @@ def verdict(now: Any, after: Any, confidence: float) -> tuple[bool, str]:
         if len(still) < len(over):
             return True, (f"The plan does not keep {named} {sure}. After this pull it is expected "
                           "to.")
-        return True, (f"The plan does not keep {named} {sure}, and is not expected to after one "
-                      "more pull either. Also plan again with --confidence.")
+        return True, Text(f"The plan does not keep {named} {sure}, and is not expected to after "
+                          "one more pull either. Also plan again with ", Option("confidence"), ".")
     gained = {name: now.factors[name] / after.factors[name] for name in now.factors
               if now.excess[name] > _USED}
     if not gained:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.errors import InputError, WorkError
+from limber.core.errors import Command, InputError, Option, Text, WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
@@ -82,7 +82,8 @@ def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = 
     from limber.store.loading import load_targets
 
     if (inputs.output is None) == (inputs.data is None):
-        raise InputError("Exactly one of --output and --data must be given.",
+        raise InputError(Text("Exactly one of ", Option("output"), " and ", Option("data"), " must "
+                              "be given."),
                          "It states what to write.", "Give -o scene.blend.")
     progress(0.0, "reading the branch folder")
     branch = Branch.read(inputs.branch_folder)
@@ -94,7 +95,7 @@ def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = 
     if settings.color not in data.info["scalars"]:
         raise InputError(f"The branch has no {settings.color} to show.",
                          f"It has: {', '.join(data.info['scalars'])}.",
-                         "Run `limber plan` or `limber simulate` first.")
+                         "Run ", Command("plan"), " or ", Command("simulate"), " first.")
     if inputs.data is not None:
         data.write(_writable(inputs.data))
         return {"data": inputs.data, "vertex_count": len(data.arrays["vertices"])}
@@ -105,7 +106,7 @@ def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = 
     result = _made(data, output, inputs, settings, progress.part(0.1, 1.0))
     if not output.is_file():
         raise WorkError(f"Blender ended without an error but did not write {output}.", "",
-                        "`limber doctor` states which Blender was used.")
+                        Command("doctor"), " states which Blender was used.")
     return result | {"scene": output, "picture": inputs.render, "turntable": turntable}
 
 
@@ -137,7 +138,7 @@ def _write_moving(path: Path, pictures: list[Path]) -> None:
 
     if not pictures:
         raise WorkError("Blender ended without an error but rendered nothing.", "",
-                        "`limber doctor` states which Blender was used.")
+                        Command("doctor"), " states which Blender was used.")
     images = [Image.open(picture).convert("RGB") for picture in pictures]
     beside = path.with_name(f".{path.name}.part")
     try:

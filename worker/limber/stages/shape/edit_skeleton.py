@@ -35,7 +35,7 @@ from pydantic import Field
 
 from limber.core.alignment import Alignment
 from limber.core.constants import FOUND_SKELETON
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.stages.inputs import BranchInputs, NoOptions, NoSettings, by_name
@@ -315,8 +315,8 @@ def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
 
 def _doubtful_line(result: Mapping[str, Any]) -> str:
     count = len(result["doubtful"])
-    return (f"{count} doubtful {'part' if count == 1 else 'parts'}. Edits (a JSON list) are "
-            "applied with --edits." if count else "No part of it is doubtful.")
+    return (Text(f"{count} doubtful {'part' if count == 1 else 'parts'}. Edits (a JSON list) are "
+                 "applied with ", Option("edits"), ".") if count else "No part of it is doubtful.")
 
 
 STAGE = StageDescription(

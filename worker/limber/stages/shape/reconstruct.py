@@ -14,7 +14,14 @@ from pydantic import Field
 
 from limber.core.alignment import Alignment
 from limber.core.constants import FOUND_SKELETON
-from limber.core.errors import Cancelled, InputError, LimberError, PartlyFailedError
+from limber.core.errors import (
+    Cancelled,
+    Command,
+    InputError,
+    LimberError,
+    Option,
+    PartlyFailedError,
+)
 from limber.core.files.atomic import file_digest, replacing, require_file
 from limber.core.files.safe_names import same_named
 from limber.core.machine_errors import machine_error
@@ -174,10 +181,9 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
                                      progress=progress.keeping(warnings))
         except LimberError as error:
             if is_kept and not isinstance(error, Cancelled):
-                progress.warn(
-                    f"The skeleton as found is in {branch.folder / FOUND_SKELETON}.swc, in the "
-                    "scan's coordinates. Correct it and return it (--skeleton), or edit it "
-                    "(--edits).")
+                progress.warn(f"The skeleton as found is in {branch.folder / FOUND_SKELETON}.swc, "
+                              "in the scan's coordinates. Correct it and return it (",
+                              Option("skeleton"), "), or edit it (", Option("edits"), ").")
             raise
         stage.manifest.alignment = made.alignment
         stage.manifest.source = {"file": Path(cloud_path).name, "unit": settings.unit,
@@ -240,8 +246,8 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
         except LimberError as error:
             failed[path.name] = str(error)
         except Exception as error:  # a bug costs this scan, not the others
-            failed[path.name] = str(machine_error(error, target) or f"internal error: {error!r}; "
-                                    "please report it (`limber bug-report`).")
+            failed[path.name] = str(machine_error(error, target) or (
+                f"internal error: {error!r}; please report it ({Command('bug-report')})."))
         part.warn(failed[path.name])
     result: dict[str, Any] = {"done": done, "done_count": len(done)}
     if failed:
@@ -303,10 +309,10 @@ def _without(cloud: Cloud, path: Path) -> Cloud:
     if keep.all():
         raise InputError(f"None of the {len(gone)} points of {path} is in the cloud.",
                          "Points to leave out are given in the cloud's coordinates and unit.",
-                         "Take them from that cloud file, or omit --without.")
+                         "Take them from that cloud file, or omit ", Option("without"), ".")
     if not keep.any():
-        raise InputError(f"All {len(cloud)} points of the cloud are in {path}.",
-                         "Nothing would be left.", "Leave out fewer points, or omit --without.")
+        raise InputError(f"All {len(cloud)} points of the cloud are in {path}.", "Nothing would be "
+                         "left.", "Leave out fewer points, or omit ", Option("without"), ".")
     return cloud.subset(keep)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option, Text
 from limber.core.settings import POSITION, Groups, Settings
 from limber.stages.inputs import PlacedInputs, RunOptions, argument, by_name
 from limber.stages.registry import StageDescription
@@ -97,14 +97,14 @@ def _check_request(name: str, settings: TargetSettings) -> None:
                          "Names appear in files and tables of other programs.",
                          "Use letters, digits, dash and underscore, 64 at most.")
     if settings.remove == (settings.at is not None):
-        seen = "Both --at and --remove" if settings.remove else "Neither --at nor --remove"
-        raise InputError(f"{seen} for target {name}.", "A target is either set at a position or "
-                                                        "removed.",
-                         "Give --at X Y Z, or --remove.")
+        both = ("Both ", " and ") if settings.remove else ("Neither ", " nor ")
+        raise InputError(
+            Text(both[0], Option("at"), both[1], Option("remove"), f" for target {name}."),
+            "A target is either set at a position or removed.",
+            "Give ", Option("at"), " X Y Z, or ", Option("remove", True), ".")
     if settings.at is not None and not np.isfinite(settings.at).all():
-        raise InputError(f"Target {name} at {settings.at}.", "A position has three finite "
-                                                             "numbers.",
-                         "Give --at X Y Z in metres.")
+        raise InputError(f"Target {name} at {settings.at}.", "A position has three finite numbers.",
+                         "Give ", Option("at"), " X Y Z in metres.")
 
 
 def _placed(mesh: Any, name: str, at: tuple[float, float, float], settings: TargetSettings,
