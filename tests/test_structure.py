@@ -182,7 +182,7 @@ PARTS = {"core": ("numerics", "files", "processes"),
          "mechanics": ("materials", "elements", "linear", "statics", "dynamics", "loads"),
          "estimation": ("forward", "fitting", "uncertainty", "online"),
          "planning": ("field", "goals", "constraints", "certificate", "planners"),
-         "robot": ("ur", "cell", "motion", "driver", "virtual"),
+         "robot": ("ur", "motion", "driver", "virtual"),
          "results": ("exports", "scene", "report")}
 
 

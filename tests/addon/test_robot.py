@@ -151,7 +151,7 @@ def test_while_it_moves_there_is_a_stop(bpy, checked, tmp_path):
 
 def test_the_file_is_the_workers(addon):
     """Reader and writer speak of the same file in the same way."""
-    from limber.robot.driver import live_force
+    from limber.robot.driver import link as live_force
 
     ours = part("live_force")
     assert (ours.FILE, ours.FORMAT) == (live_force.FILE, live_force.FORMAT)

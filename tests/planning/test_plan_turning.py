@@ -10,7 +10,7 @@ from limber.core.errors import InputError, NoPathError
 from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.settings import PlanSettings
-from limber.robot.motion.turning import Turned
+from limber.robot.motion.execution import Turned
 from limber.stages.paths import plan_turning
 from limber.stages.paths.plan import plan
 from limber.stages.paths.plan_turning import Clamped, turned_by

@@ -13,7 +13,7 @@ from limber.cell.ur_arms import ARMS
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices
 from limber.robot.motion.execution import robot_motion
-from limber.robot.motion.expected_wrench import Predicted
+from limber.robot.motion.trajectory import Predicted
 
 
 @pytest.mark.parametrize("name", sorted(ARMS))

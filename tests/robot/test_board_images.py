@@ -10,7 +10,7 @@ from limber.cell.cell_file import CameraEntry, Cell, read_cell, write_cell
 from limber.cli.commands.robot import command
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotation_vector
-from limber.robot.cell.board_images import Board, View, find_board, fit_pictures
+from limber.robot.calibration import Board, View, find_board, fit_pictures
 
 CAMERA = CameraEntry(pose=(0,) * 6, width=1280, height=960, focal_px=(1100.0, 1100.0),
                      centre_px=(640.0, 480.0))

@@ -15,8 +15,8 @@ from limber.cli.commands.robot import command
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
-from limber.robot.cell.base_calibration import fit_base, touched_point
-from limber.robot.cell.controller_settings import differences
+from limber.robot.calibration import fit_base, touched_point
+from limber.robot.controller_settings import differences
 from limber.robot.interface import Sample
 from limber.robot.ur.factory_calibration import (
     PRIMARY_PORT,

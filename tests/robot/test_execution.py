@@ -14,10 +14,10 @@ from limber.cell.ur_arms import ARMS
 from limber.core.errors import InputError, NoPathError, SafetyStop
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
-from limber.robot.cell.base_calibration import fit_base
+from limber.robot.calibration import fit_base
 from limber.robot.motion.execution import across, followed, robot_motion
-from limber.robot.motion.expected_wrench import Predicted
-from limber.robot.pull_plausibility import NUDGE_M
+from limber.robot.motion.trajectory import Predicted
+from limber.robot.recorder import NUDGE_M
 from limber.stages.paths import execute_path
 from limber.stages.paths.execute import (
     ExecuteOptions,

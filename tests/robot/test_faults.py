@@ -26,8 +26,7 @@ from limber.core.errors import LimberError, SafetyStop
 from limber.core.numerics.compiled import cache_folder
 from limber.core.progress import SILENT
 from limber.robot.driver.link import RobotLink
-from limber.robot.motion.expected_wrench import ExpectedWrench
-from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.operator_decisions import _force_left, retreat_if_chosen
 
 pytest.importorskip("rtde_control")

@@ -6,13 +6,13 @@ from tests.robot.test_start import ARM, POSE, led, line, sample_at
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
-from limber.robot.motion.followed_path import (
+from limber.robot.motion.retreat import (
     FollowedPathFile,
+    RetreatPath,
     followed_path,
     followed_path_file,
     read_followed_path,
 )
-from limber.robot.motion.retreat import RetreatPath
 from limber.robot.motion.trajectory import Trajectory, along
 
 CELL = Cell(robot={"model": "ur5e", "address": "127.0.0.9"}, base={"pose": (0,) * 6})

@@ -10,7 +10,7 @@ import pytest
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import WorkError
-from limber.robot.driver.force_sensors import Ft300UsbSensor
+from limber.robot.driver.force_samples import Ft300UsbSensor
 from limber.robot.interface import Sample
 from limber.robot.ur.ft300_modbus import REQUEST, Ft300Line, checked
 

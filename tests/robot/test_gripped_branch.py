@@ -20,9 +20,8 @@ from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.mechanics.sensitivities import grasp_slopes
 from limber.robot.virtual.branch_solver import BranchSetting, BranchSolver
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.depth_camera import scanned, views_around
 from limber.robot.virtual.gripped_branch import HeldBranch
-from limber.robot.virtual.launch import VirtualRobot
+from limber.robot.virtual.launch import VirtualRobot, scanned, views_around
 
 TIP = np.array([0.0, 0.0, 0.3])
 

@@ -8,9 +8,8 @@ import pytest
 from limber.cell.cell_file import Cell
 from limber.core.errors import SafetyStop, WorkError
 from limber.core.progress import SILENT
-from limber.robot.grippers import drive_gripper, holds
 from limber.robot.operator_decisions import _opened_without_driver, grip
-from limber.robot.ur.robotiq import HELD_CLOSING, RobotiqGripper
+from limber.robot.ur.grippers import HELD_CLOSING, RobotiqGripper, drive_gripper, holds
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.payload import Nothing, RobotiqRegisters
 from limber.robot.virtual.server import Server, new_loop

@@ -11,8 +11,7 @@ from limber.cell.cell_file import LimitsEntry, WorkspaceEntry
 from limber.cell.ur_arms import ARMS
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.driver.guard import Guard
-from limber.robot.driver.guard_states import GuardSettings, State, Verdict
+from limber.robot.driver.guard import Guard, GuardSettings, State, Verdict
 from limber.robot.interface import Sample
 
 ARM = ARMS["ur5e"]

@@ -10,7 +10,7 @@ from limber.cell.cell_file import Cell, read_cell, write_cell
 from limber.cli.commands.robot import command
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
-from limber.robot.cell.hand_eye import base_from_camera, fit_camera
+from limber.robot.calibration import base_from_camera, fit_camera
 from limber.store import Branch
 
 STANDING = np.array([1.2, -0.3, 0.6, -1.9, 0.4, 0.3])

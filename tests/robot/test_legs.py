@@ -7,9 +7,8 @@ from limber.cell.cell_file import Cell
 from limber.cell.obstacles import Box
 from limber.core.progress import Progress
 from limber.planning.plan_file import PlanPath
-from limber.robot.motion.execution import robot_motion
-from limber.robot.motion.expected_wrench import Predicted
-from limber.robot.motion.legs import described, legs_of
+from limber.robot.motion.execution import described, legs_of, robot_motion
+from limber.robot.motion.trajectory import Predicted
 from limber.stages.paths.plan_legs import legs_in_cell, legs_without_cell
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},

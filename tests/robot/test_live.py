@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from limber.robot.driver.live_force import FILE, LiveForce
+from limber.robot.driver.link import FILE, LiveForce
 
 
 def _samples(force, expected=np.nan):

@@ -8,9 +8,8 @@ import pytest
 from benchmarks.robot_stepped import Run, Spring
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
-from limber.robot.driver.expected_force import ForceErrors, noise_at_rest, not_seen, white_noise
-from limber.robot.motion.expected_wrench import ExpectedWrench
-from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.driver.guard import ForceErrors, noise_at_rest, not_seen, white_noise
+from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.payload import Nothing
 from limber.stages.paths.execute_path import require_watched

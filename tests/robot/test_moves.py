@@ -16,9 +16,8 @@ from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.robot.driver.link import RobotLink
-from limber.robot.motion.joint_planner import joint_space_path
+from limber.robot.motion.joint_path import joint_space_path, to_joints
 from limber.robot.motion.trajectory import along_bounded
-from limber.stages.paths.arm_moves import to_joints
 from limber.store import Branch
 
 GRASP = (0, 0, 0.15, 0, 0, 0)

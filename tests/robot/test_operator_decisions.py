@@ -87,7 +87,7 @@ def test_where_the_driver_is_gone_another_takes_its_place(monkeypatch):
     def no_link(cell):
         raise WorkError("No robot answers.")
     monkeypatch.setattr("limber.robot.operator_decisions.RobotLink", no_link)
-    monkeypatch.setattr("limber.robot.grippers.switch_output",
+    monkeypatch.setattr("limber.robot.ur.grippers.switch_output",
                         lambda *arguments: switched.append(arguments))
     found = retreat_if_chosen(cell_with("digital_output"), gone, "retreat", SILENT)
     assert not found["retreated"] and found["gripper_opened"] and found["force_n"] is None

@@ -7,7 +7,7 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.motion.trajectory import Trajectory
-from limber.robot.pull_plausibility import (
+from limber.robot.recorder import (
     LOOKED_M,
     NUDGE_M,
     PredictedPull,

@@ -13,8 +13,7 @@ from limber.cli.commands.robot import command
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress
 from limber.geometry.io.clouds import read_cloud
-from limber.robot.live_view import look
-from limber.robot.realsense import RealSense, camera_differences, seen_points
+from limber.robot.depth_camera import RealSense, camera_differences, look, seen_points
 from limber.stages.paths.plan_cell import cell_positions
 
 WIDTH, HEIGHT, SCALE = 12, 8, 0.001

@@ -27,7 +27,7 @@ from limber.geometry.cloud.camera import D455
 from limber.perception.observe import observe
 from limber.recordings.recording import read_pull
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
-from limber.robot.virtual.depth_camera import VirtualCamera
+from limber.robot.virtual.launch import VirtualCamera
 from limber.stages.pulls.record import (
     RecordOptions,
     RecordSettings,

@@ -16,15 +16,13 @@ from limber.cell.cell_file import Cell, write_cell
 from limber.cli.commands.ros import command
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
-from limber.robot.motion.trajectory import Trajectory, along, densely
-from limber.robot.pull_plausibility import PredictedPull, PullPlausibility
+from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
+from limber.robot.recorder import PredictedPull, PullPlausibility
 from limber.robot.ros import guarded_robot
 from limber.robot.ros.bridge import Bridge
-from limber.robot.ros.cloud_topic import CloudTopic
 from limber.robot.ros.guarded_robot import RosRobot, Topics
-from limber.robot.ros.messages import JointStates, cloud_of, goal_of, spline
+from limber.robot.ros.messages import CloudTopic, JointStates, cloud_of, goal_of, spline
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
             tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})

@@ -15,11 +15,11 @@ from benchmarks.robot_rosbridge import STEP, RosBridge, SteppedBridge
 from limber.cell.cell_file import Cell, write_cell
 from limber.cli.commands.ros import command
 from limber.core.errors import Cancelled, InputError, SafetyStop, WorkError
-from limber.robot.driver import delays
+from limber.robot.driver import force_samples as delays
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.ros import guarded_robot
 from limber.robot.ros.guarded_robot import RosRobot, Topics
-from limber.robot.ros.topics import wrench_topic
+from limber.robot.ros.messages import wrench_topic
 
 GRIPPER = {"name": ["finger_joint", "other_finger_joint"], "position": [0.4, 0.4],
            "velocity": [0.0, 0.0]}

@@ -9,10 +9,8 @@ from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
 from limber.robot.interface import Sample
-from limber.robot.motion.expected_wrench import ExpectedWrench
-from limber.robot.motion.retreat import RetreatPath
-from limber.robot.motion.start_check import require_start
-from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.motion.retreat import RetreatPath, require_start
+from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.stages.pulls.record_path import there_and_back
 
 ARM = ARMS["ur5e"]

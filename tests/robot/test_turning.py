@@ -7,9 +7,9 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import angle_between, pose_vectors, turn_between
 from limber.planning.plan_file import PlanTurning
-from limber.robot.motion import turning
-from limber.robot.motion.expected_wrench import Predicted
-from limber.robot.motion.turning import TurnCost, turned, turned_motion
+from limber.robot.motion import execution as turning
+from limber.robot.motion.execution import TurnCost, turned, turned_motion
+from limber.robot.motion.trajectory import Predicted
 from limber.stages.paths.execute_path import offsets_along
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},

@@ -6,9 +6,8 @@ from tests.robot.conftest import Registers
 
 from limber.cell.ur_arms import ARMS
 from limber.core.numerics.rigid import matrices
-from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.controller_modes import RuntimeState, SafetyMode
-from limber.robot.virtual.force_sensor import E_SERIES, ForceSensor
+from limber.robot.virtual.controller import Controller, RuntimeState, SafetyMode
+from limber.robot.virtual.payload import E_SERIES, ForceSensor
 
 SERVO_JOINTS, SERVO_STOP, PAYLOAD, SERVO_POSE, TOOL, WATCHDOG = 11, 16, 17, 24, 29, 35
 

@@ -12,9 +12,8 @@ from tests.robot.conftest import let_go
 from limber.core.errors import InputError, WorkError
 from limber.robot.ur import rtde
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.dashboard import answer
 from limber.robot.virtual.launch import VirtualRobot
-from limber.robot.virtual.server import FT300_PORT, RTDE_PORT, Server, _RtdeClient
+from limber.robot.virtual.server import FT300_PORT, RTDE_PORT, Server, _RtdeClient, answer
 
 
 class Wire(asyncio.Transport):

@@ -7,9 +7,14 @@ from benchmarks.robot_stepped import Run, Wall
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices
-from limber.robot.motion.contact_speed import contact_speed, speed_within
-from limber.robot.motion.expected_wrench import ExpectedWrench
-from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.motion.trajectory import (
+    ExpectedWrench,
+    Trajectory,
+    along,
+    contact_speed,
+    densely,
+    speed_within,
+)
 from limber.robot.virtual.controller import Controller
 from limber.stages.pulls.record_path import there_and_back
 

@@ -11,14 +11,8 @@ from limber.cli.robot_commands.moves import log_move
 from limber.cli.robot_commands.weigh import weighed, weightless
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.weighing import (
-    require_weighed,
-    tilted_joints,
-    unweighed,
-    weigh,
-    weighed_as,
-)
-from limber.stages.paths.arm_moves import to_joints
+from limber.robot.motion.joint_path import to_joints
+from limber.robot.robot_state import require_weighed, tilted_joints, unweighed, weigh, weighed_as
 
 MASS = 0.9
 SWAPPED = np.eye(3)[[1, 2, 0]]

@@ -41,8 +41,7 @@ from benchmarks.robot_stops import RETREAT_ROW, STATES_ROW, retreats, wrong_stat
 from benchmarks.table import Asked, Part, Row, Setting
 from benchmarks.trials import Trial, column, sound
 from limber.robot.driver.link import RobotLink
-from limber.robot.motion.expected_wrench import ExpectedWrench
-from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.virtual.launch import VirtualRobot
 
 _ADDRESS = "127.0.0.71"

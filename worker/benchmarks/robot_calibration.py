@@ -13,9 +13,7 @@ from limber.cell.cell_file import CameraEntry, Cell
 from limber.cell.ur_arms import ARMS
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotation_vector
 from limber.core.numerics.rigid_kernels import pose_of
-from limber.robot.cell.base_calibration import fit_base, touched_point
-from limber.robot.cell.board_images import View, fit_pictures
-from limber.robot.cell.hand_eye import CameraOn
+from limber.robot.calibration import CameraOn, View, fit_base, fit_pictures, touched_point
 from limber.robot.interface import Sample
 from limber.robot.ur.factory_calibration import one_arm
 

@@ -16,8 +16,7 @@ from limber.cell.cell_file import Cell
 from limber.cell.known_arms import arm_named
 from limber.core.errors import LimberError
 from limber.robot.driver.link import RobotLink
-from limber.robot.motion.expected_wrench import ExpectedWrench
-from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.virtual.launch import VirtualRobot
 from limber.robot.virtual.server import SCRIPT_PORT
 

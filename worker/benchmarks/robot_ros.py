@@ -16,9 +16,8 @@ from benchmarks.table import Asked, Row, Setting
 from limber.cell.cell_file import Cell
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.robot.driver.real_time import claim_real_time, keep_awake
-from limber.robot.motion.expected_wrench import ExpectedWrench
 from limber.robot.motion.joint_path import joint_path
-from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.ros.bridge import Bridge
 from limber.robot.ros.guarded_robot import RosRobot, Topics
 

@@ -11,8 +11,7 @@ from limber.cell.cell_file import Cell
 from limber.core.numerics.rigid_kernels import crossed
 from limber.robot.driver import control_loop
 from limber.robot.interface import Sample
-from limber.robot.virtual.arm_motions import Braking, Servo, nearest_joints
-from limber.robot.virtual.controller import Controller
+from limber.robot.virtual.controller import Braking, Controller, Servo, nearest_joints
 from limber.robot.virtual.payload import Nothing
 
 _LATE_STEPS = 2  # until a target that was sent moves the arm

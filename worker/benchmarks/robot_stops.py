@@ -20,9 +20,8 @@ from limber.core.errors import LimberError
 from limber.core.numerics.rigid_kernels import crossed
 from limber.robot.driver.link import COLUMNS
 from limber.robot.interface import Sample
-from limber.robot.motion.contact_speed import speed_within
-from limber.robot.motion.trajectory import Trajectory, along, densely
-from limber.robot.pull_plausibility import (
+from limber.robot.motion.trajectory import Trajectory, along, densely, speed_within
+from limber.robot.recorder import (
     NUDGE_M,
     NUDGE_M_S,
     NUDGE_SECONDS,

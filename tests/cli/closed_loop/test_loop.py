@@ -25,7 +25,7 @@ from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.planning.path_problem import UNPROVEN
-from limber.robot.cell.base_calibration import fit_base
+from limber.robot.calibration import fit_base
 
 TOOL = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 

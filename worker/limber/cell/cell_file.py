@@ -6,7 +6,7 @@ angles in radians, masses in kilograms. The branch's frame is that of its folder
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -127,7 +127,8 @@ class ApproachEntry(_Entry):
         length = float(np.linalg.norm(value))
         if length < 1e-9:
             raise ValueError("is zero and has no direction")
-        return tuple(float(part) / length for part in value)
+        x, y, z = (float(part) / length for part in value)
+        return x, y, z
 
 
 class SensorEntry(_Entry):
@@ -332,13 +333,13 @@ class Cell(_Entry):
         Returns:
             Shape [..., 4, 4].
         """
-        return (inverted(matrices(self.base.pose)) @ matrices(grasp_poses)
-                @ inverted(matrices(self.tool.grasp_pose)))
+        return (inverted(matrices(np.array(self.base.pose))) @ matrices(grasp_poses)
+                @ inverted(matrices(np.array(self.tool.grasp_pose))))
 
     def grasp_frames(self, flange_frames: np.ndarray) -> np.ndarray:
         """Return the grasp's frames in the branch's frame for flange frames [..., 4, 4]."""
-        return (matrices(self.base.pose) @ np.asarray(flange_frames, float)
-                @ matrices(self.tool.grasp_pose))
+        return (matrices(np.array(self.base.pose)) @ np.asarray(flange_frames, float)
+                @ matrices(np.array(self.tool.grasp_pose)))
 
 
 def read_cell(path: str | Path) -> Cell:
@@ -374,11 +375,12 @@ def write_cell(path: str | Path, cell: Cell) -> None:
     write_atomically(Path(path), tomlkit.dumps(content))
 
 
-def _problem_text(path: Path, item: dict) -> str:
+def _problem_text(path: Path, item: Mapping[str, Any]) -> str:
     key = ".".join(str(part) for part in item["loc"])
     message = item["msg"].removeprefix("Value error, ")
     # An error that several entries cause together begins with the name of one of them.
-    named = tuple(re.match(r"[\w.]+", message)[0].split(".")) if not item["loc"] else item["loc"]
+    first = re.match(r"[\w.]+", message)
+    named = tuple(first[0].split(".")) if first and not item["loc"] else item["loc"]
     line = _line_of(path, named)
     where = f"{path}, line {line}" if line else f"{path}"
     return f"{where}: {key}: {message}" if key else f"{where}: {message}"

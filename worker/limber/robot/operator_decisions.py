@@ -10,8 +10,8 @@ import numpy as np
 
 from limber.core.errors import InputError, LimberError, Option, SafetyStop
 from limber.robot.driver.link import COLUMNS, RobotLink
-from limber.robot.grippers import drive_gripper, holds, is_driven
 from limber.robot.robot_state import show_before_motion
+from limber.robot.ur.grippers import drive_gripper, holds, is_driven
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell

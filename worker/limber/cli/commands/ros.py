@@ -44,7 +44,7 @@ def check(run: Run, cell_file: Path, url: str) -> dict[str, Any]:
     from limber.cell.cell_file import read_cell
     from limber.robot.ros.bridge import Bridge
     from limber.robot.ros.guarded_robot import RosRobot, Topics
-    from limber.robot.ros.topics import wrench_topic
+    from limber.robot.ros.messages import wrench_topic
 
     cell = read_cell(cell_file)
     felt = wrench_topic(cell)
@@ -109,8 +109,7 @@ def scan(run: Run, cell_file: Path, topic: str, output: Path, views: int, url: s
     from limber.core.errors import InputError
     from limber.geometry.cloud.cloud import Cloud
     from limber.robot.ros.bridge import Bridge
-    from limber.robot.ros.cloud_topic import CloudTopic
-    from limber.robot.ros.topics import Topics
+    from limber.robot.ros.messages import CloudTopic, Topics
 
     cell = read_cell(cell_file)
     if views > 1 and not sys.stdin.isatty():
@@ -161,9 +160,9 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
     """
     from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError, SafetyStop
+    from limber.robot.robot_state import require_weighed
     from limber.robot.ros.bridge import SECONDS
-    from limber.robot.ros.topics import wrench_topic
-    from limber.robot.weighing import require_weighed
+    from limber.robot.ros.messages import wrench_topic
     from limber.stages.paths.execute import ExecuteSettings, planned_motion
 
     wrench_topic(read_cell(cell_file))
@@ -208,8 +207,8 @@ def retreat(run: Run, cell_file: Path, armed: bool, confirm: str | None, url: st
     """
     from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError, SafetyStop
-    from limber.robot.motion.followed_path import followed_path
-    from limber.robot.ros.topics import wrench_topic
+    from limber.robot.motion.retreat import followed_path
+    from limber.robot.ros.messages import wrench_topic
 
     cell = read_cell(cell_file)
     wrench_topic(cell)
@@ -248,9 +247,8 @@ def serve(run: Run, cell_file: Path, service: str, armed: bool, confirm: str | N
     """
     from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError, SafetyStop
-    from limber.robot.ros.bridge import Bridge
-    from limber.robot.ros.topics import wrench_topic
-    from limber.robot.ros.trigger_service import TriggerService
+    from limber.robot.ros.bridge import Bridge, TriggerService
+    from limber.robot.ros.messages import wrench_topic
 
     cell = read_cell(cell_file)
     wrench_topic(cell)
@@ -276,7 +274,7 @@ def serve(run: Run, cell_file: Path, service: str, armed: bool, confirm: str | N
 def _answered(run: Run, cell: Cell, armed: bool, url: str) -> tuple[bool, str]:
     """Retreat for a call of the service; whether the branch is free, and in words."""
     from limber.core.errors import LimberError
-    from limber.robot.motion.followed_path import followed_path
+    from limber.robot.motion.retreat import followed_path
 
     try:
         way = followed_path(cell, "Open the gripper, and free the branch by hand.")
@@ -308,8 +306,7 @@ def gripper(run: Run, cell_file: Path, position: float, effort: float, action: s
     """Close or open the gripper by its action in ROS; `stalled` tells that it holds something."""
     from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError, SafetyStop
-    from limber.robot.ros.bridge import SECONDS, Bridge
-    from limber.robot.ros.gripper_action import drive
+    from limber.robot.ros.bridge import SECONDS, Bridge, drive
 
     cell = read_cell(cell_file)
     result: dict[str, Any] = {"armed": armed, "action": action, "wanted": position}

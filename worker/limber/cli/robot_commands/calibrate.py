@@ -15,7 +15,7 @@ from limber.cli.main import Run, stage_command
 from limber.core.errors import Option, Text
 
 if TYPE_CHECKING:
-    from limber.robot.cell.hand_eye import CameraFit
+    from limber.robot.calibration import CameraFit
 
 CameraSide = Literal["stand", "gripper"]
 
@@ -92,7 +92,7 @@ def _views_of(views_file: Path, camera_on: CameraSide, largest_residual: float,
     """Fit the camera to a table of board poses that another program has found."""
     from limber.core.files.tables import read_columns
     from limber.recordings.recording import POSE_COLUMNS
-    from limber.robot.cell.hand_eye import fit_camera
+    from limber.robot.calibration import fit_camera
 
     robot_columns = [f"robot_{name}" for name in POSE_COLUMNS]
     seen_columns = [f"seen_{name}" for name in POSE_COLUMNS]
@@ -110,7 +110,7 @@ def _pictures_of(run: Run, cell: Any, images_file: Path | None, camera_on: Camer
                  dictionary: str | None) -> tuple[CameraFit, dict[str, Any]]:
     """Find a board in pictures and fit the camera to them."""
     from limber.core.errors import InputError
-    from limber.robot.cell.board_images import Board, find_board, fit_pictures
+    from limber.robot.calibration import Board, find_board, fit_pictures
 
     assert images_file is not None
     if cell.camera is None:
@@ -158,7 +158,7 @@ def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any,
                found: tuple[CameraFit, dict[str, Any]], camera_on: CameraSide,
                scan_pose: tuple[float, ...] | None) -> dict[str, Any]:
     from limber.core.numerics.rigid import matrices, pose_vectors
-    from limber.robot.cell.hand_eye import base_from_camera
+    from limber.robot.calibration import base_from_camera
     from limber.store.loading import load_skeleton
 
     fit, summary = found
@@ -189,7 +189,7 @@ def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any,
 def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file: Path,
                  largest_residual: float) -> dict[str, Any]:
     from limber.core.errors import InputError
-    from limber.robot.cell.base_calibration import fit_base, require_frame
+    from limber.robot.calibration import fit_base, require_frame
 
     names, on_branch, touched = _points(points_file)
     # Before the user touches any points.
@@ -268,8 +268,8 @@ def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
     """Read the tool's position at each point; the arm is guided by hand, no command is sent to it.
     """
     from limber.core.errors import WorkError
-    from limber.robot.cell.base_calibration import touched_point
-    from limber.robot.ur.samples import SampleStream
+    from limber.robot.calibration import touched_point
+    from limber.robot.ur.rtde import SampleStream
 
     touched = []
     stream = SampleStream(cell.robot.address)

@@ -37,7 +37,7 @@ def check(run: Run, cell_file: Path, offline: bool, folder: Path | None, plan: s
     """
     from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError
-    from limber.robot.weighing import unweighed
+    from limber.robot.robot_state import unweighed
 
     if ((folder or plan) and not offline) or (plan and folder is None):
         raise InputError(
@@ -106,7 +106,7 @@ def _not_stated(cell: Cell) -> list[str]:
 
 def _camera(run: Run, cell: Cell) -> dict[str, Any]:
     """Compare the connected camera with the cell's."""
-    from limber.robot.realsense import RealSense, camera_differences
+    from limber.robot.depth_camera import RealSense, camera_differences
 
     with RealSense() as camera:
         differences = camera_differences(cell, camera.camera)

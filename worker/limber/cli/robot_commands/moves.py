@@ -84,8 +84,7 @@ def retreat(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
     from limber.cell.cell_file import read_cell
     from limber.core.errors import SafetyStop
     from limber.robot.driver.link import RobotLink
-    from limber.robot.motion.followed_path import followed_path
-    from limber.robot.motion.retreat import RetreatPath
+    from limber.robot.motion.retreat import RetreatPath, followed_path
     from limber.robot.operator_decisions import require_confirmation, retreat_if_chosen
 
     cell = read_cell(cell_file)
@@ -118,8 +117,8 @@ def release(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict
     """Open the gripper, and retreat from the branch opposite to the approach."""
     from limber.cell.cell_file import read_cell
     from limber.robot.driver.link import RobotLink
+    from limber.robot.motion.joint_path import away_from_branch
     from limber.robot.operator_decisions import grip, require_confirmation
-    from limber.stages.paths.arm_moves import away_from_branch
 
     cell = read_cell(cell_file)
     sample, pose = stands(cell)
@@ -142,8 +141,8 @@ def open_gripper(run: Run, cell_file: Path, confirm: str | None, armed: bool) ->
     """
     from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError
-    from limber.robot.grippers import drive_gripper, is_driven
-    from limber.robot.motion.followed_path import FollowedPathFile
+    from limber.robot.motion.retreat import FollowedPathFile
+    from limber.robot.ur.grippers import drive_gripper, is_driven
 
     cell = read_cell(cell_file)
     if not is_driven(cell):
@@ -171,8 +170,8 @@ def _to(run: Run, cell_file: Path, cell: Cell, folder: Path | None, goal: np.nda
     from limber.cell.obstacles import cell_obstacles
     from limber.cell.reach_and_collision import ArmSurroundings
     from limber.robot.driver.link import RobotLink
+    from limber.robot.motion.joint_path import is_at, to_joints
     from limber.robot.operator_decisions import require_confirmation
-    from limber.stages.paths.arm_moves import is_at, to_joints
     from limber.store import Branch
     from limber.store.loading import load_skeleton
 
@@ -221,7 +220,7 @@ def _followed(run: Run, cell_file: Path, word: str, link: RobotLink, motion: Tra
 
 def stands(cell: Cell) -> tuple[Sample, np.ndarray]:
     """Current position of the arm: a sample, and the pose of the gripper's middle [6]."""
-    from limber.robot.cell.base_calibration import gripper_pose
+    from limber.robot.calibration import gripper_pose
     from limber.robot.robot_state import observe
 
     sample = observe(cell, _OBSERVED_SECONDS).samples[-1]
@@ -237,7 +236,7 @@ def _with_pose(sample: Sample, pose: np.ndarray) -> Sample:
 def require_empty(cell: Cell, run: Run) -> None:
     """Refuse a motion of the arm alone if the gripper is known to hold the branch."""
     from limber.core.errors import SafetyStop
-    from limber.robot.motion.followed_path import read_followed_path
+    from limber.robot.motion.retreat import read_followed_path
 
     followed = read_followed_path(cell)
     if followed is not None and followed.gripper_closed:
@@ -260,7 +259,7 @@ def log_move(cell_file: Path, word: str, result: dict[str, Any]) -> None:
     import json
 
     from limber.core.json_values import plain
-    from limber.robot.motion.followed_path import log_path
+    from limber.robot.motion.retreat import log_path
 
     path = log_path()
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,7 @@ def scan(run: Run, address: str, cell_file: Path | None, output: Path,
     from limber.cell.cell_file import read_cell
     from limber.core.errors import InputError
     from limber.geometry.cloud.cloud import Cloud
-    from limber.robot.virtual.depth_camera import scanned, views_around
+    from limber.robot.virtual.launch import scanned, views_around
 
     count = views or (8 if cell_file is None else 1)
     if cell_file is not None:
@@ -66,7 +66,7 @@ def _seen(cell: Cell, count: int) -> np.ndarray:
     from limber.cli.robot_commands.moves import stands
     from limber.core.errors import InputError
     from limber.core.numerics.rigid import inverted, matrices
-    from limber.robot.realsense import RealSense, seen_points
+    from limber.robot.depth_camera import RealSense, seen_points
 
     if cell.camera is None:
         raise InputError("The cell file has no [camera].", "The cloud would be in an unknown "

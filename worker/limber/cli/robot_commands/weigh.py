@@ -34,9 +34,9 @@ def weigh(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[s
     from limber.cell.reach_and_collision import ArmSurroundings
     from limber.core.errors import SafetyStop
     from limber.robot.driver.link import RobotLink
+    from limber.robot.motion.joint_path import to_joints
     from limber.robot.operator_decisions import require_confirmation
-    from limber.robot.weighing import require_tilts, tilted_joints, weighed_as
-    from limber.stages.paths.arm_moves import to_joints
+    from limber.robot.robot_state import require_tilts, tilted_joints, weighed_as
 
     cell = read_cell(cell_file)
     require_empty(cell, run)
@@ -70,7 +70,7 @@ def weightless(cell: Cell) -> Cell:
 def weighed(cell: Cell, link: RobotLink, moves: list[Trajectory], rows: list[np.ndarray]) -> Any:
     """Read the sensor at each end of ``moves``, and compare; ``rows`` grows as samples come."""
     from limber.core.errors import SafetyStop
-    from limber.robot.weighing import weigh as weigh_readings
+    from limber.robot.robot_state import weigh as weigh_readings
 
     link.wait_for_samples()
     link.tare(_TARE_SECONDS)

@@ -15,22 +15,30 @@ import numpy as np
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.core.numerics.rigid_kernels import frame_of, pose_of, turn_between
-from limber.robot.cell.controller_settings import require_tool
+from limber.robot.controller_settings import require_tool
 from limber.robot.driver.controls import control_of
-from limber.robot.driver.current_motion import Following, UnderWay
-from limber.robot.driver.deadline import CONNECT_SECONDS, RenewedDeadline, set_deadline
-from limber.robot.driver.delays import HoldUps
-from limber.robot.driver.force_samples import Senses
-from limber.robot.driver.force_sensors import ForceTorqueSensor, WrenchChain, open_sensor
-from limber.robot.driver.guard import Guard
-from limber.robot.driver.guard_states import GuardSettings, State
-from limber.robot.driver.messages import Words
-from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
+from limber.robot.driver.force_samples import (
+    Following,
+    ForceTorqueSensor,
+    HoldUps,
+    Senses,
+    UnderWay,
+    WrenchChain,
+    open_sensor,
+)
+from limber.robot.driver.guard import Guard, GuardSettings, State
+from limber.robot.driver.real_time import (
+    CONNECT_SECONDS,
+    RenewedDeadline,
+    Words,
+    claim_real_time,
+    keep_awake,
+    set_deadline,
+    spare_what_is_loaded,
+)
 from limber.robot.interface import ArmControl, Sample
-from limber.robot.motion.expected_wrench import ExpectedWrench
-from limber.robot.motion.retreat import RetreatPath
-from limber.robot.motion.start_check import require_start
-from limber.robot.motion.trajectory import Trajectory
+from limber.robot.motion.retreat import RetreatPath, require_start
+from limber.robot.motion.trajectory import ExpectedWrench, Trajectory
 
 PARENT_SECONDS = 1.0
 """Longest time between messages of the parent before the robot stops."""

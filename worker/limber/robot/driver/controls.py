@@ -6,7 +6,7 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import Command, InputError, WorkError
 from limber.robot.interface import ArmControl
 from limber.robot.ur.factory_calibration import FactoryCalibration, read_calibration
-from limber.robot.ur.samples import Dashboard
+from limber.robot.ur.rtde import Dashboard
 from limber.robot.ur.ur_control import UrControl
 
 _JOINTS = 6  # joints for which samples and recordings have columns

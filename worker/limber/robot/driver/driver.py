@@ -17,8 +17,7 @@ import time
 from limber.cell.cell_file import Cell
 from limber.core.errors import LimberError
 from limber.robot.driver.control_loop import Driver, Orders
-from limber.robot.driver.deadline import clear_deadline
-from limber.robot.driver.messages import Words
+from limber.robot.driver.real_time import Words, clear_deadline
 
 _LAST_SECONDS = 10.0  # after the last order; a stop takes at most one second
 

@@ -1,11 +1,18 @@
-"""Real-time priority for the loops that talk to a robot, if the system grants it."""
+"""What the loops that talk to a robot need of the system: priority, a deadline, unhurried words."""
 
 import ctypes
+import faulthandler
 import gc
+import json
 import os
+import queue
+import signal
 import struct
 import sys
+import threading
+import time
 from pathlib import Path
+from typing import Any, TextIO
 
 VIRTUAL_ROBOT_PRIORITY = 25
 """Before the driver that controls it: a real controller has a computer of its own."""
@@ -70,3 +77,92 @@ def keep_awake() -> bool:
     except OSError:
         return False
     return True
+
+
+# A time limit on calls into ur-rtde, kept by the system: it ends this process.
+#
+# ur-rtde waits in C++, for minutes and with the interpreter's lock, for an answer that never comes
+# if a connection works in one direction only. No Python thread can act then. The controller's own
+# watchdog ends its program a tenth of a second after the last message of this process.
+
+CALL_SECONDS = 1.5
+"""Longer than any call that the controller answers, and shorter than a person waits."""
+CONNECT_SECONDS = 12.0
+"""ur-rtde uploads its program and waits up to 5 s until it runs."""
+
+_RENEWED_SECONDS = 0.2
+
+
+def set_deadline(seconds: float = CALL_SECONDS) -> None:
+    """End this process in ``seconds`` unless a new deadline is set by then."""
+    if hasattr(signal, "setitimer"):
+        # The alarm has no handler, so that the kernel ends the process.
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+    else:
+        faulthandler.dump_traceback_later(seconds, exit=True)
+
+
+def clear_deadline() -> None:
+    """Cancel the deadline."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+    else:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def ended_by_deadline(exit_code: int | None) -> bool:
+    """Whether an exit code of a process is that of its deadline."""
+    if hasattr(signal, "setitimer"):
+        return exit_code == -signal.SIGALRM
+    return exit_code == 1
+
+
+class RenewedDeadline:
+    """The deadline of a loop, renewed some times a second rather than in each cycle."""
+
+    def __init__(self) -> None:
+        self._set_at = -float("inf")
+
+    def renew(self) -> None:
+        """Give the loop :data:`CALL_SECONDS` from now on, or from a fifth of a second ago."""
+        now = time.monotonic()
+        if now - self._set_at > _RENEWED_SECONDS:
+            self._set_at = now
+            set_deadline()
+
+
+class Words:
+    """The events of the driver, written by a separate thread.
+
+    If the parent is slow to read, the pipe fills within a third of a second. A loop that waited for
+    it would starve the controller's watchdog.
+
+    Args:
+        out: Destination of events, one JSON object a line.
+    """
+
+    def __init__(self, out: TextIO):
+        self._out = out
+        self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._write, name="words", daemon=True)
+        self._thread.start()
+
+    def tell(self, **content: Any) -> None:
+        """Send an event; returns immediately."""
+        self._lines.put(json.dumps(content))
+
+    def close(self, seconds: float = 2.0) -> None:
+        """Wait until all events are sent, at most this long."""
+        self._lines.put(None)
+        self._thread.join(seconds)
+
+    def _write(self) -> None:
+        # It shares the interpreter's lock with the loop, which must not wait for its turn.
+        claim_real_time()
+        while (line := self._lines.get()) is not None:
+            try:
+                self._out.write(line + "\n")
+                self._out.flush()
+            except OSError:
+                # The parent does not listen; the end of the orders shows that it has ended.
+                return

@@ -1,12 +1,26 @@
-"""Joint angles along a path of poses, on one continuous branch of the inverse kinematics."""
+"""Joint angles along a path of poses, and motions of an arm alone past cell and branch."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
 from limber.cell.arm import Arm
+from limber.cell.cell_file import Cell
+from limber.cell.reach_and_collision import ArmSurroundings
 from limber.core.errors import InputError, NoPathError
+from limber.core.numerics.rigid import inverted, matrices, pose_vectors
+from limber.core.numerics.rigid_kernels import length, turn_between
+from limber.robot.motion.trajectory import (
+    ExpectedWrench,
+    Trajectory,
+    along,
+    along_bounded,
+    densely,
+    speed_within,
+)
 
 # Between neighbouring poses of a path a joint rotates little; more is a jump to another solution.
 _LARGEST_STEP = 0.35  # rad
@@ -66,10 +80,14 @@ def follow(arm: Arm, frames: np.ndarray, *, singularity_margin: float = 0.05,
         raise InputError(f"The frames have shape {frames.shape} or are not finite.",
                          "A path consists of finite 4 x 4 transforms.", "Check the poses.")
     limits = arm.joint_limits if joint_limits is None else np.asarray(joint_limits, float)
-    paths, refusals = [], []
+    paths: list[JointPath] = []
+    refusals: list[Refusal] = []
     for branch, joints in enumerate(arm.configurations(frames)):
         found = _one_branch(arm, branch, joints, limits, singularity_margin, joint_margin)
-        (paths if isinstance(found, JointPath) else refusals).append(found)
+        if isinstance(found, JointPath):
+            paths.append(found)
+        else:
+            refusals.append(found)
     return sorted(paths, key=lambda path: -path.singularity), refusals
 
 
@@ -116,8 +134,8 @@ def _one_branch(arm: Arm, branch: int, joints: np.ndarray, limits: np.ndarray,
     joints = joints + _whole_turns(joints, limits)
     margin = _margins(joints, limits)
     if margin.min() < joint_margin:
-        index, joint = np.unravel_index(margin.argmin(), margin.shape)
-        return Refusal(branch, int(index), f"joint {joint + 1} at its limit")
+        pose, joint = np.unravel_index(margin.argmin(), margin.shape)
+        return Refusal(branch, int(pose), f"joint {joint + 1} at its limit")
     return JointPath(branch, joints, float(distance.min()), float(margin.min()))
 
 
@@ -160,3 +178,204 @@ def no_branch(refusals: list[Refusal], frames: np.ndarray) -> NoPathError:
         ("The arm would have to change its configuration on the path, which would swing the "
          "branch."),
         "Move the robot's base, choose a path nearer to it, or rotate the tool.")
+
+
+# Path of an arm between joint angles that avoids obstacles (RRT-Connect).
+#
+# Kuffner and LaValle 2000, "RRT-Connect: an efficient approach to single-query path planning". The
+# straight path is used if it is free. The path found is shortened, not optimal.
+
+STEP_RAD = 0.05  # of the joint that turns most, between checked configurations
+_GROWN_RAD = 0.4
+_MOST = 1500  # nodes of the two trees
+_SHORTCUTS = 80
+
+Free = Callable[[np.ndarray], np.ndarray]
+"""Whether an arm with joint angles [n, joints] is free of collisions, shape [n]."""
+
+
+@dataclass
+class _Tree:
+    angles: list[np.ndarray]
+    parents: list[int] = field(default_factory=lambda: [-1])
+
+    def nearest(self, target: np.ndarray) -> int:
+        return int(np.abs(np.array(self.angles) - target).max(axis=1).argmin())
+
+    def path_to(self, index: int) -> list[np.ndarray]:
+        """From the root to an entry."""
+        path = []
+        while index >= 0:
+            path.append(self.angles[index])
+            index = self.parents[index]
+        return path[::-1]
+
+
+def joint_space_path(start: np.ndarray, goal: np.ndarray, limits: np.ndarray, free: Free, *,
+                     seed: int = 0) -> np.ndarray:
+    """Return joint angles from ``start`` [n] to ``goal`` [n] on a free path, shape [k, n].
+
+    Neighbours are at most :data:`STEP_RAD` apart.
+
+    Args:
+        limits: Least and greatest angles [rad], shape [n, 2].
+        free: Returns which joint angles are free.
+
+    Raises:
+        NoPathError: start or goal is not free, or no path was found.
+    """
+    for name, angles in (("start", start), ("goal", goal)):
+        if not free(angles[None])[0]:
+            raise NoPathError(f"The arm's {name} is in collision, or closer than allowed.",
+                              "So no way begins or ends there.",
+                              "Move the arm by hand, or correct the cell's obstacles.")
+    if free(straight(start, goal)).all():
+        return straight(start, goal)
+    rng = np.random.default_rng(seed)
+    low = np.maximum(limits[:, 0], np.minimum(start, goal) - np.pi)
+    high = np.minimum(limits[:, 1], np.maximum(start, goal) + np.pi)
+    trees = [_Tree([start]), _Tree([goal])]
+    for _ in range(_MOST):
+        reached = _grown(trees[0], rng.uniform(low, high), free)
+        if reached is not None and (met := _connected(trees[1], trees[0].angles[reached], free)):
+            first, second = trees[0].path_to(reached), trees[1].path_to(met)
+            corners = first + second[::-1][1:]
+            if not np.array_equal(corners[0], start):
+                corners.reverse()
+            return densely_turned(_shortened(corners, free, rng))
+        trees.reverse()
+    raise NoPathError("No free way of the arm was found between its start and its goal.",
+                      f"{_MOST} directions were tried.",
+                      "Move the arm by hand, or check the cell's obstacles.")
+
+
+def straight(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return angles from ``first`` [n] to ``second`` [n], all joints at once, shape [k, n]."""
+    count = max(int(np.ceil(np.abs(second - first).max() / STEP_RAD)), 1)
+    return first + np.linspace(0.0, 1.0, count + 1)[:, None] * (second - first)
+
+
+def densely_turned(corners: list[np.ndarray]) -> np.ndarray:
+    """Return angles close together through ``corners``, shape [k, n]."""
+    parts = [straight(first, second)[1:] for first, second in pairwise(corners)]
+    return np.vstack([corners[:1], *parts])
+
+
+def _grown(tree: _Tree, sample: np.ndarray, free: Free) -> int | None:
+    """Grow a tree one step towards ``sample``; returns the new entry, None if blocked."""
+    near = tree.nearest(sample)
+    step = sample - tree.angles[near]
+    size = float(np.abs(step).max())
+    target = tree.angles[near] + step * min(1.0, _GROWN_RAD / max(size, 1e-12))
+    if size < 1e-9 or not free(straight(tree.angles[near], target)[1:]).all():
+        return None
+    tree.angles.append(target)
+    tree.parents.append(near)
+    return len(tree.angles) - 1
+
+
+def _connected(tree: _Tree, target: np.ndarray, free: Free) -> int | None:
+    """Grow a tree until it reaches ``target``; returns the entry there, None if blocked."""
+    while (last := _grown(tree, target, free)) is not None:
+        if np.array_equal(tree.angles[last], target) or (
+                np.abs(tree.angles[last] - target).max() < 1e-9):
+            return last
+    return None
+
+
+def _shortened(corners: list[np.ndarray], free: Free, rng: np.random.Generator,
+               ) -> list[np.ndarray]:
+    """Remove corners between two that are connected by a free path."""
+    for _ in range(_SHORTCUTS):
+        if len(corners) < 3:
+            break
+        first, last = sorted(rng.choice(len(corners), 2, replace=False))
+        if last - first > 1 and free(straight(corners[first], corners[last])[1:-1]).all():
+            corners = corners[:first + 1] + corners[last:]
+    return corners
+
+
+_NEAR_M = 0.15  # m from the branch: nearer, the arm is slower
+_SLOWEST = 0.25
+_AT_GOAL_RAD = 1e-3
+_JOINT_SPEED = 0.4  # rad/s: an elbow is as fast as a gripper, and nobody watches it
+
+
+def is_at(joints: np.ndarray, goal: np.ndarray) -> bool:
+    """Whether joint angles [rad, n] are those of a goal."""
+    return bool(np.abs(joints - goal).max() < _AT_GOAL_RAD)
+
+
+def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurroundings,
+              ) -> Trajectory:
+    """Return the motion from joint angles ``start`` [n] to ``goal`` [n], the gripper empty.
+
+    It keeps clear of cell, branch and the arm itself, and is slow near the branch.
+
+    Raises:
+        NoPathError: there is no such path, start or goal collide, or the gripper would leave the
+        workspace.
+    """
+    _require_limits(cell, goal)
+    if is_at(start, goal):
+        raise NoPathError("The arm is there already.", "", "")
+    joints = joint_space_path(start, goal, cell.joint_limits, around.free)
+    poses = pose_vectors(cell.arm.forward(joints) @ matrices(np.array(cell.tool.grasp_pose)))
+    _require_workspace(cell, poses)
+    limits, fastest = cell.limits, speed_within(cell, cell.limits.speed_m_s)
+    lengths = np.array([max(length(second[:3] - first[:3]), fastest * max(
+        length(turn_between(first, second)) / (0.8 * limits.turn_speed_rad_s),
+        float(np.abs(turned).max()) / _JOINT_SPEED))
+        for (first, second), turned in zip(pairwise(poses), np.diff(joints, axis=0), strict=True)])
+    share = np.clip(around.from_branch(joints) / _NEAR_M, _SLOWEST, 1.0)
+    times = along_bounded(lengths, share * fastest, limits.acceleration_m_s2)
+    return Trajectory(times, poses, ExpectedWrench.nothing(poses), joints, by_joints=True)
+
+
+def away_from_branch(cell: Cell, joints: np.ndarray, pose: np.ndarray) -> Trajectory:
+    """Return the straight retreat of an open gripper from the branch, opposite to its approach.
+
+    Args:
+        joints: Current joint angles [rad], shape [n].
+        pose: Pose of the gripper's middle from the controller, base frame [m, rad], shape [6].
+
+    Raises:
+        NoPathError: the arm cannot reach so far.
+    """
+    here = matrices(pose)
+    back = here.copy()
+    back[:3, 3] -= cell.approach.distance_m * here[:3, :3] @ np.array(cell.approach.direction)
+    poses = densely(pose_vectors(np.array([here, back])))
+    flange = matrices(poses) @ inverted(matrices(np.array(cell.tool.grasp_pose)))
+    taken = joint_path(cell.arm, flange, start=joints, joint_limits=cell.joint_limits,
+                       singularity_margin=cell.limits.singularity,
+                       joint_margin=cell.limits.joint_margin_rad)
+    speed = speed_within(cell, _SLOWEST * cell.limits.speed_m_s)
+    times = along(poses, speed, cell.limits.acceleration_m_s2)
+    return Trajectory(times, poses, ExpectedWrench.nothing(poses), taken.joints)
+
+
+def _require_workspace(cell: Cell, poses: np.ndarray) -> None:
+    """Refuse poses [n, 6] of the gripper, base frame, at which the guard would stop the arm."""
+    if cell.workspace is None:
+        return
+    grasp = (matrices(np.array(cell.base.pose)) @ matrices(poses))[:, :3, 3]
+    outside = np.maximum(np.array(cell.workspace.low_m) - grasp,
+                         grasp - np.array(cell.workspace.high_m)).max(axis=1)
+    if outside.max() > 1e-3:
+        position = ", ".join(f"{value:.3f}" for value in grasp[int(outside.argmax())])
+        raise NoPathError(
+            f"The gripper would be at ({position}) m in the branch's frame, "
+            f"{1e3 * outside.max():.0f} mm outside the workspace.", "The guard would stop it.",
+            "Widen [workspace] in the cell file, correct base.pose, or jog the arm inside first.")
+
+
+def _require_limits(cell: Cell, goal: np.ndarray) -> None:
+    """Refuse joint angles [n] beyond the limits."""
+    limits = cell.joint_limits
+    outside = (goal < limits[:, 0]) | (goal > limits[:, 1])
+    if outside.any():
+        joint = int(outside.argmax())
+        raise NoPathError(f"Joint {joint + 1} ({cell.arm.joint_names[joint]}) would be at "
+                          f"{np.degrees(goal[joint]):.0f} degrees, beyond its limit.", "",
+                          "Widen robot.joint_limits_rad in the cell file, or choose another goal.")

@@ -1,15 +1,253 @@
-"""An arm's measured path, for a retreat along it."""
+"""An arm's measured path, kept on disk, for a retreat along it."""
 
+import hashlib
+import json
+import os
+import queue
+import threading
+import time
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import platformdirs
 
-from limber.core.errors import SafetyStop
+from limber.cell.cell_file import Cell
+from limber.core.errors import Command, InputError, SafetyStop, Text
+from limber.core.json_values import json_objects, plain
 from limber.core.numerics.rigid_kernels import length, turn_between
 from limber.robot.interface import Sample
-from limber.robot.motion.followed_path import FollowedPath, FollowedPathFile
-from limber.robot.motion.start_check import POSITION_M, ROTATION_RAD, different_joints
 from limber.robot.motion.trajectory import Trajectory, along
+
+# Checks that an arm is at the start of a motion, in the configuration that was checked.
+#
+# Several joint poses bring the gripper to the same position, and each of them again with joints a
+# full turn further. Reach, limits, singularities and obstacles were checked for one of them, so
+# every motion compares position, rotation and joints. A full turn counts as a difference: the joint
+# is nearer to its limit, and the cables are wound differently.
+
+POSITION_M = 0.005
+ROTATION_RAD = np.radians(2.0)
+# Arms differ from their nominal dimensions by some milliradians. Half of the difference between two
+# configurations at the usual distance from a singularity (limits.singularity).
+JOINT_RAD = 0.05
+
+
+def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
+                  start_joints: np.ndarray | None, names: Sequence[str]) -> None:
+    """Refuse a motion that starts away from the arm's pose, or in another configuration.
+
+    Args:
+        pose: Measured, base frame [m, rad], shape [6].
+        joints: Measured [rad], shape [n].
+        start: Pose with which the motion begins, shape [6].
+        start_joints: Joint angles for which it was checked [rad], shape [n]; None: it was not.
+        names: Names of the joints.
+
+    Raises:
+        SafetyStop: states the differences, with both values.
+    """
+    away = length(start[:3] - pose[:3])
+    if away > POSITION_M:
+        raise SafetyStop(f"The path starts {1000 * away:.1f} mm away from the robot.",
+                         f"At most {1000 * POSITION_M:.0f} mm are allowed.",
+                         "Move the robot to the start, or plan from its current pose.")
+    problems = []
+    turn = length(turn_between(start, pose))
+    if turn > ROTATION_RAD:
+        problems.append(f"the gripper is turned by {np.degrees(turn):.1f} degrees against the "
+                        "path's "
+                        f"start: its rotation vector is {in_degrees(pose[3:])} degrees instead of "
+                        f"{in_degrees(start[3:])}")
+    problems += [] if start_joints is None else different_joints(joints, start_joints, names)
+    if problems:
+        raise SafetyStop(
+            "The arm is not in the configuration that the path was checked for: "
+            f"{'; '.join(problems)}.",
+            "Its links, joints and cables would move where nothing was checked.",
+            "Rotate the gripper to the path's start." if start_joints is None else
+            Text(f"Move the joints to {in_degrees(start_joints)} degrees. A dry run of ",
+                 Command("execute"), " states them as start_joints_rad."))
+
+
+def different_joints(joints: np.ndarray, expected: np.ndarray, names: Sequence[str]) -> list[str]:
+    """Return which joints [rad, n] differ from ``expected``, with both angles in degrees."""
+    differences = []
+    for number in np.flatnonzero(~(np.abs(joints - expected) <= JOINT_RAD)):
+        turns = (joints[number] - expected[number]) / (2 * np.pi)
+        whole = round(turns) != 0 and abs(turns - round(turns)) * 2 * np.pi <= JOINT_RAD
+        differences.append(f"joint {number + 1} ({names[number]}) is at "
+                           f"{np.degrees(joints[number]):.1f} degrees instead of "
+                           f"{np.degrees(expected[number]):.1f}"
+                           + (" (whole turns apart)" if whole else ""))
+    return differences
+
+
+def in_degrees(angles: np.ndarray) -> str:
+    """Return angles [rad] as text, without their unit."""
+    return "(" + ", ".join(f"{value:.1f}" for value in np.degrees(angles)) + ")"
+
+
+# An arm's path on disk: a retreat finds it even after the program has crashed.
+#
+# There is one file per controller, in this user's state folder (``LIMBER_STATE`` names another).
+# Each line is a JSON object: the first identifies the arm and tool, the others hold the poses
+# passed since, or that the gripper moved. The driver adds to it while the arm moves. After the
+# driver is killed, all but the last lines are there.
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class FollowedPath:
+    """A path read from disk.
+
+    Attributes:
+        poses: Poses of the tool's centre, base frame [m, rad], in order, shape [n, 6].
+        joints: [rad], shape [n, joints].
+        speeds: Greatest speeds on it [m/s], [rad/s], shape [2].
+        bias: Bias of the force sensor by its last tare, flange frame [N, N m], shape [6]; None if
+            it is not known with the cell's payload (`limber robot weigh` tares with another).
+        gripper_closed: Whether the gripper was last closed; None: it was not moved.
+        at: Start time of the path, seconds since 1970.
+    """
+
+    poses: np.ndarray
+    joints: np.ndarray
+    speeds: np.ndarray
+    bias: np.ndarray | None
+    gripper_closed: bool | None
+    at: float
+
+
+def followed_path_file(cell: Cell) -> Path:
+    """Return the file of the path of a cell's robot."""
+    key = hashlib.sha256(cell.robot.address.encode()).hexdigest()[:16]
+    return _state_folder() / "robot-ways" / f"{key}.jsonl"
+
+
+def log_path() -> Path:
+    """Return the log of motions by `limber robot`, one JSON object a line."""
+    return _state_folder() / "robot-moves.jsonl"
+
+
+def read_followed_path(cell: Cell) -> FollowedPath | None:
+    """Return the path that the cell's robot followed last; None if none is known.
+
+    A line that is half written is ignored; a path of another arm or tool does not count.
+    """
+    try:
+        with open(followed_path_file(cell), encoding="utf-8") as stream:
+            lines = list(json_objects(stream))
+    except FileNotFoundError:
+        return None
+    if not lines or lines[0].get("head") != plain(_head(cell)):
+        return None
+    try:
+        pose_lines = [line for line in lines if "pose" in line]
+        last = {name: line[name] for line in lines[1:] for name in line}
+        if last.get("bias_with") != plain(_payload(cell)):
+            last["bias"] = None
+        followed = FollowedPath(
+            _rows([line["pose"] for line in pose_lines], 6),
+            _rows([line["joints"] for line in pose_lines], len(cell.arm.joint_names)),
+            np.array(last.get("speeds", (0.0, 0.0)), float),
+            None if last.get("bias") is None else np.array(last["bias"], float).reshape(6),
+            last.get("gripper_closed"), float(lines[0]["at"]))
+    except (KeyError, TypeError, ValueError):
+        return None
+    whole = all(np.isfinite(part).all() for part
+                in (followed.poses, followed.joints, followed.speeds))
+    return followed if whole and (followed.bias is None
+                                  or np.isfinite(followed.bias).all()) else None
+
+
+def followed_path(cell: Cell, otherwise: str) -> FollowedPath:
+    """Return the path that the cell's robot followed last.
+
+    Args:
+        otherwise: What to do instead, for the message.
+
+    Raises:
+        InputError: none is known.
+    """
+    followed = read_followed_path(cell)
+    if followed is None:
+        raise InputError(f"No path that the robot at {cell.robot.address} followed with this arm "
+                         "and tool is known.", "It followed none from this account, or the cell "
+                         "has changed since.", otherwise)
+    return followed
+
+
+class FollowedPathFile:
+    """Writes a path while it is followed, in its own thread: the loop waits for no disk."""
+
+    def __init__(self, cell: Cell):
+        self._lasting: dict[str, Any] = {}
+        self._path, self._head = followed_path_file(cell), _head(cell)
+        self._payload = _payload(cell)
+        self._lines: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._write, name="way", daemon=True)
+        self._thread.start()
+
+    def begin(self) -> None:
+        """Begin a new path; the old one is discarded."""
+        self._lines.put({"format": _FORMAT, "head": self._head, "at": time.time()})
+        self.add(**self._lasting)
+
+    def tared(self, bias: np.ndarray) -> None:
+        """The force sensor's bias [6] is known; it holds for later paths."""
+        self._lasting |= {"bias": bias.copy(), "bias_with": self._payload}
+        self.add(**self._lasting)
+
+    def gripped(self, closed: bool) -> None:
+        """The gripper was closed or opened; it stays so for later paths."""
+        self._lasting["gripper_closed"] = closed
+        self.add(gripper_closed=closed)
+
+    def add(self, **content: Any) -> None:
+        """Add new data; returns at once."""
+        self._lines.put(content)
+
+    def close(self, seconds: float = 1.0) -> None:
+        """Wait until all is written, at most this long."""
+        self._lines.put(None)
+        self._thread.join(seconds)
+
+    def _write(self) -> None:
+        """Write data as it arrives; a disk error ends this, and a retreat then finds less."""
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            while (line := self._lines.get()) is not None:
+                with open(self._path, "w" if "head" in line else "a", encoding="utf-8") as stream:
+                    stream.write(json.dumps(plain(line)) + "\n")
+        except OSError:
+            return
+
+
+def _state_folder() -> Path:
+    return Path(os.environ.get("LIMBER_STATE") or platformdirs.user_state_path("limber"))
+
+
+def _rows(values: list[Any], count: int) -> np.ndarray:
+    """Rows of ``count`` numbers; another count is a ValueError."""
+    rows = np.array(values, float) if values else np.zeros((0, count))
+    if rows.ndim != 2 or rows.shape[1] != count:
+        raise ValueError(f"rows of shape {rows.shape}")
+    return rows
+
+
+def _payload(cell: Cell) -> dict[str, Any]:
+    """What the controller subtracts from the force, and so what a tare is relative to."""
+    return {"mass_kg": cell.tool.mass_kg, "centre_of_mass_m": cell.tool.centre_of_mass_m}
+
+
+def _head(cell: Cell) -> dict[str, Any]:
+    """Arm and tool to which the path belongs: poses are of this arm's tool."""
+    return {"address": cell.robot.address, "arm": cell.arm.name, "tool": cell.tool.grasp_pose}
+
 
 _APART_M, _APART_RAD = 1e-3, 0.005  # between the stored poses
 _SAME = 0.3  # fraction of the distance bridged at a start below which two poses are the same

@@ -1,14 +1,208 @@
 """Poses over time, for the robot to follow, with the wrench that the model expects at each."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
-from limber.core.numerics.rigid import angle_between, matrices
+from limber.core.numerics.rigid import angle_between, matrices, rotations_at
+from limber.core.numerics.rigid import turn_between as turns_between
 from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
-from limber.robot.motion.expected_wrench import ExpectedWrench
+
+OVER_HARD = 1.1
+"""Largest contact force as a multiple of the hard limit."""
+
+# Time from a force to the brake: half of the sensor's own smoothing, the loop's time, and two steps
+# of the controller. Measured with the virtual one: 4 ms at 500 Hz, 14 ms at 125 Hz.
+_LOOP_SECONDS = 0.002
+_STEPS = 2.0
+_FT300_SECONDS = {"ft300": 0.010, "ft300_usb": 0.022}  # between two of its readings, at most
+# The joints brake at 8 rad/s^2; the joint that moves a gripper is rarely nearer than this.
+_BRAKING_M_S2 = 8.0 * 0.3
+_SLOWEST_M_S = 1e-3
+
+
+def reaction_seconds(cell: Cell) -> float:
+    """Return the longest time from a force to the brake [s]."""
+    sensor = _FT300_SECONDS.get(cell.sensor.kind, 0.0)
+    return _LOOP_SECONDS + _STEPS / cell.arm.rate + sensor
+
+
+def contact_speed(cell: Cell) -> float:
+    """Return the greatest speed [m/s] at which a contact stays below the hard limit plus a tenth.
+
+    The arm brakes from the soft limit on. The path v t + v^2 / 2a times the stiffness of the
+    contact (``limits.contact_n_per_m``) may add no more than the difference between the two.
+
+    Raises:
+        InputError: not even a millimetre a second is slow enough.
+    """
+    limits = cell.limits
+    distance = (OVER_HARD * limits.hard_force_n - limits.soft_force_n) / limits.contact_n_per_m
+    lost = _BRAKING_M_S2 * reaction_seconds(cell)
+    speed = float(np.sqrt(lost**2 + 2 * _BRAKING_M_S2 * distance) - lost)
+    if speed < _SLOWEST_M_S:
+        raise InputError(
+            f"A contact of {limits.contact_n_per_m:g} N/m (limits.contact_n_per_m) adds more than "
+            f"the force between limits.soft_force_n ({limits.soft_force_n:g} N) and "
+            f"limits.hard_force_n ({limits.hard_force_n:g} N) even at "
+            f"{1e3 * _SLOWEST_M_S:g} mm/s.",
+            f"The arm needs {1e3 * reaction_seconds(cell):.0f} ms to brake.",
+            "Lower limits.soft_force_n, or state in limits.contact_n_per_m how stiff the stiffest "
+            "thing is that the gripper can run into.")
+    return speed
+
+
+def speed_within(cell: Cell, speed: float, warn: Callable[[str], None] | None = None) -> float:
+    """Return ``speed`` [m/s], or less where a contact requires it.
+
+    Args:
+        warn: Is told of a speed that is reduced.
+
+    Raises:
+        InputError: as :func:`contact_speed`.
+    """
+    most = contact_speed(cell)
+    if speed > most and warn is not None:
+        limits = cell.limits
+        warn(f"The arm moves at {1e3 * most:.1f} mm/s instead of {1e3 * speed:.1f} mm/s, so that "
+             f"running into something of {limits.contact_n_per_m:g} N/m stays below "
+             f"{OVER_HARD * limits.hard_force_n:.3g} N (limits.hard_force_n plus a tenth). Where "
+             "nothing is so stiff, state limits.contact_n_per_m in the cell file to go faster.")
+    return min(speed, most)
+
+
+# The wrench that a model expects along a path: its value, slope and uncertainty.
+#
+# A branch is stiff along its axis: a tenth of a millimetre of the gripper's position is newtons
+# there. So the expected wrench is that at the gripper's *actual* position: the wrench at the
+# planned pose plus the tangent stiffness times the displacement from there. Errors of that
+# displacement (the arm's own repeatability, a base that is rotated against its calibration) times
+# the stiffness are errors of the wrench. The covariance states them, and the guard and the report
+# allow for it.
+
+@dataclass(frozen=True)
+class ExpectedWrench:
+    """Expected wrenches along a path of the gripper, branch frame.
+
+    Attributes:
+        wrenches: Wrenches of the gripper on the branch, about its middle [N, N m], shape [n, 6].
+        slopes: Their derivative to the gripper's position [m] and rotation [rad], shape [n, 6, 6].
+        covariance: Covariance of the wrenches, shape [n, 6, 6].
+        rest_pose: Pose of the gripper when it closes on the resting branch, the robot's base frame
+            [m, rad], shape [6].
+    """
+
+    wrenches: np.ndarray
+    slopes: np.ndarray
+    covariance: np.ndarray
+    rest_pose: np.ndarray
+
+    @classmethod
+    def nothing(cls, poses: np.ndarray) -> "ExpectedWrench":
+        """Return the wrenches of an empty gripper that passes through ``poses`` [n, 6]."""
+        count = len(poses)
+        return cls(np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6)),
+                   poses[0])
+
+    def reversed(self) -> "ExpectedWrench":
+        """Return the same in reverse order."""
+        return ExpectedWrench(self.wrenches[::-1], self.slopes[::-1], self.covariance[::-1],
+                              self.rest_pose)
+
+    def at(self, k: int, part: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return wrench [6], slopes [6, 6] and covariance [6, 6] between rows k and k + 1."""
+        return ((1 - part) * self.wrenches[k] + part * self.wrenches[k + 1],
+                (1 - part) * self.slopes[k] + part * self.slopes[k + 1],
+                (1 - part) * self.covariance[k] + part * self.covariance[k + 1])
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """A clamped grasp along a path, as predicted by the model.
+
+    Attributes:
+        poses: Poses of the grasped piece from its rest pose on, branch frame [m, rad], shape [n,
+        6].
+        wrenches: Wrenches of a rigid gripper [N, N m], shape [n, 6].
+        stiffness: Their derivative to the pose, shape [n, 6, 6].
+        young_covariance: Covariance of the forces from the uncertainty of Young's modulus, [n, 3,
+        3].
+    """
+
+    poses: np.ndarray
+    wrenches: np.ndarray
+    stiffness: np.ndarray
+    young_covariance: np.ndarray
+
+    @classmethod
+    def of_forces(cls, poses: np.ndarray, forces: np.ndarray, torques: np.ndarray | None = None,
+                  ) -> "Predicted":
+        """Return a prediction from forces and torques [n, 3] at poses [n, 6] alone."""
+        count = len(poses)
+        torques = np.zeros((count, 3)) if torques is None else torques
+        return cls(poses, np.hstack([forces, torques]), np.zeros((count, 6, 6)),
+                   np.zeros((count, 3, 3)))
+
+    def first(self, count: int) -> "Predicted":
+        """Return the prediction at the first ``count`` poses alone."""
+        return Predicted(self.poses[:count], self.wrenches[:count], self.stiffness[:count],
+                         self.young_covariance[:count])
+
+    def felt(self, cell: Cell, rest_pose: np.ndarray) -> ExpectedWrench:
+        """Return the wrench expected at a cell's gripper, which has some compliance itself.
+
+        Args:
+            rest_pose: Pose of the gripper when it closes, base frame [m, rad], shape [6].
+        """
+        count = len(self.poses)
+        yielding = np.tile(np.eye(6), (count, 1, 1))
+        yielding[:, :, :3] += cell.tool.compliance_m_per_n * self.stiffness[:, :, :3]
+        slopes = np.linalg.solve(yielding, self.stiffness)
+        wrenches = np.linalg.solve(yielding, self.wrenches[..., None])[..., 0]
+        covariance = slopes @ self._path_covariance(cell) @ slopes.transpose(0, 2, 1)
+        young = np.zeros((count, 6, 6))
+        young[:, :3, :3] = self.young_covariance
+        inverse = np.linalg.inv(yielding)
+        covariance += inverse @ young @ inverse.transpose(0, 2, 1)
+        return ExpectedWrench(wrenches, slopes, covariance, rest_pose)
+
+    def _path_covariance(self, cell: Cell) -> np.ndarray:
+        """Covariance of the gripper's displacement since it closed, shape [n, 6, 6] in m and rad.
+        """
+        offsets = self.poses[:, :3] - self.poses[0, :3]
+        turns = turns_between(self.poses[0, 3:], self.poses[:, 3:])
+        by_base = np.concatenate([_crossing(offsets), _crossing(turns)], axis=1)
+        covariance = cell.base.rotation_sigma_rad**2 * by_base @ by_base.transpose(0, 2, 1)
+        own = np.r_[np.full(3, cell.robot.pose_sigma_m), np.full(3, cell.robot.pose_sigma_rad)]
+        return covariance + np.diag(own**2)
+
+
+def interpolated(predicted: Predicted, positions: np.ndarray, query: np.ndarray) -> Predicted:
+    """Return a prediction interpolated from ``positions`` [n] along its path to others [m]."""
+    def carried(values: np.ndarray) -> np.ndarray:
+        flat = values.reshape(len(values), -1)
+        return np.column_stack([np.interp(query, positions, column) for column in flat.T]
+                               ).reshape(len(query), *values.shape[1:])
+
+    poses = carried(predicted.poses)
+    kept = np.r_[True, np.diff(positions) > 0]
+    if kept.sum() > 1:
+        poses[:, 3:] = rotations_at(positions[kept], predicted.poses[kept, 3:],
+                                    np.clip(query, positions[0], positions[-1]))
+    return Predicted(poses, carried(predicted.wrenches), carried(predicted.stiffness),
+                     carried(predicted.young_covariance))
+
+
+def _crossing(vectors: np.ndarray) -> np.ndarray:
+    """Matrices from a small rotation to the displacement of ``vectors`` [n, 3], [n, 3, 3]."""
+    x, y, z = vectors.T
+    nothing = np.zeros_like(x)
+    return np.stack([np.stack([nothing, z, -y], axis=-1), np.stack([-z, nothing, x], axis=-1),
+                     np.stack([y, -x, nothing], axis=-1)], axis=1)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ delivers messages without their time of arrival.
 
 import json
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
@@ -89,3 +90,87 @@ class Bridge:
     def close(self) -> None:
         """Close the connection."""
         self._around.close()
+
+
+_GRIPPER_COMMAND = "control_msgs/action/GripperCommand"
+_GOAL = "limber-gripper"
+_ACTION_SECONDS = 0.1
+_SUCCEEDED = 4  # action_msgs/msg/GoalStatus
+
+
+def drive(bridge: Bridge, action: str, position: float, effort: float, seconds: float,
+          ) -> dict[str, Any]:
+    """Move a gripper and wait for its result.
+
+    Args:
+        action: Name of the action.
+        position: As its controller counts it [m or rad].
+        effort: Greatest [N]; 0 leaves it to the controller.
+        seconds: Longest wait for the result [s].
+
+    Returns:
+        ``position``, ``stalled`` (something stopped it) and ``reached_goal``, as it reports them.
+
+    Raises:
+        WorkError: no result, or it failed.
+        ConnectionError: the connection was lost.
+    """
+    bridge.send(op="send_action_goal", id=_GOAL, action=action, action_type=_GRIPPER_COMMAND,
+                feedback=False, args={"command": {"position": position, "max_effort": effort}})
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        message = bridge.receive(_ACTION_SECONDS)
+        if message is None or message.get("op") != "action_result" or message.get("id") != _GOAL:
+            continue
+        values = message.get("values")
+        if not message.get("result") or message.get("status", _SUCCEEDED) != _SUCCEEDED or (
+                not isinstance(values, dict)):
+            raise WorkError(f"The gripper in ROS did not move ({values}).", "",
+                            "See its controller's log.")
+        return {name: values.get(name) for name in ("position", "stalled", "reached_goal")}
+    raise WorkError(f"The gripper in ROS gave no result within {seconds:g} s.",
+                    f"The action is {action}.",
+                    "Check its name with `ros2 action list`, or raise tool.grip_seconds.")
+
+
+_TRIGGER = "std_srvs/srv/Trigger"
+_SERVICE_SECONDS = 0.2
+
+
+class TriggerService:
+    """Offers a service until it is closed; a context manager.
+
+    Args:
+        bridge: Connection to rosbridge, which this service alone uses.
+        name: Of the service.
+        act: Called for each call; returns success and a message.
+    """
+
+    def __init__(self, bridge: Bridge, name: str, act: Callable[[], tuple[bool, str]]):
+        self._bridge, self._name, self._act = bridge, name, act
+        bridge.send(op="advertise_service", service=name, type=_TRIGGER)
+
+    def __enter__(self) -> "TriggerService":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if not isinstance(exception[1], ConnectionError):
+            self._bridge.send(op="unadvertise_service", service=self._name)
+
+    def answer(self, seconds: float = _SERVICE_SECONDS) -> dict[str, Any] | None:
+        """Answer a call if one comes within ``seconds``; return the answer, or None.
+
+        Raises:
+            ConnectionError: the connection was lost.
+        """
+        message = self._bridge.receive(seconds)
+        if message is None or message.get("op") != "call_service" or (
+                message.get("service") != self._name):
+            return None
+        success, told = self._act()
+        values = {"success": success, "message": told}
+        answer = {"service": self._name, "values": values, "result": True}
+        if "id" in message:
+            answer["id"] = message["id"]
+        self._bridge.send(op="service_response", **answer)
+        return values

@@ -19,23 +19,18 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import SafetyStop, WorkError
 from limber.core.numerics.rigid import pose_vectors
 from limber.core.numerics.rigid_kernels import frame_of, turn_between, turned_wrench
-from limber.robot.driver.delays import HoldUps
-from limber.robot.driver.force_sensors import Reading, WrenchChain
-from limber.robot.driver.guard import Guard
-from limber.robot.driver.guard_states import (
-    GO,
-    SAFETY_MODES,
-    Decision,
-    GuardSettings,
-    Verdict,
-)
+from limber.robot.driver.force_samples import HoldUps, Reading, WrenchChain
+from limber.robot.driver.guard import GO, SAFETY_MODES, Decision, Guard, GuardSettings, Verdict
 from limber.robot.driver.real_time import spare_what_is_loaded
 from limber.robot.interface import Sample
-from limber.robot.motion.followed_path import FollowedPathFile, read_followed_path
-from limber.robot.motion.retreat import RetreatPath
-from limber.robot.motion.start_check import require_start
+from limber.robot.motion.retreat import (
+    FollowedPathFile,
+    RetreatPath,
+    read_followed_path,
+    require_start,
+)
 from limber.robot.motion.trajectory import Trajectory
-from limber.robot.pull_plausibility import PullPlausibility
+from limber.robot.recorder import PullPlausibility
 from limber.robot.ros.bridge import SECONDS, Bridge
 from limber.robot.ros.messages import (
     END,
@@ -46,11 +41,12 @@ from limber.robot.ros.messages import (
     STOP,
     WRENCH,
     JointStates,
+    Topics,
     goal_of,
     status_of,
     wrench_of,
+    wrench_topic,
 )
-from limber.robot.ros.topics import Topics, wrench_topic
 
 _LISTEN_SECONDS = 0.01
 _BEAT_SECONDS = 0.1

@@ -1,16 +1,20 @@
-"""Messages of ROS 2 as the robot's own values: joint states, wrenches, trajectories."""
+"""Topics and messages of ROS 2 as the robot's own values: joints, wrenches, paths, clouds."""
 
 import base64
+import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from limber.cell.cell_file import Cell
-from limber.core.errors import InputError
+from limber.core.errors import InputError, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
+from limber.robot.driver.force_samples import require_sensor
 from limber.robot.interface import PLAYING, Sample
 from limber.robot.motion.trajectory import Trajectory
+from limber.robot.ros.bridge import Bridge
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
@@ -216,3 +220,134 @@ def _knots(times: np.ndarray, joints: np.ndarray, speeds: np.ndarray) -> list[in
             good, bad = (middle, bad) if fits(first, middle) else (good, middle)
         rows.append(good)
     return rows
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Names of the robot's topics and actions; by default those of the UR driver.
+
+    ``safety_mode`` to ``slider`` are what a UR arm's driver publishes of its controller.
+    """
+
+    joint_states: str = "/joint_states"
+    wrench: str = "/force_torque_sensor_broadcaster/wrench"
+    stop: str = "/limber/stop"
+    end: str = "/limber/end"
+    trajectory: str = "/scaled_joint_trajectory_controller/follow_joint_trajectory"
+    safety_mode: str = "/io_and_status_controller/safety_mode"
+    robot_mode: str = "/io_and_status_controller/robot_mode"
+    runtime_state: str = "/io_and_status_controller/robot_program_running"
+    slider: str = "/speed_scaling_state_broadcaster/speed_scaling"
+
+
+_USUAL = Topics()
+
+
+def wrench_topic(cell: Cell, own: str = _USUAL.wrench) -> str:
+    """Return the topic of the cell's force sensor.
+
+    Args:
+        own: Topic of the arm's own sensor.
+
+    Raises:
+        InputError: the cell names no sensor that is heard in ROS, or a CB3's own estimate.
+    """
+    require_sensor(cell)
+    sensor = cell.sensor
+    if sensor.kind == "replay":
+        raise InputError(f"The cell file replays forces from {sensor.file}.",
+                         "The guard would not feel the branch of the robot in ROS.",
+                         "Name the mounted sensor in the cell file.")
+    if sensor.kind == "controller":
+        return sensor.topic or own
+    if sensor.topic is None:
+        raise InputError(f"sensor.kind is {sensor.kind}, but the cell file states no sensor.topic.",
+                         f"{own} is not that sensor: there the arm's driver publishes the "
+                         "controller's own force.",
+                         "Set sensor.topic to the topic on which the sensor's node publishes "
+                         f"{WRENCH}; `ros2 topic list -t` lists it.")
+    # Under a name space too.
+    if cell.arm.controller == "ur" and sensor.topic.split("/")[-2:] == own.split("/")[-2:]:
+        measures = cell.arm.measures_force
+        raise InputError(f"sensor.kind is {sensor.kind}, but sensor.topic is {sensor.topic}.",
+                         "There the UR driver publishes the controller's own force" + (
+                             "." if measures else ", which a CB3 estimates from motor currents."),
+                         "Set sensor.topic to the topic of the sensor's own node" + (
+                             ", or sensor.kind to controller." if measures else "."))
+    return sensor.topic
+
+
+_CLOUD_SECONDS = 10.0  # a cloud is megabytes of text
+_CLOUD_SECONDS = 0.5
+_STANDS_RAD_S = 1e-3
+
+
+class CloudTopic:
+    """A camera's clouds; where it looks from follows from the cell and the arm's joints.
+
+    Args:
+        cell: Its [camera] states where the camera is mounted.
+        bridge: Connection to rosbridge.
+        topic: The cloud's topic, in the camera's optical frame.
+        joint_states: That of the arm, for a camera on the flange.
+
+    Raises:
+        InputError: the cell has no camera.
+    """
+
+    def __init__(self, cell: Cell, bridge: Bridge, topic: str, joint_states: str):
+        if cell.camera is None:
+            raise InputError("The cell file has no [camera].", "The cloud would be in an unknown "
+                             "frame.", "Add [camera] with pose and mount.")
+        self._cell, self._bridge, self._topic = cell, bridge, topic
+        self._joint_states = joint_states
+        self._states = JointStates(cell)
+        self._flange: np.ndarray | None = None
+        self._moves = False
+        bridge.subscribe(topic, CLOUD)
+        if cell.camera.mount == "flange":
+            bridge.subscribe(joint_states, JOINT_STATE)
+
+    def next_cloud(self) -> np.ndarray:
+        """Return the points of the next cloud [m], branch frame, shape [n, 3].
+
+        Raises:
+            WorkError: none arrives. InputError: it is no cloud.
+        """
+        end = time.monotonic() + _CLOUD_SECONDS
+        while time.monotonic() < end:
+            message = self._bridge.receive(_CLOUD_SECONDS)
+            if message is None or message.get("op") != "publish":
+                continue
+            if message.get("topic") == self._joint_states:
+                self._follow(message["msg"])
+            elif message.get("topic") == self._topic and self._is_placed:
+                return self._in_branch(cloud_of(message["msg"]))
+        raise WorkError(f"No cloud came on {self._topic} within {_CLOUD_SECONDS:.0f} s"
+                        f"{' while the arm stood' if self._moves else ''}.", "",
+                        "Check the topic's name with `ros2 topic list`, and that the arm stands.")
+
+    @property
+    def _is_placed(self) -> bool:
+        """Whether it is known where the camera is: a moving arm leaves that open."""
+        assert self._cell.camera is not None
+        return self._cell.camera.mount == "branch" or (
+            self._flange is not None and not self._moves)
+
+    def _follow(self, message: dict) -> None:
+        sample = self._states.sample(message, time.monotonic())
+        if sample is None:
+            return
+        self._moves = not float(np.abs(sample.joint_speeds).max()) < _STANDS_RAD_S
+        self._flange = self._cell.arm.forward(sample.joints)
+
+    def _in_branch(self, points: np.ndarray) -> np.ndarray:
+        camera = self._cell.camera
+        assert camera is not None
+        frame = matrices(np.array(camera.pose))
+        if camera.mount == "flange":
+            assert self._flange is not None
+            frame = matrices(np.array(self._cell.base.pose)) @ self._flange @ frame
+        near, far = camera.range_m
+        seen = points[(points[:, 2] >= near) & (points[:, 2] <= far)]
+        return seen @ frame[:3, :3].T + frame[:3, 3]

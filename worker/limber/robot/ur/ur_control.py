@@ -7,8 +7,8 @@ import numpy as np
 
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.robot.interface import Sample
-from limber.robot.ur.robotiq import RobotiqGripper
-from limber.robot.ur.samples import Dashboard, SampleStream
+from limber.robot.ur.grippers import RobotiqGripper
+from limber.robot.ur.rtde import Dashboard, SampleStream
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell

@@ -6,6 +6,8 @@ returns what they request. One call of :meth:`Controller.step` is one step of it
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -14,14 +16,277 @@ from limber.cell.arm import Arm
 from limber.cell.known_arms import arm_named
 from limber.cell.ur_arms import UrArm
 from limber.core.errors import InputError
+from limber.core.numerics.rigid import inverted, matrices
 from limber.core.numerics.rigid_kernels import crossed, frame_of, weight_wrench
 from limber.robot.ur.factory_calibration import FactoryCalibration, one_arm
-from limber.robot.virtual.arm_motions import STOP_DECELERATION, Braking, Motion
-from limber.robot.virtual.controller_modes import RobotMode, RuntimeState, SafetyMode, SensorFault
-from limber.robot.virtual.force_sensor import CB3_ESTIMATE, E_SERIES, FT300, ForceSensor
-from limber.robot.virtual.payload import Load, Nothing, RobotiqRegisters
-from limber.robot.virtual.program import ControlProgram
-from limber.robot.virtual.step_kernels import tool_state
+from limber.robot.virtual.payload import (
+    CB3_ESTIMATE,
+    E_SERIES,
+    FT300,
+    ForceSensor,
+    Load,
+    Nothing,
+    RobotiqRegisters,
+)
+from limber.robot.virtual.step_kernels import servo_step, tool_state
+
+
+class SafetyMode(IntEnum):
+    """As in RTDE's ``safety_mode`` (Universal Robots, "RTDE guide", controller output data)."""
+
+    NORMAL = 1
+    REDUCED = 2
+    PROTECTIVE_STOP = 3
+    SAFEGUARD_STOP = 5
+    ROBOT_EMERGENCY_STOP = 7
+
+
+class RuntimeState(IntEnum):
+    """As in RTDE's ``runtime_state``."""
+
+    STOPPED = 1
+    PLAYING = 2
+    PAUSED = 4
+
+
+class RobotMode(IntEnum):
+    """As in RTDE's ``robot_mode``."""
+
+    POWER_OFF = 3
+    IDLE = 5
+    RUNNING = 7
+
+
+@dataclass
+class SensorFault:
+    """Faults of the force readings, for tests.
+
+    Attributes:
+        added: Wrench added to the sensor's report, flange frame [N, N m].
+        frozen: Repeats the last reading.
+        nan: Reports no numbers.
+        joints_nan: Reports no numbers as joint angles.
+    """
+
+    added: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    frozen: bool = False
+    nan: bool = False
+    joints_nan: bool = False
+
+
+JOINT_ACCELERATION = 40.0
+"""Greatest acceleration of the motors [rad/s^2]."""
+STOP_DECELERATION = 8.0
+"""Joint deceleration of protective and emergency stops, and at a program's end [rad/s^2]."""
+
+
+class Unreachable(Exception):
+    """A motion impossible for the arm; the controller answers with a protective stop."""
+
+
+class Braking:
+    """The arm slows down to standstill on its path, every joint in the same time."""
+
+    def __init__(self, speeds: np.ndarray, deceleration: float):
+        """Brake the fastest joint with ``deceleration`` [rad/s^2]."""
+        self._duration = float(np.abs(speeds).max()) / max(deceleration, 1e-3)
+        self._initial, self._time = speeds.copy(), 0.0
+        self.finished = self._duration <= 0.0
+
+    def step(self, joints: np.ndarray, speeds: np.ndarray, seconds: float, scale: float,
+             ) -> tuple[np.ndarray, np.ndarray]:
+        first = self._time
+        self._time = min(self._time + seconds, self._duration)
+        self.finished = self._time >= self._duration
+        # Exact path under constant deceleration between the two times.
+        mean = 1.0 - 0.5 * (first + self._time) / self._duration if self._duration > 0 else 0.0
+        moved = self._initial * mean * (self._time - first)
+        left = 1.0 - self._time / self._duration if self._duration > 0 else 0.0
+        return joints + moved, self._initial * left
+
+
+class Servo:
+    """Follows a target that is updated at any rate (servoj).
+
+    The controller scales the time of its own motion by the speed slider. Below 1 the arm follows
+    the target at that fraction of the target's speed and falls behind; it catches up when the
+    slider is at 1 again.
+    """
+
+    def __init__(self) -> None:
+        self.finished = False
+        self.target = np.zeros(6)
+        self.gain, self.lookahead = 300.0, 0.1
+        self._last: np.ndarray | None = None
+        self._commanded, self._since, self._pace = np.zeros(6), 0.0, 0.0
+
+    def step(self, joints: np.ndarray, speeds: np.ndarray, seconds: float, scale: float,
+             ) -> tuple[np.ndarray, np.ndarray]:
+        return servo_step(joints, speeds, self._goal(joints, seconds, scale), self.gain,
+                          self.lookahead, seconds, JOINT_ACCELERATION)
+
+    def _goal(self, joints: np.ndarray, seconds: float, scale: float) -> np.ndarray:
+        """Joint angles to which the arm is driven now [rad], with the slider at ``scale``."""
+        if self._last is None:
+            self._last = self._commanded = joints.copy()
+        self._since += seconds
+        moved = float(np.abs(self.target - self._last).max())
+        if moved > 0.0:
+            # Targets may be less frequent than steps.
+            self._pace, self._since = moved / self._since, 0.0
+            self._last = self.target.copy()
+        if scale >= 1.0:
+            self._commanded = self.target.copy()
+            return self._commanded
+        offset = self.target - self._commanded
+        farthest = float(np.abs(offset).max())
+        if farthest > 0.0:
+            self._commanded = self._commanded + offset * min(1.0,
+                                                             scale * self._pace * seconds
+                                                             / farthest)
+        return self._commanded
+
+
+Motion = Servo | Braking
+
+
+def nearest_joints(arm: Arm, pose: np.ndarray, tool: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return the joint angles nearest to ``near`` that bring the tool to ``pose``.
+
+    Raises:
+        Unreachable: no joint angles reach it.
+    """
+    solutions = arm.inverse(matrices(pose) @ inverted(tool), near)
+    solutions = solutions[np.isfinite(solutions).all(axis=1)]
+    if len(solutions) == 0:
+        raise Unreachable("the inverse kinematics has no solution")
+    solutions = solutions + 2 * np.pi * np.round((near - solutions) / (2 * np.pi))
+    return solutions[np.abs(solutions - near).sum(axis=1).argmin()]
+
+
+# The function of ur-rtde's control script on a controller, without an interpreter.
+#
+# ur-rtde uploads a script that waits for commands in RTDE registers. This class answers the same
+# registers in the same way: ``output_int_register_0`` is 1 when ready and 2 when a command is done.
+# The client writes a command's number and arguments, waits for 2 and writes 0. Numbers and
+# arguments are those of ur-rtde 1.6; those that no driver of Limber sends end the program.
+
+_READY, _DONE = 1, 2
+_SERVO_JOINTS, _SERVO_STOP, _SERVO_POSE = 11, 16, 24
+# Commands that the script does at once, without the handshake's second half.
+_REAL_TIME = {_SERVO_JOINTS, _SERVO_POSE}
+
+
+class ControlProgram:
+    """The control script while it runs."""
+
+    def __init__(self, text: str):
+        self.is_control_script = "def rtde_control():" in text
+        self._phase = "starting"
+        self._waiting_for: Braking | None = None
+
+    def step(self, controller: "Controller") -> None:
+        """One cycle of the script's loop."""
+        if not self.is_control_script:
+            controller.stop_program("end of script")
+            return
+        command = _command(controller)
+        if self._phase == "starting":
+            controller.outputs_int[0] = _READY
+            self._phase = "ready"
+        if self._waiting_for is not None:
+            if not self._waiting_for.finished:
+                return
+            self._waiting_for = None
+            controller.outputs_int[0] = _DONE
+        elif command == 0:
+            controller.outputs_int[0] = _READY
+            self._phase = "ready"
+        elif self._phase == "ready" and command not in _REAL_TIME:
+            self._phase = "executing"
+            self._execute(command, controller)
+
+    def written(self, controller: "Controller") -> None:
+        """Take a real-time command as it arrives: the client clears it before the next step."""
+        command = _command(controller)
+        if command == _SERVO_STOP and self._phase == "ready":
+            controller.say(f"stop command {command} was received")
+        if command in _REAL_TIME and self._phase == "ready" and self._waiting_for is None:
+            self._execute(command, controller)
+
+    def _execute(self, command: int, controller: "Controller") -> None:
+        if command == _SERVO_STOP:
+            controller.say(f"stop command {command}")
+        action = _ACTIONS.get(command)
+        if action is None:
+            # The real controller would do it; this one must not pretend that it did.
+            controller.stop_program(f"the virtual controller has no command {command}")
+            return
+        try:
+            waiting = action(controller)
+        except Unreachable as reason:
+            controller.protective_stop(str(reason))
+            return
+        if waiting is not None and not waiting.finished:
+            self._waiting_for = waiting
+        elif command not in _REAL_TIME:
+            controller.outputs_int[0] = _DONE
+
+
+def _command(controller: "Controller") -> int:
+    return int(controller.inputs.get("input_int_register_0", 0))
+
+
+def _argument(controller: "Controller", number: int) -> float:
+    return float(controller.inputs.get(f"input_double_register_{number}", 0.0))
+
+
+def _vector(controller: "Controller") -> np.ndarray:
+    return np.array([_argument(controller, number) for number in range(6)])
+
+
+def _servo(controller: "Controller", is_pose: bool) -> None:
+    target = _vector(controller)
+    if is_pose:
+        target = nearest_joints(controller.arm, target, controller.tool, controller.joints)
+    motion = controller.motion
+    if not isinstance(motion, Servo):
+        motion = controller.motion = Servo()
+    motion.target = target
+    motion.lookahead = float(np.clip(_argument(controller, 9), 0.03, 0.2))
+    motion.gain = float(np.clip(_argument(controller, 10), 100.0, 2000.0))
+
+
+def _stop(controller: "Controller") -> Braking:
+    controller.motion = braking = Braking(controller.speeds, _argument(controller, 0))
+    return braking
+
+
+def _set_payload(controller: "Controller") -> None:
+    controller.payload = _argument(controller, 0)
+    controller.payload_centre = _vector(controller)[1:4]
+
+
+def _set_watchdog(controller: "Controller") -> None:
+    frequency = _argument(controller, 0)
+    controller.watchdog = ((1.0 / frequency, controller.step_count) if frequency > 0 else None)
+
+
+def _tell_tool(controller: "Controller") -> None:
+    controller.outputs_double[:6] = map(float, controller.tool_offset)
+
+
+_ACTIONS: dict[int, Callable[["Controller"], Braking | None]] = {
+    _SERVO_JOINTS: lambda c: _servo(c, False),
+    _SERVO_STOP: _stop,
+    17: _set_payload,
+    _SERVO_POSE: lambda c: _servo(c, True),
+    29: lambda c: c.set_tool(_vector(c)),
+    35: _set_watchdog,
+    40: _tell_tool,
+    255: lambda c: c.stop_program("client asked"),
+}
+
 
 _TRACKER_SIGMA_M = 1e-3
 _SLOW_HZ = 125.0  # the rate of a CB3
@@ -375,5 +640,3 @@ def _steady() -> dict[str, Any]:
 _STEADY = _steady()
 _INT_NAMES = [f"output_int_register_{k}" for k in range(48)]
 _DOUBLE_NAMES = [f"output_double_register_{k}" for k in range(48)]
-
-

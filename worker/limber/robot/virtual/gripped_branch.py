@@ -17,8 +17,13 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.numerics.rigid_kernels import crossed, frame_of, inverse_of, rotation_vector
-from limber.robot.virtual.branch_solution import NO_BENDS, Solution
-from limber.robot.virtual.branch_solver import SAME_PLACE, BranchSetting, solve_for_ever
+from limber.robot.virtual.branch_solver import (
+    NO_BENDS,
+    SAME_PLACE,
+    BranchSetting,
+    Solution,
+    solve_for_ever,
+)
 from limber.robot.virtual.step_kernels import steer
 
 _BLEND_SECONDS = 0.05

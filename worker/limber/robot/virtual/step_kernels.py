@@ -1,5 +1,4 @@
-"""Compiled computations of every step: tool state, servo and the held branch's wrench.
-"""
+"""Compiled computations of every step: tool state, servo and the held branch's wrench."""
 
 import numpy as np
 

@@ -34,12 +34,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from limber.cell.cell_file import Cell
-    from limber.robot.driver.link import RobotLink
-    from limber.robot.driver.live_force import LiveForce
-    from limber.robot.motion.execution import RobotMotion
-    from limber.robot.motion.legs import Leg
+    from limber.robot.driver.link import LiveForce, RobotLink
+    from limber.robot.motion.execution import Leg, RobotMotion
     from limber.robot.motion.trajectory import Trajectory
-    from limber.robot.pull_plausibility import PullPlausibility
+    from limber.robot.recorder import PullPlausibility
     from limber.stages.pulls.record_nudge import Nudge
 
 _SPEED, _HOLD_SECONDS = 0.03, 2.0  # m/s, s: of a plan that states none
@@ -114,7 +112,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     """
     if options.arm:
         from limber.cell.cell_file import read_cell
-        from limber.robot.weighing import require_weighed
+        from limber.robot.robot_state import require_weighed
 
         require_weighed(read_cell(cell_file))
     planned = planned_motion(folder, name, cell_file, settings, progress=progress,
@@ -195,9 +193,8 @@ def planned_motion(folder: Path, name: str, cell_file: Path, settings: ExecuteSe
 
         require_payload(cell)
     from limber.cell.reach_and_collision import blocked_by
-    from limber.robot.motion.execution import robot_motion
-    from limber.robot.motion.expected_wrench import Predicted
-    from limber.robot.motion.turning import turned
+    from limber.robot.motion.execution import robot_motion, turned
+    from limber.robot.motion.trajectory import Predicted
     from limber.stages.paths.execute_path import (
         offsets_along,
         path_nudge,
@@ -254,7 +251,7 @@ def _plan_of_cell(folder: Path, name: str, cell_file: Path, settings: ExecuteSet
         progress.warn(warning)
     settings = _as_planned(stated, settings, cell)
     settings, cell = _as_slow_as_checked(stated.get("in_motion"), settings, cell, progress)
-    from limber.robot.motion.contact_speed import speed_within
+    from limber.robot.motion.trajectory import speed_within
 
     speed_within(cell, present(settings.speed, "speed"), progress.warn)
     return branch, cell, settings, stated
@@ -303,8 +300,7 @@ def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSetting
 def _armed(planned: PlannedMotion, name: str, options: ExecuteOptions, progress: Progress,
            ) -> dict[str, Any]:
     from limber.core.numerics.rigid import matrices
-    from limber.robot.driver.link import COLUMNS, RobotLink
-    from limber.robot.driver.live_force import LiveForce
+    from limber.robot.driver.link import COLUMNS, LiveForce, RobotLink
     from limber.robot.motion.execution import followed
     from limber.stages.paths.execute_path import force_sigma
     from limber.stages.pulls.record_nudge import nudged
@@ -371,7 +367,7 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
            before_path: Callable[[], dict[str, Any]] | None, progress: Progress,
            ) -> tuple[dict[str, Any], tuple[int, int] | None]:
     """Execute the legs in order, the nudge before the path; end at the first that is stopped."""
-    from limber.robot.motion.legs import legs_of
+    from limber.robot.motion.execution import legs_of
     from limber.stages.paths.execute_path import require_watched
 
     _open_at_start(cell, link, motion)
@@ -415,8 +411,8 @@ def _open_at_start(cell: Cell, link: RobotLink, motion: RobotMotion) -> None:
     empty. Only at the path's start, as elsewhere it may hold something.
     """
     from limber.core.numerics.rigid import inverted, matrices, pose_vectors
-    from limber.robot.grippers import is_driven
-    from limber.robot.motion.start_check import require_start
+    from limber.robot.motion.retreat import require_start
+    from limber.robot.ur.grippers import is_driven
 
     row = link.wait_for_samples()
     pose = pose_vectors(inverted(matrices(np.array(cell.base.pose))) @ matrices(row[1:7]))

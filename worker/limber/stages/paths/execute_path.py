@@ -18,12 +18,10 @@ from limber.planning.constraints.chance import YoungUncertainty
 from limber.planning.cost import arc_lengths
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.recordings.recording import POSE_COLUMNS
-from limber.robot.driver.expected_force import not_seen
-from limber.robot.driver.force_sensors import INDEPENDENT_READINGS
-from limber.robot.driver.guard_states import GuardSettings
+from limber.robot.driver.force_samples import INDEPENDENT_READINGS
+from limber.robot.driver.guard import GuardSettings, not_seen
 from limber.robot.motion.execution import Blocked, RobotMotion
-from limber.robot.motion.expected_wrench import Predicted
-from limber.robot.motion.trajectory import Trajectory
+from limber.robot.motion.trajectory import Predicted, Trajectory
 from limber.stages.paths.plan_cell import KeptClear
 from limber.stages.paths.plan_uncertainty import estimated_uncertainty
 from limber.stages.pulls.record_nudge import Nudge, checked_nudge

@@ -309,7 +309,7 @@ class _InCell:
            settings: PlanSettings, grasp_model: GraspModel) -> _InCell:
         from limber.cell.obstacles import cell_obstacles
         from limber.cell.reach_and_collision import clearance_in
-        from limber.robot.live_view import look
+        from limber.robot.depth_camera import look
         from limber.stages.paths.plan_cell import cell_for, cell_positions, is_fixed, limits_in
 
         cell = cell_for(branch, path, progress)
@@ -357,7 +357,7 @@ class _InCell:
 
     def slowed(self, pace: Pace, progress: Progress) -> Pace:
         """Return the pace, no faster than the cell allows."""
-        from limber.robot.motion.contact_speed import speed_within
+        from limber.robot.motion.trajectory import speed_within
 
         most = self.cell.limits
         return replace(pace, speed=speed_within(self.cell, min(pace.speed, most.speed_m_s),

@@ -26,9 +26,9 @@ from limber.planning.field.grasp_model import GraspModel
 from limber.planning.goals.goal import Ball, CellPlace, position_text
 from limber.planning.goals.goal_kinds import View
 from limber.planning.plan_file import PlanPath
-from limber.robot.live_view import LiveView
+from limber.robot.depth_camera import LiveView
 from limber.robot.motion.execution import RobotMotion
-from limber.robot.motion.expected_wrench import Predicted
+from limber.robot.motion.trajectory import Predicted
 from limber.stages.paths.plan_legs import surface_points
 from limber.store import Branch
 

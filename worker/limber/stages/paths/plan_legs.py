@@ -13,8 +13,7 @@ from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.cost import arc_lengths
 from limber.planning.plan_file import PlanPath
-from limber.robot.motion.execution import RobotMotion
-from limber.robot.motion.legs import HELD, Leg, described, legs_of
+from limber.robot.motion.execution import HELD, Leg, RobotMotion, described, legs_of
 
 _MOST_POSES = 60  # of a leg whose distances are computed
 _MOST_POINTS = 800  # of the branch's surface

@@ -13,8 +13,8 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.cost import arc_lengths
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.path_on_full_model import SolvedPoses
-from limber.robot.motion.expected_wrench import Predicted
-from limber.robot.motion.turning import TurnCost, Turned, turned, turned_motion
+from limber.robot.motion.execution import TurnCost, Turned, turned, turned_motion
+from limber.robot.motion.trajectory import Predicted
 from limber.stages.pulls.record_path import GRASP_RADIUS_M
 
 _OF_HARD = 0.8  # of the torque at which the guard stops the arm, that an offset may need

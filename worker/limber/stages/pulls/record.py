@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from limber.robot.driver.link import RobotLink
     from limber.robot.motion.execution import Blocked
     from limber.robot.motion.trajectory import Trajectory
-    from limber.robot.pull_plausibility import PullPlausibility
-    from limber.robot.recorder import PullRecorder
+    from limber.robot.recorder import PullPlausibility, PullRecorder
     from limber.stages.pulls.record_observers import Observers
     from limber.store import Stream
 
@@ -123,7 +122,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
     from limber.cell.cell_file import check_branch, read_cell, require_payload
     from limber.cell.obstacles import cell_obstacles
     from limber.cell.reach_and_collision import blocked_by
-    from limber.robot.weighing import require_weighed
+    from limber.robot.robot_state import require_weighed
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise InputError(Text(Option("name"), f" {name!r} cannot name a recording."),
@@ -177,10 +176,8 @@ def _remove_empty(branch: Branch, name: str) -> None:
 
 def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
               options: RecordOptions, blocked: Blocked, progress: Progress) -> dict[str, Any]:
-    from limber.robot.driver.link import RobotLink
-    from limber.robot.driver.live_force import LiveForce
-    from limber.robot.pull_plausibility import off_axis
-    from limber.robot.recorder import PullRecorder
+    from limber.robot.driver.link import LiveForce, RobotLink
+    from limber.robot.recorder import PullRecorder, off_axis
     from limber.stages.pulls.record_nudge import nudge_and_checks, nudged
     from limber.stages.pulls.record_observers import Observers
     from limber.stages.pulls.record_path import grasp_point
@@ -297,7 +294,7 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
           settings: RecordSettings, blocked: Blocked, progress: Progress) -> Trajectory:
     """The motion of the gripper from its position in a sample of the robot."""
     from limber.core.numerics.rigid import matrices
-    from limber.robot.motion.contact_speed import speed_within
+    from limber.robot.motion.trajectory import speed_within
     from limber.stages.pulls.record_path import (
         arc_path,
         suggested_pull,

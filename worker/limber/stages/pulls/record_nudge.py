@@ -18,7 +18,7 @@ from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress
 from limber.robot.motion.execution import Blocked
 from limber.robot.motion.trajectory import Trajectory
-from limber.robot.pull_plausibility import (
+from limber.robot.recorder import (
     LOOKED_M,
     NUDGE_M,
     NUDGE_M_S,
@@ -31,8 +31,7 @@ from limber.stages.pulls.record_prediction import PullModel
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.robot.driver.link import RobotLink
-    from limber.robot.driver.live_force import LiveForce
+    from limber.robot.driver.link import LiveForce, RobotLink
 
 _SETTLE_SECONDS = 0.5  # until the branch rests again
 _SHARE = 0.5  # of the pull's own travel, and of the force at which a motion pauses

@@ -16,7 +16,7 @@ from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell
-    from limber.robot.depth_recording import DepthRecorder
+    from limber.robot.depth_camera import DepthRecorder
     from limber.store import Stream
 
 
@@ -67,8 +67,7 @@ class Observers:
         return self
 
     def _with_camera(self, around: ExitStack) -> DepthRecorder:
-        from limber.robot.depth_recording import DepthRecorder
-        from limber.robot.realsense import RealSense
+        from limber.robot.depth_camera import DepthRecorder, RealSense
         from limber.store.loading import load_skeleton
 
         camera = around.enter_context(RealSense())

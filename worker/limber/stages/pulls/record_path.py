@@ -13,11 +13,10 @@ from limber.core.files.tables import read_columns
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
 from limber.recordings.recording import POSE_COLUMNS
-from limber.robot.motion.contact_speed import speed_within
 from limber.robot.motion.execution import Blocked
 from limber.robot.motion.joint_path import joint_path
-from limber.robot.motion.start_check import different_joints, in_degrees
-from limber.robot.motion.trajectory import Trajectory, along, densely
+from limber.robot.motion.retreat import different_joints, in_degrees
+from limber.robot.motion.trajectory import Trajectory, along, densely, speed_within
 from limber.store import Branch
 
 GRASP_RADIUS_M = 0.012

@@ -8,7 +8,7 @@ import numpy as np
 
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
-from limber.robot.pull_plausibility import LOOKED_M, PredictedPull, certain_directions
+from limber.robot.recorder import LOOKED_M, PredictedPull, certain_directions
 from limber.stages.pulls.record_path import GRASP_RADIUS_M
 from limber.store import Branch
 

@@ -1,27 +1,31 @@
-"""A Robotiq gripper by the socket of its URCap: lines of text on port 63352 of the controller.
-
-``SET POS 255 SPE 255 FOR 0 GTO 1`` is answered by ``ack``, ``GET POS`` by ``POS 3``. Registers are
-those of the gripper: ACT (activate), GTO (go), POS (0 open, 255 closed), SPE, FOR (0 to 255), STA
-(3: activated), OBJ (0 moving, 1 and 2 stopped by an object while opening or closing, 3 at the
-requested position), FLT (fault, 0 none). Sources: Robotiq, "2F-85 and 2F-140 instruction manual",
-register mapping; the client of the same socket in ur_rtde (robotiq_gripper.cpp, SDU Robotics). It
-works while the arm is stopped: no program is needed.
-
-An activation opens and closes the gripper by itself. It is never done from here: with a branch in
-the jaws that would let it go, or crush it.
+"""Grippers that open and close on order: Robotiq's by the socket of its URCap, or a digital output.
 """
 
 import re
 import socket
 import time
 
-from limber.core.errors import WorkError
+from limber.cell.cell_file import Cell
+from limber.core.errors import InputError, WorkError
+from limber.robot.ur.rtde import SampleStream
+
+# A Robotiq gripper by the socket of its URCap: lines of text on port 63352 of the controller.
+#
+# ``SET POS 255 SPE 255 FOR 0 GTO 1`` is answered by ``ack``, ``GET POS`` by ``POS 3``. Registers
+# are those of the gripper: ACT (activate), GTO (go), POS (0 open, 255 closed), SPE, FOR (0 to 255),
+# STA (3: activated), OBJ (0 moving, 1 and 2 stopped by an object while opening or closing, 3 at the
+# requested position), FLT (fault, 0 none). Sources: Robotiq, "2F-85 and 2F-140 instruction manual",
+# register mapping; the client of the same socket in ur_rtde (robotiq_gripper.cpp, SDU Robotics). It
+# works while the arm is stopped: no program is needed.
+#
+# An activation opens and closes the gripper by itself. It is never done from here: with a branch in
+# the jaws that would let it go, or crush it.
 
 ROBOTIQ_PORT = 63352
 CLOSED = 255
 ACTIVATED, MOVING, HELD_CLOSING = 3, 0, 2
 
-_SECONDS = 0.5
+_ANSWER_SECONDS = 0.5
 _POLL_SECONDS = 0.02
 _VALUE = re.compile(rb"([A-Z]{3}) (\d+)")
 
@@ -37,7 +41,7 @@ class RobotiqGripper:
         WorkError: nothing answers, or the gripper is not activated or reports a fault.
     """
 
-    def __init__(self, address: str, seconds: float = _SECONDS):
+    def __init__(self, address: str, seconds: float = _ANSWER_SECONDS):
         self.address = address
         try:
             self._socket = socket.create_connection((address, ROBOTIQ_PORT), seconds)
@@ -119,3 +123,75 @@ class RobotiqGripper:
     def close(self) -> None:
         """Close the connection; the gripper stays as it is."""
         self._socket.close()
+
+
+# A digital output of a controller, switched without its control program.
+#
+# It works while the arm is stopped, and every wait in it has a limit: a gripper has to open even if
+# nothing else works.
+
+_SWITCH_SECONDS = 1.0
+
+
+class _Outputs(SampleStream):
+    inputs = ("standard_digital_output_mask", "standard_digital_output")
+
+
+def switch_output(address: str, number: int, on: bool) -> None:
+    """Switch a standard digital output.
+
+    Raises:
+        WorkError: no answer, another program drives the outputs, or the output did not switch.
+    """
+    bit = 1 << number
+    stream = _Outputs(address)
+    try:
+        stream.write({"standard_digital_output_mask": bit,
+                      "standard_digital_output": bit if on else 0})
+        end = time.monotonic() + _SWITCH_SECONDS
+        while time.monotonic() < end:
+            for sample in stream.read(0.1):
+                if sample.outputs is not None and bool(sample.outputs & bit) == on:
+                    return
+    except OSError as error:
+        raise WorkError(f"The output could not be switched ({error}).", "", "See the pendant."
+                        ) from error
+    finally:
+        stream.close()
+    raise WorkError(f"Digital output {number} did not switch within {_SWITCH_SECONDS:g} s.",
+                    "Its state as the controller sends it is unchanged.",
+                    "Check on the pendant that this output is free for programs.")
+
+
+def is_driven(cell: Cell) -> bool:
+    """Whether Limber drives the gripper itself."""
+    return cell.tool.gripper in ("digital_output", "robotiq")
+
+
+def drive_gripper(cell: Cell, close: bool) -> None:
+    """Close or open the gripper, without waiting until it has.
+
+    Raises:
+        InputError: Limber does not drive it. WorkError: it does not answer.
+    """
+    tool = cell.tool
+    if tool.gripper == "robotiq":
+        with RobotiqGripper(cell.robot.address) as gripper:
+            gripper.drive(close, tool.grip_force)
+    elif tool.gripper == "digital_output":
+        switch_output(cell.robot.address, tool.close_output, close)
+    else:
+        raise InputError("Limber does not drive the cell's gripper.",
+                         f"tool.gripper is {tool.gripper}.", "Close and open it by hand.")
+
+
+def holds(cell: Cell) -> bool | None:
+    """Return whether something is in the closed jaws; None if the gripper does not tell.
+
+    Raises:
+        WorkError: it does not answer, or it moves still.
+    """
+    if cell.tool.gripper != "robotiq":
+        return None
+    with RobotiqGripper(cell.robot.address) as gripper:
+        return gripper.stopped(cell.tool.grip_seconds) == HELD_CLOSING

@@ -1,1 +1,0 @@
-"""The cell: robot base, gripper, obstacles and their calibration."""
