@@ -255,7 +255,8 @@ def beam_rows(setting: Setting) -> list[Row]:
     return [Row(*BEAM_ROWS[0], f"{100 * spread:.2f} % ("
                 f"{', '.join(f'{value / 1e3:.1f}' for value in young)} kPa on "
                 f"{', '.join(str(6 * int(np.prod(cells))) for cells in _MESHES)} tetrahedra)",
-                bool(spread <= 0.007), len(found)), _other_loads(setting)[1]]
+                bool(spread <= 0.007), len(found)),
+            *([_other_loads(setting)[1]] if FOLDER.is_dir() else [])]
 
 
 def _other_loads(setting: Setting) -> tuple[Row, Row]:
