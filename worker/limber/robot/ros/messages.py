@@ -278,7 +278,7 @@ def wrench_topic(cell: Cell, own: str = _USUAL.wrench) -> str:
 
 
 _CLOUD_SECONDS = 10.0  # a cloud is megabytes of text
-_CLOUD_SECONDS = 0.5
+_CLOUD_LISTEN_SECONDS = 0.5
 _STANDS_RAD_S = 1e-3
 
 
@@ -316,7 +316,7 @@ class CloudTopic:
         """
         end = time.monotonic() + _CLOUD_SECONDS
         while time.monotonic() < end:
-            message = self._bridge.receive(_CLOUD_SECONDS)
+            message = self._bridge.receive(_CLOUD_LISTEN_SECONDS)
             if message is None or message.get("op") != "publish":
                 continue
             if message.get("topic") == self._joint_states:
