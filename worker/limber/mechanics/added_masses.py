@@ -64,15 +64,9 @@ def _scaled(row: Place, factor: float) -> Place:
 
 @dataclass(frozen=True)
 class Tied:
-    """How an added mass follows the nodes of the t elements (or the one node) that carry it.
-
-    Attributes:
-        added: The mass.
-        nodes: Shape [t, a].
-        share: Fraction of the mass, shape [t].
-        centre: Weights of the nodes in the displacement of the centre of mass, shape [t, a].
-        slopes: Weights of the nodes in the displacement gradient [1/m], shape [t, 3, a].
-    """
+    """How an added mass follows the ``nodes`` [t, a] of its t elements (or one node), each with
+    ``share`` [t] of it: weights of its centre's move [t, a], and of the gradient [1/m] [t, 3,
+    a]."""
 
     added: PointMass
     nodes: np.ndarray
@@ -107,18 +101,8 @@ class Tied:
 
 def tied(mesh: TetMesh, added: Iterable[PointMass], gradients: np.ndarray, weights: np.ndarray,
          volume_weights: np.ndarray) -> list[Tied]:
-    """Tie masses to the nodes of a mesh.
-
-    Args:
-        mesh: The branch.
-        added: The masses.
-        gradients: Gradients of the shape functions at rest [1/m], shape [tet_count, q, 3, a].
-        weights: Weights of the quadrature points [m^3], shape [tet_count, q].
-        volume_weights: Integrals of the shape functions [m^3], shape [tet_count, a].
-
-    Raises:
-        InputError: a mass is negative or not finite.
-    """
+    """Tie masses to a mesh by its shape functions' gradients [1/m] [tet_count, q, 3, a], quadrature
+    weights [m^3] and integrals [m^3] [tet_count, a]. InputError if a mass is negative."""
     found = []
     for one in added:
         if not (np.isfinite(one.mass) and one.mass >= 0):
@@ -140,10 +124,8 @@ def tied(mesh: TetMesh, added: Iterable[PointMass], gradients: np.ndarray, weigh
 
 
 def nodal_masses(ties: Iterable[Tied], count: int) -> np.ndarray:
-    """Return the mass that gravity acts on at each node [kg], shape [count].
-
-    The weight of twigs includes its moment about their base, so some nodes have a negative mass.
-    """
+    """Return the mass that gravity acts on at each node [kg], shape [count]. The weight of twigs
+    includes its moment about their base, so some nodes have a negative mass."""
     total = np.zeros(count)
     for one in ties:
         np.add.at(total, one.nodes, one.added.mass * one.share[:, None] * one.centre)
@@ -163,8 +145,7 @@ def mass_entries(ties: Iterable[Tied], count: int) -> sp.csr_matrix:
 
 def _around(mesh: TetMesh, foot: np.ndarray) -> np.ndarray:
     """Elements of the section around a twig's base: within an edge length, at least the nearest
-    one.
-    """
+    one."""
     distance = np.linalg.norm(mesh.centroids - foot, axis=1)
     nearest = int(distance.argmin())
     corners = mesh.nodes[mesh.tets[nearest, :4]]

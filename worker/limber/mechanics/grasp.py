@@ -36,12 +36,8 @@ twig.
 
 
 def parts_between(mesh: TetMesh, point: np.ndarray, half_length: float) -> np.ndarray:
-    """Return the fraction of each tetrahedron's length along the branch in a gripper, [tet_count].
-
-    Args:
-        point: Centre of the gripper [m], on the branch.
-        half_length: Half the length of the piece that it holds [m].
-    """
+    """Return the fraction [tet_count] of each tetrahedron's length in a gripper that holds
+    ``half_length`` [m] to both sides of ``point`` [m], along the branch."""
     along, is_beside = _placed(mesh, point, half_length)
     corners = mesh.tets[:, :4]
     first, last = along[corners].min(axis=1), along[corners].max(axis=1)
@@ -52,11 +48,8 @@ def parts_between(mesh: TetMesh, point: np.ndarray, half_length: float) -> np.nd
 
 
 def nodes_between(mesh: TetMesh, point: np.ndarray, half_length: float) -> np.ndarray:
-    """Return the nodes that a gripper holds; arguments as for :func:`parts_between`.
-
-    Nodes between corners of which not all are inside are left out: they would hold more of a
-    tetrahedron cut by the gripper's end than its part inside.
-    """
+    """Return the nodes that a gripper holds, see :func:`parts_between`. Nodes between corners that
+    are not all inside would hold too much of a cut tetrahedron; they are left out."""
     along, is_beside = _placed(mesh, point, half_length)
     held = (np.abs(along) <= half_length) & ~is_beside
     corners = held[mesh.tets[:, :4]]
@@ -68,8 +61,7 @@ def nodes_between(mesh: TetMesh, point: np.ndarray, half_length: float) -> np.nd
 
 def _placed(mesh: TetMesh, point: np.ndarray, half_length: float) -> tuple[np.ndarray, np.ndarray]:
     """Positions of nodes along the branch's axis at a point [m], and which nodes belong to another
-    branch.
-    """
+    branch."""
     away = mesh.nodes - np.asarray(point, float)
     distance = np.linalg.norm(away, axis=1)
     reach = max(_NEAR_RADII * half_length, np.sort(distance)[min(
@@ -326,11 +318,8 @@ class Grasp:
 
 
 def check_pose(pose: np.ndarray) -> np.ndarray:
-    """Return a pose as a float array of shape [6].
-
-    Raises:
-        InputError: the shape is wrong, or a value is not finite.
-    """
+    """Return a pose as a float array of shape [6]. InputError if the shape is wrong, or a value is
+    not finite."""
     pose = np.asarray(pose, float)
     if pose.shape != (6,) or not np.isfinite(pose).all():
         raise InputError(f"The pose has shape {pose.shape} or values that are not finite.",
@@ -340,12 +329,8 @@ def check_pose(pose: np.ndarray) -> np.ndarray:
 
 
 def _centred(weights: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Return weights that sum to 1 and whose centre is the grasp's position.
-
-    Args:
-        offset: Of the nodes from that position [m], shape [k, 3]. In directions in which the patch
-            does not extend to both sides of it, the centre stays.
-    """
+    """Return weights that sum to 1 and whose centre is the grasp, ``offset`` [k, 3] [m] from it. In
+    directions in which the patch is not on both sides of it, the centre stays."""
     centre = weights @ offset
     arm = offset - centre
     # The change of the weights is linear in the position, so their sum stays 1.

@@ -129,13 +129,8 @@ _YOUNG, _POISSON = 1e9, 0.35
 
 @dataclass(frozen=True)
 class CarriedWeight:
-    """The prestress that carries a load in the scanned shape; linear in the load.
-
-    Attributes:
-        stress: S0 [Pa] at the quadrature points, shape [tet_count, q, 6] (00 11 22 01 02 12).
-        stiffness: G [N/m] of each axis, sparse, shape [node_count, node_count].
-        base: Force of the base on its nodes while the branch hangs [N], [node_count, 3].
-    """
+    """The prestress that carries a load in the scanned shape, linear in it: S0 [tet_count, q, 6]
+    [Pa] (00 11 22 01 02 12), G of each axis [N/m], and the base's force [node_count, 3] [N]."""
 
     stress: np.ndarray
     stiffness: sp.csr_matrix
@@ -152,13 +147,8 @@ class CarriedWeight:
 
 @dataclass(frozen=True)
 class Prestress:
-    """The prestress that carries the weight of a hanging branch.
-
-    Attributes:
-        own: Prestress for the branch's own mass.
-        added: Prestress for the masses that hung on it when it was scanned; None: none.
-        mass_count: Number of the model's added masses included.
-    """
+    """The prestress that carries the weight of a hanging branch: its own, and that of the
+    ``mass_count`` added masses that hung on it when it was scanned (None: none)."""
 
     own: CarriedWeight
     added: CarriedWeight | None
@@ -175,10 +165,7 @@ class Prestress:
 
 def carried(model: "BranchModel") -> Prestress:
     """Return the prestress of a model that is assumed to hang in its mesh's shape.
-
-    Raises:
-        NotPositiveDefiniteError: the mesh cannot carry any load.
-    """
+    NotPositiveDefiniteError if the mesh cannot carry any load."""
     mesh = model.mesh
     plain = model.linear(_YOUNG, _POISSON)
     equations = plain.equations()
@@ -223,14 +210,8 @@ def geometric_stiffness(model: "BranchModel", stress: np.ndarray) -> sp.csr_matr
 
 @dataclass(frozen=True)
 class InternalState:
-    """Internal forces of one state.
-
-    Attributes:
-        force: Internal force on the nodes [N], shape [node_count, 3]; the gradient of ``energy``.
-        tet_energy: Strain energy of each tetrahedron relative to the mesh's shape [J], [tet_count].
-        min_det_f: Smallest determinant of the deformation gradient at a quadrature point.
-        weight_energy: Contribution of the weight of a hanging branch to the potential [J].
-    """
+    """Internal forces [node_count, 3] [N] of one state, the gradient of ``energy`` [J], which is
+    that of strain from the mesh's shape, and ``weight_energy`` of a hanging branch."""
 
     force: np.ndarray
     tet_energy: np.ndarray

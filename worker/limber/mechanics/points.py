@@ -13,17 +13,9 @@ _FARTHEST = 1e9  # [m]
 
 
 def point_operator(mesh: TetMesh, rest_points: np.ndarray) -> sparse.csr_matrix:
-    """Return B, shape [3 m, 3 n], with displacements of the points = B @ displacements.ravel().
-
-    A point inside a tetrahedron moves with its shape functions. A point outside, such as a marker
-    on a stalk, moves with the nearest point inside and rotates with the section there: by the mean
-    gradient of the displacement over the section, in which the strains of bending cancel. The
-    gradient at the foot itself would stretch the stalk by the strain of the skin.
-
-    Args:
-        mesh: Linear or quadratic tetrahedra at rest.
-        rest_points: [m], shape [m, 3].
-    """
+    """Return B [3 m, 3 n] that moves points with the shape functions. One outside, as on a stalk,
+    moves and turns with the section at its nearest point inside, by its mean gradient, in which
+    bending cancels: the foot's own would stretch the stalk by the skin's strain."""
     points = np.asarray(rest_points, float)
     tets, local, outside = _located(mesh, points)
     values = shape_functions(local, mesh.tets.shape[1])

@@ -25,20 +25,9 @@ from limber.mechanics.statics.solve import solve_static
 
 @dataclass(frozen=True)
 class LoadCase:
-    """Loads and constraints over the frames of a pull.
-
-    Attributes:
-        model: The branch, with its added masses.
-        start: Equilibrium before the pull, with grippers attached and without force.
-        grasp: The gripper that pulls.
-        follows_pose: Whether it follows poses; otherwise it exerts ``grasp_force``.
-        holds: Other grippers and ties; they stay in their initial positions.
-        poses_along: Poses of the gripper [m, rad], shape [frames, 6]; unused if it exerts a force.
-        grasp_force: Force at the end of the pull [N], shape [3].
-        loads: Other forces on the nodes at the end of the pull [N], shape [node_count, 3].
-        times: Times of the frames [s], shape [frames].
-        part: Fraction of the pull's forces at each frame, shape [frames].
-    """
+    """Loads over a pull's frames from ``start``, with grippers attached and no force. The grasp
+    follows ``poses_along`` [frames, 6] [m, rad] or exerts ``grasp_force``; ``holds`` stay. This
+    force and ``loads`` [node_count, 3] [N] are those of the end, ``part`` [frames] of them acts."""
 
     model: BranchModel
     start: StaticResult
@@ -71,14 +60,8 @@ class LoadCase:
         return forces
 
     def at_grippers(self, reactions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Split the reactions of held patches into the gripper's and those of the holds.
-
-        Args:
-            reactions: Reactions of the grasps in :attr:`held`, shape [frames, held, 3].
-
-        Returns:
-            Shapes [frames, 3] and [frames, holds, 3].
-        """
+        """Split reactions [frames, held, 3] of :attr:`held` patches into the gripper's [frames, 3]
+        and the holds' [frames, holds, 3]."""
         if self.follows_pose:
             return reactions[:, 0], reactions[:, 1:]
         return np.zeros((len(reactions), 3)), reactions
@@ -86,21 +69,9 @@ class LoadCase:
 
 @dataclass(frozen=True)
 class SimulatedMotion:
-    """Frames of a motion; fewer than the pull's if the branch could not follow.
-
-    Attributes:
-        times: [s], shape [frames].
-        displacement: Displacement of all nodes from the rest shape [m], shape [frames, node_count,
-        3].
-        energy, kinetic_energy: [J], shape [frames]; energy: the potential of strain and weight
-            above the first state of the pull, before any pulling force acts.
-        grasp_force, grasp_torque: Force and torque of the gripper on the branch [N, Nm], shape
-        [frames, 3].
-        hold_forces: Forces of the other holds [N], shape [frames, holds, 3].
-        min_det_f: Smallest det F, shape [frames].
-        converged: Whether all frames were reached; ``message`` states why not.
-        warnings: Warnings for the user.
-    """
+    """Frames of a motion, fewer than the pull's if the branch could not follow (``message``):
+    displacement from rest [frames, node_count, 3], and the gripper's and holds' force on the
+    branch. ``energy`` [J], of strain and weight, is above the state before any pulling force."""
 
     times: np.ndarray
     displacement: np.ndarray
@@ -173,11 +144,8 @@ _DEFAULT_BEND = 0.2
 
 
 def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
-    """Return the transverse force that bends the branch by a fifth of its reach [N], shape [3].
-
-    From the stiffness at rest. A motion along an arbitrary line in space would buckle or stretch a
-    branch, whose length is fixed; under a force it moves where it can.
-    """
+    """Return the transverse force [3] [N] that bends a branch by a fifth of its reach, by its
+    stiffness at rest. A motion along any line in space would buckle or stretch it."""
     axis = grasp.centre - model.mesh.nodes[model.fixed].mean(axis=0)
     across = any_normal(axis)
     weightless = model.with_parameters(gravity=(0.0, 0.0, 0.0))
@@ -190,18 +158,9 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
                  grasp_point: np.ndarray | Sequence[float] | None = None, *,
                  grasp_radius: float = GRASP_RADIUS_M, frame_rate: float = FRAME_RATE,
                  ) -> LoadCase:
-    """Return the load case that settings request.
-
-    Args:
-        model: Model of the scan, on which positions are given.
-        settings: Settings of the pull.
-        along: The grasp's path instead of a motion of the settings.
-        grasp_point: The position of the marked grasp [m]; None: the patch's centre.
-        grasp_radius: [m]; frame_rate: [1/s].
-
-    Raises:
-        InputError: options do not fit. ConvergenceError: no equilibrium of the branch was found.
-    """
+    """Return the load case of settings, or of a path instead of their motion. ``grasp_point`` [m]
+    None is the patch's centre. InputError if options do not fit, ConvergenceError if no
+    equilibrium."""
     def patch(point: Point, mode: Literal["rigid", "point"]) -> Grasp:
         if mode == "rigid":
             return Grasp.gripping(model.mesh, np.array(point), grasp_radius)
@@ -236,11 +195,7 @@ def with_masses(model: BranchModel, settings: SimulateSettings) -> BranchModel:
 
 
 def require_one_drive(settings: SimulateSettings, along: PoseTable | None) -> None:
-    """Reject more than one of a motion, a path and a force.
-
-    Raises:
-        InputError: there are more.
-    """
+    """Reject more than one of a motion, a path and a force. InputError if there are more."""
     moves = settings.move is not None or settings.turn is not None
     if (settings.grasp_force is not None) + moves + (along is not None) > 1:
         raise InputError("More than one of a motion, a path and a force is given.",
@@ -263,10 +218,8 @@ def motion_of(case: LoadCase, settings: SimulateSettings,
 
 def _ramp(settings: SimulateSettings, duration: float, frame_rate: float,
           ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and the fraction of the pull at each.
-
-    In motion it starts and ends at rest, and the end pose is held.
-    """
+    """Return times [s] and the fraction of the pull at each. In motion it starts and ends at rest,
+    and the end pose is held."""
     hold = settings.hold if settings.kind == "dynamic" else 0.0
     count = max(2, round((duration + hold) * frame_rate) + 1)
     times = np.arange(count) / frame_rate

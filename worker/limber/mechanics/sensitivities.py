@@ -114,25 +114,17 @@ def static_sensitivities(model: BranchModel, result: StaticResult,
 
 @dataclass(frozen=True)
 class GraspSlopes:
-    """The derivatives of a branch in a clamped grasp to the grasp's pose.
-
-    Columns are position [m] and rotation [rad, about the axes of the branch's frame].
-
-    Attributes:
-        wrench: Derivatives of force [N] and torque [N m] about the moved pose, shape [6, 6].
-        displacement: Derivatives of the displacement of all nodes [m], shape [node_count, 3, 6].
-    """
+    """Derivatives by the pose of a clamped grasp, position [m] and rotation [rad] about the
+    branch's axes: of force and torque about the moved pose [6, 6], and of all nodes [node_count, 3,
+    6]."""
 
     wrench: np.ndarray
     displacement: np.ndarray
 
 
 def grasp_slopes(model: BranchModel, grasp: Grasp, displacement: np.ndarray) -> GraspSlopes:
-    """Differentiate a state with respect to the pose of the clamped grasp that holds it.
-
-    Args:
-        model: In equilibrium at ``displacement`` [node_count, 3].
-    """
+    """Differentiate an equilibrium [node_count, 3] by the pose of the clamped grasp that holds
+    it."""
     pose = grasp.pose_of(model.mesh.nodes, displacement)
     positions = model.mesh.nodes[grasp.nodes] + displacement[grasp.nodes]
     arm = positions - pose[:3]
@@ -208,15 +200,8 @@ def young_shares(model: BranchModel, parameters: ParameterSet) -> np.ndarray:
 def explicit_forces(model: BranchModel, parameters: ParameterSet, displacement: np.ndarray, *,
                     motion: MotionState | None = None,
                     viscous: Viscous | None = None) -> list[np.ndarray]:
-    """Return the derivative of internal and inertial force less load, at fixed motion.
-
-    Each of shape [node_count, 3] [N per parameter].
-
-    Args:
-        displacement: [m], shape [node_count, 3].
-        motion: The instant of a motion; None: equilibrium.
-        viscous: The viscous part of that instant.
-    """
+    """Return the derivatives [node_count, 3] [N per parameter] of internal and inertial force less
+    load, at fixed motion (None: equilibrium)."""
     changes, partials = lame_changes(model, parameters), []
     plain = [name.rsplit("_", 1)[0] if name.startswith("log_young") else name
              for name in parameters.labels()]
@@ -280,11 +265,7 @@ def reactions(grasps: Sequence[Grasp], out: np.ndarray) -> np.ndarray:
 
 
 def checked_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names as a tuple.
-
-    Raises:
-        InputError: a name is not in PARAMETERS.
-    """
+    """Return the names as a tuple. InputError if a name is not in PARAMETERS."""
     for name in names:
         if name not in PARAMETERS:
             raise InputError(f"There is no parameter {name!r}.",

@@ -30,16 +30,9 @@ class Place:
 
 @dataclass(frozen=True)
 class StrainState:
-    """Means over each tetrahedron, shape [tet_count] or [tet_count, 3].
-
-    Strain and stress of a branch that hangs as scanned include those that carry its weight.
-
-    Attributes:
-        energy_density: Strain energy density [J/m^3], of the strain relative to the model's mesh.
-        principal_strain: Principal Green-Lagrange strains, ascending.
-        principal_stress: Principal Cauchy stresses [Pa], ascending.
-        det_f: Volume relative to that at rest, at the quadrature point with the smallest.
-    """
+    """Means over tetrahedra [tet_count] or ascending [tet_count, 3], with those that carry a
+    hanging branch's weight. Energy [J/m^3] is relative to the mesh; det F is the smallest at a
+    point."""
 
     energy_density: np.ndarray
     principal_strain: np.ndarray
@@ -71,12 +64,9 @@ def strain_state(model: BranchModel, displacement: np.ndarray) -> StrainState:
 
 
 def peak_load(model: BranchModel, displacement: np.ndarray) -> tuple[float, int, float]:
-    """Return the largest principal strain by magnitude, its tetrahedron, and the largest principal
-    stress by magnitude [Pa]: the same as from :func:`strain_state`, in a tenth of the time.
-
-    A symmetric tensor's largest principal value is at least its norm over the root of 3: only
-    tetrahedra whose norm is near the largest are evaluated.
-    """
+    """Largest principal strain by magnitude, its tetrahedron and largest stress [Pa], as
+    :func:`strain_state` in a tenth of the time. A symmetric tensor's largest principal value is at
+    least its norm over root 3: only tetrahedra near the largest norm are evaluated."""
     part = model.weights / model.weights.sum(axis=1, keepdims=True)
     green = np.einsum("eq,eqk->ek", part, model.strains(displacement))
     carried = carried_strain(model)
@@ -124,8 +114,7 @@ def strain_of(model: BranchModel, stress: np.ndarray, tets: np.ndarray | slice =
 
 def carried_strain(model: BranchModel) -> np.ndarray | None:
     """Return the mean strain that carries the weight on the scan, [tet_count, 6] (00 11 22 01 02
-    12); None if no weight is carried there.
-    """
+    12); None if no weight is carried there."""
     if model.prestress is None:
         return None
     part = model.weights / model.weights.sum(axis=1, keepdims=True)

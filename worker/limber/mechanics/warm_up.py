@@ -11,12 +11,8 @@ from limber.mechanics.sensitivities import ParameterSet
 
 
 def warm_up(progress: Progress = SILENT) -> None:
-    """Run statics, motion and derivatives with one tetrahedron.
-
-    It calls every kernel with the same types as users' branches; the compiled code stays in the
-    user's cache folder. It takes about a minute if nothing is compiled yet, and under two seconds
-    afterwards.
-    """
+    """Run statics, motion and derivatives with one tetrahedron and users' types, so that each
+    kernel is compiled into the user's cache: a minute at first, under two seconds later."""
     corners = 0.01 * np.vstack([np.zeros(3), np.eye(3)])
     mesh = TetMesh(corners, np.array([[0, 1, 2, 3]])).quadratic()
     for number, damping in enumerate((RayleighDamping(), RayleighDamping(0.0, 0.0))):

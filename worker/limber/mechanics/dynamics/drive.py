@@ -23,23 +23,8 @@ _DIFFERENCE = 2e-5
 
 
 class PosePath:
-    """Poses of one or several grasps over time.
-
-    A cubic spline through positions and (unwrapped) rotation vectors that starts at rest.
-
-    Args:
-        grasps: The grasps.
-        rest: Rest positions of all nodes [m].
-        times: Times of the poses [s].
-        poses: [m, rad], shape [frames, 6] or [frames, grasps, 6].
-
-    Attributes:
-        poses: Shape [frames, grasps, 6], rotation vectors unwrapped.
-        clamped, pinned: The grasps of each mode.
-
-    Raises:
-        InputError: shapes do not fit, or values are not finite.
-    """
+    """Poses [frames, 6] or [frames, grasps, 6] [m, rad] of grasps over time: a cubic spline that
+    starts at rest, rotation vectors unwrapped. InputError if shapes do not fit."""
 
     def __init__(self, grasps: Sequence[Grasp], rest: np.ndarray, times: np.ndarray,
                  poses: np.ndarray):
@@ -62,12 +47,8 @@ class PosePath:
                                                 (2, np.zeros(expected[1:]))))
 
     def at(self, instant: float) -> tuple[list[list[np.ndarray]], list[np.ndarray]]:
-        """Return displacement, velocity and acceleration at a time.
-
-        Returns:
-            For the nodes of each clamped grasp: three lists of arrays [k, 3]; and for the means
-            of the pinned ones: three arrays [pinned, 3].
-        """
+        """Return displacement, velocity and acceleration at a time [s]: three lists of [k, 3] for
+        the clamped grasps' nodes, and three arrays [pinned, 3] for the pinned means."""
         before, now, after = (self._placed(instant + shift)
                               for shift in (-_DIFFERENCE, 0.0, _DIFFERENCE))
         held = [now[0],
@@ -109,17 +90,8 @@ def unwrapped(poses: np.ndarray) -> np.ndarray:
 
 
 class Drive:
-    """Loads and constraints of a motion; arguments as for simulate_dynamics.
-
-    Attributes:
-        times: Times of the frames [s].
-        grasps: All grasps; single: whether one was given by itself.
-        path: The grasps' motion; None if they do not follow poses.
-        equations: Those with pose-driven grasps held.
-
-    Raises:
-        InputError: the arguments contradict each other.
-    """
+    """Loads and constraints of a motion; arguments as for simulate_dynamics. ``path`` is None if no
+    grasp follows poses. InputError if the arguments contradict each other."""
 
     def __init__(self, model: BranchModel, grasp: Grasp | Sequence[Grasp] | None,
                  poses: np.ndarray | None, grasp_forces: np.ndarray | None,
@@ -154,11 +126,8 @@ class Drive:
         return load
 
     def equilibrium(self) -> StaticResult:
-        """Return the equilibrium under the pose and the loads of the first time.
-
-        Raises:
-            ConvergenceError: no equilibrium exists.
-        """
+        """Return the equilibrium under the pose and the loads of the first time. ConvergenceError
+        if no equilibrium exists."""
         pose = self.path.poses[0] if self.path else None
         force = None if self._grasp_forces is None else self._grasp_forces[0]
         loads = None if self._nodal_forces is None else self._nodal_forces[0]
@@ -166,11 +135,8 @@ class Drive:
                             nodal_forces=loads).require()
 
     def moves(self, state: MotionState) -> tuple[np.ndarray | None, np.ndarray]:
-        """Return how held nodes and pinned means have to move to reach the path.
-
-        Returns:
-            [m], shape [node_count, 3], or None if they do not, and shape [pinned, 3].
-        """
+        """Return how held nodes [node_count, 3] (None if they do not) and pinned means [pinned, 3]
+        have to move to reach the path [m]."""
         if not self.path:
             return None, np.zeros((0, 3))
         held, means = self._at(state.time)
@@ -249,15 +215,8 @@ def _checked_times(times: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PoseTable:
-    """Poses of a gripper over time; only the motion relative to the first pose matters.
-
-    Attributes:
-        times: [s], ascending, shape [n].
-        poses: Position and rotation vector [m, rad], shape [n, 6].
-
-    Raises:
-        InputError: fewer than two poses, or values that are not finite.
-    """
+    """Poses [n, 6] [m, rad] of a gripper at ascending times [s]; only the motion relative to the
+    first pose matters. InputError if under two poses, or values that are not finite."""
 
     times: np.ndarray
     poses: np.ndarray
@@ -277,11 +236,8 @@ class PoseTable:
         return float(self.times[-1] - self.times[0])
 
     def changes(self, times: np.ndarray) -> np.ndarray:
-        """Return the gripper's displacement and rotation since the first pose, shape [m, 6].
-
-        Args:
-            times: Times since the first pose [s], shape [m]; after the last pose it stays there.
-        """
+        """Return displacement and rotation since the first pose [m, 6], at times [m] [s] since it;
+        after the last pose the gripper stays there."""
         from scipy.spatial.transform import Rotation, Slerp
 
         since = self.times - self.times[0]

@@ -42,13 +42,8 @@ from limber.mechanics.strain import principal_stretch
 
 
 class Stepper(ABC):
-    """Takes steps and keeps the tangent of the last one.
-
-    Attributes:
-        iteration_count: Iterations so far.
-        status, trouble: Reason for the failure of the last step.
-        tangent: Tangent of the last solve; None before the first.
-    """
+    """Takes steps and keeps the tangent of the last one, None before the first. ``status`` and
+    ``trouble`` say why the last step failed."""
 
     def __init__(self, drive: Drive, settings: MotionSettings):
         self.drive, self.settings = drive, settings
@@ -113,12 +108,8 @@ class NewmarkStepper(Stepper):
 
     def step(self, old: MotionState, dt: float,
              viscous: Viscous | None) -> MotionState | None:
-        """Return the state ``dt`` after ``old``, or None if it is not found.
-
-        The first solve starts from the previous balanced state, not from an extrapolation in time:
-        linear extrapolation stretches rotating parts. Mixed-point Newton then works as well as in
-        statics.
-        """
+        """Return the state ``dt`` after ``old``, or None. The first solve starts from the last
+        balanced state: linear extrapolation in time stretches rotating parts."""
         model, equations, settings = self.model, self.equations, self.settings
         load = self.drive.load_at(old.time + dt)
         new = replace(old, time=old.time + dt, step_before=dt,
@@ -173,10 +164,8 @@ class NewmarkStepper(Stepper):
         self.drive.hold(new)
 
     def _may_keep(self, dt: float) -> bool:
-        """Whether the last tangent fits the state before this step.
-
-        It does if its own solve reduced the residual a thousandfold.
-        """
+        """Whether the last tangent fits the state before this step. It does if its own solve
+        reduced the residual a thousandfold."""
         return (self.settings.keep_factor > 0 and self.tangent is not None
                 and self._tangent_step == dt and self._tangent_error <= _KEPT_TANGENT_ERROR)
 
@@ -258,12 +247,9 @@ class EnergyMomentumStepper(Stepper):
 
     def step(self, old: MotionState, dt: float, viscous: Viscous | None = None,
              ) -> MotionState | None:
-        """Return the state ``dt`` after ``old``, or None if it is not found.
-
-        Newton's unknown is the mean displacement. Its tangent F(u_m) C F(u_1) is not symmetric. The
-        factorised matrix is F(u_m) C F(u_m), so each iteration reduces the error by a factor of
-        about the rotation in half a step.
-        """
+        """Return the state ``dt`` after ``old``, or None. The unknown is the mean displacement. Its
+        tangent F(u_m) C F(u_1) is not symmetric. F(u_m) C F(u_m) is factorised, so each iteration
+        reduces the error by about the rotation in half a step."""
         equations, settings = self.equations, self.settings
         new = replace(old, time=old.time + dt, step_before=dt,
                       displacement=old.displacement.copy())
@@ -310,11 +296,8 @@ class EnergyMomentumStepper(Stepper):
         return None
 
     def borne(self, instant: float) -> np.ndarray | None:
-        """Return the reactions of the holds on each node [N], shape [node_count, 3].
-
-        Extrapolated from the mid-points of the last two steps, where forces balance; None before
-        there are two. At the ends of a step, modes that the mesh cannot resolve ring.
-        """
+        """Return the holds' reactions on nodes [N] [node_count, 3], extrapolated from the last two
+        mid-points, where forces balance; None before. At steps' ends unresolved modes ring."""
         if len(self._balances) < 2:
             return None
         (before, was), (last, now) = self._balances
@@ -322,8 +305,7 @@ class EnergyMomentumStepper(Stepper):
 
     def _bearing_strain(self, before: np.ndarray, after: np.ndarray, dt: float) -> np.ndarray:
         """Return the strain whose linear elastic stress equals that of the step, including
-        viscosity.
-        """
+        viscosity."""
         mean, change = 0.5 * (before + after), after - before
         if not self.model.material.is_hookean:
             mean = self._bearing_mean(before, after)
@@ -331,8 +313,7 @@ class EnergyMomentumStepper(Stepper):
 
     def _bearing_mean(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """Return the strain whose linear elastic stress times the change gives the change of
-        energy.
-        """
+        energy."""
         model, law = self.model, self.model.material
         lam, mu = model.lame_lambda[:, None], model.lame_mu[:, None]
         change = after - before

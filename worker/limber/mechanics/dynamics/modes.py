@@ -16,30 +16,16 @@ _TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Modes:
-    """Small undamped free vibrations.
-
-    Attributes:
-        frequencies: [Hz], ascending, shape [k].
-        shapes: Mode shapes of unit modal mass [kg^-1/2], shape [k, node_count, 3].
-    """
+    """Small undamped free vibrations: ascending frequencies [k] [Hz], and shapes [k, node_count, 3]
+    of unit modal mass [kg^-1/2]."""
 
     frequencies: np.ndarray
     shapes: np.ndarray
 
 
 def lowest_modes(model: BranchModel, count: int, displacement: np.ndarray | None = None) -> Modes:
-    """Return the lowest modes by subspace iteration (Bathe) with one factorisation.
-
-    Args:
-        model: The hanging branch, or a model without weight.
-        count: Number of modes.
-        displacement: Displacement of the equilibrium about which the branch vibrates [m], shape
-            [node_count, 3]; default the mesh's own shape.
-
-    Raises:
-        NotPositiveDefiniteError: the equilibrium is not stable.
-        ConvergenceError: the iteration does not converge.
-    """
+    """Return the lowest modes about an equilibrium (None: the mesh's shape), by subspace iteration
+    (Bathe). NotPositiveDefiniteError if not stable, ConvergenceError if it does not end."""
     at = np.zeros_like(model.mesh.nodes) if displacement is None else displacement
     tangent = model.equations(()).tangent(model, at)
     vectors = np.random.default_rng(0).standard_normal((count + _SPARE, *model.mesh.nodes.shape))
@@ -57,16 +43,8 @@ def lowest_modes(model: BranchModel, count: int, displacement: np.ndarray | None
 
 def subspace_round(model: BranchModel, tangent: Tangent, vectors: np.ndarray,
                    ) -> tuple[np.ndarray, np.ndarray]:
-    """Do one iteration of the subspace (Bathe), with Rayleigh-Ritz.
-
-    Args:
-        tangent: Tangent of the equilibrium.
-        vectors: Vectors of the subspace, shape [k, node_count, 3].
-
-    Returns:
-        Squared angular frequencies [1/s^2], ascending, shape [k], and their modes of unit modal
-        mass, from the next subspace.
-    """
+    """Iterate the subspace [k, node_count, 3] once (Bathe, Rayleigh-Ritz): squared angular
+    frequencies [1/s^2], ascending, and their modes of unit modal mass."""
     pushed = np.array([model.mass_times(vector) for vector in vectors])
     vectors = np.array([tangent.solve(force) for force in pushed])
     flat = vectors.reshape(len(vectors), -1)

@@ -12,15 +12,9 @@ from limber.mechanics.statics.result import Status
 
 @dataclass
 class MotionState:
-    """One instant.
-
-    Attributes:
-        time: [s].
-        displacement, velocity, acceleration: [m, m/s, m/s^2], shape [node_count, 3].
-        strain, strain_before: Strain at the quadrature points now and one step earlier (or their
-            derivatives), shape [tet_count, q, 6]; empty if there is no viscosity.
-        step_before: Length of that step [s]; infinite if there is no earlier state.
-    """
+    """One instant, arrays [node_count, 3]. Strains now and a step earlier (or derivatives) are
+    [tet_count, q, 6], empty without viscosity; ``step_before`` [s] is infinite without an earlier
+    state."""
 
     time: float
     displacement: np.ndarray
@@ -31,11 +25,8 @@ class MotionState:
     step_before: float = np.inf
 
     def rate_formula(self, dt: float) -> tuple[float, float, float]:
-        """Return factors [1/s] of the next, current and previous strains in the rate after ``dt``.
-
-        The second-order backward difference for unequal steps; first-order if there is no previous
-        state.
-        """
+        """Factors [1/s] of next, current and previous strain in the rate after ``dt``: the
+        second-order backward difference for unequal steps, first-order without a previous state."""
         ratio = dt / self.step_before
         return ((1 + 2 * ratio) / ((1 + ratio) * dt), -(1 + ratio) / dt,
                 ratio**2 / ((1 + ratio) * dt))
@@ -100,14 +91,8 @@ class NewmarkSettings(MotionSettings):
 
 @dataclass(frozen=True)
 class DynamicSensitivities:
-    """Derivatives along a motion.
-
-    Attributes:
-        labels: Name of each of the p columns (:mod:`limber.mechanics.sensitivities`).
-        displacement: Derivatives for the followed nodes [m per parameter], shape [frames, nodes, 3,
-        p].
-        reaction_force: [N per parameter], shape [frames, 3, p] ([frames, g, 3, p] for several).
-    """
+    """Derivatives along a motion by the p parameters of ``labels``: of the followed nodes [frames,
+    nodes, 3, p] [m], and of forces [frames, 3, p] ([frames, g, 3, p] for several) [N]."""
 
     labels: list[str]
     displacement: np.ndarray

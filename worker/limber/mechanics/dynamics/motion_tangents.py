@@ -19,12 +19,8 @@ from limber.mechanics.statics.result import StaticResult
 
 
 class MotionTangents:
-    """Derivatives of the current state with respect to the parameters.
-
-    Args:
-        requested: The requested parameters.
-        followed: Nodes whose derivatives are stored at the frames; None: all.
-    """
+    """Derivatives of the current state by the parameters; frames store those of the ``followed``
+    nodes (None: all)."""
 
     def __init__(self, drive: Drive, settings: NewmarkSettings, requested: ParameterSet,
                  followed: np.ndarray | None):

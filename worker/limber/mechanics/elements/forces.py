@@ -39,12 +39,8 @@ from limber.mechanics.materials.laws import NEO_HOOKE, SMALL_STRAIN
 
 
 class ForceLayout:
-    """Elements in batches, in their own order; the element is the last axis.
-
-    Attributes:
-        nodes [batch, n, LANES], gradients [batch, q, n, 3, LANES], weights [batch, q, LANES]: the
-        arguments of :func:`internal_force`. Padding in the last batch has zero weight.
-    """
+    """Elements in batches, the last axis: nodes [batch, n, LANES], gradients [batch, q, n, 3,
+    LANES], weights [batch, q, LANES] for :func:`internal_force`. Padding has zero weight."""
 
     def __init__(self, tets: np.ndarray, gradients: np.ndarray, weights: np.ndarray):
         count = len(tets)

@@ -45,15 +45,8 @@ def stiffness_quadrature(mesh: TetMesh) -> Quadrature:
 
 
 def element_gradients(mesh: TetMesh, rule: Quadrature) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradients of the shape functions at rest, and volume weights.
-
-    Returns:
-        gradients [1/m], shape [tet_count, q, 3, nodes a tetrahedron], and weights [m^3], shape
-        [tet_count, q]; the weights of an element sum to its volume.
-
-    Raises:
-        InputError: an element is inverted or flat; its number and position are given.
-    """
+    """Return gradients at rest [tet_count, q, 3, n] [1/m], and weights [tet_count, q] [m^3] that
+    sum to the volume. InputError says which element is inverted or flat."""
     local = shape_gradients(rule.points, mesh.tets.shape[1])
     jacobian, determinant = _jacobian(mesh, local)
     _check_orientation(mesh, determinant)
@@ -62,11 +55,8 @@ def element_gradients(mesh: TetMesh, rule: Quadrature) -> tuple[np.ndarray, np.n
 
 
 def _jacobian(mesh: TetMesh, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of positions to local coordinates and their determinants at q points.
-
-    Shapes [tet_count, q, 3, 3] and [tet_count, q]; q is 1 for straight elements, where both are the
-    same at all points.
-    """
+    """Derivatives of positions to local coordinates [tet_count, q, 3, 3] and determinants
+    [tet_count, q]; q is 1 for straight elements, where all points agree."""
     if not has_curved_sides(mesh):
         corners = mesh.nodes[mesh.tets[:, :4]]
         jacobian = (corners[:, 1:] - corners[:, :1])[:, None]
@@ -76,12 +66,8 @@ def _jacobian(mesh: TetMesh, local: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def node_weights(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return the integrals of N_a N_b over each element, consistent and lumped.
-
-    Returns:
-        consistent [m^3], shape [tet_count, n, n], and lumped [m^3], shape [tet_count, n]: the
-        diagonal scaled to the element's volume (Hinton, Rock and Zienkiewicz 1976), positive.
-    """
+    """Return integrals of N_a N_b [tet_count, n, n] [m^3], and lumped [tet_count, n]: the diagonal
+    scaled to the volume (Hinton, Rock and Zienkiewicz 1976), positive."""
     shape, weights = _weighted_shapes(mesh)
     consistent = np.einsum("eq,qa,qb->eab", weights, shape, shape, optimize=True)
     diagonal = np.einsum("eaa->ea", consistent)
@@ -90,10 +76,8 @@ def node_weights(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def volume_weights(mesh: TetMesh) -> np.ndarray:
-    """Return the integral of each shape function over each element [m^3], shape [tet_count, n].
-
-    Those of the corners of a quadratic element are negative: gravity times density is consistent.
-    """
+    """Return the integral of each shape function [tet_count, n] [m^3]. Those of a quadratic
+    element's corners are negative: gravity times density is consistent."""
     shape, weights = _weighted_shapes(mesh)
     return np.einsum("eq,qa->ea", weights, shape)
 

@@ -42,10 +42,8 @@ VOLUME_TERMS = 10
 def _strain_pairs(points: int) -> Callable:
     @compiled
     def strain_pairs(one, two, terms, lam, mu, block):
-        """Add the blocks of St. Venant-Kirchhoff elements, summed over a few points.
-
-        With u = F g it is lambda u u'^T + mu u' u^T + mu (g g') F F^T + (g S g') 1.
-        """
+        """Add the blocks of St. Venant-Kirchhoff elements, summed over a few points. With u = F g
+        it is lambda u u'^T + mu u' u^T + mu (g g') F F^T + (g S g') 1."""
         for l in range(LANES):
             o00 = o11 = o22 = o01 = o10 = o02 = o20 = o12 = o21 = 0.0
             b00 = b11 = b22 = b01 = b02 = b12 = 0.0
@@ -88,11 +86,9 @@ def _strain_pairs(points: int) -> Callable:
 def _volume_pairs(points: int) -> Callable:
     @compiled
     def volume_pairs(one, two, terms, both, block):
-        """Add the blocks of stable neo-Hookean elements, summed over a few points.
-
-        With c = cof(F) g it is mu (g g') 1 + (lambda + mu) c c'^T + the skew matrix of pressure F
-        (g' x g), from the change of the cofactor.
-        """
+        """Add the blocks of stable neo-Hookean elements. With c = cof(F) g it is mu (g g') 1 +
+        (lambda + mu) c c'^T + the skew matrix of pressure F (g' x g), from the change of the
+        cofactor."""
         for l in range(LANES):
             n00 = n11 = n22 = n01 = n10 = n02 = n20 = n12 = n21 = 0.0
             t0 = t1 = t2 = own = 0.0
@@ -212,21 +208,9 @@ def scatter_block(block, slots, lengths, is_diagonal, values):
 @compiled
 def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, lame_mu, nodes,
                       material, growth, memory, slots, lengths, values):
-    """Add the tangent stiffness [N/m] of all elements to ``values``.
-
-    Args:
-        displacement: See limber.mechanics.elements.forces.
-        increment: The last increment of the displacement. The geometric part then uses the stress
-            at the strain less dH^T dH / 2, with dH the increment's gradient: the stress that the
-            last linearisation predicted (mixed integration points, Magisano, Leonetti and Garcea
-            2017). Without rows: Newton's. Only for St. Venant-Kirchhoff.
-        gradients, weights: Shapes [batch, q, n, 3, LANES] and [batch, q, LANES].
-        lame_lambda, lame_mu: Shape [batch, LANES].
-        nodes: Shape [batch, n, LANES].
-        growth, memory: See limber.mechanics.elements.forces; memory of shape [batch, q, 6, LANES].
-        slots, lengths: Shape [batch, pairs, LANES]; pair (a, b <= a) has number a (a+1)/2 + b.
-        values: Lower triangle by columns, followed by a few numbers of scratch space.
-    """
+    """Add all elements' tangent stiffness [N/m] to ``values``. With an ``increment`` (St.
+    Venant-Kirchhoff; without rows: Newton) the stress is that at the strain less dH^T dH / 2, as
+    the last linearisation predicted (mixed points, Magisano, Leonetti and Garcea 2017)."""
     batch_count, point_count = weights.shape[0], weights.shape[1]
     node_count = nodes.shape[1]
     flat = gradients.reshape(batch_count, point_count, 3 * node_count * LANES)
@@ -487,15 +471,8 @@ def _add_volume_pairs(one, two, terms, both, point_count, block):
 def moduli_stiffness(displacement: np.ndarray, gradients: np.ndarray, weights: np.ndarray,
                      moduli: np.ndarray, nodes: np.ndarray, slots: np.ndarray,
                      lengths: np.ndarray, values: np.ndarray) -> None:
-    """Add the integral of B^T C B [N/m] of all elements to ``values``; B gives the strain's change.
-
-    An element may have any number of nodes.
-
-    Args:
-        moduli: C by rows, 00 11 22 and shear angles 01 02 12 [Pa], shape [batch, q, 36, LANES].
-        displacement, gradients, weights, nodes, slots, lengths, values: See
-            limber.mechanics.elements.stiffness.
-    """
+    """Add the integral of B^T C B [N/m] of all elements to ``values``, B the strain's change, C
+    [batch, q, 36, LANES] [Pa] by rows 00 11 22 and shear angles 01 02 12."""
     batch_count, point_count = weights.shape[0], weights.shape[1]
     node_count = nodes.shape[1]
     flat = gradients.reshape(batch_count, point_count, 3 * node_count * LANES)

@@ -101,14 +101,7 @@ def add_pull(P, gradients, pull):
 @compiled
 def largest_principal_strains(displacement, mean_gradients, nodes, carried, out):
     """Write each element's largest principal Green-Lagrange strain of its mean deformation.
-
-    Args:
-        displacement: [m], shape [node_count, 3].
-        mean_gradients, nodes: From limber.mechanics.elements.forces.ForceLayout.
-        carried: Strain of each element in the mesh's shape, [tet_count, 6] (00 11 22 01 02 12), or
-            no rows.
-        out: Shape [tet_count].
-    """
+    ``carried`` [tet_count, 6] (00 11 22 01 02 12) is that in the mesh's shape, or has no rows."""
     node_count = nodes.shape[1]
     flat = mean_gradients.reshape(len(nodes), 3 * node_count * LANES)
     local, F, E = np.empty(3 * node_count * LANES), np.empty(9 * LANES), np.empty(6 * LANES)

@@ -49,13 +49,8 @@ def make_factor(pattern: "Pattern") -> Factor:
 
 
 def elimination_order(graph: sp.csr_matrix) -> np.ndarray:
-    """Return an order of nodes (new to old) with little fill, by approximate minimum degree.
-
-    Each subtree of the elimination is a contiguous run (postorder).
-
-    Args:
-        graph: Symmetric pattern of the nodes, [n, n].
-    """
+    """Return an order of nodes (new to old) of little fill, by approximate minimum degree on a
+    symmetric pattern [n, n]. Each subtree is a contiguous run (postorder)."""
     try:
         from cvxopt import amd, matrix, spmatrix
     except ImportError:
@@ -76,19 +71,8 @@ _SCRATCH = 9
 
 
 class Pattern:
-    """Lower triangle by columns of the free nodes' stiffness, three rows and columns per node.
-
-    Args:
-        tets: Node indices, shape [tet_count, n].
-        node_count: Nodes of the mesh.
-        free: Whether a node is free, shape [node_count].
-        cliques: Further groups of coupled nodes (pinned patches).
-
-    Attributes:
-        order: Free nodes in elimination order; position: its inverse, -1 if constrained.
-        node_starts, node_rows: The same triangle on nodes, by columns.
-        diagonal: Positions of the diagonal, shape [3 free nodes].
-    """
+    """Lower triangle by columns of the free nodes' stiffness, three rows a node. ``cliques`` are
+    more coupled nodes (pinned patches); ``position`` in ``order`` is -1 if constrained."""
 
     def __init__(self, tets: np.ndarray, node_count: int, free: np.ndarray,
                  cliques: Sequence[np.ndarray] = ()):
@@ -152,12 +136,9 @@ class Pattern:
 
 
 class LaneLayout:
-    """Elements of a pattern in batches; element as last axis, earlier eliminated nodes first.
-
-    Attributes:
-        nodes [batch, n, LANES], gradients [batch, q, n, 3, LANES], weights [batch, q, LANES], slots
-        and lengths [batch, pairs, LANES]: the arguments of the stiffness kernel.
-    """
+    """Elements in batches, the last axis, earlier eliminated nodes first: nodes [batch, n, LANES],
+    gradients [batch, q, n, 3, LANES], weights [batch, q, LANES], slots and lengths [batch, pairs,
+    LANES] for the kernel. Pair (a, b <= a) has number a (a+1)/2 + b."""
 
     def __init__(self, pattern: Pattern, tets: np.ndarray, gradients: np.ndarray,
                  weights: np.ndarray):
@@ -220,30 +201,17 @@ fractions of its mean: from just above round-off to a different matrix.
 
 @dataclass(frozen=True)
 class Viscous:
-    """Viscous stress in motion: the stress is that of the strain ``growth * E + memory``.
-
-    Attributes:
-        growth: 1 plus the damping factor times the derivative of the strain rate to the strain.
-        memory: Contribution of the previous strains, shape [tet_count, q, 6].
-    """
+    """Viscous stress: that of the strain ``growth * E + memory``. Growth is 1 plus damping times
+    the rate's derivative by the strain; memory [tet_count, q, 6] is from earlier strains."""
 
     growth: float
     memory: np.ndarray
 
 
 class Tangent:
-    """A factorised stiffness, optionally with inertia; it stays valid while others are made.
-
-    Its memory returns to the equations when nothing refers to it.
-
-    Attributes:
-        equations: Equations with the constraints of this tangent.
-        is_positive_definite: Whether it was positive definite as assembled. If not, its diagonal
-            was raised until it was: a solution is then still a descent direction of the energy, but
-            not Newton's.
-        diagonal_norm: 2-norm of its diagonal [N/m].
-        drag: Term added to its diagonal on purpose [N/m].
-    """
+    """A factorised stiffness, perhaps with inertia; its memory returns when nothing refers to it.
+    If not positive definite as assembled, the diagonal was raised: solutions are still descent
+    directions, but not Newton's. ``diagonal_norm`` and ``drag``, added on purpose, are in N/m."""
 
     def __init__(self, equations: "Equations", factor: Factor, values: np.ndarray, drag: float):
         self.equations, self._factor = equations, factor
@@ -287,22 +255,14 @@ class Tangent:
         return self._factor.solve(self.equations.pin_rows)
 
     def solve(self, right: np.ndarray, pin_moves: np.ndarray | None = None) -> np.ndarray:
-        """Return the displacement [node_count, 3], 0 at held nodes, for forces ``right``.
-
-        Args:
-            right: Forces [N] on all nodes, shape [node_count, 3]; those on held nodes are ignored.
-            pin_moves: Prescribed means of the pinned patches [m], shape [pinned, 3]; default 0.
-        """
+        """Return the displacement [node_count, 3], 0 at held nodes, for forces ``right`` [N],
+        ignored there, and means of the pinned patches [pinned, 3] [m] (None: 0)."""
         return self.solve_all([right], pin_moves)[0]
 
     def solve_all(self, rights: Sequence[np.ndarray], pin_moves: np.ndarray | None = None,
                   ) -> list[np.ndarray]:
-        """Return the displacements for several forces, as :meth:`solve` does for one.
-
-        Args:
-            rights: The forces, each as for :meth:`solve`.
-            pin_moves: As for :meth:`solve`, or one set per force for S forces, shape [3 pinned, S].
-        """
+        """Return displacements for several forces, each as in :meth:`solve`; ``pin_moves`` as
+        there, or one set a force, [3 pinned, S]."""
         equations = self.equations
         order = equations.pattern.order
         forces = np.stack([right[order].ravel() for right in rights], axis=1)
@@ -332,19 +292,9 @@ class Tangent:
 
 
 class Equations:
-    """Stiffness equations for one set of constraints; shared by models of one mesh.
-
-    Fixed nodes and those of clamped grasps are eliminated. A pinned grasp prescribes the mean of
-    its patch by three Lagrange multipliers, on a stiffness augmented by the outer product of the
-    mean's weights. The augmentation changes no solution, and makes the matrix positive definite
-    wherever the constrained problem is.
-
-    Attributes:
-        held: Whether a node is fixed or clamped, shape [node_count].
-        pinned: The pinned grasps.
-        pin_rows: Constraint rows: the mean of each patch, shape [size, 3 pinned].
-        factorisation_count: Numeric factorisations so far.
-    """
+    """Stiffness equations for one set of constraints, shared by a mesh's models. Clamped nodes are
+    eliminated; a pinned mean has three multipliers, on a stiffness plus the outer product of its
+    weights. This changes no solution, and is positive definite wherever the problem is."""
 
     def __init__(self, tets: np.ndarray, gradients: np.ndarray, weights: np.ndarray,
                  fixed: np.ndarray, grasps: Sequence[Grasp]):
@@ -377,14 +327,8 @@ class Equations:
         return other
 
     def exact_tangent(self, model: "BranchModel", displacement: np.ndarray) -> Tangent:
-        """Return the tangent stiffness at a state; the last one is cached.
-
-        A solve uses it to check whether its end is stable. The derivatives at that end and the next
-        solve need it too.
-
-        Raises:
-            NotPositiveDefiniteError: as for :meth:`tangent`.
-        """
+        """Return the tangent at a state, and keep it: a solve's check of stability, its derivatives
+        and the next solve need it. NotPositiveDefiniteError as for :meth:`tangent`."""
         known = self._known
         if known is None or known[0] is not model or not np.array_equal(known[1], displacement):
             tangent = self.tangent(model, displacement)
@@ -395,20 +339,9 @@ class Equations:
                 increment: np.ndarray | None = None, strain: np.ndarray | None = None,
                 viscous: Viscous | None = None, mass_factor: float = 0.0,
                 drag: float = 0.0) -> Tangent:
-        """Return tangent stiffness plus ``mass_factor`` [1/s^2] times the mass, factorised.
-
-        Args:
-            increment: The last increment [m], for mixed-point Newton; no effect if the force is not
-                cubic.
-            strain: Strain whose stress the geometric part uses instead, shape [tet_count, q, 6]
-                (St. Venant-Kirchhoff only).
-            viscous: Viscous part in motion.
-            drag: Fraction of the mean diagonal that is added to the diagonal.
-
-        Raises:
-            NotPositiveDefiniteError: it is not positive definite, however far its diagonal is
-                raised.
-        """
+        """Return the tangent with ``mass_factor`` [1/s^2] times the mass, factorised. Mixed-point
+        Newton takes ``increment`` [m], ``strain`` [tet_count, q, 6] sets the geometric stress (St.
+        Venant-Kirchhoff). NotPositiveDefiniteError if no raised diagonal helps."""
         # Its memory is reused for the new one.
         self._known = None
         return self.factorised(self.assemble(
@@ -422,12 +355,8 @@ class Equations:
         return self.factorised(self._values[:self.pattern.value_count])
 
     def factorised(self, values: np.ndarray, drag: float = 0.0) -> Tangent:
-        """Return the tangent of assembled ``values``; the diagonal is raised in place if needed.
-
-        Args:
-            values: Lower triangle by columns, from :meth:`assemble`.
-            drag: As for :meth:`tangent`.
-        """
+        """Return the tangent of ``values`` from :meth:`assemble`; the diagonal is raised in place
+        if needed."""
         factor = self._spare.pop() if self._spare else self._twin()
         return Tangent(self, factor, values, drag)
 
@@ -438,10 +367,8 @@ class Equations:
     def assemble(self, model: "BranchModel", displacement: np.ndarray, *,
                  increment: np.ndarray | None = None, strain: np.ndarray | None = None,
                  viscous: Viscous | None = None, mass_factor: float = 0.0) -> np.ndarray:
-        """Return the matrix of :meth:`tangent`, lower triangle by columns, shape [value_count].
-
-        All assembly of these equations writes to the same memory.
-        """
+        """Return the matrix of :meth:`tangent`, lower triangle by columns, shape [value_count]. All
+        assembly of these equations writes to the same memory."""
         if mass_factor:
             np.multiply(self._mass_values(model), mass_factor, out=self._values)
         else:
@@ -469,10 +396,8 @@ class Equations:
 
     def _add_moduli(self, model: "BranchModel", displacement: np.ndarray,
                     viscous: Viscous | None) -> tuple[float, np.ndarray]:
-        """Add the stiffness for a law's own moduli.
-
-        Return growth and memory for which Hooke's kernel adds the law's stress and viscosity.
-        """
+        """Add the stiffness for a law's own moduli. Return growth and memory for which Hooke's
+        kernel adds the law's stress and viscosity."""
         layout, strain = self.layout, model.strains(displacement)
         moduli = model.material.moduli(strain, model.lame_lambda[:, None], model.lame_mu[:, None])
         moduli_stiffness(for_kernels(displacement), layout.gradients, layout.weights,

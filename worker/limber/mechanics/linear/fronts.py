@@ -24,22 +24,9 @@ along with the kernels on 2,752 quadratic tetrahedra; not measured one by one.
 
 @dataclass(frozen=True)
 class Fronts:
-    """Layout of a factor in memory.
-
-    Attributes:
-        first: First node of each supernode, and the node count at the end, shape [count + 1].
-        row_start: Start of each supernode's nodes below in ``rows``, shape [count + 1].
-        rows: Node numbers below, ascending.
-        row_positions: Position of each of ``rows`` in the parent's front, counted in nodes.
-        panel: Start of each supernode's columns in the factor, shape [count + 1].
-        children, child_start: Children of each supernode.
-        work: Start of each update matrix in its work space; there is one work space for even depths
-            of the tree and one for odd depths. depth: selects the work space.
-        work_size: Sizes of the two work spaces, shape [2].
-        value_start: Start of the values of each supernode's columns, shape [count + 1].
-        targets: Position of each value in its supernode's columns.
-        flops: Multiplications and additions of a factorisation.
-    """
+    """Layout of a factor. Per supernode: first node, ``rows`` below with positions in the parent's
+    front, start of columns in ``panel`` and of values, whose ``targets`` are in its columns. Update
+    matrices lie in two work spaces, of even and odd ``depth``."""
 
     first: np.ndarray
     row_start: np.ndarray
@@ -57,23 +44,16 @@ class Fronts:
 
 
 def postordered(graph: sp.csr_matrix, order: np.ndarray) -> np.ndarray:
-    """Return an elimination order with the same fill in which each subtree is a contiguous run.
-
-    Args:
-        graph: Symmetric pattern of the nodes, [n, n].
-        order: New to old, shape [n].
-    """
+    """Return an order of elimination (new to old) with the same fill, in which each subtree is a
+    contiguous run."""
     lower = sp.tril(graph[order][:, order], -1).tocsr()
     parent = _elimination_tree(lower.indptr.astype(np.int64), lower.indices.astype(np.int64))
     return order[_postorder(parent)]
 
 
 def make_fronts(starts: np.ndarray, rows: np.ndarray) -> Fronts:
-    """Return the fronts of a matrix, in postorder.
-
-    Args:
-        starts, rows: Lower triangle with diagonal, on nodes, by columns, sorted.
-    """
+    """Return the fronts of a matrix in postorder from its lower triangle with diagonal, on nodes,
+    by columns, sorted."""
     count = len(starts) - 1
     lower = sp.csc_matrix((np.ones(len(rows), np.int8), rows, starts), (count, count))
     by_rows = sp.tril(lower, -1).tocsr()
@@ -248,11 +228,8 @@ def _supernodes(parent, lengths, widest, zeros_allowed):
 
 @compiled
 def _work_offsets(parents, sizes, children, child_start):
-    """Return depth modulo 2, the start of each update matrix, and the sizes of the work spaces.
-
-    Supernodes are in postorder, so the update matrices of one parity of depth form a stack: a
-    parent's matrix is pushed after its grandchildren's have been popped.
-    """
+    """Return depth modulo 2, the start of each update matrix, and both work spaces' sizes. Matrices
+    of one parity form a stack: a parent's is pushed after its grandchildren's are popped."""
     count = len(parents)
     depth = np.zeros(count, np.int64)
     for s in range(count - 1, -1, -1):

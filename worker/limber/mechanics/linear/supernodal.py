@@ -204,11 +204,7 @@ _COUNT = np.uint64
 
 
 class SupernodalFactor:
-    """Factor of a matrix with a fixed pattern.
-
-    Args:
-        fronts: From limber.mechanics.linear.fronts.
-    """
+    """Factor of a matrix with a fixed pattern."""
 
     def __init__(self, fronts: Fronts):
         self._fronts = fronts
@@ -224,10 +220,7 @@ class SupernodalFactor:
 
     def factorise(self, values: np.ndarray) -> None:
         """Factorise the matrix with these ``values``, lower triangle by columns.
-
-        Raises:
-            NotPositiveDefiniteError: it is not positive definite.
-        """
+        NotPositiveDefiniteError if it is not positive definite."""
         f = self._fronts
         if not _factorise(values, f.value_start, f.targets, f.first, f.row_start, f.panel,
                           f.row_positions, f.children, f.child_start, f.work, f.depth, self._even,
@@ -235,18 +228,13 @@ class SupernodalFactor:
             raise NotPositiveDefiniteError("a pivot is not positive")
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Return the solution for right-hand sides of shape [size] or [size, k].
-
-        Three are solved in the time of one, which is spent on reading the factor; if they are
-        mostly 0, in four fifths of that.
-        """
+        """Return the solution for right sides [size] or [size, k]. Three take the time of one,
+        which goes into reading the factor; if they are mostly 0, four fifths of that."""
         return self.up(self.down(right))
 
     def down(self, right: np.ndarray) -> np.ndarray:
-        """Return the first half of a solution (forward substitution), of the same shape.
-
-        If the right sides are mostly 0, this takes almost no time.
-        """
+        """Return the first half of a solution (forward substitution), of the same shape. If the
+        right sides are mostly 0, this takes almost no time."""
         return self._halved(right, solve_down_one, solve_down_three)
 
     def up(self, half: np.ndarray) -> np.ndarray:
@@ -371,13 +359,8 @@ def _eliminate(columns, width, height, inverse):
 
 @compiled
 def _subtract(columns, width, height, row, begin, runs, target, stride, at):
-    """Subtract the first ``width`` ``columns``' contribution from three columns of ``target``.
-
-    Args:
-        row: Row of ``columns`` that belongs to the first of the three.
-        begin: Row of ``columns`` that belongs to the start of the target; runs: rows / PAD.
-        stride, at: Height of the target and position of its first number.
-    """
+    """Subtract the contribution of the first ``width`` columns from three of ``target``. ``row``
+    belongs to the first of the three, ``begin`` to the target's start; ``runs`` are rows / PAD."""
     h, r, z, n = _COUNT(height), _COUNT(row), _COUNT(begin), _COUNT(runs)
     t0 = _COUNT(at)
     t1 = t0 + _COUNT(stride)

@@ -34,11 +34,8 @@ def tip_node(outdoors: LoadedOutdoors) -> int:
 
 
 def required_rest(outdoors: LoadedOutdoors) -> StaticResult:
-    """Return the equilibrium of the branch under all of its loads.
-
-    Raises:
-        WorkError: no equilibrium was found.
-    """
+    """Return the equilibrium of the branch under all of its loads. WorkError if no equilibrium was
+    found."""
     found = outdoors.rest()
     if not found.converged:
         raise WorkError(Text("The branch has no equilibrium under these loads (", found.message,
@@ -51,28 +48,9 @@ def required_rest(outdoors: LoadedOutdoors) -> StaticResult:
 def load_effects(outdoors: LoadedOutdoors, *, strain_limit: float, deviation: float | None,
                  most: float | None = None, progress: Progress = SILENT,
                  ) -> tuple[Bent, dict[str, Any]]:
-    """Return the branch in equilibrium under its loads, and the reported values.
-
-    Intervals (95 %) are those of a branch that is softer or stiffer throughout, which are the
-    widest.
-
-    Args:
-        outdoors: The branch with its loads.
-        strain_limit: Strain at which the wood is assumed to fail.
-        deviation: Standard deviation of log E, assumed equal for all moduli; None: no intervals.
-        most: Also find the factor on these loads that the branch bears, up to this factor.
-        progress: Receives the progress.
-
-    Returns:
-        The state, and ``tip_displacement_m`` [3], ``sag_m`` (of the tip, along gravity),
-        ``greatest_strain``, ``strain_over_limit``, ``along``, ``frequencies_hz``, ``wind_force_n``,
-        ``added_mass_kg``, ``cut_mass_kg``, ``young_deviation``; with ``most`` also ``bears_times``
-        and ``held_by`` (``strain``, ``equilibrium`` or ``nothing``); and the intervals, or None,
-        for sag, greatest strain, first frequency and the factor borne.
-
-    Raises:
-        WorkError: no equilibrium was found under the loads.
-    """
+    """Return the equilibrium under the loads, and the stage's values, with 95 % intervals of a
+    branch that is softer or stiffer throughout (``deviation`` of log E; None: none). ``most`` also
+    asks for the factor on the loads that it bears, up to this. WorkError if no equilibrium."""
     gravity = outdoors.unloaded.gravity
     down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
     tip = tip_node(outdoors)
@@ -130,8 +108,7 @@ def _limits(outdoors: LoadedOutdoors, others: dict[float, LoadedOutdoors], strai
 def _limit(trouble: Callable[[float], str], guess: float, step: float, most: float,
            ) -> tuple[float, str]:
     """Bisect the fraction of the loads at which failure begins, and return its kind; below ``most``
-    there may be none.
-    """
+    there may be none."""
     low = high = guess
     why = trouble(guess)
     if why:
@@ -166,33 +143,22 @@ _CALM = 0.01  # [m/s]
 
 @dataclass(frozen=True)
 class WindRecord:
-    """A measured wind.
-
-    Attributes:
-        times: [s], ascending, shape [n].
-        speeds: Speeds along the mean direction [m/s], shape [n].
-    """
+    """A measured wind: speeds [n] [m/s] along the mean direction at ascending times [s]."""
 
     times: np.ndarray
     speeds: np.ndarray
 
     @classmethod
     def read(cls, path: Path) -> "WindRecord":
-        """Read a CSV file with ``time_s`` and ``speed_m_s``.
-
-        Raises:
-            InputError: it cannot be read, is too short, or has no forward mean speed.
-        """
+        """Read a CSV file with ``time_s`` and ``speed_m_s``. InputError if it cannot be read, is
+        too short, or has no forward mean speed."""
         columns = read_columns(path, ("time_s", "speed_m_s"), "a wind record")
         return cls.checked(columns["time_s"], columns["speed_m_s"], str(path))
 
     @classmethod
     def checked(cls, times: np.ndarray, speeds: np.ndarray, what: str) -> "WindRecord":
-        """Make a record of external numbers; ``what`` names them in error messages.
-
-        Raises:
-            InputError: as for :meth:`read`.
-        """
+        """Make a record of external numbers; ``what`` names them in error messages. InputError as
+        for :meth:`read`."""
         if len(times) != len(speeds) or len(times) < LEAST_RECORD or not (
                 np.diff(times) >= _LEAST_STEP).all() or not speeds.mean() >= _CALM or (
                 not np.abs(speeds).max() < FASTEST):
@@ -209,14 +175,8 @@ class WindRecord:
         return cls(times, speeds)
 
     def even_wind(self, direction: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Return the steady wind [m/s] with the same mean pressure as this one.
-
-        Args:
-            direction: Direction of the wind; its length is ignored.
-
-        Raises:
-            InputError: the mean pressure is backwards.
-        """
+        """Return the steady wind [m/s] of the same mean pressure along a direction of any length.
+        InputError if the mean pressure is backwards."""
         push = float((self.speeds * np.abs(self.speeds)).mean())
         if not push > 0:
             raise InputError(
@@ -228,14 +188,8 @@ class WindRecord:
 
 @dataclass(frozen=True)
 class Turbulence:
-    """Gusts given by their spectrum; see :func:`~limber.mechanics.loads.outdoor.turbulent`.
-
-    Attributes:
-        intensity: Standard deviation of the speed over its mean.
-        length: Turbulent length scale [m]. The default is that of EN 1991-1-4 at 2 m above open
-            land; among trees it is about their height.
-        seconds: Duration for which the peak is expected; EN 1991-1-4 averages over ten minutes.
-    """
+    """Gusts by their spectrum: deviation over mean of the speed, length scale [m] (default: EN
+    1991-1-4, 2 m above open land; among trees about their height), and time of the peak [s]."""
 
     intensity: float
     length: float = 27.0
@@ -247,11 +201,8 @@ Gusts = WindRecord | Turbulence
 
 def blown(direction: tuple[float, float, float], gusts: Gusts | None,
           ) -> tuple[float, float, float]:
-    """Return the steady wind [m/s] about which the gusts vary; a record has its own.
-
-    Raises:
-        InputError: gusts without a wind, or a record against it.
-    """
+    """Return the steady wind [m/s] about which the gusts vary; a record has its own. InputError if
+    there are gusts without a wind, or a record is against it."""
     if gusts is not None and not np.any(direction):
         raise InputError("Gusts are given without a wind.", "Gusts need a wind with a direction.",
                          "Give ", Option("wind"), " X Y Z.")
@@ -260,21 +211,8 @@ def blown(direction: tuple[float, float, float], gusts: Gusts | None,
 
 def with_peak(outdoors: LoadedOutdoors, gusts: Gusts, damping: RayleighDamping,
               ) -> tuple[LoadedOutdoors, dict[str, Any]]:
-    """Return the loads at the peak of gusts, from the sway of the tip, and the reported values.
-
-    Args:
-        outdoors: The branch under the steady wind, see :func:`blown`.
-        gusts: Gusts of that wind.
-        damping: Damping of the wood.
-
-    Returns:
-        The loads, and ``factor`` (peak load over mean load), ``deviation``, ``peak_factor``,
-        ``crossing_hz``, ``dynamic`` (relative to a quasi-static branch), ``damping`` of the first
-        mode, ``first_frequency_hz``, ``mean_speed_m_s`` and ``mean_tip_displacement_m``.
-
-    Raises:
-        WorkError: the branch finds no equilibrium under the steady wind.
-    """
+    """Return the loads at the peak of gusts of the steady wind, from the sway of the tip, and the
+    reported values. WorkError if there is no equilibrium under the steady wind."""
     mean, tip = required_rest(outdoors), tip_node(outdoors)
     sway = outdoors.sways(mean, tip, damping)
     if isinstance(gusts, WindRecord):

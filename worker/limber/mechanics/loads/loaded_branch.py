@@ -34,13 +34,8 @@ from limber.mechanics.statics.solve import solve_static
 
 @dataclass(frozen=True)
 class NamedTarget:
-    """A point of interest on the branch: a flower, a fruit, a leaf.
-
-    Attributes:
-        name: Name of the target.
-        position: Position on the hanging branch [m].
-        mass: Mass in addition to the scanned branch [kg]; it hung there when it was scanned.
-    """
+    """A point of interest on the hanging branch [m]: a flower, a fruit, a leaf. Its mass [kg] adds
+    to the scan's, and hung there when it was scanned."""
 
     name: str
     position: tuple[float, float, float]
@@ -54,13 +49,8 @@ def target_masses(targets: tuple[NamedTarget, ...]) -> tuple[PointMass, ...]:
 
 @dataclass(frozen=True)
 class LoadedBranch:
-    """A branch as it hangs; see the module's docstring.
-
-    Attributes:
-        model: Model of the scan, which includes the bending by its weight; weightless if requested.
-        targets: Named points on it.
-        grasp_point: Position of the grasp that the mesh marks [m]; None: the patch's centre.
-    """
+    """A branch as it hangs; see the module's docstring. The model includes the bending by its
+    weight, unless weightless; ``grasp_point`` [m] is None at the patch's centre."""
 
     model: BranchModel
     targets: tuple[NamedTarget, ...] = ()
@@ -76,29 +66,18 @@ class LoadedBranch:
         return replace(self, model=self.model.with_young(young))
 
     def marked_grasp(self, mode: Literal["rigid", "point"]) -> Grasp:
-        """Return the grasp that the mesh marks.
-
-        Raises:
-            InputError: none is marked.
-        """
+        """Return the grasp that the mesh marks. InputError if none is marked."""
         return Grasp.from_mesh(self.mesh, mode, self.grasp_point)
 
     def equilibrium(self, grasp: Grasp | None, pose: np.ndarray | None, *,
                     start: StaticResult | np.ndarray | None = None) -> StaticResult:
-        """Return the state with the grasp at a pose [m, rad]; without one the hanging state.
-
-        Energy and force are those of the module's docstring. It does not raise if it does not
-        converge.
-        """
+        """Return the state with the grasp at a pose [m, rad]; without one the hanging state. Energy
+        and force are those of the module's docstring. It does not raise if it does not converge."""
         return solve_static(self.model, grasp=grasp, pose=pose, start=start)
 
     def target_positions(self, displacement: np.ndarray) -> np.ndarray:
-        """Return the positions of the targets [m], shape [targets, 3].
-
-        Args:
-            displacement: Displacement of all nodes from the hanging state [m], shape [node_count,
-            3].
-        """
+        """Return the targets' positions [targets, 3] [m] at a displacement from the hanging
+        state."""
         if not self.targets:
             return np.zeros((0, 3))
         moved = (self._operator @ displacement.ravel()).reshape(-1, 3)
@@ -111,22 +90,8 @@ class LoadedBranch:
 
 def hang(model: BranchModel, targets: tuple[NamedTarget, ...] = (), *, loaded: bool = False,
          progress: Progress = SILENT) -> LoadedBranch:
-    """Return a model's branch as it hangs in its mesh's shape.
-
-    If the branch is too soft to be stable in that shape, all of its weight is left out, and a
-    warning is given.
-
-    Args:
-        model: Its gravity is that of the scan; zero for a branch without weight. Its masses include
-            those of the targets.
-        targets: Named points on it.
-        loaded: Whether further weights are hung on it. They need gravity, so a branch that is too
-            soft is refused.
-        progress: Receives the warning.
-
-    Raises:
-        InputError: it is ``loaded`` and too soft.
-    """
+    """Return a model's branch as it hangs in its mesh's shape. If it is too soft to be stable so,
+    its weight is left out with a warning; InputError if it is ``loaded`` with more weights."""
     if not model.gravity.any():
         return LoadedBranch(model, targets)
     hanging = model.as_scanned()

@@ -41,14 +41,8 @@ _POINTS = 6000
 
 @dataclass(frozen=True)
 class Swaying:
-    """The response of one displacement of a branch to a force that varies as a whole.
-
-    Attributes:
-        frequencies: Frequencies of the modes [Hz], shape [k].
-        damping: Damping ratios, including aerodynamic damping, shape [k].
-        shares: Fraction of each mode in the static response; the remainder to 1 is quasi-static,
-        shape [k].
-    """
+    """The response of one displacement to a force that varies as a whole: modes' frequencies [k]
+    [Hz], damping ratios with air, and shares of the static response (the rest is quasi-static)."""
 
     frequencies: np.ndarray
     damping: np.ndarray
@@ -63,16 +57,8 @@ class Swaying:
 
 @dataclass(frozen=True)
 class GustResponse:
-    """The effect of gusts on a mean load.
-
-    Attributes:
-        factor: The load that statically bends the branch as far as the peak of its sway, over the
-            mean load.
-        deviation: Standard deviation of the displacement over its mean.
-        peak_factor: Standard deviations from mean to peak.
-        crossing: Rate at which the displacement crosses its mean upwards [Hz].
-        dynamic: Standard deviation over that of a quasi-static branch.
-    """
+    """Gusts on a mean load: ``factor`` on the load that bends as far as the sway's peak, deviation
+    over mean, mean to peak in deviations, crossings [Hz], deviation over the quasi-static one."""
 
     factor: float
     deviation: float
@@ -83,17 +69,8 @@ class GustResponse:
 
 def swaying(model: BranchModel, displacement: np.ndarray, force: np.ndarray, tip: int,
             damping: RayleighDamping, air: np.ndarray | None = None) -> Swaying:
-    """Return the response of a node's displacement to a force about an equilibrium.
-
-    Args:
-        model: The branch.
-        displacement: Displacement of the equilibrium [m], shape [node_count, 3].
-        force: The varying force [N], shape [node_count, 3].
-        tip: The node; its displacement is taken in the direction in which the force moves it.
-        damping: Damping of the wood.
-        air: Aerodynamic force per velocity [N s/m], shape [3 node_count, 3 node_count] or as a
-            product with it; None: none.
-    """
+    """Return the response of node ``tip``, along its motion under the varying force [N], about an
+    equilibrium. ``air`` is the aerodynamic force per velocity [N s/m], or a product with it."""
     tangent = model.equations(()).tangent(model, displacement)
     static = tangent.solve(force)[tip]
     direction = static / np.linalg.norm(static)
@@ -109,28 +86,16 @@ def swaying(model: BranchModel, displacement: np.ndarray, force: np.ndarray, tip
 
 
 def wind_spectrum(frequency: np.ndarray, speed: float, length: float) -> np.ndarray:
-    """Return the spectrum of the speed along the wind over its variance [1/Hz], EN 1991-1-4 B.1.
-
-    Args:
-        frequency: [Hz].
-        speed: Mean [m/s].
-        length: Turbulent length scale [m].
-    """
+    """Return the spectrum of the speed along the wind over its variance [1/Hz], EN 1991-1-4 B.1,
+    with the turbulent length scale [m]."""
     slowness = length / speed
     return 6.8 * slowness / (1 + 10.2 * slowness * np.asarray(frequency)) ** (5 / 3)
 
 
 def turbulent(sway: Swaying, speed: float, intensity: float, length: float, seconds: float,
               ) -> GustResponse:
-    """Return the effect of turbulence with a spectrum on a branch.
-
-    Args:
-        sway: Response of the displacement in question.
-        speed: Mean speed of the wind [m/s].
-        intensity: Standard deviation of the speed over its mean.
-        length: Turbulent length scale [m].
-        seconds: Duration for which the peak is expected.
-    """
+    """Return the effect of turbulence of deviation ``intensity`` times the mean speed and length
+    scale [m]; the peak is that expected in ``seconds``."""
     at = _frequencies(sway, speed / length)
     # The contribution of resonance; without it the branch follows all of the turbulence.
     added = np.abs(sway.transfer(at)) ** 2 - 1
@@ -145,13 +110,8 @@ def turbulent(sway: Swaying, speed: float, intensity: float, length: float, seco
 
 
 def recorded(sway: Swaying, times: np.ndarray, speeds: np.ndarray) -> GustResponse:
-    """Return the effect of a recorded wind on a branch; the load goes with the square of its speed.
-
-    Args:
-        sway: Response of the displacement in question.
-        times: [s], ascending, shape [n].
-        speeds: Speeds along the mean wind [m/s], shape [n].
-    """
+    """Return the effect of speeds [n] [m/s] along the mean wind at ascending times [s]; the load
+    goes with the square of the speed."""
     step = float(np.median(np.diff(times)))
     even = np.arange(times[0], times[-1] + step / 2, step)
     load = np.interp(even, times, speeds)
@@ -186,15 +146,8 @@ _REMAINS = 1e-3
 
 @dataclass(frozen=True)
 class Outdoors:
-    """Loads on a branch in addition to its weight as scanned.
-
-    Attributes:
-        wind: Velocity of the air, uniform along the branch [m/s], shape [3].
-        drag: Drag coefficient of a cylinder across the wind, without leaves.
-        snow: Mass per area of the branch projected on the ground [kg/m^2].
-        fruit: Positions [m] and masses [kg].
-        cuts: Positions on the branch [m]; the part beyond them is cut off.
-    """
+    """Loads besides the scanned weight: even wind [m/s], drag coefficient of a leafless cylinder,
+    snow per area on the ground [kg/m^2], fruit, and cuts [m], beyond which the branch goes."""
 
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
     drag: float = 1.1
@@ -205,13 +158,8 @@ class Outdoors:
 
 @dataclass(frozen=True)
 class Bent:
-    """A branch in equilibrium under a load.
-
-    Attributes:
-        displacement: From the hanging state [m], shape [node_count, 3].
-        strains: Largest principal strain of each tetrahedron, including that of its weight, [t].
-        frequencies: Lowest frequencies about this state [Hz], shape [3].
-    """
+    """A branch in equilibrium: displacement from the hanging state [m], largest principal strain
+    [tet_count] with that of its weight, and lowest frequencies [3] [Hz]."""
 
     displacement: np.ndarray
     strains: np.ndarray
@@ -222,17 +170,8 @@ class LoadedOutdoors:
     """A branch with its loads; each is scaled by one fraction."""
 
     def __init__(self, model: BranchModel, skeleton: Skeleton, loads: Outdoors):
-        """Compute forces and masses.
-
-        Args:
-            model: The branch as it hangs.
-            skeleton: Its axes.
-            loads: The loads.
-
-        Raises:
-            InputError: a cut leaves nothing, or is at the base; or the branch has no weight, so
-            that fruit and snow would have none.
-        """
+        """Compute forces and masses. InputError if a cut leaves nothing or is at the base, or the
+        branch has no weight, so that fruit and snow would have none."""
         if (loads.fruit or loads.snow) and not model.gravity.any():
             raise InputError("The branch has no weight, so fruit and snow would have none either.",
                              "Its weight was switched off, or neglected because it could not carry "
@@ -351,14 +290,8 @@ class LoadedOutdoors:
 
 def wind_forces(vectors: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: float,
                 ) -> np.ndarray:
-    """Return the drag on cylinders [N], shape [n, 3], from the flow across each (Morison).
-
-    Args:
-        vectors: Vectors from start to end [m], shape [n, 3].
-        radius: [m], shape [n].
-        wind: [m/s], shape [3].
-        drag: Drag coefficient of a cylinder across the flow.
-    """
+    """Return the drag [n, 3] [N] on cylinders from start to end ``vectors`` [n, 3] [m], from the
+    flow across each (Morison)."""
     length = np.linalg.norm(vectors, axis=1)
     tangent = vectors / np.maximum(length, 1e-300)[:, None]
     across = wind - (tangent @ wind)[:, None] * tangent

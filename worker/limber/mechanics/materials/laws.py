@@ -171,12 +171,8 @@ def law_digest(law: MaterialLaw) -> str:
 
 
 def check_law(law: MaterialLaw) -> None:
-    """Check an external law at a few strains.
-
-    Raises:
-        InputError: it has stress at rest, its derivatives are not those of its energy, it is not
-            linear in the Lamé coefficients, or it is unstable at rest.
-    """
+    """Check an external law at a few strains. InputError if it has stress at rest, wrong
+    derivatives, is not linear in the Lamé coefficients, or is unstable at rest."""
     strain, lam, mu = _tried()
     other = lam[::-1]
     energy = law.energy(strain, lam, mu)
@@ -266,9 +262,7 @@ class Linear(StVenantKirchhoff):
 
 class StableNeoHookean(MaterialLaw):
     """Smith, de Goes and Kim (2018) without the logarithmic barrier; stable in strong compression.
-
-    Its energy is mu/2 (I_C - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2.
-    """
+    Its energy is mu/2 (I_C - 3) - mu (J - 1) + (lambda + mu)/2 (J - 1)^2."""
 
     name = "stable_neo_hookean"
     is_compiled = True
@@ -344,11 +338,8 @@ def material_names() -> tuple[str, ...]:
 
 
 def material_named(name: "str | MaterialLaw") -> "MaterialLaw":
-    """Return the law of that name; a law is returned unchanged.
-
-    Raises:
-        InputError: there is no law of that name, or a package's law cannot be used.
-    """
+    """Return the law of that name; a law is returned unchanged. InputError if there is no law of
+    that name, or a package's law cannot be used."""
     if not isinstance(name, str):
         return name
     if name in BUILT_IN:

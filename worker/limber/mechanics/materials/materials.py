@@ -50,11 +50,8 @@ def lame_by_poisson(young: np.ndarray, poisson: np.ndarray) -> tuple[np.ndarray,
 
 
 def per_tet(name: str, value: float | np.ndarray, tet_count: int) -> np.ndarray:
-    """Return ``value`` for each tetrahedron, shape [tet_count].
-
-    Raises:
-        InputError: neither one number nor one per tetrahedron, or not finite.
-    """
+    """Return ``value`` for each tetrahedron, shape [tet_count]. InputError if it is neither one
+    number nor one per tetrahedron, or not finite."""
     array = np.asarray(value, float)
     if array.ndim > 1 or (array.ndim == 1 and len(array) != tet_count):
         raise InputError(f"{name} has shape {array.shape}; the mesh has {tet_count} tetrahedra.",
@@ -148,11 +145,8 @@ SPECIES = {
 
 
 def strain_limit(name: str) -> float:
-    """Return the largest allowable principal strain for a branch of a species.
-
-    Raises:
-        KeyError: no limit is known for this species.
-    """
+    """Return the largest allowable principal strain for a branch of a species. KeyError if no limit
+    is known for this species."""
     strain = SPECIES[name].rupture_strain
     if strain is None:
         raise KeyError(name)
@@ -179,27 +173,16 @@ LEAST_WOOD = 0.02
 
 @dataclass(frozen=True)
 class LayeredSection:
-    """Layers of the same thickness all along a branch.
-
-    Attributes:
-        pith_radius: Radius of the hollow, or of the pith, which carries nothing [m].
-        bark_thickness: [m].
-        bark_modulus: Young's modulus of the bark over that of the wood.
-    """
+    """Layers of one thickness all along a branch: a pith or hollow that carries nothing [m], and
+    bark [m] whose modulus is relative to the wood's."""
 
     pith_radius: float = 0.0
     bark_thickness: float = 0.0
     bark_modulus: float = 0.0
 
     def bending_factor(self, radius: np.ndarray) -> np.ndarray:
-        """Return the equivalent modulus of solid sections over that of the wood.
-
-        Args:
-            radius: Outer radius [m], any shape.
-
-        Raises:
-            InputError: the layers do not fit into the thinnest section.
-        """
+        """Return the equivalent modulus of solid sections of outer radius [m] over the wood's.
+        InputError if the layers do not fit into the thinnest."""
         wood = radius - self.bark_thickness
         thinnest = float(radius.min())
         if np.any(wood - self.pith_radius < LEAST_WOOD * radius):

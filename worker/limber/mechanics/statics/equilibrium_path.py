@@ -22,13 +22,8 @@ from limber.mechanics.strain import Place, principal_stretch
 
 @dataclass(frozen=True)
 class Target:
-    """The target of a solve: held nodes, means of pinned patches, loads.
-
-    Attributes:
-        held: Displacement of held nodes [m] (others unused), shape [node_count, 3].
-        pins: Displacement of the pinned means [m], shape [pinned, 3].
-        load: Forces on the nodes [N], shape [node_count, 3].
-    """
+    """The target of a solve: displacement of held nodes [node_count, 3] (others unused) and of
+    pinned means [pinned, 3] [m], and loads [node_count, 3] [N]."""
 
     held: np.ndarray
     pins: np.ndarray
@@ -147,22 +142,16 @@ def make_result(problem: StaticProblem, displacement: np.ndarray, state: Interna
 
 
 def base_forces(model: BranchModel, out: np.ndarray) -> np.ndarray:
-    """Return the force of the base on its nodes [N], 0 elsewhere, shape [node_count, 3].
-
-    Args:
-        out: Internal and inertial force less loads on all nodes [N], shape [node_count, 3].
-    """
+    """Return the base's force on its nodes, 0 elsewhere; ``out`` [node_count, 3] [N] is internal
+    and inertial force less loads."""
     base = np.where(model.fixed[:, None], out, 0.0)
     return base if model.prestress is None else base + model.prestress.total.base
 
 
 def grasp_wrench(problem: StaticProblem, grasp: Grasp, positions: np.ndarray, out: np.ndarray,
                  centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return force [N] and torque [Nm] about ``centre`` of a gripper on the branch.
-
-    Args:
-        out: Internal force less loads on all nodes [N], shape [node_count, 3].
-    """
+    """Return force [N] and torque [N m] about ``centre`` of a gripper on the branch; ``out``
+    [node_count, 3] [N] is internal force less loads."""
     if not problem.is_held:
         return np.zeros(3), np.zeros(3)
     forces = out[grasp.nodes]
@@ -174,11 +163,8 @@ def grasp_wrench(problem: StaticProblem, grasp: Grasp, positions: np.ndarray, ou
 
 def checked_forces(values: np.ndarray, shape: tuple[int, ...],
                    name: str = "nodal forces") -> np.ndarray:
-    """Return a nodal field as floats.
-
-    Raises:
-        InputError: the shape is wrong, or a value is not finite.
-    """
+    """Return a nodal field as floats. InputError if the shape is wrong, or a value is not
+    finite."""
     values = np.asarray(values, float)
     if values.shape != shape or not np.isfinite(values).all():
         raise InputError(f"The {name} have shape {values.shape} or are not finite.",
@@ -211,11 +197,8 @@ _MODE_ITERATIONS = 30
 
 
 def settle(path: "Path", part: float) -> float | None:
-    """Let the branch snap to its equilibrium at the fraction ``part`` of the path.
-
-    Each creep step is an implicit Euler step of the gradient flow of the potential, so the
-    potential only falls. Return the length of the step; None if the branch does not come to rest.
-    """
+    """Let the branch snap to its equilibrium at the fraction ``part`` of the path, by implicit
+    Euler steps of the potential's gradient flow. Length of the last; None if it does not rest."""
     if path.model.material.is_linear:
         return None
     target, pins = path.constraint_at(part)
@@ -248,10 +231,8 @@ def settle(path: "Path", part: float) -> float | None:
 def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray,
            load: np.ndarray, drag: float,
            ) -> tuple[np.ndarray, bool, float, bool, float] | None:
-    """Return the state after one creep step, whether it converged quickly, and its imbalance.
-
-    And whether its tangent is positive definite and the norm of its diagonal [N/m].
-    """
+    """Return the state after one creep step, whether it converged quickly, and its imbalance. And
+    whether its tangent is positive definite and the norm of its diagonal [N/m]."""
     model, equations, held = path.model, path.equations, path.equations.held
     moved = np.where(held[:, None], target - start, 0.0)
     now = np.array([g.weights @ start[g.nodes] for g in equations.pinned]).reshape(-1, 3)
@@ -292,10 +273,8 @@ def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray
 
 def pushed_off(model: BranchModel, equations: Equations, state: np.ndarray,
                load: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return a state perturbed off a saddle to the side where the potential falls more.
-
-    And whether there was a mode to push it along.
-    """
+    """Return a state perturbed off a saddle to the side where the potential falls more. And whether
+    there was a mode to push it along."""
     mode, curvature = lowest_mode(model, equations, state)
     if curvature >= 0:
         return state, False
@@ -308,11 +287,8 @@ def pushed_off(model: BranchModel, equations: Equations, state: np.ndarray,
 
 def lowest_mode(model: BranchModel, equations: Equations, state: np.ndarray,
                 ) -> tuple[np.ndarray, float]:
-    """Return the mode of least tangent stiffness [node_count, 3] and its stiffness [N/m].
-
-    Inverse iteration on the tangent whose diagonal was raised until it could be factorised: raising
-    does not change the eigenvectors. The Rayleigh quotient is that of the tangent itself.
-    """
+    """Return the mode of least stiffness [node_count, 3] and its Rayleigh quotient [N/m], by
+    inverse iteration on the tangent with a raised diagonal, which has the same eigenvectors."""
     tangent = equations.tangent(model, state)
     mode = np.random.default_rng(0).normal(size=state.shape)
     for _ in range(_MODE_ITERATIONS):
@@ -389,9 +365,7 @@ class Path:
     def run(self, progress: Progress, guess: np.ndarray | None = None,
             strain: np.ndarray | None = None) -> StaticResult:
         """Follow the path; start from a ``guess`` of its end [node_count, 3] if there is one.
-
-        ``strain`` [tet_count, q, 6] belongs to the guess, if known.
-        """
+        ``strain`` [tet_count, q, 6] belongs to the guess, if known."""
         step = 1.0
         if guess is not None and not self._leap(guess, strain):
             step = 0.5
@@ -478,17 +452,9 @@ class Path:
     def correct(self, trial: np.ndarray, increment: np.ndarray, part: float,
                 diagonal_norm: float, steady: bool, strain: np.ndarray | None = None,
                 ) -> float | None:
-        """Iterate from ``trial`` to equilibrium at the fraction ``part`` of the path.
-
-        Args:
-            trial: Displacement [m], shape [node_count, 3], after ``increment``.
-            diagonal_norm: Of a nearby tangent [N/m]; it gives the floor set by round-off.
-            steady: Whether that tangent is positive definite.
-            strain: Shape [tet_count, q, 6]; given if it is known better than from ``trial``.
-
-        Returns:
-            Length of the step; None if there is none.
-        """
+        """Iterate to equilibrium at the fraction ``part`` of the path; length of the step or None.
+        The ``diagonal_norm`` [N/m] of a nearby tangent, ``steady`` if positive definite, sets the
+        round-off; ``strain`` [tet_count, q, 6] is one known better than from ``trial``."""
         settings, load = self.settings, self.load_at(part)
         best, worse = np.inf, 0
         stable = True
@@ -519,10 +485,7 @@ class Path:
                      load: np.ndarray, residual: np.ndarray,
                      ) -> tuple[np.ndarray, np.ndarray, bool, float] | None:
         """Return the state after a step, its increment, and whether the tangent is stable and its
-        norm.
-
-        The tangent itself is freed, so at most one of a large mesh is in memory.
-        """
+        norm. The tangent itself is freed, so at most one of a large mesh is in memory."""
         mixed = self.problem.mixed
         try:
             tangent = self.equations.tangent(
@@ -542,9 +505,7 @@ class Path:
     def _gone_on(self, trial: np.ndarray, increment: np.ndarray, tangent: Tangent,
                  load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the state after further steps with the same factorisation, and the last increment.
-
-        A step is taken only if it removes most of the imbalance.
-        """
+        A step is taken only if it removes most of the imbalance."""
         _, residual, norm, reference = self._imbalance(trial, load)
         while norm > self._enough(reference, tangent.diagonal_norm):
             further = tangent.solve(residual)
@@ -557,8 +518,7 @@ class Path:
     def _imbalance(self, trial: np.ndarray, load: np.ndarray,
                    ) -> tuple[InternalState, np.ndarray, float, float]:
         """Return the state at ``trial``, the imbalance [N], its norm, and the norm of loads and
-        reactions.
-        """
+        reactions."""
         state = self.model.internal(trial)
         out = load - state.force
         residual = self.equations.free_part(out)
@@ -610,11 +570,8 @@ class Path:
         return taken
 
     def _lost(self, trial: np.ndarray, state: InternalState, part: float) -> float:
-        """Return by how much the potential falls in a step beyond the work of forces and loads.
-
-        Relative to both. The work is integrated by the trapezium rule. Between neighbouring
-        equilibria the difference is only the error of that rule.
-        """
+        """Return the potential's fall in a step beyond the work of forces and loads, relative to
+        both. Between neighbouring equilibria it is only the trapezium rule's error."""
         before, now = self.load_at(self.reached), self.load_at(part)
         moved = trial - self.displacement
         work = 0.5 * float(((self.state.force - before + state.force - now) * moved).sum()
@@ -669,9 +626,7 @@ _SAME = 1e-3
 
 def why_uncertain(path: Path, result: StaticResult) -> str:
     """Return why a converged result may not be the only state of its grasp, or an empty string.
-
-    Free unless the branch snapped; then it costs as much as the path itself.
-    """
+    Free unless the branch snapped; then it costs as much as the path itself."""
     if not path.snaps:
         return ""
     where = f"the branch snapped through at {100 * path.snaps[0][0]:.0f} % of the path"
