@@ -62,7 +62,7 @@ def test_the_command_writes_table_and_figure(planned_branch, tmp_path, monkeypat
         rows = list(csv.DictReader(file))
     assert [row["planner"] for row in rows] == list(COMPARED.values())
     assert (folder / "comparisons/planners.png").stat().st_size > 10_000
-    (title, table), = stage_description("compare").tables(result)
+    (title, table), = stage_description("compare").result.of(result).tables()
     assert "1 random starts" in title and len(table) == 1 + len(COMPARED)
     assert table[1][0] == "copy" and table[1][3] == "" and float(table[5][5]) != 0.0
     monkeypatch.setattr("limber.planning.compared_planners.run_trials", pytest.fail)

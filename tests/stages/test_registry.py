@@ -42,7 +42,7 @@ def parsed(name, arguments):
         seen.extend(given[:3])
         return {}
     stage = stage_description(name)
-    caught = type(stage)(**{**vars(stage), "run": run, "tables": None, "found": ()})
+    caught = type(stage)(**{**vars(stage), "run": run, "result": None, "found": ()})
     command = main.command_of(caught, stage_module(name).__doc__)
     with pytest.raises(SystemExit) as stop:
         command.main(arguments, standalone_mode=False)

@@ -15,7 +15,7 @@ import click
 from limber.batch.job_file import BranchJob, JobFile, StageTask
 from limber.core.errors import InputError, Option
 from limber.core.files.atomic import write_atomically
-from limber.stages.command_line import command_line, stage_options
+from limber.stages.command_line import command_line, given, stage_options
 from limber.stages.registry import stage_description
 
 # A stage's task as the command line that runs it, and back.
@@ -37,8 +37,8 @@ def task_of_line(line: list[str]) -> StageTask:
 
     @click.command(stage.name)
     @stage_options(stage)
-    def command(values: dict[str, Any]) -> StageTask:
-        return StageTask(stage.name, *stage.models(values))
+    def command(**options: Any) -> StageTask:
+        return StageTask(stage.name, *stage.models(given(options)))
 
     return command.main(line[1:], prog_name=f"limber {stage.name}", standalone_mode=False)
 

@@ -144,10 +144,7 @@ def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.
     together with ``command``, ``status``, ``seconds``, ``warnings`` and ``error``.
     """
     def wrap(function: Callable[..., dict[str, Any]]) -> click.Command:
-        @functools.wraps(function)
-        def body(as_json: bool, verbose: bool, progress_style: str, **options: Any) -> None:
-            style = "json" if as_json else "verbose" if verbose else "short"
-            sys.exit(_execute(name, function, style, progress_style, options))
+        body = functools.update_wrapper(functools.partial(_execute, name, function), function)
         decorated = click.option(
             "--progress", "progress_style", type=click.Choice(["auto", "bar", "json", "none"]),
             default="auto", show_default=True,
@@ -165,7 +162,7 @@ def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.
 
 def command_of(stage: "StageDescription", help_text: str) -> click.Command:
     """Make the command of a stage: its inputs, settings and options become options."""
-    from limber.stages.command_line import GroupedOption, stage_options
+    from limber.stages.command_line import GroupedOption, given, stage_options
 
     @stage_command(stage.name)
     @click.option("--schema", cls=GroupedOption, expert=True, is_flag=True, is_eager=True,
@@ -173,10 +170,10 @@ def command_of(stage: "StageDescription", help_text: str) -> click.Command:
                   help="Print the stage's inputs, settings and options as a JSON schema, and "
                        "exit.")
     @stage_options(stage)
-    def command(run: Run, values: dict[str, Any]) -> dict[str, Any]:
-        models = stage.models(values)
+    def command(run: Run, **options: Any) -> dict[str, Any]:
+        models = stage.models(given(options))
         result = stage.run(*models, run.progress)
-        for title, rows in stage.tables(_plain(result)) if stage.tables else ():
+        for title, rows in stage.result.of(_plain(result)).tables() if stage.result else ():
             run.show(title, rows)
         known = {name: value for model in models for name, value in dict(model).items()}
         _close_stage(run, stage, known | _plain(result))
@@ -267,9 +264,11 @@ def _output_lost(error: OSError) -> int:
     return 3
 
 
-def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
-             progress_style: str, options: dict[str, Any]) -> int:
+def _execute(name: str, function: Callable[..., dict[str, Any]], *, as_json: bool, verbose: bool,
+             progress_style: str, **options: Any) -> None:
+    """Run a command's function, print its outcome and exit with its code."""
     started = time.perf_counter()
+    style = "json" if as_json else "verbose" if verbose else "short"
     if progress_style == "auto":
         progress_style = "bar" if sys.stderr.isatty() else "log"
     outcome: dict[str, Any] = {"command": name, "status": "done", "error": None}
@@ -306,7 +305,7 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], style: str,
         outcome["warning_parts"] = [{"text": text, "parts": text.as_json(), "place": text.place}
                                     for text in told]
     _print_outcome(outcome, result or {}, style, state.closing)
-    return code
+    sys.exit(code)
 
 
 def _remedies(error: LimberError) -> list[dict[str, Any]]:

@@ -157,16 +157,15 @@ def settings_options(model: type[BaseModel], name: str = "settings", *,
     fields = {field: model for field in model.model_fields if field not in without}
 
     def wrap(function: Callable) -> Callable:
-        def body(*args: Any, values: dict[str, Any], **options: Any) -> Any:
-            return function(*args, **{name: checked_settings(model, values)}, **options)
+        def body(*args: Any, **options: Any) -> Any:
+            settings = checked_settings(model, given(options, name))
+            return function(*args, **{name: settings}, **options)
         return _with_options(functools.wraps(function)(body), fields, name)
     return wrap
 
 
 def stage_options(stage: StageDescription) -> Callable[[Callable], Callable]:
-    """Add one option for each input, setting and option of a stage. The function gets ``values``,
-    the values given by name, as :meth:`StageDescription.models` takes them.
-    """
+    """Add one option for each input, setting and option of a stage; :func:`given` takes them."""
     fields = {field: model for model in (stage.inputs, stage.settings, stage.options)
               for field in model.model_fields}
     return lambda function: _with_options(function, fields, "stage")
@@ -174,15 +173,17 @@ def stage_options(stage: StageDescription) -> Callable[[Callable], Callable]:
 
 def _with_options(function: Callable, fields: Mapping[str, type[BaseModel]],
                   prefix: str) -> Callable:
-    """Add an option per field of a model; the function gets ``values``, those that were given."""
-    @functools.wraps(function)
-    def body(*args: Any, **options: Any) -> Any:
-        chosen = {field: options.pop(f"{prefix}__{field}") for field in fields}
-        values = {field: value for field, value in chosen.items() if value is not None}
-        return function(*args, values=values, **options)
     for name, model in reversed(fields.items()):
-        body = _parameter(model, name, model.model_fields[name], f"{prefix}__{name}")(body)
-    return body
+        function = _parameter(model, name, model.model_fields[name], f"{prefix}__{name}")(function)
+    return function
+
+
+def given(options: dict[str, Any], prefix: str = "stage") -> dict[str, Any]:
+    """Take from a command's options those of a model's fields, and return the values given."""
+    chosen = {option: options.pop(option) for option in list(options)
+              if option.startswith(f"{prefix}__")}
+    return {option.removeprefix(f"{prefix}__"): value for option, value in chosen.items()
+            if value is not None}
 
 
 def command_line(*models: Settings) -> list[str]:

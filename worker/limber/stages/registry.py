@@ -45,7 +45,6 @@ class StageDescription:
             Empty: it makes none.
         reads: Names of the branch folder's files that it reads; ``{name}`` as in ``key``.
         writes: Names of the files that it writes.
-        tables: Titles and rows to show beside the result; the first row is the header.
         found: Lines of findings, which :func:`limber.cli.terminal.found_lines` fills from inputs,
             settings and result; without any, the whole result is shown.
         then: The usual next command, its names and paths filled in likewise.
@@ -64,8 +63,6 @@ class StageDescription:
     key: str = ""
     reads: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
-    tables: ("Callable[[dict[str, Any]], Sequence[tuple[str, Sequence[Sequence[str]]]]]"
-             " | None") = None
     found: "Sequence[str | Callable[[Mapping[str, Any]], str | None]]" = ()
     then: str = ""
     step: str = ""
@@ -195,7 +192,12 @@ def result_of(branch: "Branch", key: str, values: Mapping[str, Any]) -> "Result"
 def result_kinds() -> "dict[str, type[Result]]":
     """Return the results' models by the first words of the manifest's entries."""
     stages = map(stage_description, stage_summaries())
-    kinds = {stage.key.partition(":")[0]: stage.result for stage in stages if stage.result}
+    # Where two stages make the same entry, it is of the one that it is named after.
+    kinds: dict[str, type[Result]] = {}
+    for stage in stages:
+        word = stage.key.partition(":")[0]
+        if stage.result and (stage.name == word or word not in stage_summaries()):
+            kinds[word] = stage.result
     return kinds | ({"replay": kinds["simulate"]} if "simulate" in kinds else {})
 
 

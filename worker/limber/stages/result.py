@@ -42,6 +42,7 @@ from pydantic import (
 from limber.core.errors import InputError
 from limber.core.files.reading import checked_as
 from limber.core.json_values import number_array, plain
+from limber.core.labels import BESIDE, SCALES, text_of
 from limber.core.optional import require_extra
 
 if TYPE_CHECKING:
@@ -51,12 +52,6 @@ if TYPE_CHECKING:
     from limber.store import Branch
 
 _MOST_PRINTED = 7  # values printed in one line; the notebook's table shows all
-_SCALES = {"mm": ("m", 1e3), "MPa": ("Pa", 1e-6), "mJ": ("J", 1e3), "%": ("", 100.0),
-           "percent": ("%", 1.0)}
-"""Shown units, each with the SI unit of its value and how many of them that is."""
-
-_BESIDE = {"": "", "%": " %", "percent": " %"}
-"""Units that stand with each value; others stand in the heading."""
 
 
 def frozen(values: Any) -> np.ndarray:
@@ -89,24 +84,22 @@ class _Label:
     """How a field is shown; attributes as of :func:`shown`."""
 
     title: str
-    digits: str
-    unit: str
+    form: str
     interval: str
     of: Callable[[Any], Any] | None
     unless_zero: bool
 
     @property
+    def unit(self) -> str:
+        return self.form.partition(" ")[2]
+
+    @property
     def heading(self) -> str:
         """The title with the unit; percent stand with the value."""
-        return f"{self.title} [{self.unit}]" if self.unit not in _BESIDE else self.title
+        return f"{self.title} [{self.unit}]" if self.unit not in BESIDE else self.title
 
     def text(self, value: Any) -> str:
-        if isinstance(value, bool):
-            return "yes" if value else "no"
-        if not isinstance(value, int | float | np.floating):
-            return str(value)
-        scaled = _SCALES.get(self.unit, ("", 1))[1] * value
-        return f"{scaled:{self.digits}}{_BESIDE.get(self.unit, '')}"
+        return text_of(value, self.form)
 
     def between(self, ends: Any) -> str:
         if ends is None or not np.isfinite(ends).all():
@@ -126,9 +119,9 @@ def shown(title: str, form: str = "", *, interval: str = "", of: Callable[[Any],
         unless_zero: Not to show it if it is zero.
         meaning: What it is for the documentation; without it the title, with the SI unit.
     """
-    digits, _, unit = form.partition(" ")
-    si = _SCALES.get(unit, (unit, 1))[0]
-    extra: Any = {"label": _Label(title, digits, unit, interval, of, unless_zero)}
+    unit = form.partition(" ")[2]
+    si = SCALES.get(unit, (unit, 1))[0]
+    extra: Any = {"label": _Label(title, form, interval, of, unless_zero)}
     return Field(None, description=meaning or (f"{title} [{si}]" if si else title),
                  json_schema_extra=extra)
 
@@ -154,6 +147,14 @@ def _unit_name(found: re.Match[str]) -> str:
 
 
 _UNIT_NAMES = re.compile(r"[ ^/%]")
+
+
+Table = tuple[str, list[list[str]]]
+"""A title, and rows of which the first is the header."""
+
+
+def filled(*tables: Table) -> list[Table]:
+    return [(title, rows) for title, rows in tables if rows]
 
 
 @dataclass(frozen=True)
@@ -222,6 +223,13 @@ class Result(BaseModel):
         of_files = {name for name, field in cls.model_fields.items() if field.exclude}
         return {cls._keys.get(key, key): value for key, value in values.items()
                 if key not in of_files}
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Self:
+        """Return the result of a command's output, without its files."""
+        made = cls.model_validate({**values})
+        made._values = MappingProxyType({**values})
+        return made
 
     @classmethod
     def read(cls, branch: "Branch | None", key: str, values: Mapping[str, Any]) -> Self:
@@ -300,10 +308,15 @@ class Result(BaseModel):
 
         if not self.heading:
             return None
-        section = Section(self.heading.format(name=key.partition(":")[2]),
-                          tables=[("", rows)] if len(rows := self.rows()) > 1 else [])
+        rows = self.rows()
+        section = Section(self.heading.format(name=key.partition(":")[2]), tables=[
+            *([("", rows)] if len(rows) > 1 else []), *self.tables()])
         self.illustrate(section, branch, key)
         return section
+
+    def tables(self) -> list[Table]:
+        """Return tables that terminal and report show beside the rows: titles and rows."""
+        return []
 
     def illustrate(self, section: "Section", branch: "Branch", key: str) -> None:
         """Add texts, tables and figures to its section: its pictures."""
@@ -331,7 +344,7 @@ class Result(BaseModel):
     def _shown(self) -> dict[str, str]:
         """The printed values, by label."""
         found = {label.title: f"{value}{f' ({between})' if between else ''}"
-                 f"{f' {label.unit}' if label.unit not in _BESIDE else ''}"
+                 f"{f' {label.unit}' if label.unit not in BESIDE else ''}"
                  for label, value, between in self._labelled()}
         return found or {name: f"{value:.4g}" if isinstance(value, float) else str(value)
                          for name, value in self.values.items()

@@ -18,16 +18,7 @@ from limber.results.findings import (
     path_sentence,
     simulated_pull,
 )
-from limber.results.report.report_tables import (
-    action_rows,
-    cause_rows,
-    deviation_rows,
-    held_out_rows,
-    is_assumed,
-    modulus_rows,
-    pull_rows,
-    rigidity_rows,
-)
+from limber.results.report.report_tables import action_rows, cause_rows, is_assumed
 from limber.results.report.section import Section, inline_png
 from limber.results.report.shape_sections import (
     cylinders_section,
@@ -141,37 +132,6 @@ def _summary(branch: Branch) -> Section:
                          f"interval) [{'cm3' if scale > 1 else unit}]",
                          f"{values[0]} ({values[1]} to {values[2]})"])
     section.tables.append(("", rows))
-    return section
-
-
-def estimate_section(branch: Branch) -> Section:
-    from limber.results.report import estimate_figures
-
-    section = Section("Young's modulus along the branch")
-    estimate = read_estimate(branch.path("estimate.json"))
-    virtual = simulated_pull(branch)
-    section.tables.append((
-        "Estimated" if not virtual else "Estimated against assumed" if is_assumed(virtual)
-        else "Estimated against true", modulus_rows(estimate, virtual)))
-    if is_assumed(virtual):
-        section.text.append(ASSUMED)
-        if estimate.get("truth"):
-            estimate["truth"]["assumed"] = True
-    for title, rows in [
-            ("Flexural rigidity (I: mean of the control point's part)", rigidity_rows(estimate)),
-            ("Sources of uncertainty: standard deviations", deviation_rows(estimate)),
-            ("Modulus by pull", pull_rows(estimate)),
-            ("Pulls predicted by a fit without them: RMS errors",
-             held_out_rows(estimate))]:
-        if rows:
-            section.tables.append((title, rows))
-    section.text.append(
-        f"Method: {estimate['method']}; {estimate['forward_count']} forward simulations; "
-        f"loss {estimate['loss_m2']:.3g} m²; "
-        f"{'converged' if estimate['converged'] else 'NOT converged'}.")
-    for figure, caption in estimate_figures.report_figures(estimate):
-        section.draw(figure, caption)
-    section.text += estimate.get("warnings", [])
     return section
 
 

@@ -2,8 +2,10 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
+from limber.core.labels import place_text, table_of
 from limber.results.findings import ASSUMED, remarks_on
 
 
@@ -102,17 +104,14 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
 
 def leg_rows(legs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return a plan's legs in order; a row is left empty where nothing moves or is known."""
-    rows = [["leg", "from [s]", "for [s]", "length [mm]", "speed [mm/s]", "force [N]",
-             "to obstacles [mm]", "arm to branch [mm]"]]
-    for leg in legs:
-        moves = leg["length_m"] > 0.0
-        rows.append([
-            leg["name"], f"{leg['start_s']:.1f}", f"{leg['duration_s']:.1f}",
-            f"{1e3 * leg['length_m']:.0f}" if moves else "",
-            f"{1e3 * leg['peak_speed_m_s']:.0f}" if moves else "", f"{leg['peak_force_n']:.3g}",
-            *("" if leg.get(key) is None else f"{1e3 * leg[key]:.0f}"
-              for key in ("obstacle_distance_m", "branch_distance_m"))])
-    return rows if len(rows) > 1 else []
+    moving = [leg if leg["length_m"] > 0.0 else {**leg, "length_m": None, "peak_speed_m_s": None}
+              for leg in legs]
+    return table_of(
+        moving, ("leg", "name"), ("from [s]", "start_s", ".1f"), ("for [s]", "duration_s", ".1f"),
+        ("length [mm]", "length_m", ".0f mm"), ("speed [mm/s]", "peak_speed_m_s", ".0f mm"),
+        ("force [N]", "peak_force_n", ".3g"),
+        ("to obstacles [mm]", "obstacle_distance_m", ".0f mm"),
+        ("arm to branch [mm]", "branch_distance_m", ".0f mm"))
 
 
 def _below(plan: Mapping[str, Any]) -> list[list[str]]:
@@ -165,14 +164,12 @@ def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
         estimate: ``causes``, each with ``cause``, ``share``, ``deviation`` and ``advice``
             (:func:`limber.estimation.uncertainty.covariance.largest`).
     """
-    causes = estimate.get("causes") or []
-    if not causes:
-        return []
-    rows = [["cause", "fraction of the variance", "resulting deviation of E",
-             "what would reduce it"]]
-    return rows + [[each["cause"], f"{100 * each['share']:.0f} %",
-                    f"up to {100 * min(each['deviation'], 99.0):.1f} %", each["advice"]]
-                   for each in causes]
+    return table_of(
+        estimate.get("causes") or [], ("cause", "cause"),
+        ("fraction of the variance", "share", ".0f %"),
+        ("resulting deviation of E",
+         lambda each: f"up to {100 * min(each['deviation'], 99.0):.1f} %"),
+        ("what would reduce it", "advice"))
 
 
 def action_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
@@ -182,13 +179,11 @@ def action_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
         estimate: ``next_actions``, as of
             :meth:`limber.estimation.uncertainty.next_actions.Prospects.best`.
     """
-    actions = estimate.get("next_actions") or []
-    if not actions:
-        return []
-    rows = [["action", "how", "intervals shrink by", "E then known to [MPa]"]]
-    return rows + [[each["action"], each["how"], f"{100 * (1 - each['width_share']):.0f} %",
-                    "; ".join(f"{low / 1e6:.4g} to {high / 1e6:.4g}"
-                              for low, high in each["young_interval_pa"])] for each in actions]
+    return table_of(
+        estimate.get("next_actions") or [], ("action", "action"), ("how", "how"),
+        ("intervals shrink by", lambda each: 1 - each["width_share"], ".0f %"),
+        ("E then known to [MPa]", lambda each: "; ".join(
+            f"{low / 1e6:.4g} to {high / 1e6:.4g}" for low, high in each["young_interval_pa"])))
 
 
 def pull_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
@@ -198,13 +193,11 @@ def pull_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
         estimate: ``pull_moduli`` and ``drift``
             (:mod:`limber.estimation.uncertainty.drift`).
     """
-    moduli = estimate.get("pull_moduli") or []
-    if not moduli:
-        return []
-    rows = [["pull", "recorded", "E over the joint E", "95 % interval"]]
-    rows += [[each["pull"], each["recorded"] or "-", f"{each['factor']:.3g}",
-              "{:.3g} to {:.3g}".format(*each["interval"])] for each in moduli]
-    if change := estimate.get("drift"):
+    rows = table_of(
+        estimate.get("pull_moduli") or [], ("pull", "pull"),
+        ("recorded", lambda each: each["recorded"] or "-"), ("E over the joint E", "factor", ".3g"),
+        ("95 % interval", lambda each: "{:.3g} to {:.3g}".format(*each["interval"])))
+    if rows and (change := estimate.get("drift")):
         low, high = change["interval"]
         rows.append(["change per day", "", f"{100 * change['per_day']:+.2g} %",
                      f"{100 * low:+.2g} to {100 * high:+.2g} %"])
@@ -219,65 +212,56 @@ def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
             ``relative_force`` (each None if not measured) and ``in_fit``.
     """
     scores = estimate.get("held_out") or {}
-    if not scores:
-        return []
-    rows = [["pull", "points [mm]", "relative to travel", "force [N]", "relative to peak",
-             "predicted by"]]
-    for name, score in scores.items():
-        rows.append([
-            name, _known(score.get("rms_m"), "{:.2f}", 1e3),
-            _known(score.get("relative_distance"), "{:.1f} %", 100),
-            _known(score.get("rms_force_n"), "{:.3g}"),
-            _known(score.get("relative_force"), "{:.1f} %", 100),
-            "the other pulls" if score.get("in_fit", True) else "this estimate"])
-    return rows
+    return table_of(
+        [{"pull": name, **score} for name, score in scores.items()], ("pull", "pull"),
+        ("points [mm]", "rms_m", ".2f mm"), ("relative to travel", "relative_distance", ".1f %"),
+        ("force [N]", "rms_force_n", ".3g"), ("relative to peak", "relative_force", ".1f %"),
+        ("predicted by", lambda score: "the other pulls" if score.get("in_fit", True)
+         else "this estimate"), missing="-")
 
 
 
 def share_rows(shares: Mapping[str, float]) -> list[list[str]]:
     """Return the fraction of the axes' length that has each state of the radius."""
-    return [["radius", "fraction of the axes' length"],
-            *([name, f"{100 * share:.1f} %"] for name, share in shares.items())]
+    return table_of(shares.items(), ("radius", itemgetter(0)),
+                    ("fraction of the axes' length", itemgetter(1), ".1f %"))
 
 
 def order_rows(orders: Sequence[Mapping[str, float]]) -> list[list[str]]:
     """Return branches, length, volume and taper of each branching order, and in total."""
-    def row(name: str, part: Mapping[str, float]) -> list[str]:
-        return [name, f"{part['branch_count']:.0f}", f"{part['length_m']:.3f}",
-                f"{1e6 * part['volume_m3']:.1f}", f"{1e3 * part['taper']:.2f}"]
-    whole = {name: sum(part[name] for part in orders)
-             for name in ("branch_count", "length_m", "volume_m3")}
+    whole: dict[str, Any] = {name: sum(part[name] for part in orders)
+                             for name in ("branch_count", "length_m", "volume_m3")}
     whole["taper"] = sum(part["taper"] * part["length_m"] for part in orders) / max(
         whole["length_m"], 1e-300)
-    return [["order", "branches", "length [m]", "volume [cm3]", "taper [mm of radius per m]"],
-            *(row(str(part["order"]), part) for part in orders), row("all", whole)]
+    return table_of(
+        [*orders, {**whole, "order": "all"}], ("order", "order"),
+        ("branches", "branch_count", ".0f"), ("length [m]", "length_m", ".3f"),
+        ("volume [cm3]", "volume_m3", ".1f cm3"),
+        ("taper [mm of radius per m]", "taper", ".2f mm"))
 
 
 def diameter_rows(diameters: Sequence[Mapping[str, float]]) -> list[list[str]]:
     """Return diameters at fractions of the main path's length."""
-    return [["fraction of the main path", "from the root [m]", "diameter [mm]",
-             "standard deviation [mm]"],
-            *([f"{100 * row['share']:.0f} %", f"{row['along_m']:.3f}",
-               f"{1e3 * row['diameter_m']:.2f}", _known(row["sigma_m"] or None, "{:.2f}", 1e3)]
-              for row in diameters)]
+    return table_of(
+        diameters, ("fraction of the main path", "share", ".0f %"),
+        ("from the root [m]", "along_m", ".3f"), ("diameter [mm]", "diameter_m", ".2f mm"),
+        ("standard deviation [mm]", lambda row: row["sigma_m"] or None, ".2f mm"), missing="-")
 
 
 def caliper_rows(compared: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return the scan's diameters and those measured with calipers."""
-    return [["from the root [m]", "calipers [mm]", "scan [mm]", "difference",
-             "in standard deviations"],
-            *([f"{row['along_m']:.3f}", f"{1e3 * row['measured_m']:.2f}",
-               f"{1e3 * row['diameter_m']:.2f}", f"{100 * row['difference']:+.1f} %",
-               _known(row["sigmas"], "{:+.1f}")] for row in compared)]
+    return table_of(
+        compared, ("from the root [m]", "along_m", ".3f"),
+        ("calipers [mm]", "measured_m", ".2f mm"), ("scan [mm]", "diameter_m", ".2f mm"),
+        ("difference", "difference", "+.1f %"),
+        ("in standard deviations", "sigmas", "+.1f"), missing="-")
 
 
 def edit_rows(effects: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return what edits of a skeleton did: ``do``, ``at`` [3], ``off_m``, ``length_change_m``."""
-    rows = [["edit", "took the node at", "off [mm]", "length added [mm]"]]
-    for each in effects:
-        rows.append([each["do"], " ".join(f"{value:.8g}" for value in each["at"]),
-                     f"{1e3 * each['off_m']:.1f}", f"{1e3 * each['length_change_m']:+.0f}"])
-    return rows
+    return table_of(
+        effects, ("edit", "do"), ("took the node at", lambda each: place_text(each["at"])),
+        ("off [mm]", "off_m", ".1f mm"), ("length added [mm]", "length_change_m", "+.0f mm"))
 
 
 def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
@@ -298,17 +282,16 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
              "limited radius": "radius, split (two limbs)", "radius jump": "radius, split",
              "bridged gap": "confirm, bridge", "kink": "move", "starts backwards": "bridge",
              "attachment": "bridge", "root": "root"}
-    rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "uncertainty", "edit"]]
-    for part in doubtful:
-        value = part["value"]
-        if part["kind"] in ("kink", "starts backwards"):
-            value = math.degrees(value)
-        rows.append([part["kind"], str(part["branch"]),
-                     " ".join(f"{value:.8g}" for value in part["at"]),
-                     f"{1e3 * part['length_m']:.0f}", f"{1e3 * part['radius_m']:.2f}",
-                     value_formats[part["kind"]].format(value) if part["kind"] in value_formats
-                     else "no points", edits[part["kind"]]])
-    return rows
+
+    def uncertainty(part: Mapping[str, Any]) -> str:
+        angle = part["kind"] in ("kink", "starts backwards")
+        value = math.degrees(part["value"]) if angle else part["value"]
+        return value_formats.get(part["kind"], "no points").format(value)
+    return table_of(
+        doubtful, ("what", "kind"), ("branch", "branch"),
+        ("at", lambda part: place_text(part["at"])), ("length [mm]", "length_m", ".0f mm"),
+        ("radius [mm]", "radius_m", ".2f mm"), ("uncertainty", uncertainty),
+        ("edit", lambda part: edits[part["kind"]]))
 
 
 def alternative_rows(graphs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
@@ -318,14 +301,17 @@ def alternative_rows(graphs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
         graphs: Each with ``probability``, ``length_m`` and ``edits``, as of `limber skeleton`.
     """
     used = max(graphs[0]["probability"], 1e-300)
-    rows = [["number", "against the one in use", "length [mm]", "what differs"]]
-    for number, graph in enumerate(graphs, start=1):
-        texts = [" ".join([edit["do"], *(
-            f"{name} {' '.join(f'{value:.8g}' for value in edit[name])}"
-            for name in ("at", "to") if name in edit)]) for edit in graph["edits"]]
-        rows.append([str(number), f"{graph['probability'] / used:.2g} times as likely",
-                     f"{1e3 * graph['length_m']:.0f}", "; ".join(texts) or "in use"])
-    return rows
+
+    def differs(graph: Mapping[str, Any]) -> str:
+        return "; ".join(" ".join([edit["do"], *(
+            f"{name} {place_text(edit[name])}" for name in ("at", "to") if name in edit)])
+            for edit in graph["edits"]) or "in use"
+    return table_of(
+        enumerate(graphs, start=1), ("number", itemgetter(0)),
+        ("against the one in use",
+         lambda each: f"{each[1]['probability'] / used:.2g} times as likely"),
+        ("length [mm]", lambda each: each[1]["length_m"], ".0f mm"),
+        ("what differs", lambda each: differs(each[1])))
 
 
 def _holds(estimate: Mapping[str, Any], number: int, truth: float) -> bool:
@@ -336,10 +322,6 @@ def _holds(estimate: Mapping[str, Any], number: int, truth: float) -> bool:
 def _mpa(value: float) -> str:
     """Four digits, in the unit of the column [MPa]."""
     return f"{float(f'{value / 1e6:.4g}'):,.10g}"
-
-
-def _known(value: float | None, form: str, scale: float = 1.0) -> str:
-    return "-" if value is None else form.format(scale * value)
 
 
 def _interval(estimate: Mapping[str, Any], number: int) -> str:

@@ -19,7 +19,7 @@ from limber.core.settings import Groups
 from limber.estimation.settings import EstimateSettings, FitSpec
 from limber.stages.inputs import BranchInputs, RunOptions
 from limber.stages.registry import StageDescription
-from limber.stages.result import Numbers, Picture, Result, frozen, of_files, shown
+from limber.stages.result import Numbers, Picture, Result, Table, filled, frozen, of_files, shown
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -102,10 +102,48 @@ class Estimate(Result):
                 "fractions": frozen(file["fractions"]),
                 "control_points": frozen(file["control_points_m"])}
 
-    def section(self, branch: Branch, key: str) -> Section:
-        from limber.results.report.page import estimate_section
+    def tables(self) -> list[Table]:
+        from limber.results.report.report_tables import action_rows, cause_rows, modulus_rows
 
-        return estimate_section(branch)
+        return filled(("Young's modulus", modulus_rows(self.values, None)), *self._details(),
+                      ("Sources of uncertainty, largest first", cause_rows(self.values)),
+                      ("What to do next, best first", action_rows(self.values)))
+
+    def _details(self) -> list[Table]:
+        from limber.results.report import report_tables as rows_of
+
+        known = self.file or self.values
+        return filled(
+            ("Flexural rigidity (I: mean of the control point's part)",
+             rows_of.rigidity_rows(known)),
+            ("Sources of uncertainty: standard deviations",
+             rows_of.deviation_rows(known) if "fractions" in known else []),
+            ("Modulus by pull", rows_of.pull_rows(known)),
+            ("Pulls predicted by a fit without them: RMS errors", rows_of.held_out_rows(known)))
+
+    def section(self, branch: Branch, key: str) -> Section:
+        from limber.results.findings import ASSUMED, simulated_pull
+        from limber.results.report.estimate_figures import report_figures
+        from limber.results.report.report_tables import is_assumed, modulus_rows
+        from limber.results.report.section import Section
+
+        estimate, pull = self.file, simulated_pull(branch)
+        title = ("Estimated" if not pull else "Estimated against assumed" if is_assumed(pull)
+                 else "Estimated against true")
+        section = Section(self.heading, tables=[(title, modulus_rows(estimate, pull)),
+                                                *self._details()])
+        if is_assumed(pull):
+            section.text.append(ASSUMED)
+            if estimate.get("truth"):
+                estimate["truth"]["assumed"] = True
+        section.text.append(
+            f"Method: {estimate['method']}; {estimate['forward_count']} forward simulations; "
+            f"loss {estimate['loss_m2']:.3g} m²; "
+            f"{'converged' if estimate['converged'] else 'NOT converged'}.")
+        for figure, caption in report_figures(estimate):
+            section.draw(figure, caption)
+        section.text += estimate.get("warnings", [])
+        return section
 
 
 def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = False,
@@ -379,30 +417,6 @@ def _with_bag(branch_folder: Path, bag: Path, cell: Path | None, settings: Estim
     return settings.model_copy(update={"pull": tuple(dict.fromkeys((*settings.pull, name)))})
 
 
-def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    from limber.results.report.report_tables import (
-        action_rows,
-        cause_rows,
-        held_out_rows,
-        modulus_rows,
-        pull_rows,
-        rigidity_rows,
-    )
-
-    tables = [("Young's modulus", modulus_rows(result, None))]
-    if rigidity := rigidity_rows(result):
-        tables.append(("Flexural rigidity (I: mean of the control point's part)", rigidity))
-    if causes := cause_rows(result):
-        tables.append(("Sources of uncertainty, largest first", causes))
-    if actions := action_rows(result):
-        tables.append(("What to do next, best first", actions))
-    if by_pull := pull_rows(result):
-        tables.append(("Modulus by pull", by_pull))
-    if held_out := held_out_rows(result):
-        tables.append(("Pulls predicted by a fit without them: RMS errors", held_out))
-    return tables
-
-
 def _moduli_line(values: Mapping[str, Any]) -> str:
     from limber.results.findings import ASSUMED_PULL, modulus_sentence, simulated_pull
 
@@ -414,7 +428,7 @@ STAGE = StageDescription(
     "estimate", 70, run, BranchInputs, EstimateSettings, EstimateOptions, key="estimate",
     result=Estimate,
     reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("estimate.json", "mesh.vtu"),
-    tables=_tables, found=(
+    found=(
         _moduli_line, "Main cause of the uncertainty: {causes[0][cause]} "
         "({causes[0][share]:share} of the variance). Remedy: {causes[0][advice]}.",
         "Next: {next_actions[0][action]}, {next_actions[0][how]}."),

@@ -17,6 +17,7 @@ from limber.core.errors import InputError, Option, Text
 from limber.core.files.atomic import file_digest
 from limber.core.files.reading import read_json
 from limber.core.json_values import number_array
+from limber.core.labels import table_of
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings, possible_force
 from limber.stages.inputs import BranchInputs, RunOptions, by_name
@@ -26,6 +27,7 @@ from limber.stages.result import (
     Numbers,
     Picture,
     Result,
+    Table,
     Vector,
     frozen,
     kept,
@@ -162,6 +164,13 @@ class Load(Result):
         path = branch.path(f"loads/{key.partition(':')[2]}.json")
         return path, read_json(path, "the effects of loads")
 
+    def tables(self) -> list[Table]:
+        limit = self.strain_over_limit / max(self.greatest_strain, 1e-300)
+        return [("Greatest strain along the main path", table_of(
+            self.values["along"], ("from [m]", "from_m", ".3f"), ("to [m]", "to_m", ".3f"),
+            ("strain", "strain", ".5f"),
+            ("of the limit", lambda row: limit * row["strain"], ".0f %")))]
+
     def illustrate(self, section: Section, branch: Branch, key: str) -> None:
         from limber.results.report.loads_section import bent_branch
         from limber.store.loading import load_mesh
@@ -296,14 +305,6 @@ def _require_near(nodes: np.ndarray, points: list[_Place]) -> None:
                              "A fruit must hang on the branch.", "Check frame and unit.").at(point)
 
 
-def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    limit = result["strain_over_limit"] / max(result["greatest_strain"], 1e-300)
-    return [("Greatest strain along the main path", [
-        ["from [m]", "to [m]", "strain", "of the limit"],
-        *([f"{row['from_m']:.3f}", f"{row['to_m']:.3f}", f"{row['strain']:.5f}",
-           f"{100 * limit * row['strain']:.0f} %"] for row in result["along"])])]
-
-
 def _failure_line(result: Mapping[str, Any]) -> str:
     from limber.results.findings import failure_sentence
 
@@ -314,7 +315,6 @@ STAGE = StageDescription(
     "load", 45, by_name(load, folder="branch_folder"), BranchInputs, LoadSettings, RunOptions,
     key="load:{name}", result=Load, reads=("mesh.vtu", "skeleton.swc"),
     writes=("loads/{name}.json", "frames/load-{name}.pc2", "frames/load-{name}.json"),
-    tables=_tables,
     found=("Under the loads the tip sags by {sag_m:m}; greatest strain {greatest_strain:share}, "
            "{strain_over_limit:share} of the limit; first frequency {frequencies_hz[0]:Hz}.",
            _failure_line,

@@ -11,15 +11,17 @@ from pydantic import Field
 
 from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.core.files.tables import table_text
+from limber.core.labels import table_of
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import POSITION, Groups, Settings
 from limber.planning.settings import PlanSettings
 from limber.stages.inputs import ParallelOptions, PlacedInputs, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import Result, Table, shown
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from limber.planning.compared_planners import ComparedTrial
 
@@ -51,6 +53,31 @@ class CompareSettings(Settings):
     max_detour: float | None = Field(8.1, ge=0, le=1000, description=(
         "Largest extra length of the gentle path over that of RRT* [%]. Default: the paper's "
         "mean."))
+
+
+class Comparison(Result):
+    """Planners on the branch's energy field, from random starts."""
+
+    heading = "Planners compared: {name}"
+
+    trial_count: int = shown("random starts", ",")
+    planned_count: int = shown("of them planned", ",")
+    gap_percent_median: float = shown("median of the gap to the best possible path", ".2g percent",
+                                      meaning="median gap to the best possible path")
+
+    def tables(self) -> list[Table]:
+        """In the paper's form: each planner against RRT*, mean and deviation over the trials."""
+        from limber.planning.compared_planners import BASELINE, COMPARED
+
+        def saved(key: str) -> Callable[[tuple[str, dict[str, Any]]], str]:
+            return lambda each: "" if each[0] == BASELINE else f"{each[1][key]:.2f}"
+        return [(f"Planners over {self.planned_count} random starts, on the energy field", table_of(
+            self.values["planners"].items(), ("branch", lambda _: self.values["branch"]),
+            ("planner", lambda each: COMPARED[each[0]]),
+            ("path length [m]", lambda each: _spread(each[1], "length_m", ".3f")),
+            ("longer [%]", saved("longer_percent")),
+            ("deformation energy [N mm]", lambda each: _spread(each[1], "energy_sum_nmm", ".2f")),
+            ("saved [%]", saved("saved_percent"))))]
 
 
 def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
@@ -110,21 +137,6 @@ def _rows(trials: Sequence[ComparedTrial]) -> str:
         for trial in trials for path, score in trial.scores.items()))
 
 
-def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    """In the paper's form: each planner against RRT*, mean and deviation over the trials."""
-    from limber.planning.compared_planners import BASELINE, COMPARED
-
-    rows = [["branch", "planner", "path length [m]", "longer [%]", "deformation energy [N mm]",
-             "saved [%]"]]
-    for path, row in result["planners"].items():
-        is_base = path == BASELINE
-        rows.append([result["branch"], COMPARED[path], _spread(row, "length_m", ".3f"),
-                     "" if is_base else f"{row['longer_percent']:.2f}",
-                     _spread(row, "energy_sum_nmm", ".2f"),
-                     "" if is_base else f"{row['saved_percent']:.2f}"])
-    return [(f"Planners over {result['planned_count']} random starts, on the energy field", rows)]
-
-
 def _spread(row: dict[str, Any], key: str, form: str) -> str:
     mean, deviation = row[f"{key}_mean"], row[f"{key}_deviation"]
     return f"{mean:{form}}" if deviation is None else f"{mean:{form}} ± {deviation:{form}}"
@@ -142,6 +154,6 @@ def _saving(values: Mapping[str, Any]) -> str | None:
 STAGE = StageDescription(
     "compare", 105, by_name(compare, folder="branch_folder"), CompareInputs, CompareSettings,
     ParallelOptions, key="compare:{name}", reads=("energy.npz",),
-    writes=("comparisons/{name}.csv", "comparisons/{name}.png"), tables=_tables,
+    writes=("comparisons/{name}.csv", "comparisons/{name}.png"), result=Comparison,
     found=("{planned_count} of {trial_count} random starts were planned.", _saving),
     then="limber report {branch_folder}", step="plan", label="Compare Planners")

@@ -32,7 +32,18 @@ from limber.core.settings import Groups
 from limber.planning.settings import PlanSettings
 from limber.stages.inputs import ParallelOptions, PlacedInputs, by_name
 from limber.stages.registry import StageDescription
-from limber.stages.result import FORCE, POSE, Picture, Result, drawn, frozen, of_files, shown
+from limber.stages.result import (
+    FORCE,
+    POSE,
+    Picture,
+    Result,
+    Table,
+    drawn,
+    filled,
+    frozen,
+    of_files,
+    shown,
+)
 from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
@@ -125,6 +136,13 @@ class Plan(Result):
                 "file": found, "field": EnergyField.read(branch.path("energy.npz")),
                 "damage": DamageAlong.read(branch.path(damage)) if branch.has(damage) else None}
 
+    def tables(self) -> list[Table]:
+        from limber.results.report.report_tables import comparison_rows, leg_rows
+
+        return filled(
+            ("Both paths, on the full model", comparison_rows(self.values)),
+            ("The whole motion, leg by leg", leg_rows(self.values.get("legs", []))))
+
     def plot_damage(self) -> Figure:
         """Draw where along the branch the gentle path would damage it, and how probably.
 
@@ -145,9 +163,29 @@ class Plan(Result):
         return drawn(lambda: along_paths(self.file))
 
     def section(self, branch: Branch, key: str) -> Section:
-        from limber.results.report.path_sections import plan_section
+        from limber.results.findings import beyond_sentence, certificate_sentence
+        from limber.results.report import plan_figures
+        from limber.results.report.section import Section
 
-        return plan_section(branch, self.name)
+        plan = self.file.summary
+        section = Section(self.heading.format(name=self.name), tables=self.tables())
+        saved, added = plan["energy_saved_percent"], plan["length_added_percent"]
+        section.text.append((
+            "The start is inside the goal, so the paths have no length and no energy can be saved."
+            if saved is None or added is None else
+            f"The gentle path saves {saved:.1f} % of the energy along the path and changes the "
+            f"length by {added:+.1f} %.") + f" Seed {plan['seed']}.")
+        section.text.append(certificate_sentence(plan))
+        if moving := plan.get("in_motion"):
+            peaks = ", ".join(f"{key} {peak['moving']:.3g} ({peak['standing']:.3g} quasi-static)"
+                              for key, peak in moving["peaks"].items())
+            section.text.append(
+                "A simulation over time on the full model, with inertia and at "
+                f"{1e3 * moving['speed_m_s']:.0f} mm/s, keeps all limits. Peaks: {peaks}.")
+        section.text += filter(None, [beyond_sentence(plan)])
+        for figure, caption in plan_figures.report_figures(branch, self.name):
+            section.draw(figure, caption)
+        return section
 
 
 def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
@@ -436,14 +474,6 @@ def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: PlanPath
     np.savez_compressed(stage.path(f"frames/{name}.npz"), **surface_fields(mesh, states))
 
 
-def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    from limber.results.report.report_tables import comparison_rows, leg_rows
-
-    legs = leg_rows(result.get("legs", []))
-    return [("Both paths, on the full model", comparison_rows(result)),
-            *([("The whole motion, leg by leg", legs)] if legs else [])]
-
-
 def _found_lines(values: Mapping[str, Any]) -> str:
     from limber.results.findings import (
         beyond_sentence,
@@ -464,5 +494,5 @@ STAGE = StageDescription(
     writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
             "plans/{name}-motion.csv", "plans/{name}-setpoints.csv", "plans/{name}-trees.csv",
             "plans/{name}-damage.csv", "plans/{name}-bound.npz", "frames/{name}.pc2",
-            "frames/{name}.json", "frames/{name}.npz"), tables=_tables, found=(_found_lines,),
+            "frames/{name}.json", "frames/{name}.npz"), found=(_found_lines,),
     then="limber report {branch_folder}", step="plan", label="Plan Path")

@@ -4,11 +4,10 @@
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, SafetyStop
-from limber.core.files.reading import FileContent, read_json_as
+from limber.core.files.reading import read_json_as
 from limber.core.files.tables import read_columns
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.core.progress import Progress
@@ -25,19 +24,6 @@ GRASP_RADIUS_M = 0.012
 _SAME_PLACE_M = 0.01  # from the position where a suggested pull holds the branch
 _STATES = 12  # of an arc: a chord of 4 mm on a bend of 0.3 m stretches a branch by 7 micrometres
 _NEAR_M = 0.005  # from the gripper to the first given pose
-
-
-_Vector = tuple[float, float, float]
-
-
-class _Pull(FileContent):
-    grasp_point_m: _Vector
-    end_m: _Vector
-    travel_m: float = Field(gt=0, le=0.5)
-
-
-class _Suggested(FileContent):
-    best: _Pull
 
 
 def grasp_point(branch: Branch, gripper: np.ndarray) -> tuple[np.ndarray, float]:
@@ -114,9 +100,11 @@ def suggested_pull(branch: Branch, point: np.ndarray) -> tuple[np.ndarray, float
     Raises:
         BranchFolderError: none was suggested. InputError: the suggested grasp is elsewhere.
     """
+    from limber.stages.pulls.suggest_pull import SuggestedPulls
+
     path = branch.require("suggested_pull.json", "suggest-pull")
-    found = read_json_as(path, _Suggested, "a suggested pull").best
-    grasp = np.array(found.grasp_point_m)
+    found = read_json_as(path, SuggestedPulls, "a suggested pull").best
+    grasp = found.grasp_point
     away = float(np.linalg.norm(grasp - point))
     if away > _SAME_PLACE_M:
         raise InputError(
@@ -124,8 +112,8 @@ def suggested_pull(branch: Branch, point: np.ndarray) -> tuple[np.ndarray, float
             f"({', '.join(f'{x:.3f}' for x in grasp)}) m.", "The same motion at another grasp "
             "gives other information and other strains.", "Move the gripper there.")
     # The end is on the arc, closer to the root, which is the origin: the pull is across.
-    travel, out = np.array(found.end_m) - grasp, grasp / max(float(np.linalg.norm(grasp)), 1e-9)
-    return travel - (travel @ out) * out, found.travel_m
+    travel, out = found.end - grasp, grasp / max(float(np.linalg.norm(grasp)), 1e-9)
+    return travel - (travel @ out) * out, found.travel
 
 
 def waypoint_path(path: Path, gripper: np.ndarray) -> np.ndarray:

@@ -17,11 +17,13 @@ from pydantic import Field
 
 from limber.core.errors import Option, Text
 from limber.core.json_values import plain
+from limber.core.labels import table_of
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, Settings
 from limber.estimation.settings import EstimateSettings
 from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import Result, Table, Vector, filled
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -55,6 +57,42 @@ class SuggestPullSettings(Settings):
     max_strain: float = Field(0.01, gt=0, lt=1, description=(
         "Largest principal strain during a pull (0.01 is 1 %)."))
     max_force: float | None = Field(None, gt=0, description="Largest force of the gripper [N].")
+
+
+class SuggestedPull(Result):
+    """A pull that would narrow the intervals of Young's modulus."""
+
+    grasp_point: Vector = Field(description="where the gripper holds the branch [m]")
+    end: Vector = Field(description="where it moves that to [m]")
+    travel: float = Field(gt=0, le=0.5, description="the way [m]")
+
+
+class SuggestedPulls(Result):
+    """The pulls that would narrow the intervals of Young's modulus most."""
+
+    heading = "Suggested pulls"
+
+    best: SuggestedPull = Field(description="the best one")
+
+    def tables(self) -> list[Table]:
+        from limber.results.report.report_tables import action_rows
+
+        pulls, plan = [self.values["best"], *self.values["others"]][:8], self.values.get("plan")
+        return filled(
+            ("Suggested pulls, best first", table_of(
+                pulls, ("held at", "grasp_fraction", ".2f"),
+                ("to [m]", lambda pull: " ".join(f"{x:.3f}" for x in pull["end_m"])),
+                ("travel", lambda pull: f"{1e3 * pull['travel_m']:.0f} mm"),
+                ("strain", "peak_strain", ".2g %"),
+                ("force", lambda pull: f"{pull['peak_force_n']:.3g} N"),
+                ("tells", lambda pull: f"{pull['bits']:.1f} bit"),
+                ("per % of strain", lambda pull: f"{pull['bits_per_percent_strain']:.1f} bit"),
+                ("E then known within", lambda pull: " ".join(
+                    f"{100 * share:.0f} %" for share in pull["young_deviation"])))),
+            ("Instead of a pull, best first",
+             action_rows({"next_actions": self.values.get("instead")})),
+            (f"Worthwhile for the plan {plan['name']}?",
+             [["yes" if plan["worth"] else "no"], [plan["why"]]]) if plan else ("", []))
 
 
 def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: str | None = None,
@@ -223,32 +261,11 @@ def verdict(now: Any, after: Any, confidence: float) -> tuple[bool, str]:
                    f"make only {100 * (ratio - 1):.1f} % more of that limit usable.")
 
 
-def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    from limber.results.report.report_tables import action_rows
-
-    rows = [["held at", "to [m]", "travel", "strain", "force", "tells", "per % of strain",
-             "E then known within"]]
-    for pull in [result["best"], *result["others"]][:8]:
-        end = " ".join(f"{x:.3f}" for x in pull["end_m"])
-        rows.append([
-            f"{pull['grasp_fraction']:.2f}", end, f"{1e3 * pull['travel_m']:.0f} mm",
-            f"{100 * pull['peak_strain']:.2g} %", f"{pull['peak_force_n']:.3g} N",
-            f"{pull['bits']:.1f} bit", f"{pull['bits_per_percent_strain']:.1f} bit",
-            " ".join(f"{100 * share:.0f} %" for share in pull["young_deviation"])])
-    tables = [("Suggested pulls, best first", rows)]
-    if instead := action_rows({"next_actions": result.get("instead")}):
-        tables.append(("Instead of a pull, best first", instead))
-    if plan := result.get("plan"):
-        worth = "yes" if plan["worth"] else "no"
-        tables.append((f"Worthwhile for the plan {plan['name']}?", [[worth], [plan["why"]]]))
-    return tables
-
-
 STAGE = StageDescription(
     "suggest-pull", 78, by_name(suggest_pull), SuggestPullInputs, SuggestPullSettings,
     ParallelOptions, key="suggest-pull",
     reads=("mesh.vtu", "skeleton.swc", "estimate.json", "plans/"), writes=("suggested_pull.json",),
-    tables=_tables,
+    result=SuggestedPulls,
     found=("Best: hold the branch at {best[grasp_fraction]:.2f} of its main path and move it by "
            "{best[travel_m]:m}, with up to {best[peak_force_n]:N}.",),
     then="limber record {branch_folder} --suggested --cell cell.toml", step="estimate",

@@ -40,6 +40,7 @@ from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.stages.inputs import BranchInputs, NoOptions, NoSettings, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import Result, Table, filled
 from limber.stages.shape.reconstruct import EDITS, edits_digest, load_edits, write_branch
 from limber.store import Branch
 
@@ -70,6 +71,22 @@ class SkeletonInputs(BranchInputs):
     output: Path | None = Field(
         None, description="Also write the edited skeleton in the scan's coordinates: .swc, or "
         ".csv with intervals and probabilities.", json_schema_extra={"short": "-o"})
+
+
+class Review(Result):
+    """A branch's skeleton, and what is doubtful about it."""
+
+    def tables(self) -> list[Table]:
+        """Return what the edits did, the doubtful parts and the alternatives."""
+        from limber.results.report.report_tables import alternative_rows, doubtful_rows, edit_rows
+
+        doubtful, others = self.values["doubtful"], self.values["alternatives"]
+        places = f"places in the scan's coordinates [{self.values['unit']}]"
+        more = f" ({len(doubtful) - _SHOWN} more with --json)" if len(doubtful) > _SHOWN else ""
+        return filled(
+            (f"Edits, {places}", edit_rows(self.values["edit_effects"])),
+            (f"Doubtful parts, {places}{more}", doubtful_rows(doubtful[:_SHOWN])),
+            (f"Alternatives, {places}", alternative_rows(others) if len(others) > 1 else []))
 
 
 def review_skeleton(folder: Path, *, edits_path: Path | None = None,
@@ -296,23 +313,6 @@ def _part_entry(uncertain_part: DoubtfulPart, alignment: Alignment) -> dict[str,
     }
 
 
-def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
-    """Return what the edits did, the doubtful parts and the alternatives, as tables."""
-    from limber.results.report.report_tables import alternative_rows, doubtful_rows, edit_rows
-
-    doubtful = result["doubtful"]
-    places = f"places in the scan's coordinates [{result['unit']}]"
-    shown: list[tuple[str, Sequence[Sequence[str]]]] = []
-    if result["edit_effects"]:
-        shown.append((f"Edits, {places}", edit_rows(result["edit_effects"])))
-    if doubtful:
-        more = f" ({len(doubtful) - _SHOWN} more with --json)" if len(doubtful) > _SHOWN else ""
-        shown.append((f"Doubtful parts, {places}{more}", doubtful_rows(doubtful[:_SHOWN])))
-    if len(result["alternatives"]) > 1:
-        shown.append((f"Alternatives, {places}", alternative_rows(result["alternatives"])))
-    return shown
-
-
 def _doubtful_line(result: Mapping[str, Any]) -> str:
     count = len(result["doubtful"])
     return (Text(f"{count} doubtful {'part' if count == 1 else 'parts'}. Edits (a JSON list) are "
@@ -325,7 +325,7 @@ STAGE = StageDescription(
     reads=("cloud.ply", "skeleton.csv", f"{FOUND_SKELETON}.csv"),
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
             "point_masses.json", EDITS),
-    tables=tables,
+    result=Review,
     found=("{node_count:count} nodes in {branch_count:#branch/branches}, {length_m:m}; the mesh is "
            "{mesh}.",
            _doubtful_line),
