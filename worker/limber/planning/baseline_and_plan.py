@@ -52,17 +52,9 @@ _ANY = 1e6  # gap: any path suffices
 
 @dataclass(frozen=True)
 class PathPair:
-    """The shortest path known and the gentle plan between the same start and goal region.
-
-    ``approach`` [k, 3] is a gentle path from the rest pose to the start: a branch that is pushed
-    there straight may buckle on the path and arrive in another state. ``certificate`` gives the
-    plan's gap to the best possible path on the field; ``compared`` has the polylines [n, 3] of all
-    found paths, by name. ``margins`` is by how much the limits were tighter than requested;
-    ``detour`` the effect of a limit on the length. ``trees`` has the results of the planners that
-    grow a tree, by the planner's name. ``unbounded`` is the problem of a plan that the full model
-    probably refuses, of which no close bound was computed (:func:`with_bound`). ``in_doubt``: no
-    path was found that keeps the limits on the field; these may keep them on the branch.
-    """
+    """The shortest path known and the gentle plan. ``approach`` leads from rest to the start:
+    pushed there straight, a branch may buckle. ``unbounded`` still needs a close bound
+    (:func:`with_bound`); ``in_doubt``: these paths may keep the limits on the branch only."""
 
     baseline: FoundPath
     plan: FoundPath
@@ -92,23 +84,9 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
                 limits: Limits, *, asked: Limits | None = None, asked_goal: Goal | None = None,
                 before: PathPair | None = None, is_bounded: bool = True,
                 progress: Progress = SILENT) -> PathPair:
-    """Plan both paths within ``limits``, tightened by the field's possible error where feasible.
-
-    ``asked`` are the limits before they were tightened for the field's error, ``limits`` if not
-    given: a proof that no path exists refers to those. ``asked_goal`` is the goal before it was
-    drawn in, for the bound. ``before`` has the results before the field learnt: its trees are not
-    grown again if their paths still hold, and its plan is one of the paths to start from. Without
-    ``is_bounded`` the bound is left to :func:`with_bound`.
-
-    If no path keeps the margins, or cells show none that keeps the limits even without, one that
-    keeps the limits on the field alone is planned. If none
-    does either, and that proves nothing, one is planned that may keep them on the branch
-    (:meth:`~.limits.Limits.in_doubt`). The full model decides whether it holds.
-
-    Raises:
-        InputError: the start is not allowed.
-        NoPathError: the goal cannot be reached; states why, and whether that is proven.
-    """
+    """As :func:`plan_pair`, within the field's possible error; else on the field alone; else in
+    doubt (:meth:`~.limits.Limits.in_doubt`). A proof refers to ``asked``, the bound to
+    ``asked_goal``; ``before`` gives paths to start from, so that trees are kept."""
     margins = limits.margins(field)
     check_start(field, start, limits.on(field))
     closed, is_open = _closed_by_field(field, start, goal, limits, asked or limits)
@@ -146,12 +124,8 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
 
 def _closed_by_field(field: EnergyField, start: np.ndarray, goal: Goal, limits: Limits,
                      asked: Limits) -> tuple[BlockedError | None, bool]:
-    """Return the error if cells show, before any search, that no path keeps the limits by the field
-    without its error, None if they do not; and whether they show a path.
-
-    Raises:
-        BlockedError: they prove that there is none with the field's error as well.
-    """
+    """The error if cells show before any search that no path keeps the limits by the field itself,
+    or None; and whether they show a path. BlockedError if proven with the field's error too."""
     if not limits.asked():
         return None, True
     problem = GentleProblem(field, limits.on(field), EdgeWeights(0.0, 1.0, STEP), start, goal,
@@ -174,10 +148,7 @@ def _in_doubt(none: BlockedError, field: EnergyField, start: np.ndarray, goal: G
               settings: PlanSettings, limits: Limits, surely: FieldArrays,
               **options: Any) -> PathPair:
     """Return the plan with limits relaxed by the field's possible error, without a close bound.
-
-    Raises:
-        BlockedError: ``none``, if it is proven, the field has no error, or relaxing does not help.
-    """
+    BlockedError if ``none``, if it is proven, the field has no error, or relaxing does not help."""
     doubts, options = limits.doubts(field), options | {"is_bounded": False}
     if UNPROVEN not in none.seen or not any(doubts.values()):
         raise none
@@ -203,17 +174,9 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
               errors: Mapping[str, LocalError] | None = None, asked_goal: Goal | None = None,
               before: PathPair | None = None, detour_from_tree: bool = False,
               is_bounded: bool = True, progress: Progress = SILENT) -> PathPair:
-    """Plan both paths under the same limits, and bound the cost of any path from below.
-
-    ``limits`` are those of the settings if not given; ``beyond``, ``errors`` and ``asked_goal`` are
-    used by the bound (:class:`~.path_problem.GentleProblem`). With ``detour_from_tree``, the
-    settings' largest detour counts from the path of RRT* as its tree has it, as in the paper;
-    otherwise from the shortest path known. Without ``is_bounded`` any bound will do.
-
-    Raises:
-        InputError: the start is not allowed.
-        NoPathError: the goal cannot be reached; states why, and whether that is proven.
-    """
+    """Plan both paths under the same limits (None: the settings'), and bound any path
+    (:class:`~.path_problem.GentleProblem`). The largest detour counts from the shortest path, or
+    RRT*'s as in the paper. InputError if the start is not allowed, NoPathError if none."""
     limits = limits or Limits.of(settings).on(field)
     check_start(field, start, limits)
     if goal.distance(field, start[None])[0] <= goal.tolerance:
@@ -270,11 +233,8 @@ def with_bound(pair: PathPair, progress: Progress = SILENT) -> PathPair:
 
 def _chosen(problem: GentleProblem, gentle: GentlePath, trees: dict[str, FoundPath],
             settings: PlanSettings) -> tuple[FoundPath, Certificate]:
-    """Return the plan of the requested planner, and its gap to the best.
-
-    Raises:
-        NoPathError: that planner found none.
-    """
+    """Return the plan of the requested planner, and its gap to the best. NoPathError if that
+    planner found none."""
     certificate = gentle.certificate
     if settings.planner == "eikonal":
         return FoundPath(gentle.points, gentle.cost, gentle.cost, [
@@ -313,8 +273,7 @@ def _gentle(problem: GentleProblem, known: list[np.ndarray], tree: np.ndarray | 
 def _detour(problem: GentleProblem, known: list[np.ndarray], tree: np.ndarray | None,
             settings: PlanSettings, progress: Progress) -> DetourPath:
     """Return the gentlest path within the length that the settings allow over the ``tree``'s path
-    [n, 3], or the shortest one if it has none.
-    """
+    [n, 3], or the shortest one if it has none."""
     if settings.planner != "eikonal":
         raise InputError(
             Text(Option("max_detour"), " is given with ", Option("planner", "d-rrt-star"), "."),
@@ -356,9 +315,7 @@ def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,
 
 def _shortest_known(problem: GentleProblem, tree: FoundPath | None, plan: FoundPath) -> FoundPath:
     """Return the shortest of RRT*'s path, the plan, and these two shortened as far as possible.
-
-    RRT*'s alone has the error of its samples: it was longer than some plans.
-    """
+    RRT*'s alone has the error of its samples: it was longer than some plans."""
     rough = [plan] if tree is None else [tree, plan]
     shortened = [_shortest(problem, points) for points in distinct([one.points for one in rough])]
     shortest = min((*rough, *(one for one in shortened if np.isfinite(one.cost))),
@@ -374,11 +331,8 @@ def _shortest(problem: GentleProblem, path: np.ndarray) -> FoundPath:
 
 
 def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
-    """Return a gentle path [k, 3] from rest to the start, within the same limits.
-
-    Raises:
-        NoPathError: there is none.
-    """
+    """Return a gentle path [k, 3] from rest to the start, within the same limits. NoPathError if
+    there is none."""
     field, start = problem.energy_field, problem.start
     if np.linalg.norm(start - field.rest) < STEP:
         return field.rest[None]

@@ -84,8 +84,7 @@ def _score(field: EnergyField, path: np.ndarray) -> PlannerScore:
 
 def summarised(trials: Sequence[ComparedTrial]) -> dict[str, dict[str, float | None]]:
     """Return by planner mean and deviation of length and energy, and the change of the means from
-    the baseline's [%], over the trials in which both found a path.
-    """
+    the baseline's [%], over the trials in which both found a path."""
     found: dict[str, dict[str, float | None]] = {}
     for name in COMPARED:
         both = [trial for trial in trials if name in trial.scores and BASELINE in trial.scores]

@@ -35,8 +35,7 @@ class EdgeWeights(NamedTuple):
 @dataclass(frozen=True)
 class CostWeights:
     """The dimensionless weights ``a_def`` and ``a_dis``, and the scales ``E0`` [J], ``L0`` [m]. The
-    baseline RRT* is ``a_def = 0``, ``a_dis = 1``.
-    """
+    baseline RRT* is ``a_def = 0``, ``a_dis = 1``."""
 
     deformation: float
     distance: float
@@ -62,15 +61,8 @@ class CostWeights:
 
 @dataclass(frozen=True)
 class PathMeasures:
-    """The measures of a path; the same for every path.
-
-    Attributes:
-        length_m: Length of the grasp's path [m].
-        energy_integral_jm: Integral of energy over length [J m].
-        energy_sum_nmm: Sum of energies at 5 mm spacing [N mm]: the paper's number.
-        peak_energy_j, peak_force_n: Largest energy [J] and gripper force [N].
-        positive_work_j: Sum of the increases of energy along the path [J].
-    """
+    """The measures of any path. ``energy_sum_nmm`` sums energies at 5 mm spacing [N mm]: the
+    paper's number. ``positive_work_j`` sums the increases of energy along the path."""
 
     length_m: float
     energy_integral_jm: float
@@ -81,13 +73,8 @@ class PathMeasures:
 
 
 def measure_path(positions: np.ndarray, energies: np.ndarray, forces: np.ndarray) -> PathMeasures:
-    """Return the measures of a path given at points along it.
-
-    Args:
-        positions: Grasp positions [m], shape [n, 3], at 5 mm spacing or less.
-        energies: Deformation energy there [J], shape [n].
-        forces: Magnitude of the gripper's force there [N], shape [n].
-    """
+    """Return the measures of a path by positions [n, 3] [m] at 5 mm spacing or less, energies [J]
+    and the gripper's force magnitudes [N]."""
     along = arc_lengths(positions)
     spots = np.linspace(0.0, along[-1], max(round(along[-1] / STEP), 1) + 1)
     return PathMeasures(
@@ -108,10 +95,8 @@ def resample(path: np.ndarray, spacing: float) -> np.ndarray:
 
 @compiled
 def edge_cost(start, stop, field, weights):
-    """Return the cost of the straight edge; infinite if any of it is not allowed.
-
-    Midpoint rule at ``weights.step`` or finer; ``stop`` is checked, ``start`` is assumed checked.
-    """
+    """Return the cost of the straight edge; infinite if any of it is not allowed. Midpoint rule at
+    ``weights.step`` or finer; ``stop`` is checked, ``start`` is assumed checked."""
     length = np.sqrt(np.sum((stop - start) ** 2))
     pieces = max(int(np.ceil(length / weights.step)), 1)
     total = 0.0

@@ -129,19 +129,9 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
 
 @dataclass
 class _Rounds:
-    """Rounds of planning on the field, checking on the full model, and learning from it.
-
-    Attributes:
-        limits, goal: As requested.
-        field: Field including the states learnt so far.
-        aim, planned_limits: Goal and limits for planning, tightened by the amounts that earlier
-            plans missed them by.
-        pair: The last paths on the field; ``plan`` and ``baseline`` on the full model, the latter
-            of ``baseline_points``.
-        risks, moving: Of the plans so far: their risks, and the last one's motion in time.
-        round_records: One row per round.
-        holding: The plan that is passed on if one that ends less deep in the goal does not hold.
-    """
+    """Rounds of planning on the field, checking on the full model, and learning. ``aim`` and
+    ``planned_limits`` are tightened by what earlier plans missed; ``baseline`` is that of
+    ``baseline_points``; ``holding`` is passed on if a less deep plan does not hold."""
 
     grasp_model: GraspModel
     settings: PlanSettings
@@ -214,10 +204,8 @@ class _Rounds:
         return False
 
     def _is_too_deep(self, pair: PathPair, plan: ResolvedPath) -> bool:
-        """Return whether the field's error, not the goal, decides how deep in the goal the plan
-        ends. If so, its last states have become samples, and the plan is kept for the case that no
-        better one holds.
-        """
+        """Whether the field's error decides how deep in the goal the plan ends. If so, its last
+        states become samples, and it is kept for the case that no better one holds."""
         end = pair.plan.points[-1:]
         if pair.stays or not isinstance(self.aim, TargetGoal) or (
                 self.aim.margin_at(self.field, end) < ENOUGH * arc_lengths(pair.plan.points)[-1]):
@@ -229,11 +217,8 @@ class _Rounds:
         return True
 
     def _planned(self, ahead: Progress, is_last: bool) -> PathPair | None:
-        """Return paths on the field; None if poses were added instead.
-
-        Raises:
-            BlockedError: none was found, or none exists and the full model confirms it.
-        """
+        """Return paths on the field; None if poses were added instead. BlockedError if none was
+        found, or none exists and the full model confirms it."""
         try:
             pair = self._within_goal(ahead.part(0.0, 0.3))
         except BlockedError as none:
@@ -255,11 +240,7 @@ class _Rounds:
 
     def _within_goal(self, ahead: Progress) -> PathPair:
         """Return paths on the field that end as deep in the goal as the field's error asks for; if
-        none is found, paths that end anywhere in it.
-
-        Raises:
-            NoPathError: neither was found.
-        """
+        none is found, paths that end anywhere in it. NoPathError if neither was found."""
         # Probably the first plan to a region ends too deep in it, and a later one is refused.
         is_deep = isinstance(self.aim, TargetGoal) and self.aim.margin > 0.0
         is_bounded = self.holding is not None or (self.pair is None and not is_deep)
@@ -282,11 +263,8 @@ class _Rounds:
             return paths(self.aim, ahead.part(0.5, 1.0))
 
     def _closed(self, none: BlockedError, is_last: bool, ahead: Progress) -> None:
-        """Pass on that there is no path, or learn evidence against it.
-
-        Raises:
-            BlockedError: no evidence against it was found, or no round is left.
-        """
+        """Pass on that there is no path, or learn evidence against it. BlockedError if no evidence
+        against it was found, or no round is left."""
         if none.is_proven:
             ahead(0.0, "checking on the full model where the way is closed")
             check = checked_wall(self.field, self.grasp_model, self.limits, none, self.goal,
@@ -306,8 +284,7 @@ class _Rounds:
 
     def _solved(self, pair: PathPair, ahead: Progress) -> ResolvedPath:
         """Return the plan on the full model, and keep the baseline there unless the plan is
-        probably refused.
-        """
+        probably refused."""
         ahead(0.3, "both paths on the full model")
         points = [pair.plan.points]
         if pair.unbounded is None and self._lacks_baseline(pair):
@@ -338,8 +315,7 @@ class _Rounds:
 
     def _broken(self, plan: ResolvedPath, is_near: bool, ahead: Progress) -> list[str]:
         """Return the limits that a plan breaks, at standstill, with other moduli, or in motion; the
-        next one is planned with limits tightened accordingly.
-        """
+        next one is planned with limits tightened accordingly."""
         broken = broken_on_full_model(plan, self.limits, self.goal, self.grasp_model.mesh.nodes)
         if plan.is_whole:
             self.aim = self.aim.drawn_in(plan.solved)

@@ -35,14 +35,8 @@ _LEARNT_APART = 0.5 * _APART
 
 @dataclass(frozen=True)
 class WallCheck:
-    """Full-model result where a path is blocked.
-
-    Attributes:
-        solved: How many states have a solution.
-        bears_out: Whether these states confirm the proof; also true if neither a limit nor a
-            target's position blocks the path, but the border of the sampled region does.
-        learnt: The states as samples, if they do not confirm the proof.
-    """
+    """Full-model result at ``solved`` states of a blocked path. They bear the proof out also if
+    only the sampled region's border blocks; otherwise ``learnt`` has them as samples."""
 
     solved: int
     bears_out: bool
@@ -52,11 +46,8 @@ class WallCheck:
 def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, none: BlockedError,
                  goal: Goal, *, workers: int | None = None, progress: Progress = SILENT,
                  ) -> WallCheck:
-    """Solve the branch where ``none`` states that the path is blocked.
-
-    A pose without a solution is closed as well: the branch cannot be there. Without any solution
-    nothing is confirmed.
-    """
+    """Solve the branch where ``none`` states that the path is blocked. A pose without a solution is
+    closed as well: the branch cannot be there. Without any solution nothing is confirmed."""
     wall = _chosen(none.wall)
     points = np.concatenate([wall, _chosen(none.nearest)])
     if not len(points):
@@ -81,8 +72,7 @@ def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, no
 
 def _chosen(wall: np.ndarray) -> np.ndarray:
     """Return places [k, 3] of a wall [n, 3], its first one first, each apart from the others; half
-    of them the earliest ones, half those far from all before.
-    """
+    of them the earliest ones, half those far from all before."""
     chosen: list[np.ndarray] = []
     for cell in wall:
         if len(chosen) == _STATES // 2:
@@ -111,9 +101,8 @@ def _meets(field: EnergyField, goal: Goal, one: Solved) -> bool:
 
 def _over_and_off(field: EnergyField, limits: Limits, samples: GraspSamples,
                   ) -> tuple[np.ndarray, np.ndarray]:
-    """Return which states break a limit, and which are farther below the field than its error,
-    bool [n] each.
-    """
+    """Return which states break a limit, and which are farther below the field than its error, bool
+    [n] each."""
     sizes, points = sampled_sizes(samples), samples.positions
     errors, asked = limits.errors(field), limits.asked()
     places = field.region.chart.plain.map(points)
@@ -138,8 +127,7 @@ def confirmed(none: BlockedError, check: WallCheck) -> BlockedError:
 
 def not_confirmed(limits: Limits, easiest: LeastViolation | None) -> BlockedError:
     """Return the error of a proof that the full model does not confirm; ``easiest`` is the path
-    that exceeds the limits least.
-    """
+    that exceeds the limits least."""
     least = "" if easiest is None or easiest.worst <= 1.0 else (
         f" By the field the easiest way takes {100.0 * easiest.worst:.0f} % of a limit, within its "
         "error.")
@@ -156,8 +144,7 @@ def not_confirmed(limits: Limits, easiest: LeastViolation | None) -> BlockedErro
 @dataclass(frozen=True)
 class Passages:
     """The easiest path to the goal on the full model: the states ``learnt`` there, and in words
-    ``summary`` what it takes.
-    """
+    ``summary`` what it takes."""
 
     learnt: GraspSamples
     summary: str
@@ -166,8 +153,7 @@ class Passages:
 def solved_if_undecided(field: EnergyField, grasp_model: GraspModel, start: np.ndarray, goal: Goal,
                         limits: Limits, progress: Progress = SILENT) -> Passages | None:
     """Solve the branch along the path that exceeds the limits least; None if the field's error
-    leaves no doubt that it exceeds them, or nothing new can be learnt there.
-    """
+    leaves no doubt that it exceeds them, or nothing new can be learnt there."""
     path = easiest_path(field, limits.on(field), start, goal)
     asked, margins = limits.asked(), limits.margins(field)
     reserve = max((margins[name] / limit for name, limit in asked.items()), default=0.0)

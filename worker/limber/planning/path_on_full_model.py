@@ -18,21 +18,9 @@ _MOST_UNSOLVED = 0.1  # fraction of a path's poses
 
 @dataclass(frozen=True)
 class SolvedPoses:
-    """States of the branch at poses of the gripper.
-
-    Attributes:
-        poses: Positions [m] and natural rotations [rad], shape [n, 6].
-        energies: Potential of strain and weight above the hanging state [J], shape [n].
-        forces, torques: Force and torque of the gripper on the branch [N, Nm], shape [n, 3].
-        strains: Largest principal Green-Lagrange strain anywhere in the branch, shape [n].
-        strain_places: Position of that strain in the rest shape [m], shape [n, 3].
-        stresses: Largest principal Cauchy stress by magnitude [Pa], shape [n].
-        min_det_f: Least determinant of the deformation gradient, shape [n].
-        tips: Position of the branch's tip [m], shape [n, 3].
-        targets: Positions of the named targets [m], shape [n, targets, 3].
-        axial_forces: Component of the forces along the branch, outward [N], shape [n].
-        displacements: Displacements of all nodes [m], shape [n, node_count, 3].
-    """
+    """States at poses [n, 6] [m, rad]: energy above hanging [J], force and torque [n, 3] of the
+    gripper on the branch, its outward part along it [N], largest Green-Lagrange strain and its rest
+    position, largest Cauchy stress [Pa], least det F, and positions of targets [n, targets, 3]."""
 
     poses: np.ndarray
     energies: np.ndarray
@@ -90,15 +78,8 @@ class SolvedPoses:
 
 @dataclass(frozen=True)
 class ResolvedPath:
-    """A path solved by finite elements.
-
-    Attributes:
-        solved: The states along it.
-        approach: States on the path from rest, the hanging state first, up to the path's start.
-        unsolved: Positions on approach and path without an acceptable solution [m], shape [k, 3].
-        reasons: Reason for each of the k.
-        is_whole: Whether the end was reached; the path ends early if over a tenth is unsolved.
-    """
+    """A path solved by finite elements, with states from hanging to its start, positions [k, 3] [m]
+    without solution and why. It ends early, not ``is_whole``, if over a tenth is unsolved."""
 
     solved: SolvedPoses
     approach: SolvedPoses
@@ -123,12 +104,8 @@ class ResolvedPath:
         return len(self.reasons)
 
     def require(self) -> "ResolvedPath":
-        """Return this.
-
-        Raises:
-            ConvergenceError: over a tenth of the poses, or the last one, has no acceptable
-            solution.
-        """
+        """Return this. ConvergenceError if over a tenth of the poses, or the last one, has no
+        acceptable solution."""
         if self.is_whole:
             return self
         kinds = ", ".join(f"{self.reasons.count(kind)} {kind}"

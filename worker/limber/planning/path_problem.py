@@ -21,12 +21,9 @@ UNPROVEN = "but it is not proven that none exists"
 
 
 class BlockedError(NoPathError):
-    """No path from the start to the goal keeps the limits on the field: proven, or none found.
-
-    ``wall`` are grasp positions where limits block the path, those least over them first [m], shape
-    [k, 3]; ``nearest`` positions that are reached, those nearest to the goal first, if the field
-    does not know the target's position exactly.
-    """
+    """No path keeps the limits on the field: proven, or none found. ``wall`` [k, 3] [m] are
+    positions that block it, least over first; ``nearest`` those reached, nearest to the goal first,
+    where the field does not know the target exactly."""
 
     wall: np.ndarray = np.empty((0, 3))
     nearest: np.ndarray = np.empty((0, 3))
@@ -45,19 +42,10 @@ class BlockedError(NoPathError):
 
 @dataclass(frozen=True)
 class GentleProblem:
-    """Any path from ``start`` [3] into ``goal`` within ``limits`` (see ``EnergyField.limited``).
-
-    ``weights`` are the cost of an edge. For a lower bound, ``field_error`` [J] is subtracted from
-    the energy, so that the bound holds for every branch whose energy is within it. No path may be
-    longer than ``longest`` [m]; bounds ignore that limit, and also hold with it. Paths may end in a
-    part of the requested goal only; the bound is for all of it, ``asked_goal`` (by default the
-    same).
-
-    ``beyond`` are limits that the field exceeds only where the branch exceeds the requested ones
-    (:meth:`~limber.planning.constraints.limits.Limits.beyond`). Bounds and proofs use them alone;
-    without them no limit proves anything. They allow for the field's largest error anywhere;
-    ``errors``, by limit, give how much smaller it is at a position.
-    """
+    """Any path from ``start`` into ``goal`` within ``limits`` (see ``EnergyField.limited``). A bound
+    is for the whole ``asked_goal``, any length, and every branch whose energy is within
+    ``field_error`` [J] of the field. ``beyond`` (:meth:`~.limits.Limits.beyond`) are limits that
+    prove something; ``errors`` say by limit how much less the field errs at a position."""
 
     energy_field: EnergyField
     limits: FieldArrays
@@ -91,11 +79,8 @@ class GentleProblem:
                                     max_loads=np.full_like(self.limits.max_loads, np.inf))
 
     def cost(self, path: np.ndarray) -> float:
-        """Return the cost of a polyline [n, 3]; infinite if it breaks a limit, is too long or
-        misses the goal.
-
-        Finer than the planners' edges: reported values must not depend on their quadrature.
-        """
+        """Return the cost of a polyline [n, 3]; infinite over a limit, too long or off the goal.
+        Finer than planners' edges: reported values must not depend on their quadrature."""
         from limber.planning.cost import path_cost
 
         if self.goal_excess(path[-1]) > 1e-9:
@@ -151,11 +136,8 @@ def not_found(problem: GentleProblem, why: str) -> BlockedError:
 
 
 def start_of(field: EnergyField, goal: Goal, settings: PlanSettings) -> np.ndarray:
-    """Return the requested start [m], shape [3].
-
-    Raises:
-        InputError: two are requested. NoPathError: none could be drawn.
-    """
+    """Return the requested start [3] [m]. InputError if two are requested, NoPathError if none
+    could be drawn."""
     if settings.start is not None and settings.start_seed is not None:
         raise InputError(Text("Both ", Option("start"), " and ", Option("start_seed"), " are "
                               "given."),
@@ -168,15 +150,9 @@ def start_of(field: EnergyField, goal: Goal, settings: PlanSettings) -> np.ndarr
 
 
 def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: int) -> np.ndarray:
-    """Return a random deformed configuration far from rest and from the goal, shape [3].
-
-    The paper's trials start from "randomized initial configurations", without stating how they were
-    drawn. Here: uniform over the allowed region, at least half the largest deflection away from
-    rest and from the goal's middle, and a quarter of it from its border.
-
-    Raises:
-        NoPathError: no such configuration was found.
-    """
+    """Draw a start, as the paper's "randomized initial configurations", whose way it does not
+    state: uniform, at least half the largest deflection from rest and the goal's middle, and a
+    quarter from its border. NoPathError if none was found."""
     generator = np.random.default_rng([seed, 7])
     points = field.region.draw(4000, generator)
     half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())

@@ -242,13 +242,8 @@ class PlanSummary(_Told):
 
 @dataclass(frozen=True)
 class PlanFile:
-    """A plan as read.
-
-    Attributes:
-        summary: All of the file except the columns.
-        baseline, plan: Between start and goal.
-        motion: The whole motion.
-    """
+    """A plan as read: ``summary`` is all but the columns, ``motion`` the whole, with approach and
+    return."""
 
     summary: dict[str, Any]
     baseline: PlanPath
@@ -260,11 +255,8 @@ def path_record(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
                 pace: Pace = DEFAULT_PACE, stops: tuple[int, ...] = (),
                 field_energies: np.ndarray | None = None,
                 phases: tuple[str, ...] | None = None) -> PlanPath:
-    """Return the path of solved poses, as fast as ``pace`` allows, at standstill at ``stops``.
-
-    Args:
-        targets: Names, in the order of the solution's targets.
-    """
+    """Return the path of solved poses as fast as ``pace`` allows, at standstill at ``stops``;
+    target names in the order of the solution."""
     return PlanPath(
         poses=solved.poses, energies=solved.energies, strains=solved.strains, forces=solved.forces,
         torques=solved.torques,
@@ -276,10 +268,8 @@ def path_record(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
 
 def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = (),
                  pace: Pace = DEFAULT_PACE) -> PlanPath:
-    """Return approach from rest, path, and the return path, which is the same reversed.
-
-    Equilibria have no memory: on the return path the branch takes the same states.
-    """
+    """Return approach from rest, path, and the return path, which is the same reversed. Equilibria
+    have no memory: on the return path the branch takes the same states."""
     ahead, on_path = path.ahead, len(path.solved.poses)
     back = np.arange(len(ahead.poses) - 1)[::-1]
     phases = (("approach",) * (len(ahead.poses) - on_path) + ("path",) * on_path
@@ -304,11 +294,7 @@ def limits_of_motion(motion: PlanPath, limits: Limits) -> dict[str, dict[str, fl
 
 def plan_text(summary: dict[str, Any], baseline: PlanPath, plan: PlanPath, motion: PlanPath,
               limits: dict[str, dict[str, float]], pace: Pace = DEFAULT_PACE) -> str:
-    """Return the content of a file of format 2.
-
-    Args:
-        summary: Summary with an entry for ``baseline`` and for ``plan``.
-    """
+    """Return a file of format 2; the summary has an entry for ``baseline`` and for ``plan``."""
     content = {
         "format_version": FORMAT, **summary, "targets": sorted(plan.targets),
         "timing": {"kind": "limited acceleration", "speed_m_s": pace.speed,
@@ -320,11 +306,8 @@ def plan_text(summary: dict[str, Any], baseline: PlanPath, plan: PlanPath, motio
 
 
 def read_plan(path: Path) -> PlanFile:
-    """Read a plan of format 2.
-
-    Raises:
-        InputError: it is not a plan, is damaged, or is from a newer program.
-    """
+    """Read a plan of format 2. InputError if it is not a plan, is damaged, or is from a newer
+    program."""
     try:
         content = read_json(path, "a plan")
         version = content.get("format_version")
@@ -344,11 +327,8 @@ def read_plan(path: Path) -> PlanFile:
 
 
 def read_plan_summary(path: Path) -> dict[str, Any]:
-    """Return the entries of a plan's file beside its columns, as far as present.
-
-    Raises:
-        InputError: it is not a plan, or is damaged.
-    """
+    """Return the entries of a plan's file beside its columns, as far as present. InputError if it
+    is not a plan, or is damaged."""
     content = read_json(path, "a plan")
     checked_as(path, PlanSummary, content, "a plan", strict=True)
     return content
@@ -427,14 +407,9 @@ def summary_of(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair
 
 def _on_full_model(field: EnergyField, goal: Goal, pair: PathPair, found: PathMeasures,
                    ) -> dict[str, Any]:
-    """Return the bound for every branch whose energy is nowhere farther below the field's than 95 %
-    of the samples were, each left out in turn, and the plan's gap to that bound.
-
-    With c = w E + l and E reduced by an error e, but not below 0, c is nowhere less than l / (l + w
-    e) times its former value, and so is the bound. An integral of energy over at most a length is
-    reduced by at most e times that length. For a goal of a target no bound is given: the field does
-    not know the target's position well enough.
-    """
+    """Bound for any branch with energy nowhere farther below the field's than 95 % of left-out
+    samples. As E falls by e, c falls to at least l / (l + w e) of itself, an integral by e times
+    length. None for targets, whose position the field knows too badly."""
     weights, detour = pair.cost.weights, pair.detour
     cheap = field.samples.energies <= 1.5 * max(found.peak_energy_j, 1e-12)
     missed = np.abs(field.missed[cheap & ~field.region.is_face(), 0])

@@ -21,14 +21,8 @@ _OF_GRID = ("origin_m", "edges_m", "costs", "has_cost", "known")
 
 @dataclass(frozen=True)
 class BoundGrid:
-    """The bound on one grid: a quadratic B-spline with one coefficient a cell, at its centre.
-
-    Attributes:
-        origin: Corner of the first cell [m], shape [3].
-        edges: Edges of a cell [m], shape [3].
-        costs: Coefficients; NaN where there is none, shape [nx, ny, nz].
-        known: Cells in which the bound holds, bool, of that shape.
-    """
+    """The bound on one grid from ``origin``, the first cell's corner [m]: a quadratic B-spline with
+    a coefficient [nx, ny, nz] at each cell's centre, NaN if none, valid in ``known`` cells."""
 
     origin: np.ndarray
     edges: np.ndarray
@@ -36,11 +30,8 @@ class BoundGrid:
     known: np.ndarray
 
     def at(self, points: np.ndarray, axes: np.ndarray, *, fills: bool) -> np.ndarray:
-        """Return it at ``points`` [n, 3]; NaN in cells where it is not known.
-
-        With ``fills``, a missing coefficient is that of the nearest cell, and the bound is known in
-        the whole grid.
-        """
+        """Return it at points [n, 3], NaN where unknown. With ``fills`` a missing coefficient is
+        the nearest cell's, and the bound is known in the whole grid."""
         from scipy.ndimage import distance_transform_edt, map_coordinates
 
         costs, known = self.costs, self.known
@@ -59,25 +50,15 @@ class BoundGrid:
 
 @dataclass(frozen=True)
 class CostToGo:
-    """A lower bound on what a path still costs from a place to the goal.
-
-    The first grid's holds for every path. A later grid has the places where a path could still be
-    cheaper than the known one; its bound is of paths from the start that are no dearer than that.
-
-    Attributes:
-        axes: Axes of all grids, unit, as rows, shape [3, 3].
-        grids: From the coarsest, which has cubes for cells.
-    """
+    """A lower bound on a path's further cost. The first grid, of cubes, holds for any; a later one
+    where and for paths that may be cheaper than the known one. Axes [3, 3] are rows."""
 
     axes: np.ndarray
     grids: tuple[BoundGrid, ...]
 
     def at(self, points: np.ndarray) -> np.ndarray:
-        """Return the largest bound of all grids at ``points`` [n, 3], for pictures.
-
-        A region may be thinner than a cell of the first grid: there the nearest known cell counts.
-        NaN outside that grid.
-        """
+        """Return the largest bound of all grids at points [n, 3], for pictures; the nearest known
+        cell's where a region is thinner than one. NaN outside the first grid."""
         out = self.grids[0].at(points, self.axes, fills=True)
         for grid in self.grids[1:]:
             out = np.fmax(out, grid.at(points, self.axes, fills=False))
@@ -96,11 +77,7 @@ class CostToGo:
 
     @classmethod
     def read(cls, path: Path) -> "CostToGo":
-        """Read a file that :meth:`write` wrote.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """Read a file that :meth:`write` wrote. InputError if the file is damaged."""
         arrays = read_arrays(path, _WHAT)
         grids: list[BoundGrid] = []
         while not grids or _numbered("costs", len(grids)) in arrays:
@@ -119,13 +96,8 @@ def _numbered(name: str, number: int) -> str:
 
 
 def read_trees(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return nodes [n, 3] [m] and parents [n] of each planner's search tree, by planner.
-
-    A parent comes before its children; the first node is the start and has the parent -1.
-
-    Raises:
-        BranchFolderError: the file is damaged.
-    """
+    """Return nodes [n, 3] [m] and parents [n] of each planner's tree: the start first, with -1, and
+    parents before children. BranchFolderError if the file is damaged."""
     rows = csv_records(path, "search trees")
     found = {}
     for planner in dict.fromkeys(row.get("planner") or "" for row in rows):

@@ -35,13 +35,8 @@ DEFAULT_PACE = Pace()
 
 @dataclass(frozen=True)
 class TimeLaw:
-    """Distance of a motion along its path over time, with constant acceleration between knots.
-
-    Attributes:
-        along: Distance along the path at the knots [m], from 0, ascending, shape [k].
-        times: Times at the knots [s], from 0, shape [k].
-        speeds: Speeds there [m/s], shape [k].
-    """
+    """Distance [m] of a motion along its path over time [s], with constant acceleration between
+    knots [k], which start at 0."""
 
     along: np.ndarray
     times: np.ndarray
@@ -69,10 +64,8 @@ class TimeLaw:
 
 
 def time_law(positions: np.ndarray, pace: Pace, stops: tuple[int, ...] = ()) -> TimeLaw:
-    """Return the fastest motion along ``positions`` [n, 3], two or more.
-
-    It is at standstill at both ends and at the points ``stops``.
-    """
+    """Return the fastest motion along ``positions`` [n, 3], two or more. It is at standstill at
+    both ends and at the points ``stops``."""
     edges = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     slowest = _at_corners(positions, edges, pace)
     slowest[[0, -1, *stops]] = 0.0
@@ -102,14 +95,8 @@ def times_along(positions: np.ndarray, pace: Pace, stops: tuple[int, ...] = ()) 
 
 def poses_at(poses: np.ndarray, law: TimeLaw, instants: np.ndarray,
              stops: tuple[int, ...] = ()) -> np.ndarray:
-    """Return the poses [m, rad] of a motion through ``poses`` [n, 6] at ``instants`` [s], [m, 6].
-
-    Between stops a smooth curve through the positions (Akima's, which hardly overshoots), and the
-    shortest turns between rotations.
-
-    Args:
-        law: Time law of these poses' positions and stops.
-    """
+    """Return poses [m, 6] [m, rad] at ``instants`` [s] of a timed motion: between stops a curve
+    through positions (Akima's, which hardly overshoots), and shortest turns of rotations."""
     from scipy.interpolate import Akima1DInterpolator
 
     knots = law.along[::_PIECES]

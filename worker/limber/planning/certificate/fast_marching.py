@@ -14,8 +14,7 @@ from limber.core.numerics.compiled import compiled
 @compiled
 def neighbours(active):
     """Return numbers of the nodes ``active`` [nx, ny, nz], -1 elsewhere, their indices in the flat
-    grid [n], and the numbers of their neighbours below and above along each axis [n, 6].
-    """
+    grid [n], and the numbers of their neighbours below and above along each axis [n, 6]."""
     shape = np.array(active.shape)
     steps = np.array([shape[1] * shape[2], shape[2], 1])
     flat = active.ravel()
@@ -36,15 +35,8 @@ def neighbours(active):
 
 @compiled
 def march(rate, near, known, values, edges):
-    """Return arrival costs ``u`` [n]; infinite at unreachable nodes.
-
-    Args:
-        rate: Cost per metre at the nodes [1/m], shape [n].
-        near: As :func:`neighbours` gives them, shape [n, 6].
-        known: Nodes whose value is given, bool [n].
-        values: Their values, shape [n].
-        edges: Distance between nodes along each axis [m], shape [3].
-    """
+    """Return arrival costs [n], infinite where unreachable, from cost per metre [n], neighbours [n,
+    6], values [n] at ``known`` nodes, and the grid's edges [3] [m]."""
     count = len(rate)
     u = np.full(count, np.inf)
     done = np.zeros(count, np.bool_)
@@ -76,10 +68,8 @@ def march(rate, near, known, values, edges):
 
 @compiled
 def _arrival(node, u, done, rate, edges, near, used):
-    """Solve sum_i w_i (u - t_i)^2 = rate^2 over the axes whose upwind neighbour is done.
-
-    ``used`` [4, 3] is room for t, w, the neighbour's value and the edge of each axis.
-    """
+    """Solve sum_i w_i (u - t_i)^2 = rate^2 over the axes whose upwind neighbour is done. ``used``
+    [4, 3] is room for t, w, the neighbour's value and the edge of each axis."""
     count = 0
     for axis in range(3):
         best, value = -1, np.inf

@@ -96,8 +96,7 @@ class _Cells:
 
     def path(self, begin: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
         """Return the cells [k] of the shortest path from ``begin`` to ``ends``; None if not
-        connected.
-        """
+        connected."""
         if not begin.any() or not ends.any():
             return None
         away, before, _ = dijkstra(self._neighbours(), directed=False, min_only=True,
@@ -133,13 +132,9 @@ class _Cells:
 
 @dataclass(frozen=True)
 class Verdict:
-    """``edges`` [m] along and off the shell, shape [3], of the last cells; whether they prove that
-    there is no path, or that there is none by the field without its error; a ``path`` [k, 3]
-    through cells that keep all limits at their corners, if any; the ``wall`` [k, 3], middles of the
-    cells that block the path, those least over a limit first; and, where the field does not know
-    the target's position exactly, ``nearest`` [k, 3]: middles of reached cells, those that come
-    nearest to the goal first.
-    """
+    """What cells with last ``edges`` [3] [m] along and off the shell show: a proof, or a path [k,
+    3]. ``wall`` [k, 3] are middles that block it, least over a limit first; ``nearest`` [k, 3]
+    those reached, nearest to the goal first, where the field does not know the target exactly."""
 
     edges: np.ndarray
     proven: bool = False
@@ -151,8 +146,7 @@ class Verdict:
 
 def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
     """Return a path on the field, or whether it is proven that none exists; undecided if that would
-    take more than ``most_cells`` at once.
-    """
+    take more than ``most_cells`` at once."""
     most = most_cells or _MOST_CELLS
     exact = replace(problem, beyond=problem.limits, errors={})
     on_field = _judged(exact, most, is_exact=True)
@@ -162,9 +156,8 @@ def judge(problem: GentleProblem, most_cells: int | None = None) -> Verdict:
 
 
 def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> Verdict:
-    """Cut cells until they prove that no path keeps the sure limits and comes as near to the goal
-    as the field's error there, which is 0 if ``is_exact``; or contain a path, or become too many.
-    """
+    """Cut cells until they prove that no path keeps the sure limits and comes within the field's
+    error of the goal (0 if ``is_exact``), or contain a path, or are too many."""
     cells, wall = _first(problem), _Wall(problem)
     while True:
         cells = cells.take(~_surely_outside(cells))
@@ -266,9 +259,8 @@ def _surely_outside(cells: _Cells) -> np.ndarray:
 
 def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Return in which cells no point keeps the sure limits, bool [n], and the uncertainty of this
-    due to each axis, [n, 3]; ``nodes`` [n, 32] are the numbers of each cell's ``positions`` [m, 3].
-    """
+    """Cells in which no point keeps the sure limits, bool [n], and this one's uncertainty by axis
+    [n, 3]; ``nodes`` [n, 32] number each cell's ``positions`` [m, 3]."""
     over, uncertainty = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
     for values, slopes, limits in _limited(cells.problem, positions):
         along = cells.chart.push_forward(positions, slopes) * cells.edges
@@ -293,8 +285,7 @@ def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
 def _limited(problem: GentleProblem, positions: np.ndarray,
              ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Yield the limited quantities at ``positions`` [m, 3] besides the force, smooth, shape [m],
-    their slopes to the position, [m, 3], and their sure limits there, [m].
-    """
+    their slopes to the position, [m, 3], and their sure limits there, [m]."""
     field, limits = problem.energy_field, problem.sure_limits
     if limits.max_energy < np.inf:
         yield (field.energy(positions), field.force(positions),
@@ -307,10 +298,8 @@ def _limited(problem: GentleProblem, positions: np.ndarray,
 
 
 def _least(values: np.ndarray, slopes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower bound in each cell, [n], of a function with ``values`` [n, 32] at
-    ``_STENCIL``, and ``slopes`` [n, 32, 3] there along the edges, times their lengths; and the part
-    of the reduction due to curvature along each axis, [n, 3].
-    """
+    """The lower bound [n] in cells of a function with values [n, 32] at ``_STENCIL``, and slopes
+    [n, 32, 3] along edges times their lengths; and what curvature takes off by axis [n, 3]."""
     corners = values[:, _AT]
     bends = _bends(values[..., None])
     if slopes is not None:
@@ -322,10 +311,8 @@ def _least(values: np.ndarray, slopes: np.ndarray | None = None) -> tuple[np.nda
 
 
 def _bends(values: np.ndarray) -> np.ndarray:
-    """Return the largest deviation of a function with ``values`` [n, 32, c] at ``_STENCIL`` from
-    the trilinear interpolation of the corners due to its second differences along each axis, [n,
-    3].
-    """
+    """The largest deviation of a function with values [n, 32, c] at ``_STENCIL`` from the corners'
+    trilinear interpolation, by its second differences along each axis [n, 3]."""
     beside = values[:, _BESIDE]
     second = beside[..., 0, :] - 2.0 * values[:, None, _AT] + beside[..., 1, :]
     return CURVATURE_FACTOR / 8.0 * np.linalg.norm(second, axis=-1).max(axis=2)

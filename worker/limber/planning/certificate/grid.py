@@ -30,10 +30,8 @@ _PAD = RIM + 1  # closed cells around the grid, for its coefficients and second 
 
 @dataclass
 class Grid:
-    """Cells in the rotated frame; corner ``(i, j, k)`` is at ``origin + (i, j, k) * edges``.
-
-    The distance to the goal is only needed in the cells ``about_goal``.
-    """
+    """Cells in the rotated frame; corner ``(i, j, k)`` is at ``origin + (i, j, k) * edges``. The
+    distance to the goal is only needed in the cells ``about_goal``."""
 
     origin: np.ndarray
     axes: np.ndarray
@@ -84,8 +82,7 @@ def first_grid(problem: GentleProblem) -> tuple[Grid, np.ndarray]:
 
 def _axes(start: np.ndarray, goal: np.ndarray, chart: Chart) -> np.ndarray:
     """Return three unit rows: the last is normal to the shell half-way, the first as near to the
-    direction from ``start`` [3] to ``goal`` [3] as that allows. Without a shell it is along it.
-    """
+    direction from ``start`` [3] to ``goal`` [3] as that allows. Without a shell it is along it."""
     direction = goal - start
     length = float(np.linalg.norm(direction))
     if length == 0.0:
@@ -105,11 +102,8 @@ def _axes(start: np.ndarray, goal: np.ndarray, chart: Chart) -> np.ndarray:
 
 def refined(grid: Grid, keep: np.ndarray, about_goal: np.ndarray, cell: np.ndarray,
             ratio: float | np.ndarray = FINEST) -> tuple[Grid, np.ndarray]:
-    """Return cells of ``ratio`` times the edges, for all or [3], at most 1, over ``keep``, in the
-    smallest box; and the start's.
-
-    The start stays in the centre of a cell. A new cell that overlaps a kept one is open.
-    """
+    """Cells of ``ratio`` (at most 1) times the edges over ``keep``, in the smallest box, and the
+    start's, which it stays in the centre of. A new cell that overlaps a kept one is open."""
     indices, centre, ratio = np.argwhere(keep), cell + 0.5, np.full(3, ratio)
     low, high = np.minimum(indices.min(axis=0), cell), np.maximum(indices.max(axis=0), cell) + 1
     before = np.ceil((centre - low) / ratio - 0.5 - _ROUND_OFF).astype(int) + _PAD
@@ -159,13 +153,9 @@ _FLAT = 0.5  # least fraction of that growth that its mean counts as
 
 @dataclass(frozen=True)
 class AboutGoal:
-    """A signed cost to the goal, negative inside it, and the cells where it is known.
-
-    Every point of the goal is in a cell that has all its coefficients among those ``known``; there
-    the spline of the ``cost`` is at most ``slack``. ``inside``: cells entirely inside the goal.
-    ``meets``: whether any open cell may contain a point of the goal. ``near``: where the queried
-    cells of the next grid are.
-    """
+    """A signed cost to the goal, negative inside, where ``known``: each point of the goal is in a
+    cell with all coefficients there, and the cost's spline is at most ``slack``. ``meets``: an open
+    cell may have a point of the goal. ``near``: the next grid's queried cells."""
 
     known: np.ndarray
     cost: np.ndarray
@@ -176,11 +166,8 @@ class AboutGoal:
 
 
 def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal:
-    """Return the goal data.
-
-    A spline with a function's values as coefficients differs from it by ``h^2 / 8 sum_i max |second
-    derivative|``.
-    """
+    """Return the goal data. A spline with a function's values as coefficients differs from it by
+    ``h^2 / 8 sum_i max |second derivative|``."""
     edges, shape = ground.edges, ground.open_cells.shape
     cells = np.argwhere(ground.active & grid.about_goal)
     nothing = np.zeros(shape, bool)
@@ -241,13 +228,9 @@ def short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, nea
 
 def _cost_left(length: np.ndarray, depth: np.ndarray, rate: np.ndarray, edges: np.ndarray,
                ) -> np.ndarray:
-    """Return the cost of a ``length`` [m] to the goal, at the ``rate`` half-way, for cells with
-    ``edges`` [3] [m]; nan where not known.
-
-    A single rate for all sides of the goal would be the smallest of them. Inside, where no
-    condition holds, the length flattens out to a goal's middle ``depth`` [m] below its surface: it
-    has no tip there.
-    """
+    """Cost of a length to the goal at the rate half-way, nan where unknown: one rate for all sides
+    would be the least. Inside, the length flattens out to the middle ``depth`` [m] below the
+    surface."""
     flat = np.maximum(length, -depth)
     flat = np.where(flat < 0.0, flat + flat**2 / (2.0 * depth), flat)
     growing = sum(np.gradient(rate, edges[axis], axis=axis)
@@ -258,11 +241,8 @@ def _cost_left(length: np.ndarray, depth: np.ndarray, rate: np.ndarray, edges: n
 
 
 def _growth(distance: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest growth of the goal's ``distance`` per metre in each cell, and a smooth
-    mean, of the same shape; by which the distance is divided to be a length.
-
-    The mean needs no reserve: the sub-solution is scaled down wherever it is too steep.
-    """
+    """The largest growth of the goal's distance per metre in each cell, and a smooth mean to divide
+    by. It needs no reserve: the sub-solution is scaled down wherever it is too steep."""
     ahead, behind = [], []
     for axis, edge in enumerate(edges):
         unknown = np.full_like(distance.take([0], axis), np.nan)

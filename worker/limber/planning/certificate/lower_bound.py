@@ -66,18 +66,9 @@ COST, ENERGY = "cost", "energy_integral_jm"
 
 @dataclass(frozen=True)
 class Certificate:
-    """A lower bound and how it was reached.
-
-    Attributes:
-        lower: No path that keeps the limits, on the field or on the branch, costs less to the
-            field's position of the goal.
-        upper: Cost of the best known path, infinite without one.
-        levels: For each grid ``spacing_m``, ``open_cells``, ``lower``, ``upper`` and when [s].
-        field_error_j: Subtracted from the energy before bounding [J].
-        to_go: The bound from any position, on all grids; None if the first has none.
-        stopped: Whether it was cancelled before the gap was small enough.
-        quantity: Bounded quantity, ``COST`` or ``ENERGY``.
-    """
+    """No path within the limits, on field or branch, costs under ``lower``; ``upper`` is the best
+    known, or infinite. ``field_error_j`` came off the energy; ``to_go`` is the bound from anywhere
+    (None: the first grid has none); ``stopped``: cancelled before the gap was small."""
 
     lower: float
     upper: float
@@ -110,25 +101,15 @@ Improve = Callable[[np.ndarray | None], float]
 
 def certify(problem: GentleProblem, improve: Improve, *, enough: float = ENOUGH,
             progress: Progress = SILENT) -> Certificate:
-    """Return a lower bound on the cost of every path, refined until it is close to the known one.
-
-    If cancelled (or by Ctrl-C) once a path is known, it returns the current result.
-
-    Raises:
-        NoPathError: closed cells separate start and goal; it is proven that no path exists.
-    """
+    """Return a lower bound on every path's cost, refined until close to the known one, or cancelled
+    with a path known. NoPathError if closed cells prove that there is no path."""
     return certify_all([problem], [improve], enough=[enough], progress=progress)[0]
 
 
 def certify_all(problems: Sequence[GentleProblem], improve: Sequence[Improve], *,
                 enough: Sequence[float], progress: Progress = SILENT) -> list[Certificate]:
-    """Return the same for each of problems that differ in the weight of length alone.
-
-    They share the grids and, on each, the energies of the field.
-
-    Raises:
-        NoPathError: as for one.
-    """
+    """Return the same for each of problems that differ in the weight of length alone. They share
+    the grids and, on each, the energies of the field. NoPathError as for one."""
     searches = [_Search(*each) for each in zip(problems, improve, enough, strict=True)]
     following: tuple[Grid, np.ndarray] | None = first_grid(problems[0])
     stopped = False
@@ -222,8 +203,7 @@ class _Search:
 
     def ratio(self) -> float:
         """Return the ratio of the next grid's cell edge to this one's: as fine as needed to close
-        the gap, which is proportional to the square of the edge.
-        """
+        the gap, which is proportional to the square of the edge."""
         gap = self.upper / self.lower - 1.0 if self.lower > 0.0 else np.inf
         if not np.isfinite(gap):
             return FINEST
@@ -239,12 +219,8 @@ class _Search:
 
 
 def _ratios(rates: Terrain, keep: np.ndarray, ratio: float) -> np.ndarray:
-    """Return the ratios of the next grid's edges to this one's, [3], for the cells ``keep``.
-
-    Together they lower what the bends of c take off it as a common ``ratio`` would, with the fewest
-    cells: equal bends along each axis. None is too flat for the sub-solution, which bends along all
-    axes near start and goal.
-    """
+    """Ratios [3] of the next grid's edges that lower what c's bends take off as one common ratio
+    would, with the fewest cells: equal bends. None is too flat for the sub-solution's own bends."""
     bends = np.array([axis[keep].mean() for axis in rates.bends])
     ratios = ratio * np.sqrt(bends.mean() / np.maximum(bends, 1e-9 * bends.mean() + 1e-300))
     ratios = np.clip(ratios, FINEST, 1.0)
@@ -286,13 +262,8 @@ class _Bounds:
 
 
 class _FieldOnGrid(NamedTuple):
-    """What a grid has for any weight of length.
-
-    Attributes:
-        open_cells: Cells connected to the start's. over: Those that limits close.
-        corners: Numbers of the evaluated corners [n, 3].
-        energy, slopes: There, energy [J] [n], and its growth along a cell's edges [n, 3].
-    """
+    """What a grid has for any weight of length: cells connected to the start, those that limits
+    close, and at evaluated corners [n, 3] energy [n] [J] and its growth along edges [n, 3]."""
 
     open_cells: np.ndarray
     over: np.ndarray
@@ -375,8 +346,7 @@ def _surely_outside(problem: GentleProblem, grid: Grid) -> np.ndarray:
 def _surely_over(problem: GentleProblem, grid: Grid, cells: np.ndarray, corners: np.ndarray,
                  energy: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Return those of ``cells`` in which no point keeps the limits, including the field's error;
-    ``energy`` [n] and ``force`` [n, 3] at ``corners`` [n, 3]: theirs and those next to them.
-    """
+    ``energy`` [n] and ``force`` [n, 3] at ``corners`` [n, 3]: theirs and those next to them."""
     limits, field, over = problem.sure_limits, problem.energy_field, np.zeros(cells.shape, bool)
     nodes = np.argwhere(corners_of(cells))
 

@@ -60,10 +60,8 @@ _NEARER = 12  # steps towards the point of a hull nearest to zero
 
 @compiled
 def turns(slopes, cells):
-    """Return ``M_i h^2`` of convex functions, [3, *shape of cells], in ``cells`` [nx, ny, nz].
-
-    ``slopes`` [nx + 1, ny + 1, nz + 1, 3] are those at the corners, times h; nan counts as no turn.
-    """
+    """Return ``M_i h^2`` of convex functions [3, *shape of cells] from slopes at corners [nx + 1,
+    ny + 1, nz + 1, 3] times h; nan counts as no turn."""
     out = np.zeros((3,) + cells.shape)
     for i in range(cells.shape[0]):
         for j in range(cells.shape[1]):
@@ -83,11 +81,8 @@ def turns(slopes, cells):
 
 @compiled
 def least_between(values, slopes, cells):
-    """Return lower bounds in ``cells`` [nx, ny, nz] of functions with ``values`` [nx + 1, ny + 1,
-    nz + 1] and ``slopes`` at the corners, as in :func:`turns`; -inf where not known.
-
-    A second difference that includes an unknown value, nan, counts as 0.
-    """
+    """Lower bounds in cells [nx, ny, nz] from values [nx + 1, ny + 1, nz + 1] and slopes as in
+    :func:`turns`, -inf where unknown. Second differences with a nan count as 0."""
     out = np.full(cells.shape, -np.inf)
     turned = turns(slopes, cells)
     indices = np.argwhere(cells)
@@ -117,8 +112,7 @@ def least_between(values, slopes, cells):
 @compiled
 def least_size(vectors, cells):
     """Return the least length in ``cells`` [nx, ny, nz] of a vector with values ``vectors`` [nx +
-    1, ny + 1, nz + 1, 3] at the corners; 0 where not known.
-    """
+    1, ny + 1, nz + 1, 3] at the corners; 0 where not known."""
     out = np.zeros(cells.shape)
     indices = np.argwhere(cells)
     corners, curved, step = np.empty((8, 3)), np.empty(3), np.empty(3, np.int64)
@@ -199,16 +193,9 @@ _LARGE = 100_000  # a single round for so many cells: it takes a third of a seco
 
 
 class Terrain(NamedTuple):
-    """A grid of cells, which of them are open, and the cost per metre there.
-
-    Attributes:
-        edges: Of a cell [m], shape [3].
-        open_cells: Cells that a path may enter, bool [nx, ny, nz]; none at the grid's border.
-        rate: c at the corners [1/m], shape [nx + 1, ny + 1, nz + 1].
-        bends: Subtracted from it half-way along each axis, [3, *shape of open_cells].
-        level: Cells where only the floor counts, shape of ``open_cells``.
-        floor: Lower bound of c [1/m].
-    """
+    """A grid and its cost per metre c [1/m]: at corners [nx + 1, ny + 1, nz + 1], less ``bends``
+    [3, *cells] half-way along each axis, at least ``floor``. No cell at the border is open; in
+    ``level`` cells only the floor counts."""
 
     edges: np.ndarray
     open_cells: np.ndarray
@@ -219,11 +206,8 @@ class Terrain(NamedTuple):
 
     @property
     def active(self) -> np.ndarray:
-        """Cells that have coefficients: open cells and ``RIM`` layers around them.
-
-        Open cells need those of their neighbours. The others let a cost arrive along an oblique
-        border as if there were none: at each of its steps it would bend and be too steep.
-        """
+        """Cells that have coefficients: open ones and ``RIM`` layers around them. The layers let a
+        cost arrive along an oblique border, at whose steps it would be too steep."""
         return widened(self.open_cells, RIM)
 
 
@@ -241,12 +225,9 @@ def widened(cells: np.ndarray, times: int = 1) -> np.ndarray:
 
 def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cells: np.ndarray,
             edges: np.ndarray, floor: float) -> Terrain:
-    """Return the terrain of ``rate`` at the corners, nowhere below ``floor`` [1/m].
-
-    ``slopes`` [..., 3] are its growth per cell edge there, along each axis; ``positive`` marks the
-    corners where the energy is not cut off; corners that were not evaluated are nan in ``rate`` and
-    are not neighbours of an open cell's.
-    """
+    """The terrain of ``rate`` [1/m] at corners, nan if not evaluated, at least ``floor``;
+    ``slopes`` [..., 3] are its growth per edge, ``positive`` corners where the energy is not cut
+    off."""
     bends = turns(slopes, open_cells)
     del slopes  # three numbers a corner of the whole box
     bends *= 0.25
@@ -258,9 +239,7 @@ def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cel
 @compiled
 def _bends(values, cells):
     """Return ``M_i h^2 / 4`` of the module's text in ``cells``, shape [3, *shape of cells].
-
-    ``values`` at the corners; a second difference with one that is not known (nan) counts as 0.
-    """
+    ``values`` at the corners; a second difference with one that is not known (nan) counts as 0."""
     out = np.zeros((3,) + cells.shape)
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     at, step = np.empty(3, np.int64), np.empty(3, np.int64)
@@ -336,17 +315,9 @@ def with_corner(nodes: np.ndarray) -> np.ndarray:
 
 def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells: np.ndarray,
                 rounds: int = _ROUNDS) -> tuple[np.ndarray, float]:
-    """Return coefficients of a ``u`` with |grad u| <= c in every open cell, and a factor.
-
-    Args:
-        rates: The cost a length at the corners, with its slopes.
-        known: Cells on and about the source, bool [nx, ny, nz].
-        shape: A length [m] there that grows by about a metre per metre: a signed distance.
-        free_cells: Cells without a condition: those entirely inside the source.
-        rounds: Number of local reweightings; fewer give a lower ``u``, never an invalid one.
-
-    The coefficients are ``factor * shape`` on ``known``; infinite where unreachable from there.
-    """
+    """Return coefficients of a ``u`` with |grad u| <= c in every open cell but ``free_cells``, and
+    a factor: ``factor * shape`` on ``known``, with ``shape`` a signed distance [m]; infinite where
+    unreachable. Fewer local reweightings give a lower ``u``, never an invalid one."""
     active = rates.active
     around = known & active
     u = np.full(active.shape, np.inf)
@@ -493,8 +464,7 @@ def _slope_first(source, out):
 @compiled
 def _excess(u, edges, open_cells, rate, bends, level, floor, asked):
     """Return for each of the open cells ``asked`` [n, 3] the largest |grad u| relative to the
-    allowed value there, else 0.
-    """
+    allowed value there, else 0."""
     over = np.zeros(len(asked))
     along, down = np.empty((3, 3, 3)), np.empty((3, 3, 3))
     one, two, three = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))

@@ -34,13 +34,8 @@ _DRAWS_LOG2 = 14  # quasi-random draws (log2): the probability of 0.95 is within
 
 @dataclass(frozen=True)
 class Risk:
-    """Probability that limits hold with uncertain moduli.
-
-    Attributes:
-        kept: Lower bound of the probability that all are kept along the motion.
-        factors: By limit: possible peak over its peak on the estimate, at the given confidence.
-        excess: By limit: possible peak over the allowed value.
-    """
+    """Probability, at least ``kept``, that limits hold with uncertain moduli; by limit the possible
+    peak at the given confidence over its peak on the estimate, and over the limit."""
 
     kept: float
     factors: dict[str, float]
@@ -48,10 +43,7 @@ class Risk:
 
     def left(self, limits: Limits, path: ResolvedPath) -> Limits:
         """Return the limits on the estimate's branch in motion with which the motion keeps
-        ``limits``.
-
-        As far below the limits as at standstill, at the pose nearest to each.
-        """
+        ``limits``. As far below the limits as at standstill, at the pose nearest to each."""
         standing = sizes(path.ahead)
         return limits.tightened({
             name: share * getattr(limits, name) / float(np.abs(standing[name]).max())
@@ -110,12 +102,8 @@ def _features(steps: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Exposure:
-    """Limited quantities at poses of a motion that come near their limits.
-
-    Attributes:
-        asked: The limits, by name.
-        surfaces: Surface of each quantity; none if no pose comes near.
-    """
+    """Limited quantities at poses of a motion that come near their limits; no surfaces if none
+    does."""
 
     asked: dict[str, float]
     surfaces: dict[str, Surface]
@@ -144,14 +132,8 @@ def _draws(covariance: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class YoungUncertainty:
-    """Moduli at control points, log-normal about the estimate.
-
-    Attributes:
-        shares: Fraction of each control point in each tetrahedron's modulus, rows sum to 1, [tets,
-        K].
-        deviations: Standard deviations of log E at the control points, shape [K].
-        correlation: Shape [K, K].
-    """
+    """Log-normal moduli: ``shares`` [tets, K] of control points in tetrahedra, rows summing to 1,
+    standard deviations of log E [K], and correlation [K, K]."""
 
     shares: np.ndarray
     deviations: np.ndarray
@@ -175,20 +157,14 @@ class YoungUncertainty:
 
     def risk(self, grasp_model: GraspModel, path: ResolvedPath, limits: Limits, confidence: float,
              progress: Progress = SILENT) -> Risk:
-        """Return how a motion keeps limits with a confidence between 0.5 and 1.
-
-        Raises:
-            ConvergenceError: the branch with other moduli cannot be solved at a pose.
-        """
+        """Return how a motion keeps limits with a confidence between 0.5 and 1. ConvergenceError if
+        the branch with other moduli cannot be solved at a pose."""
         return self.exposure(grasp_model, path, limits, progress).risk(self.covariance, confidence)
 
     def exposure(self, grasp_model: GraspModel, path: ResolvedPath, limits: Limits,
                  progress: Progress = SILENT) -> "Exposure":
-        """Return how the limited values change with the moduli along a motion.
-
-        Raises:
-            ConvergenceError: the branch with other moduli cannot be solved at a pose.
-        """
+        """Return how the limited values change with the moduli along a motion. ConvergenceError if
+        the branch with other moduli cannot be solved at a pose."""
         # With the grasp at a given position, the branch's shape hardly depends on its modulus.
         asked = limits.asked_loads()
         whole = path.approach.joined(path.solved)
@@ -216,11 +192,8 @@ class YoungUncertainty:
 
     def solved(self, grasp_model: GraspModel, logs: np.ndarray, states: SolvedPoses,
                ) -> SolvedPoses:
-        """Return the same poses with changed moduli, each solved from its state.
-
-        Raises:
-            ConvergenceError: one cannot be solved.
-        """
+        """Return the same poses with changed moduli, each solved from its state. ConvergenceError
+        if one cannot be solved."""
         other, results = self.scaled(grasp_model, logs), []
         for pose, displacement in zip(states.poses, states.displacements, strict=True):
             result = other.follow(pose[None, :3], displacement)[0]
@@ -236,8 +209,7 @@ class YoungUncertainty:
 
 def _axes(covariance: np.ndarray) -> np.ndarray:
     """Return changes of log E by one standard deviation along the axes of the posterior that have
-    any variance, the largest first, shape [K, r].
-    """
+    any variance, the largest first, shape [K, r]."""
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     order = np.argsort(-variances, kind="stable")
     order = order[variances[order] > 1e-12 * max(float(variances.max()), 1e-300)]
@@ -246,8 +218,7 @@ def _axes(covariance: np.ndarray) -> np.ndarray:
 
 def _design(count: int, far: float) -> tuple[np.ndarray, np.ndarray]:
     """Return places [m, r] along and between axes, the middle first, and the axes [p, 2] whose
-    products they determine.
-    """
+    products they determine."""
     crossed = [(k, other) for k in range(min(count, _CROSSED)) for other in range(k)]
     unit = far * np.eye(count)
     between = [(unit[k] + unit[other]) / np.sqrt(2.0) for k, other in crossed]
@@ -265,8 +236,7 @@ def _parts(states: SolvedPoses, name: str) -> np.ndarray:
 
 def _chosen(states: SolvedPoses, asked: dict[str, float]) -> np.ndarray:
     """Return the poses to solve: some of those that may break a limit under some moduli, evenly
-    along the motion, and the pose nearest to each limit.
-    """
+    along the motion, and the pose nearest to each limit."""
     known = sizes(states)
     high = np.flatnonzero(np.any([known[name] > max(_HIGH * known[name].max(), _NEAR * limit)
                                   for name, limit in asked.items()], axis=0))

@@ -42,15 +42,8 @@ _RADII = np.array([-1.8, -1.1, -0.4, 0.4, 1.1, 1.8])  # deviations of the radius
 
 @dataclass(frozen=True)
 class Strength:
-    """The strain at break of branches like this one.
-
-    Attributes:
-        shapes, scales: Parameters of equally likely Weibull distributions, shapes [d]; scales are
-        strains.
-        radius_deviation: Relative deviation of the branch's radius.
-        source: Origin of the data, in words.
-        tests: Number of break tests; 0: none.
-    """
+    """The strain at break: equally likely Weibull distributions with shapes and scales (strains)
+    [d], and the radius's relative deviation. ``source`` is in words; 0 tests: none."""
 
     shapes: np.ndarray
     scales: np.ndarray
@@ -61,11 +54,8 @@ class Strength:
     @classmethod
     def of_tests(cls, strains: np.ndarray, source: str, radius_deviation: float = 0.0,
                  ) -> "Strength":
-        """Return the strength from break tests at ``strains`` [n].
-
-        Raises:
-            InputError: there are too few, or all are equal.
-        """
+        """Return the strength from break tests at ``strains`` [n]. InputError if there are too few,
+        or all are equal."""
         if len(strains) < _FEWEST:
             raise InputError(f"{source} has {len(strains)} break tests.",
                              "The scatter of the strength cannot be told from so few.",
@@ -116,8 +106,7 @@ class Strength:
 
 def assumed_strain(young: float) -> float | None:
     """Return the strain at break assumed for a branch with this median modulus [Pa]; None for one
-    that is softer than wood.
-    """
+    that is softer than wood."""
     return STRENGTH_OVER_YOUNG if young >= LEAST_YOUNG else None
 
 
@@ -128,11 +117,8 @@ def assumed(strain: float) -> dict[str, Any]:
 
 
 def read_break_tests(path: Path) -> np.ndarray:
-    """Return strains at break [n] of a CSV with a column ``strain_at_break``.
-
-    Raises:
-        InputError: there is no such file or column, or a value is not a strain.
-    """
+    """Return strains at break [n] of a CSV with a column ``strain_at_break``. InputError if there
+    is no such file or column, or a value is not a strain."""
     rows = csv_records(path, "a CSV file of break tests")
     if not rows or _COLUMN not in rows[0]:
         raise InputError(f"{path} has no column {_COLUMN}.",
@@ -189,15 +175,8 @@ _WHAT = "the table of a plan's damage"
 
 @dataclass(frozen=True)
 class DamageAlong:
-    """Values at the nodes of the branch's axes.
-
-    Attributes:
-        nodes: Positions in the hanging branch [m], shape [n, 3].
-        parents: Row of each node's parent, -1 for the root, shape [n].
-        strains: Largest principal strain there in any state of the motion, shape [n].
-        probabilities: Probability that this strain breaks the branch there, shape [n]; None if the
-            strength is not known.
-    """
+    """At nodes [n, 3] [m] of the hanging branch's axes, with parent rows (-1: root), the largest
+    strain of a motion and the probability [n] that it breaks there (None: strength unknown)."""
 
     nodes: np.ndarray
     parents: np.ndarray
@@ -230,11 +209,7 @@ class DamageAlong:
 
     @classmethod
     def read(cls, path: Path) -> "DamageAlong":
-        """Read what :meth:`write` wrote.
-
-        Raises:
-            InputError: it is no such table.
-        """
+        """Read what :meth:`write` wrote. InputError if it is no such table."""
         table = read_columns(path, _COLUMNS, _WHAT)
         parents = table["parent"].astype(int)
         if (parents >= np.arange(len(parents))).any() or (parents < -1).any():

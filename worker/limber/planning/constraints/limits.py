@@ -32,13 +32,8 @@ from limber.planning.settings import PlanSettings
 
 @dataclass(frozen=True)
 class Broken:
-    """A limit that a state of the full model breaks.
-
-    Attributes:
-        name: Name of the limit, with its unit.
-        value, limit: The state's value and the requested limit.
-        position: Position of the grasp there [m], shape [3].
-    """
+    """A limit, named with its unit, that a state of the full model breaks at a grasp position [3]
+    [m]."""
 
     name: str
     value: float
@@ -86,11 +81,8 @@ _SCALE = 0.1  # [m] in which closeness falls to a third
 
 @dataclass(frozen=True)
 class Obstacles(Constraint):
-    """Bodies that the branch must not touch.
-
-    The limited quantity is the closeness, ``exp(-d / 0.1 m)`` of the clearance d: 1 where the
-    branch touches a body, more inside; smooth for a planner's field.
-    """
+    """Bodies that the branch must not touch. Limited is the closeness ``exp(-d / 0.1 m)`` of the
+    clearance d: 1 on contact, more inside; smooth for a planner's field."""
 
     @classmethod
     def keeping(cls, bodies: tuple[Obstacle, ...], clearance: float) -> "Obstacles":
@@ -137,17 +129,9 @@ CONSTRAINTS: list[Callable[[PlanSettings], Constraint | None]] = []
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits as requested; infinite if none is.
-
-    Attributes:
-        energy: Energy above the hanging state [J].
-        force: Magnitude of the gripper's force [N].
-        strain, stress: Largest principal values anywhere in the branch, stress in Pa.
-        axial_force: Force of the gripper along the branch, pulling or pushing [N].
-        torque: Torque of the gripper [Nm].
-        low, high: Box that the grasp stays in [m], shape [3].
-        constraints: Additional constraints.
-    """
+    """The limits as requested, infinite if none: energy above hanging [J], force [N] and torque [N
+    m] of the gripper, its pull or push along the branch [N], largest principal strain and stress
+    [Pa], and a box [3] [m] for the grasp."""
 
     energy: float = np.inf
     force: float = np.inf
@@ -162,11 +146,7 @@ class Limits:
     def with_cell(self, low: np.ndarray | None, high: np.ndarray | None, force: float,
                   obstacles: tuple[Obstacle, ...], clearance: float = 0.0) -> "Limits":
         """Return the limits with those of a robot's cell added; ``clearance`` [m] is kept from its
-        obstacles.
-
-        Raises:
-            InputError: the workspaces do not intersect.
-        """
+        obstacles. InputError if the workspaces do not intersect."""
         more = (Obstacles.keeping(obstacles, clearance),) if obstacles else ()
         both = replace(self, force=min(self.force, force),
                        constraints=(*more, *self.constraints),
@@ -180,8 +160,7 @@ class Limits:
 
     def values(self, grasps: np.ndarray, nodes: np.ndarray) -> dict[str, np.ndarray]:
         """Return the constraints' quantities of states with the grasp at ``grasps`` [k, 3] and the
-        nodes at ``nodes`` [k, n, 3], by name, shape [k] each.
-        """
+        nodes at ``nodes`` [k, n, 3], by name, shape [k] each."""
         return {each.name: each.values(grasps, nodes) for each in self.constraints}
 
     def met(self, grasps: np.ndarray, nodes: np.ndarray) -> list[str]:
@@ -190,14 +169,8 @@ class Limits:
 
     @classmethod
     def of(cls, settings: PlanSettings, stiffer: float = 1.0) -> "Limits":
-        """Return the settings' limits.
-
-        ``stiffer`` is the possible ratio of Young's modulus to its estimate: the stress may exceed
-        that of a model with the estimate by this factor.
-
-        Raises:
-            InputError: the workspace is empty, or the strain is limited twice.
-        """
+        """Return the settings' limits; ``stiffer``, the modulus over its estimate, is left room in
+        stress. InputError if the workspace is empty or strain limited twice."""
         strain = settings.max_strain or np.inf
         if settings.wood is not None and settings.max_damage is None:
             if settings.max_strain is not None:
@@ -254,13 +227,9 @@ class Limits:
         return found
 
     def doubts(self, known: EnergyField) -> "dict[str, float]":
-        """Return by how much the field may exceed a limit at a pose that keeps it: by limit, 0 if
-        not requested, infinite if the field's error is not known.
-
-        The largest overestimate of the field, fitted without it, at a sample that keeps the limit
-        or is not far over it. A proof that no path keeps the limits relies on this. Margins, which
-        most poses keep, are sufficient for a plan that is checked afterwards, but not for a proof.
-        """
+        """By limit, how far the field may exceed it at a pose that keeps it (0: not asked,
+        infinite: unknown): its largest overestimate, fitted without it, at samples not far over.
+        Proofs need this; margins that most poses keep suffice for a plan that is checked."""
         found = dict.fromkeys(UNITS, 0.0)
         inner, values = ~known.region.is_face(), sampled_sizes(known.samples)
         above = self.above(known)
@@ -285,8 +254,7 @@ class Limits:
     @staticmethod
     def above(known: EnergyField) -> dict[str, np.ndarray]:
         """Return the field's overestimate at each sample, fitted without it, by the names of
-        ``UNITS`` and of constraints, shape [m] each; nan if not known.
-        """
+        ``UNITS`` and of constraints, shape [m] each; nan if not known."""
         samples, missed = known.samples, known.missed
         size = np.linalg.norm(samples.forces, axis=1)
         above = {"energy": missed[:, 0],
@@ -297,23 +265,20 @@ class Limits:
 
     def errors(self, known: EnergyField) -> dict[str, LocalError]:
         """Return the field's possible overestimate as a function of the position in the plain
-        chart, by limit: no left-out sample exceeded it; nowhere more than :meth:`doubts`.
-        """
+        chart, by limit: no left-out sample exceeded it; nowhere more than :meth:`doubts`."""
         doubts = self.doubts(known)
         return self._local(known, 1.0, 1.0, {name: doubts[name] for name in self.asked()
                                              if np.isfinite(doubts[name])})
 
     def within(self, known: EnergyField, share: float) -> FieldArrays:
         """Return the field with these limits, tighter at each position by a ``share`` of the
-        field's possible underestimate there, which 95 % of the left-out samples keep.
-        """
+        field's possible underestimate there, which 95 % of the left-out samples keep."""
         return self._slackened(known, self._local(known, -1.0, _COVERED, {
             name: _MOST * limit for name, limit in self.asked().items()}), share)
 
     def in_doubt(self, known: EnergyField) -> FieldArrays:
         """Return the field with limits that it may exceed at a position where the branch keeps
-        these: extended by the field's possible overestimate there; infinite if not known.
-        """
+        these: extended by the field's possible overestimate there; infinite if not known."""
         return self._slackened(known, self.errors(known), -1.0)
 
     def _slackened(self, known: EnergyField, errors: dict[str, LocalError], share: float,
@@ -328,8 +293,7 @@ class Limits:
     def _local(self, known: EnergyField, side: float, covered: float, most: dict[str, float],
                ) -> dict[str, LocalError]:
         """Return the errors of the limits of ``most``; on the ``side`` of overestimates, 1, or
-        underestimates, -1.
-        """
+        underestimates, -1."""
         inner, above = ~known.region.is_face(), self.above(known)
         mapped = known.region.chart.plain.map(known.samples.positions)[inner]
         return {name: LocalError.of(mapped, side * above[name][inner], covered, limit)

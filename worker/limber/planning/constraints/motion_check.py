@@ -37,16 +37,8 @@ _TOWARDS = 0.8  # fraction of a limit's reserve for inertia that the next pace u
 
 @dataclass(frozen=True)
 class MotionCheck:
-    """A motion on the full model in time.
-
-    Attributes:
-        pace: The last one tried; the one to use if nothing is broken.
-        broken: Limits that it breaks, each with its position; empty if the motion is allowed.
-        peaks, static_peaks: Largest values by requested limit, with inertia and without.
-        slowings: Number of times the motion was slowed down.
-        excess: By limit: its peak over the allowed value.
-        step_count, seconds: Totals of all simulations.
-    """
+    """A motion on the full model in time, at the last pace, and the limits it breaks, with
+    positions. Peaks are by limit with inertia and without, ``excess`` is peak over limit."""
 
     pace: Pace
     broken: list[str]
@@ -68,12 +60,8 @@ class MotionCheck:
 def check_motion(grasp_model: GraspModel, path: ResolvedPath, limits: Limits, pace: Pace, *,
                  slowings: int, workers: int | None = None, progress: Progress = SILENT,
                  ) -> MotionCheck:
-    """Move the branch along approach and path and back; slow the motion until ``limits`` hold.
-
-    Args:
-        path: Keeps the limits at standstill at every pose.
-        slowings: Most times to slow down and try again.
-    """
+    """Move along approach, path and back, slowing up to ``slowings`` times until the limits hold.
+    The path keeps them at standstill."""
     ahead = path.ahead
     standing = {name: float(np.abs(size).max()) for name, size in sizes(ahead).items()}
     paths = [(ahead.poses, ahead.displacements[0]),
@@ -169,10 +157,8 @@ def _sizes(grasp_model: GraspModel, found: DynamicResult, limits: Limits) -> dic
 
 def _slower(peaks: dict[str, float], standing: dict[str, float], limits: Limits,
             has_failed: bool) -> float | None:
-    """Return the factor by which to slow down next; None if no pace keeps a limit.
-
-    The effect of inertia falls with the square of the pace.
-    """
+    """Return the factor by which to slow down next; None if no pace keeps a limit. The effect of
+    inertia falls with the square of the pace."""
     needed = [_LEAST_SLOWING] if not has_failed else [2.0]
     for name, peak in peaks.items():
         limit = getattr(limits, name)
@@ -194,17 +180,8 @@ _SLACK = 1e-3  # fraction of the goal's tolerance that is rounding
 
 def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: np.ndarray,
                          ) -> list[str]:
-    """Return the violations of a motion, each with its position; empty if it is allowed.
-
-    Every pose of approach and path must have an acceptable solution within the limits and keep the
-    constraints, and the end must be in the goal region. The return path takes the same states.
-
-    Args:
-        path: Solved on the full model.
-        limits: As requested, without margins.
-        goal: Where it must end.
-        nodes: Nodes of the mesh at rest [m], shape [n, 3].
-    """
+    """Return a motion's violations with positions: every pose must be solved within limits and
+    constraints, without margins, and the end in the goal. The way back takes the same states."""
     faults: list[str] = []
     for position, reason in zip(path.unsolved, path.reasons, strict=True):
         point_text = ", ".join(f"{x:.3f}" for x in position)
@@ -231,8 +208,7 @@ def field_error(field: EnergyField, states: SolvedPoses) -> float:
 def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limits: Limits,
            ) -> GraspSamples:
     """Return states of a rejected path as samples: its end, where limits are broken, and where the
-    field's error is largest; and poses without a solution as rejected ones.
-    """
+    field's error is largest; and poses without a solution as rejected ones."""
     whole = path.approach.joined(path.solved)
     off = np.abs(field.energy(whole.poses[:, :3]) - whole.energies)
     added = limits.values(whole.poses[:, :3], grasp_model.mesh.nodes + whole.displacements)
@@ -255,8 +231,7 @@ def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limi
 def as_samples(grasp_model: GraspModel, states: SolvedPoses, like: GraspSamples, limits: Limits,
                unsolved: np.ndarray = _NONE) -> GraspSamples:
     """Return states as samples with what those ``like`` them have, and the quantities of the
-    ``limits``' constraints; ``unsolved`` grasp positions [q, 3] as rejected ones.
-    """
+    ``limits``' constraints; ``unsolved`` grasp positions [q, 3] as rejected ones."""
     names = ("targets", "torques", "strain_places", "stresses", "axial_forces")
     optional = {name: getattr(states, name) for name in names if getattr(like, name) is not None}
     if like.shape_slopes is not None:
@@ -270,11 +245,8 @@ def as_samples(grasp_model: GraspModel, states: SolvedPoses, like: GraspSamples,
 
 def with_constraints(field: EnergyField, grasp_model: GraspModel, limits: Limits,
                      workers: int | None, progress: Progress) -> EnergyField:
-    """Return the field with the constraints' quantities as loads.
-
-    Raises:
-        NoPathError: one is broken where the branch hangs.
-    """
+    """Return the field with the constraints' quantities as loads. NoPathError if one is broken
+    where the branch hangs."""
     nodes, rest = grasp_model.mesh.nodes, grasp_model.rest.displacement
     if met := limits.met(field.rest[None], nodes + rest[None]):
         raise NoPathError(Text("The branch breaks a limit at its rest pose: ",

@@ -82,11 +82,9 @@ class Chart:
                        np.ascontiguousarray(gradients, float), forward, *self.arrays)
 
     def growth(self, points: np.ndarray, reach: float) -> np.ndarray:
-        """Return the largest change of plain coordinates per metre within ``reach`` [m], [n].
-
-        The map's singular values are 1, R / r and R t / (r sin t). Infinite if the pivot or the
-        point opposite is within reach.
-        """
+        """The largest change [n] of plain coordinates per metre within ``reach`` [m]: singular
+        values are 1, R / r and R t / (r sin t). Infinite if pivot or opposite point are within
+        it."""
         if self.radius == 0.0:
             return np.ones(len(points))
         least, angle = self._within(points, reach)
@@ -119,8 +117,7 @@ class Chart:
 
     def _within(self, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the least distance from the pivot [m] and the largest angle from the outward axis
-        [rad] within ``reach`` [m]; no angle (NaN) if the pivot or the point opposite is near.
-        """
+        [rad] within ``reach`` [m]; no angle (NaN) if the pivot or the point opposite is near."""
         local = (points - self.pivot) @ self.axes.T
         least = np.linalg.norm(local, axis=1) - reach
         safe = np.maximum(least, 1e-9)

@@ -40,14 +40,8 @@ class FitChoice:
 
 def chosen_fits(samples: GraspSamples, region: TrustRegion, charts: Sequence[tuple[float, float]],
                 progress: Progress) -> tuple[FitChoice, FitChoice]:
-    """Return the choices of least cross-validation error: for the energy, and for the shape.
-
-    Args:
-        samples: Results of the branch model.
-        region: Region in which the fits are trusted.
-        charts: Stretch and depth of the charts to try.
-        progress: Called for each choice.
-    """
+    """Return the choices of least cross-validation error for the energy and for the shape;
+    ``charts`` are stretch and depth of those to try."""
     chart = region.chart
     picked = _spread_out(region.is_face(), _CHOOSE_FROM)
     some, face = samples.take(picked), region.is_face()[picked]
@@ -70,8 +64,7 @@ def chosen_fits(samples: GraspSamples, region: TrustRegion, charts: Sequence[tup
 def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, float]],
            progress: Progress) -> FitChoice:
     """Return the choice with the least ``missed``: the first kernel on all charts, then every other
-    kernel on the best of those.
-    """
+    kernel on the best of those."""
     first, *others = KERNELS_TRIED
     asked = [FitChoice(*first, *chart) for chart in charts]
     scores: dict[FitChoice, float] = {}
@@ -89,8 +82,7 @@ def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, f
 def misplaced_tips(samples: GraspSamples, choice: FitChoice, chart: Chart,
                    channels: slice = slice(3)) -> np.ndarray:
     """Return the tip's error at each sample in the fit to all the others [m], and its targets' with
-    more ``channels`` than those of the tip, shape [m, channels / 3].
-    """
+    more ``channels`` than those of the tip, shape [m, channels / 3]."""
     chart = choice.on(chart)
     slopes = slopes_on(chart, samples)
     missed = RadialInterpolant.leave_one_out(
@@ -102,8 +94,7 @@ def misplaced_tips(samples: GraspSamples, choice: FitChoice, chart: Chart,
 
 def with_slopes(samples: GraspSamples) -> np.ndarray:
     """Return the samples of the shape's fit: those with known slopes, which are unknown at a snap;
-    all if hardly any are known.
-    """
+    all if hardly any are known."""
     everything = np.arange(len(samples.poses))
     if samples.shape_slopes is None:
         return everything
@@ -131,17 +122,9 @@ def _spread_out(face: np.ndarray, count: int) -> np.ndarray:
 
 def cross_validated_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face: np.ndarray,
                            ) -> tuple[dict[str, float], np.ndarray]:
-    """Return errors on each sample of the fit to all the others, in closed form.
-
-    Only samples inside the hull count: the planner never leaves it.
-
-    Args:
-        face: Whether each sample is on the hull's face, bool [m].
-
-    Returns:
-        The measures of :func:`error_measures`, and prediction less truth of energy [J] and force
-        [N], shape [m, 4].
-    """
+    """Errors of a fit at each sample left out, in closed form: :func:`error_measures`, and
+    prediction less truth of energy [J] and force [N] [m, 4]. Samples on the hull's ``face`` do not
+    count: the planner never leaves the hull."""
     if not (~face).any():
         raise WorkError(f"{len(samples.poses)} grasp poses are too few for cross-validation.",
                         "The error of the energy field cannot be measured.",
@@ -159,16 +142,9 @@ def cross_validated_errors(samples: GraspSamples, chart: Chart, choice: FitChoic
 
 def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
                    ) -> dict[str, float]:
-    """Return the errors of predictions at ``truth``'s poses.
-
-    Returns:
-        ``energy_error`` and ``force_error``: root mean square error over root mean square of the
-        branch model's values; ``energy_error_median`` and ``force_error_median``: median of
-        the error of each sample over its own value; ``energy_error_most`` and
-        ``force_error_most``: 95 % of those are no larger; ``gentle_energy_error``: like the first,
-        over the half of the samples with the least energy, where gentle paths run;
-        ``held_out_count``.
-    """
+    """Errors of predictions. ``energy_error`` and ``force_error`` are root mean squares over that
+    of the truth; ``_median`` and ``_most`` (95 %) are of each sample's over its own value;
+    ``gentle_energy_error`` is over the half of least energy, where gentle paths run."""
     true_energies = np.maximum(truth.energies, 0.0)
     energy_off = np.abs(energy - true_energies)
     force_off = np.linalg.norm(force - truth.forces, axis=1)

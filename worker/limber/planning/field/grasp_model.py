@@ -49,15 +49,8 @@ _DIFFERENCE = 1e-6  # [m] displacement of the grasp for differences of rotations
 
 @dataclass(frozen=True)
 class Reach:
-    """Allowed positions of the grasp: the paper's hemisphere, bounded by the branch's length.
-
-    Attributes:
-        base: Root of the branch [m], shape [3].
-        arc_length: Length of branch between base and grasp [m].
-        chord: Straight distance between them at rest [m].
-        tip: Position of the main path's tip [m], shape [3].
-        axis: Axis of the branch at the grasp, towards the tip, unit, shape [3].
-    """
+    """Positions of the grasp, the paper's hemisphere: base [3], length along the branch and chord
+    at rest, tip [3], all [m], and the axis at the grasp, unit, towards the tip."""
 
     base: np.ndarray
     arc_length: float
@@ -82,8 +75,7 @@ class Reach:
 @dataclass(frozen=True)
 class Guess:
     """Guess of a branch's shape: ``displacement`` [m], shape [node_count, 3], and the matching
-    ``strain``, [tet_count, q, 6]; None if either is not known.
-    """
+    ``strain``, [tet_count, q, 6]; None if either is not known."""
 
     displacement: np.ndarray | None = None
     strain: np.ndarray | None = None
@@ -255,22 +247,15 @@ _REDUCED_SETTINGS = ReducedStaticSettings(tolerance=1e-7)  # the correction remo
 
 @dataclass(frozen=True)
 class CorrectedResult(StaticResult):
-    """A state of the reduced model, corrected once by the full one.
-
-    Attributes:
-        tangents: Its change with the grasp's position, shape [3, node_count, 3].
-    """
+    """A state of the reduced model, corrected once by the full one; ``tangents`` [3, node_count, 3]
+    are its change with the grasp's position."""
 
     tangents: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class LearntGraspModel(GraspModel):
-    """A branch with a trained reduced model; also picklable.
-
-    Attributes:
-        reduced: Reduced model of this branch and this grasp.
-    """
+    """A branch with a trained reduced model of this branch and grasp; also picklable."""
 
     needs_guess: ClassVar[bool] = False
 
@@ -279,14 +264,9 @@ class LearntGraspModel(GraspModel):
     @classmethod
     def learnt(cls, grasp_model: GraspModel, cache: ReducedCache | None = None, *,
                progress: Progress = SILENT) -> "LearntGraspModel":
-        """Return a grasp model that tries the reduced model of its branch first.
-
-        The model of `limber session --mode point` on the same branch, from the ``cache``, by
-        default the one that sessions use; trained now, which takes minutes, if there is none yet.
-
-        Raises:
-            ConvergenceError: no training grasp has an equilibrium.
-        """
+        """Return a grasp model that tries the branch's reduced model first: that of `limber session
+        --mode point` in ``cache`` (None: the sessions'), or trained now, which takes minutes.
+        ConvergenceError if no training grasp has an equilibrium."""
         if cache is None:
             cache = ReducedCache(default_folder(), progress=progress)
         model, grasp = grasp_model.model, grasp_model.grasp

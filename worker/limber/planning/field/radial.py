@@ -32,18 +32,9 @@ _DEGREE = {"cubic": 1, "quintic": 2, "multiquadric": 1, "gaussian": 1}
 
 @dataclass(frozen=True)
 class RadialInterpolant:
-    """A fitted field of ``dimension`` coordinates and one or several channels.
-
-    Attributes:
-        kernel: One of ``KERNELS``.
-        shape: Shape parameter of multiquadric and gaussian, in scaled coordinates.
-        smoothing: Ridge added to the diagonal of the scaled system.
-        shift, scale: Scaled coordinates are ``(x - shift) / scale``, shapes [dimension], [].
-        centres: Scaled positions of the samples, shape [m, dimension].
-        value_weights: ``c``, shape [m, channels].
-        gradient_weights: ``g``, shape [m, dimension, channels], or [0, dimension, channels].
-        polynomial: Shape [terms, channels]; exponents in ``powers``, shape [terms, dimension].
-    """
+    """A fitted field, one of ``KERNELS``, in scaled coordinates ``(x - shift) / scale``: centres
+    [m, dimension], weights of values [m, channels] and gradients [m or 0, dimension, channels],
+    polynomial [terms, channels] with ``powers`` [terms, dimension]; smoothing is the ridge."""
 
     kernel: str
     shape: float
@@ -60,13 +51,8 @@ class RadialInterpolant:
     def fit(cls, points: np.ndarray, values: np.ndarray, gradients: np.ndarray | None = None, *,
             kernel: str = "cubic", shape: float = 1.0, smoothing: float = 0.0,
             ) -> "RadialInterpolant":
-        """Fit to ``values`` [m] or [m, channels] at ``points`` [m, dimension].
-
-        ``gradients`` [m, dimension] or [m, dimension, channels], if given, are matched too.
-
-        Raises:
-            WorkError: the samples do not determine the field (too few, or coinciding).
-        """
+        """Fit values [m] or [m, channels] at points [m, dimension], and gradients [m, dimension] or
+        [m, dimension, channels] if given. WorkError if the samples do not determine the field."""
         points = np.asarray(points, float)
         values = np.asarray(values, float).reshape(len(points), -1)
         count, dimension = points.shape
@@ -93,20 +79,9 @@ class RadialInterpolant:
     def leave_one_out(points: np.ndarray, values: np.ndarray,
                       gradients: np.ndarray | None = None, *, kernel: str,
                       shape: float = 1.0, smoothing: float = 0.0) -> np.ndarray:
-        """Return the error of a fit without a sample at that sample, in closed form.
-
-        With ``A`` the system, ``b`` its right side and ``B`` the rows of one sample, the truth less
-        the prediction of the fit to all others is ``((A^-1)_BB)^-1 (A^-1 b)_B`` (Rippa 1999, here
-        for blocks of value and gradient).
-
-        Args:
-            points: Shape [m, dimension].
-            values: Shape [m] or [m, channels].
-            gradients: Shape [m, dimension] or [m, dimension, channels], if they are matched.
-
-        Returns:
-            Shape [m, 1 + dimension, channels]: value, gradient; [m, 1, channels] without gradients.
-        """
+        """Truth less the fit without a sample, at that sample [m, 1 + dimension, channels], or [m,
+        1, channels] without gradients: ``((A^-1)_BB)^-1 (A^-1 b)_B`` with the rows B of a sample
+        (Rippa 1999, here for blocks of value and gradient)."""
         points = np.asarray(points, float)
         count, dimension = points.shape
         shift, scale = _frame(points)
@@ -413,15 +388,8 @@ _FEWEST = 8  # fewest samples with a known error
 
 @dataclass(frozen=True)
 class LocalError:
-    """An error bound by position.
-
-    Attributes:
-        points: Positions of samples, in coordinates of the chart, shape [m, 3].
-        squares: Squares of their errors, floor included, shape [m].
-        near: Square of the distance within which weights hardly differ [m^2].
-        factor: Covers the requested fraction of samples; infinite if nothing is known.
-        most: Largest error that is stated.
-    """
+    """An error bound by position in the chart: squared errors [m] of samples with floor, ``near``
+    [m^2], within which weights hardly differ, and a factor, infinite if nothing is known."""
 
     points: np.ndarray
     squares: np.ndarray
@@ -432,15 +400,8 @@ class LocalError:
     @classmethod
     def of(cls, points: np.ndarray, above: np.ndarray, covered: float, most: float = np.inf,
            ) -> "LocalError":
-        """Return the bound on the field's overestimate for a fraction ``covered`` of samples.
-
-        Args:
-            points: Positions of samples, in coordinates in which the field is smooth, shape [m, 3].
-            above: Overestimate of the fit without the sample there, below 0 for an underestimate,
-                nan if not known, shape [m].
-            covered: 1: all of them.
-            most: Largest error that is stated.
-        """
+        """Bound the overestimate for a fraction ``covered`` of samples (1: all), from that of fits
+        without the sample [m], below 0 if under, nan if unknown. ``most`` is the largest stated."""
         known = np.isfinite(above)
         points, above = np.ascontiguousarray(points[known], float), above[known]
         sizes = np.abs(above)
@@ -465,15 +426,8 @@ class LocalError:
 
 
 class Slack(NamedTuple):
-    """Tightening of limits by position, for compiled loops; see :func:`slack_at`. Below 0: they are
-    extended.
-
-    Attributes:
-        points: Positions of samples in the plain chart, shape [m, 3].
-        squares: Squares of their errors, one row per limit, shape [limits, m].
-        factors, most: As in :class:`LocalError`, shape [limits]; a factor of 0: no tighter.
-        near: As in :class:`LocalError`.
-    """
+    """Tightening of limits by position for compiled loops, below 0 an extension; see
+    :func:`slack_at`. As :class:`LocalError`, a row a limit [limits, m]; factor 0: no tighter."""
 
     points: np.ndarray
     squares: np.ndarray
@@ -484,8 +438,7 @@ class Slack(NamedTuple):
 
 def slack_of(names: Sequence[str], errors: Mapping[str, LocalError], share: float) -> Slack:
     """Return a ``share`` of ``errors``, -1 to 1, as slack of the limits ``names``; none for the
-    others.
-    """
+    others."""
     known = {name: error for name, error in errors.items() if np.isfinite(error.factor)}
     first = next(iter(known.values()), None)
     points = np.empty((0, 3)) if first is None else first.points
@@ -568,8 +521,7 @@ def _spacing(points: np.ndarray) -> float:
 def _means(points: np.ndarray, samples: np.ndarray, squares: np.ndarray, near: float,
            is_left_out: bool) -> np.ndarray:
     """Return means [n] of ``squares`` [m] of ``samples`` [m, 3] at ``points`` [n, 3]; if
-    ``is_left_out``, without the sample of the same number.
-    """
+    ``is_left_out``, without the sample of the same number."""
     out = np.empty(len(points))
     for n in range(len(points)):
         total, weights = 0.0, 0.0

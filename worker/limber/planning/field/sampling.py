@@ -43,12 +43,8 @@ _held: list[GraspModel] = []  # in a process of the pool
 
 
 class SolverPool:
-    """Solves a branch in parallel; close it, or use it in a ``with``.
-
-    Args:
-        grasp_model: The branch.
-        workers: Most processes; by default the core budget. One: none is started.
-    """
+    """Solves a branch in parallel; close it, or use it in a ``with``. At most ``workers`` processes
+    (None: the core budget; one: none is started)."""
 
     def __init__(self, grasp_model: GraspModel, workers: int | None = None):
         self.grasp_model = grasp_model
@@ -57,13 +53,9 @@ class SolverPool:
 
     def run(self, function: Callable, tasks: Sequence[tuple], *, progress: Progress = SILENT,
             message: str = "") -> list:
-        """Return ``[function(grasp_model, *task) for task in tasks]``, in this order.
-
-        Results do not depend on the number of processes. ``function`` may take ``progress``.
-
-        Raises:
-            WorkError: a process crashed. Exception: the first error of a call.
-        """
+        """Return ``[function(grasp_model, *task) for task in tasks]`` with any number of processes;
+        ``function`` may take ``progress``. WorkError if a process crashed, else a call's first
+        error."""
         if self._count == 1 or len(tasks) == 1:
             return run_tasks(function, [(self.grasp_model, *task) for task in tasks], workers=1,
                              progress=progress, message=message)
@@ -125,15 +117,8 @@ def sample_between(
     *,
     progress: Progress = SILENT,
 ) -> tuple[list[Solved], np.ndarray]:
-    """Return samples between neighbours that disagree, and places [t, 3] with two shapes.
-
-    Args:
-        known: Accepted states.
-        chart: Chart in which the samples are neighbours; plain.
-        usual: Places [n, 3] at the density of queries to the field: errors near many of them matter
-            more.
-        most: Most places to solve.
-    """
+    """Return samples between neighbours that disagree in a plain chart, and places [t, 3] with two
+    shapes. ``usual`` [n, 3] are as dense as queries to the field: errors near many matter more."""
     known, begun, asked = list(known), len(known), 0
     bistable = np.empty((0, 3))
     for number in range(_ROUNDS):
@@ -156,11 +141,8 @@ def sample_between(
 
 def disagreeing(known: Sequence[Solved], chart: Chart, usual: np.ndarray, length: float,
                 ) -> list[tuple[int, int, np.ndarray]]:
-    """Return the pairs of neighbours that disagree, the most important first.
-
-    As numbers in ``known``, with those of the tetrahedra [k] that share them. The weight of a pair
-    is its jump times the number of ``usual`` places in those. ``length`` [m] is the branch's.
-    """
+    """Pairs of neighbours that disagree, the most important first, by jump times ``usual`` places
+    in the tetrahedra that share them, whose numbers [k] come too."""
     flat = chart.map(np.array([one.pose[:3] for one in known]))
     tetrahedra = Delaunay(flat)
     inside = tetrahedra.find_simplex(chart.map(usual))
@@ -184,10 +166,8 @@ def neighbours(flat: np.ndarray) -> np.ndarray:
 
 
 def jump(first: Solved, second: Solved) -> float:
-    """Return the distance between two neighbours' predictions of tip or target half-way [m].
-
-    By the slopes of each; if one has none, by the other's alone.
-    """
+    """Return the distance between two neighbours' predictions of tip or target half-way [m]. By the
+    slopes of each; if one has none, by the other's alone."""
     return float(_jumps([first, second], np.array([[0, 1]]))[0])
 
 
@@ -209,8 +189,7 @@ def _jumps(known: Sequence[Solved], edges: np.ndarray) -> np.ndarray:
 def _apart(pairs: list[tuple[int, int, np.ndarray]], known: Sequence[Solved], bistable: np.ndarray,
            chart: Chart) -> list[tuple[Pair, np.ndarray]]:
     """Return pairs and the places [1, 3] half-way, one pair per tetrahedron; none where a place
-    with two shapes is nearer than any known one.
-    """
+    with two shapes is nearer than any known one."""
     flat = chart.map(np.array([one.pose[:3] for one in known]))
     positions = np.array([one.pose[:3] for one in known])
     used: set[int] = set()
@@ -300,17 +279,9 @@ class LowEnergySurface:
 
 def walk_energy_surface(solvers: SolverPool, count: int, *, deflection: float, seed: int = 0,
                 progress: Progress = SILENT) -> tuple[LowEnergySurface, list[Solved]]:
-    """Return the shell, and states of the branch on it and a little beyond.
-
-    Args:
-        count: Number of directions; each gives two states, one under a force across and one also
-            drawn outward, as strongly as the branch is bent at the largest deflection.
-        deflection: Largest distance from rest, as a fraction of the arc length.
-        seed: Rotates the directions.
-
-    A branch that is not a cantilever (its states are not on a sphere) gets the sphere about its
-    base.
-    """
+    """Return the shell, and states on it and a little beyond: per direction one under a force
+    across, one also drawn outward. ``deflection`` is over arc length, ``seed`` turns the
+    directions. A branch that is no cantilever gets the sphere about its base."""
     grasp_model = solvers.grasp_model
     reach = grasp_model.reach
     stiffness, axes = _stiffness(grasp_model)
@@ -399,15 +370,8 @@ TWO_SHAPES = "two shapes"
 
 @dataclass(frozen=True)
 class Sampled:
-    """Results of the branch model.
-
-    Attributes:
-        samples: Samples for the fit, the rest pose first.
-        displacements: Displacements of all nodes at those [m], shape [node_count, 3] each.
-        valley: The shell that they follow.
-        reasons: Number of rejected poses by reason.
-        taut_count: Number of poses left out as taut.
-    """
+    """Results of the branch model, the rest pose first, with all nodes' displacements [node_count,
+    3] [m], the shell that they follow, and rejected poses by reason; taut ones were left out."""
 
     samples: GraspSamples
     displacements: list[np.ndarray]
@@ -545,10 +509,8 @@ def _counted(bad: list[Solved]) -> dict[str, int]:
 
 def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
                 known: Sequence[Solved], report: Callable[[int], None]) -> list[Solved]:
-    """Solve ``targets``, each from the nearest solution so far; ``numbers`` are their numbers.
-
-    A pose that cannot be reached from there is tried again at the end, from other sides.
-    """
+    """Solve ``targets``, each from the nearest solution so far; ``numbers`` are their numbers. A
+    pose that cannot be reached from there is tried again at the end, from other sides."""
     states, positions = list(known), [one.pose[:3] for one in known]
     solved: list[Solved] = []
 
@@ -585,13 +547,8 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
 
 def displacements_at(grasp_model: GraspModel, positions: np.ndarray, *,
                      workers: int | None = None, progress: Progress = SILENT) -> np.ndarray:
-    """Return the branch's states with its grasp at ``positions`` [m, 3] that were solved before.
-
-    Shape [m, node_count, 3]; each from the nearest one before.
-
-    Raises:
-        ConvergenceError: one cannot be solved again.
-    """
+    """Return states [m, node_count, 3] at ``positions`` [m, 3] that were solved before, each from
+    the nearest one before. ConvergenceError if one cannot be solved again."""
     with SolverPool(grasp_model, workers) as solvers:
         good, bad = solve_branch(solvers, positions, progress=progress)
     if bad:
@@ -611,14 +568,9 @@ def _solve_share(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarr
 
 
 def _slack(forces: np.ndarray, usual: np.ndarray, drawn: float) -> np.ndarray:
-    """Return which of ``forces`` [m] are not of a wall; ``usual`` are those of evenly spread poses.
-
-    Bending a branch, even double, takes about the same force anywhere; pulling it taut takes many
-    times that within millimetres. Such a wall spoils the field around it, and no gentle path goes
-    there. Poses over twice the median force are therefore left out, and are thus outside the
-    trusted region, except those that take no more than ``drawn`` [N], the force that the branch was
-    drawn outward with.
-    """
+    """Which forces [m] are no wall: pulled taut, a branch takes many times its usual force within
+    millimetres. This spoils the field, and no gentle path goes there. So poses over twice the
+    median are left out, except up to ``drawn`` [N], with which it was drawn outward."""
     middle = np.median(usual) if len(usual) else 0.0
     slack = forces <= max(_TAUT * middle, drawn * (1.0 + 1e-9))
     slack[0] = True
@@ -626,11 +578,8 @@ def _slack(forces: np.ndarray, usual: np.ndarray, drawn: float) -> np.ndarray:
 
 
 def energy_inputs(grasp_model: GraspModel) -> dict[str, str]:
-    """Return digests of what the field depends on: geometry, grasp, material, weight, targets.
-
-    Only of stored or counted data: a grasp's weights are computed, and their last digits differ
-    between machines, to which a branch folder may be moved.
-    """
+    """Digests of what the field depends on: geometry, grasp, material, weight, targets. Of stored
+    or counted data only: last digits of computed ones differ between machines."""
     import hashlib
 
     model, material = grasp_model.model, hashlib.sha256()
@@ -656,11 +605,8 @@ _SHARE_PLACES = 20
 def refined(grasp_model: GraspModel, sampled: Sampled, field: EnergyField, asked: float, most: int,
             *, workers: int | None = None, progress: Progress = SILENT,
             ) -> tuple[Sampled, EnergyField]:
-    """Return the field with samples added where its error is largest.
-
-    Ends when its error on left-out samples (``energy_error``) is at most ``asked``, a fraction, or
-    there are ``most`` samples, or no more can be added.
-    """
+    """Return the field with samples added where its error is largest, until its ``energy_error`` on
+    left-out samples is at most ``asked``, there are ``most``, or none can be added."""
     begun = len(field.samples.poses)
     while field.errors["energy_error"] > asked and len(field.samples.poses) < most:
         count = len(field.samples.poses)
@@ -686,8 +632,7 @@ def refined(grasp_model: GraspModel, sampled: Sampled, field: EnergyField, asked
 
 def _where_off(field: EnergyField, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return places [n, 3] half-way between neighbours where the energy's error is largest, and the
-    sample nearest to each, [n].
-    """
+    sample nearest to each, [n]."""
     chart, positions = field.region.chart, field.samples.positions
     flat = chart.map(positions)
     edges = neighbours(flat)

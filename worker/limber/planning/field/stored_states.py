@@ -106,13 +106,9 @@ class GraspSamples:
 
 @dataclass(frozen=True)
 class Solved:
-    """A solution; ``target`` is the number of the requested position, -1 if there was none.
-
-    The others as in :class:`~.energy_field.GraspSamples`, for one sample; ``trouble`` is why it
-    cannot be trusted, ``displacement`` [node_count, 3] that of all nodes [m], ``tangents`` [3,
-    node_count, 3] its change with the grasp's position, in single precision; ``reduced`` whether
-    the reduced model found it.
-    """
+    """A solution as a sample of :class:`~.energy_field.GraspSamples`, asked at number ``target``
+    (-1: none). ``trouble`` is why not to trust it; ``tangents`` [3, node_count, 3] are the change
+    with the grasp's position in single precision; ``reduced``: the reduced model found it."""
 
     target: int
     pose: np.ndarray
@@ -204,15 +200,9 @@ Share = tuple[float, np.ndarray, np.ndarray]
 
 def guess_of(grasp_model: GraspModel, known: Sequence[Solved], positions: np.ndarray,
              position: np.ndarray) -> Guess | None:
-    """Return a guess of the branch's shape with the grasp at ``position`` [3], None if nothing is
-    known; an empty guess if the model needs none.
-
-    An interpolation of the nearest states with their tangents (Hermite, radial); the nearest alone
-    if the others disagree: they may have buckled to another side.
-
-    Args:
-        known: With their ``positions`` [m], shape [m, 3].
-    """
+    """Guess the branch's shape with the grasp at a position (None: nothing known, empty: not
+    needed), by Hermite radial interpolation of states near it, or the nearest if they disagree: it
+    may have buckled to another side."""
     if not grasp_model.needs_guess:
         return Guess()
     length = grasp_model.reach.arc_length
@@ -253,12 +243,8 @@ def midpoint_blend(grasp_model: GraspModel, first: Solved, second: Solved, posit
 
 def straight_on(grasp_model: GraspModel, before: np.ndarray, now: np.ndarray, position: np.ndarray,
                 ) -> Guess | None:
-    """Return the extrapolation of two states on a path, displacements [node_count, 3], to the next
-    ``position`` [3]: straight on by the tangents of the second, plus the curvature of the path
-    since the first.
-
-    None if the path turns, or the branch is about to snap.
-    """
+    """Extrapolate two states [node_count, 3] on a path to the next position: by the second's
+    tangents and the path's curvature. None if the path turns or the branch may snap."""
     here = grasp_model.pose(now)[:3]
     back, on = grasp_model.pose(before)[:3] - here, position - here
     size = float(np.linalg.norm(back) * np.linalg.norm(on))
@@ -275,8 +261,7 @@ def straight_on(grasp_model: GraspModel, before: np.ndarray, now: np.ndarray, po
 
 def blended(grasp_model: GraspModel, shares: Sequence[Share]) -> Guess:
     """Return the sum of the states' displacements and their changes, each with its weight, and
-    likewise of their strains; empty if the model needs no guess.
-    """
+    likewise of their strains; empty if the model needs no guess."""
     if not grasp_model.needs_guess:
         return Guess()
     strains = grasp_model.model.strains

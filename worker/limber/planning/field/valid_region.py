@@ -22,15 +22,9 @@ _OUTLINE = 24  # points per side of the grid that outlines the region
 
 @dataclass(frozen=True)
 class TrustRegion:
-    """Region in which a field is trusted.
-
-    Attributes:
-        planes: Hull with ``n . y + c <= 0`` inside, in coordinates of ``chart``, shape [k, 4].
-        accepted, rejected: Sample positions [m], shapes [m, 3] and [q, 3].
-        chart: Plain.
-        low, high: Corners of a box that holds the region [m], shape [3].
-        outline: Points whose bounding box along any axes holds the region [m], shape [o, 3].
-    """
+    """Region of trust: hull planes [k, 4], ``n . y + c <= 0`` inside in the plain chart, and
+    positions accepted and rejected. ``low`` to ``high`` holds it, as does any box of the
+    ``outline`` [o, 3]."""
 
     planes: np.ndarray
     accepted: np.ndarray
@@ -44,10 +38,7 @@ class TrustRegion:
     def of(cls, accepted: np.ndarray, rejected: np.ndarray, pivot: np.ndarray | None = None,
            radius: float = 0.0) -> "TrustRegion":
         """Make the region of samples, the rest pose first, along the sphere if one is given.
-
-        Raises:
-            WorkError: the samples span no volume.
-        """
+        WorkError if the samples span no volume."""
         accepted = np.ascontiguousarray(accepted, float)
         rejected = np.ascontiguousarray(rejected, float).reshape(-1, 3)
         chart = Chart.about(pivot, radius, accepted[0])
@@ -73,19 +64,14 @@ class TrustRegion:
         return _contain(_rows(points), self.arrays)
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Return how far ``points`` [n, 3] are above the hull's highest plane [m], [n].
-
-        In flattened coordinates, negative inside.
-        """
+        """Return how far ``points`` [n, 3] are above the hull's highest plane [m], [n]. In
+        flattened coordinates, negative inside."""
         return _heights(self.chart.map(points), self.planes)[0]
 
     def surely_outside(self, centres: np.ndarray, halves: np.ndarray) -> np.ndarray:
-        """Return which boxes about ``centres`` [n, 3] hold no trusted point, bool [n].
-
-        ``halves`` [3, 3] are their half edges as rows. A box is outside if it is above the plane
-        that is highest at its centre, to second order in its size; or if all of it is nearer to one
-        refused pose than to any accepted one (the boundaries between are flat: this is exact).
-        """
+        """Which boxes with half edges as rows [3, 3] hold no trusted point, bool [n]: above the
+        plane that is highest at their centre, to second order, or all nearer to one refused pose
+        than to any accepted one (flat boundaries: exact)."""
         reach = float(np.linalg.norm(halves))
         heights, slopes = self.height_and_slope(centres)
         least = heights - np.abs(slopes @ halves.T).sum(axis=1)
@@ -122,11 +108,8 @@ class TrustRegion:
 
 
 def _outline(flat: np.ndarray, planes: np.ndarray, chart: Chart) -> np.ndarray:
-    """Return points [n, 3] whose bounding box, along any axes, holds the region.
-
-    A grid over the hull's box, and around each of its points that may be near the hull the corners
-    of the largest box that a cell becomes when mapped back.
-    """
+    """Points [n, 3] whose bounding box along any axes holds the region: a grid over the hull's box,
+    and near the hull corners of the largest box that a cell becomes when mapped back."""
     low, high = flat.min(axis=0), flat.max(axis=0)
     ticks = [np.linspace(a, b, _OUTLINE) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)

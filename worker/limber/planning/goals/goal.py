@@ -313,12 +313,8 @@ class GoalOverLimitsError(NoPathError):
 
 def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: int = 200,
                 seed: int = 0) -> np.ndarray:
-    """Return allowed grasp positions in the goal region, at most ``count``, shape [n, 3].
-
-    Raises:
-        NoPathError: the region is out of reach. GoalOverLimitsError: no drawn pose keeps the
-            limits; in a narrow valley one may.
-    """
+    """At most ``count`` allowed grasp positions [n, 3] in the goal. NoPathError if out of reach;
+    GoalOverLimitsError if no drawn pose keeps the limits, though in a narrow valley one may."""
     points = goal.guess(field, count, np.random.default_rng(seed))
     reached = points[goal.distance(field, points) <= goal.tolerance]
     trusted = reached[field.region.contains(reached)]
@@ -336,10 +332,8 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
 
 def with_near_side(points: np.ndarray, start: np.ndarray, goal: Goal, field: EnergyField,
                    limits: FieldArrays) -> np.ndarray:
-    """Return ``points`` [n, 3] of the goal, and where the straight lines to them from ``start`` [3]
-    enter it: in a large goal, short and gentle paths end on the near side. More lines are tried
-    around the nearest ones.
-    """
+    """Return points [n, 3] and where straight lines to them from ``start`` enter the goal, more
+    about the nearest: in a large goal, short and gentle paths end on the near side."""
     generator, found = np.random.default_rng(0), [points]
     aims = points
     for _ in range(_NEARER):
@@ -406,7 +400,6 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
 
 def unit_hint(off: float, field: EnergyField) -> str:
     """Return a hint about the unit if something is so far ``off`` [m] that it is hardly in metres;
-    else an empty text.
-    """
+    else an empty text."""
     size = float(np.linalg.norm(field.region.high - field.region.low))
     return " (in millimetres? Lengths are in metres)" if off > _MILLIMETRES * size else ""

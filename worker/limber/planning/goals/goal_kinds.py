@@ -184,8 +184,7 @@ class TargetGoal:
     def _walked(self, field: EnergyField, points: np.ndarray, generator: np.random.Generator,
                 ) -> np.ndarray:
         """Return ``points`` [n, 3] moved so that the target approaches places in the region; none
-        leaves the box that was sampled, beyond which the field knows nothing.
-        """
+        leaves the box that was sampled, beyond which the field knows nothing."""
         if not len(points):
             return points
         is_inside = self._entered(field.tip(points, self.target),
@@ -199,9 +198,8 @@ class TargetGoal:
         return points
 
     def _entered(self, positions: np.ndarray, is_inside: np.ndarray) -> np.ndarray:
-        """Return the points [n, 3] on the path from ``positions`` to ``is_inside`` places in the
-        region that are just inside: in a large region the others are far out of the branch's reach.
-        """
+        """Points [n, 3] just inside the region on the path to places inside: in a large region
+        others are far out of the branch's reach."""
         inside = 0.25 * self.tolerance if self.tolerance < _SMALL else 0.25 * _SMALL
         low, high = np.zeros(len(positions)), np.ones(len(positions))
         for _ in range(_HALVINGS):
@@ -250,11 +248,8 @@ def _damped_steps(slope: np.ndarray, missing: np.ndarray) -> np.ndarray:
 
 
 def target_of(asked: GoalRequest) -> tuple[int | None, str]:
-    """Return number and name of the requested target.
-
-    Raises:
-        InputError: the branch has no target of that name.
-    """
+    """Return number and name of the requested target. InputError if the branch has no target of
+    that name."""
     name = asked.settings.target
     names = [target.name for target in asked.grasp_model.branch.targets]
     if name is None:
@@ -296,13 +291,9 @@ _BEGINS = 0.6  # fraction of the tip's way to the default goal at which that rea
 
 
 def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
-    """Return a useful goal: far from rest, and reached without force.
-
-    Of the samples deflected by over three quarters of the largest deflection, the one with the
-    least energy, moved a little towards the rest pose so that the region is where the field is
-    trusted. The trusted region is a shell, often thinner than the tolerance: what counts is how
-    much of the goal is in it along the shell.
-    """
+    """A goal far from rest, reached without force: the sample of least energy of over three
+    quarters of the largest deflection, moved a little to rest, as trust is a shell often thinner
+    than the tolerance, and the part of the goal along it counts."""
     chart = field.region.chart.plain
     samples = chart.map(field.samples.positions)
     rest = chart.map(field.rest)[0]
@@ -325,13 +316,8 @@ def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
 
 
 def second_arm_goal(field: EnergyField) -> TargetGoal:
-    """Return the paper's goal: the branch's tip, with its flower, within reach of a second arm.
-
-    The arm stands on the side to which the branch bends with the least energy. Its reach is a ball.
-
-    Raises:
-        NoPathError: there is no far pose.
-    """
+    """The paper's goal: the tip with its flower in a second arm's reach, a ball on the side to
+    which the branch bends with least energy. NoPathError if there is no far pose."""
     far = default_goal(field, 0.01).centre(field)
     rest, there = field.tip(np.stack([field.rest, far]))
     way = there - rest
@@ -340,13 +326,8 @@ def second_arm_goal(field: EnergyField) -> TargetGoal:
 
 
 def tip_goal(field: EnergyField) -> TargetGoal:
-    """Return a goal as a person states one: a small ball some centimetres from the tip.
-
-    The tip is there while the grasp is half-way to the default goal: the branch reaches it.
-
-    Raises:
-        NoPathError: there is no far pose.
-    """
+    """A goal as a person states one: a small ball some centimetres from the tip, which is there
+    with the grasp half-way to the default goal. NoPathError if there is no far pose."""
     chart = field.region.chart.plain
     rest, far = chart.map(np.stack([field.rest, default_goal(field, 0.01).centre(field)]))
     x, y, z = map(float, field.tip(chart.curved((rest + _HALF * (far - rest))[None]))[0])
@@ -355,13 +336,9 @@ def tip_goal(field: EnergyField) -> TargetGoal:
 
 def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits: FieldArrays,
                     tolerance: float, seed: int) -> GraspGoal:
-    """Return a goal as the paper draws its candidates: evenly from the half ball above the branch's
-    ``base`` [m] with its ``length`` [m] as radius; of those, one that is in the trusted field,
-    keeps the limits and is at least half the largest deflection away from rest.
-
-    Raises:
-        NoPathError: no such pose was found.
-    """
+    """A goal drawn as the paper's: evenly in the half ball of the branch's length above its base
+    [m], in the trusted field, within limits, at least half the largest deflection from rest.
+    NoPathError if none was found."""
     points = field.region.draw(4000, np.random.default_rng([seed, 13]))
     half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())
     fit = (np.linalg.norm(points - base, axis=1) <= length) & (points[:, 2] >= base[2])
@@ -403,15 +380,8 @@ _NOWHERE = np.empty((0, 3))
 
 @dataclass(frozen=True, kw_only=True)
 class CellGoal(TargetGoal):
-    """A target in a region of the cell, at a valid position.
-
-    Attributes:
-        cell_place: The region and its test.
-        grasp_model: Model of the branch.
-        taken, refused: Positions of the grasp at which the target's position is valid, and at which
-            it is in the region and is not valid [m], shapes [k, 3] and [q, 3].
-        causes: Why the refused ones are not valid, clauses [q].
-    """
+    """A target at a valid position in a region of the cell. ``taken`` and ``refused`` are grasp
+    positions [m] in it where it is valid or not, and ``causes`` why not, as clauses."""
 
     cell_place: CellPlace
     grasp_model: GraspModel
@@ -446,11 +416,8 @@ class CellGoal(TargetGoal):
                                 self._surface(states.displacements[-1]))
 
     def learnt(self, field: EnergyField) -> Self:
-        """Return the goal with the results at poses of the field.
-
-        Raises:
-            NoPathError: the target is in the region at some of them, and valid at none.
-        """
+        """Return the goal with the results at poses of the field. NoPathError if the target is in
+        the region at some of them, and valid at none."""
         if self.cell_place.of_surface:
             with SolverPool(self.grasp_model, 1) as solvers:
                 found = self._of_states(field, solvers)
@@ -468,8 +435,7 @@ class CellGoal(TargetGoal):
     def _sharpened(self, causes_at: Callable[[np.ndarray], list[str]], pairs: int, halvings: int,
                    ) -> Self:
         """Return the goal with poses near its border: between invalid ones and the nearest valid
-        ones; ``causes_at`` gives why each of some poses [n, 3] is not valid.
-        """
+        ones; ``causes_at`` gives why each of some poses [n, 3] is not valid."""
         if not len(self.taken) or not len(self.refused):
             return self
         chosen = _far_apart(self.refused, pairs)
@@ -488,8 +454,7 @@ class CellGoal(TargetGoal):
 
     def _of_states(self, field: EnergyField, solvers: SolverPool) -> Self:
         """Test states of the branch model at samples of the field in the region, far apart, and
-        between them.
-        """
+        between them."""
         samples = field.samples
         positions = samples.tips if self.target is None or samples.targets is None else (
             samples.targets[:, self.target])
@@ -512,8 +477,7 @@ class CellGoal(TargetGoal):
 
     def _asked(self, grasps: np.ndarray, positions: np.ndarray, moved: np.ndarray | None) -> Self:
         """Return the goal with poses [n, 3] added that have the target at ``positions`` [n, 3]; the
-        nodes are displaced by ``moved`` [n, nodes, 3] there.
-        """
+        nodes are displaced by ``moved`` [n, nodes, 3] there."""
         inside = np.flatnonzero(self.region.distance(positions) <= 0.0)
         causes = [self._cause(positions[k], None if moved is None else moved[k]) for k in inside]
         does = np.array([not cause for cause in causes], bool)
@@ -523,8 +487,7 @@ class CellGoal(TargetGoal):
 
     def _cause(self, position: np.ndarray, moved: np.ndarray | None) -> str:
         """Return why a position is not valid, with the nodes displaced by ``moved`` [n, 3]; empty
-        if it is.
-        """
+        if it is."""
         if self.region.distance(position[None])[0] > 0.0:
             return "it lies outside"
         surface = None
@@ -584,12 +547,8 @@ def asked_kinds(settings: PlanSettings) -> list[GoalKind]:
 
 
 def goal_of(request: GoalRequest) -> Goal:
-    """Return the requested goal, or a distant pose if there is none.
-
-    Raises:
-        InputError: two are requested, or one is invalid.
-        NoPathError: there is no far pose.
-    """
+    """Return the requested goal, or a distant pose. InputError if two are requested or one is
+    invalid, NoPathError if there is no far pose."""
     settings = request.settings
     asked = asked_kinds(settings)
     if len(asked) > 1:
@@ -610,13 +569,8 @@ def goal_of(request: GoalRequest) -> Goal:
 
 @dataclass(frozen=True)
 class View(Convex):
-    """The view of a pinhole camera within a range of distances along its axis.
-
-    Attributes:
-        frame: Frame of the camera in the branch's: x right, y down, z ahead, shape [4, 4].
-        slopes: x / z and y / z at the picture's borders: left, right, top, bottom.
-        range_m: Least and greatest z [m].
-    """
+    """The view of a pinhole camera in the range of z [m]: its frame [4, 4] in the branch's (x
+    right, y down, z ahead), and x / z and y / z at the borders left, right, top, bottom."""
 
     frame: np.ndarray
     slopes: tuple[float, float, float, float]
@@ -650,11 +604,8 @@ class View(Convex):
                 "range_m": list(self.range_m)}
 
     def hidden_by(self, triangles: np.ndarray, point: np.ndarray, slack: float) -> bool:
-        """Return whether a surface is between the camera and ``point`` [3].
-
-        ``triangles`` are [f, 3, 3]; surface within ``slack`` [m] of the position belongs to it.
-        Moeller and Trumbore 1997.
-        """
+        """Whether triangles [f, 3, 3] are between camera and ``point``, to which surface within
+        ``slack`` [m] belongs (Moeller and Trumbore 1997)."""
         eye = self.frame[:3, 3]
         ray = np.asarray(point, float) - eye
         first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]

@@ -48,8 +48,7 @@ _SPACING = 0.001  # [m] spacing of a path's integral
 @dataclass(frozen=True)
 class TradePoint:
     """A weight per metre relative to the given one, the gentlest path found with it, and the lower
-    bound on the cost of any path (None if it was not computed): in J m, length at the weight.
-    """
+    bound on the cost of any path (None if it was not computed): in J m, length at the weight."""
 
     weight: float
     length_m: float
@@ -60,15 +59,8 @@ class TradePoint:
 
 @dataclass(frozen=True)
 class DetourPath:
-    """The gentlest path within a length.
-
-    Attributes:
-        found: Path, and the certificate of the requested quantity: the integral of energy [J m].
-        weight: That weight, relative to the problem's.
-        shortest, longest: Length of the shortest known path, and the largest allowed [m].
-        energy_integral: Integral of the path [J m]. energy_bound: Lower bound for paths this short.
-        curve: The trade-off, by weight.
-    """
+    """The gentlest path within a length, certified by its integral of energy [J m]. ``weight`` is
+    relative to the problem's, lengths are in m, ``energy_bound`` is for paths this short."""
 
     found: GentlePath
     weight: float
@@ -89,10 +81,7 @@ class DetourPath:
 def plan_detour(problem: GentleProblem, shortest: np.ndarray, longest: float,
                 others: list[np.ndarray], *, progress: Progress = SILENT) -> DetourPath:
     """Return the gentlest path of at most ``longest`` [m]; ``shortest`` [n, 3] is one such path.
-
-    Raises:
-        NoPathError: there is no path at all; states whether that is proven.
-    """
+    NoPathError if there is no path at all; states whether that is proven."""
     least = float(arc_lengths(shortest)[-1])
     search = _Search(problem, shortest, longest)
     progress(0.0, "refining paths of the allowed length")
@@ -123,11 +112,8 @@ class _Search:
         self.low, self.high = 0.0, np.inf
 
     def begin(self, others: list[np.ndarray]) -> None:
-        """Find the gentlest path from those known, and the saving per additional metre.
-
-        Raises:
-            NoPathError: the shortest path is not allowed.
-        """
+        """Find the gentlest path from those known, and the saving per additional metre. NoPathError
+        if the shortest path is not allowed."""
         light = _weighed(self.problem, _LIGHT)
         free = distinct([refine(path, light)[0] for path in distinct([*others, self.shortest])])
         limited = replace(light, longest=self.longest)
@@ -175,8 +161,7 @@ class _Search:
 
     def bound(self, weights: Sequence[float], progress: Progress) -> float | None:
         """Bound at the first of ``weights``, and less closely at the others; return the next one,
-        None if none is worth its time.
-        """
+        None if none is worth its time."""
         asked = [replace(_weighed(self.problem, one), longest=self.longest) for one in weights]
         enough = [self._enough(one) * (_LOOSE if k else 1.0) for k, one in enumerate(weights)]
         every = plan_gentle_all(asked, [self.path, self.shortest], enough=enough,

@@ -29,8 +29,7 @@ _DEARER = 30.0  # weight of the length at a pose twice over its limit
 @dataclass(frozen=True)
 class LeastViolation:
     """A path ``points`` [n, 3] from the start into the goal; ``worst`` is the largest ratio of a
-    quantity to its limit along it, 1 or less if all limits are kept.
-    """
+    quantity to its limit along it, 1 or less if all limits are kept."""
 
     points: np.ndarray
     worst: float
@@ -76,8 +75,7 @@ def _grid(field: EnergyField) -> tuple:
 
 def _shares(field: EnergyField, limits: FieldArrays, points: np.ndarray) -> np.ndarray:
     """Return the largest ratio of a quantity, its slack added, to its limit at ``points`` [n, 3],
-    shape [n]; infinite outside the samples' hull and the workspace.
-    """
+    shape [n]; infinite outside the samples' hull and the workspace."""
     out = np.full(len(points), np.inf)
     within = field.region.height(points) <= 0.0
     within &= ((points >= limits.low) & (points <= limits.high)).all(axis=1)
@@ -112,8 +110,7 @@ def _least_level(shares: np.ndarray, begin: tuple, ends: np.ndarray) -> float | 
 def _shortest(shares: np.ndarray, points: np.ndarray, level: float, begin: tuple,
               ends: np.ndarray) -> np.ndarray:
     """Return the numbers of the places on the shortest path that exceeds no ``level``; the part
-    over its limit counts as longer.
-    """
+    over its limit counts as longer."""
     open_cells = np.flatnonzero(shares.ravel() <= level)
     number = np.full(shares.size, -1)
     number[open_cells] = np.arange(len(open_cells))

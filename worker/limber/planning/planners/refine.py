@@ -62,11 +62,8 @@ def shortcut(path: np.ndarray, field: FieldArrays, weights: EdgeWeights, *, atte
 
 def slide_end(path: np.ndarray, goals: np.ndarray, limits: FieldArrays, weights: EdgeWeights,
               ) -> np.ndarray:
-    """Return the path bent to end in that one of ``goals`` [g, 3] which makes it cheapest.
-
-    A tree ends where its samples happened to fall in the goal region; all of the region is equally
-    good, but the paths to it are not.
-    """
+    """Return the path bent to end in the cheapest of ``goals`` [g, 3]. A tree ends where its
+    samples fell; all of the goal is equally good, but the paths to it are not."""
     part = (arc_lengths(path) / max(arc_lengths(path)[-1], _MIN_GAP))[:, None]
     best, least = path, path_cost(path, limits, weights)
     for goal in goals:
@@ -78,11 +75,9 @@ def slide_end(path: np.ndarray, goals: np.ndarray, limits: FieldArrays, weights:
 
 def polish(path: np.ndarray, energy_field: EnergyField, limits: FieldArrays,
            weights: EdgeWeights) -> np.ndarray:
-    """Return the path moved to the nearest local optimum of its cost; ends stay, [n, 3].
-
-    L-BFGS with the field's gradient. Trust and limits are not in the gradient: of the line from the
-    old path to the optimum, the farthest tenth that is allowed and cheaper is taken.
-    """
+    """Move a path [n, 3] with fixed ends to the nearest optimum, by L-BFGS with the field's
+    gradient, which has no trust or limits: the farthest tenth of the way allowed and cheaper
+    counts."""
     spacing = max(weights.step, np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
                   / _POLISH_POINTS)
     corners = resample(path, spacing)
@@ -150,11 +145,8 @@ _SAME_WAY = 0.05  # fraction of a path's length; another path around a ridge is 
 
 
 def refine(path: np.ndarray, problem: GentleProblem) -> tuple[np.ndarray, float]:
-    """Return the path [n, 3] moved to the nearest optimum of the cost, and its cost.
-
-    The end may move within the goal region. The cost is infinite if no allowed path was found
-    near; then the given path is returned.
-    """
+    """Return the path [n, 3] at the nearest optimum, its end within the goal, and its cost:
+    infinite, with the given path, if no allowed one was found near."""
     best, least, moved = path, problem.cost(path), path
     limits = Limited(problem, 0.0)
     for margin, following in zip(_MARGINS, (*_MARGINS[1:], 0.0), strict=True):
@@ -171,8 +163,7 @@ def refine(path: np.ndarray, problem: GentleProblem) -> tuple[np.ndarray, float]
 
 def is_along(rough: np.ndarray, path: np.ndarray) -> bool:
     """Return whether a rough path [n, 3] is so near to a refined one [k, 3] that refining it would
-    give the same path.
-    """
+    give the same path."""
     away = cKDTree(resample(path, _FINE)).query(rough)[0]
     return bool(away.max() <= _SAME_WAY * arc_lengths(path)[-1])
 
@@ -187,11 +178,8 @@ def distinct(paths: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def _moved(path: np.ndarray, limits: "Limited") -> tuple[np.ndarray, float]:
-    """Move a path [n, 3] to keep the margin from ``limits``, whose multipliers go on.
-
-    Returns:
-        The path, and its largest excess over a limit, relative to that limit.
-    """
+    """Move a path [n, 3] to keep the margin from ``limits``, whose multipliers go on; and its
+    largest excess over a limit, relative to it."""
     line = _Line(limits.problem)
     flat = line.chart.map(path)
     flat[0] = line.chart.map(limits.problem.start)[0]
@@ -226,11 +214,8 @@ class _Line:
         return self.chart.curved(both)
 
     def settle(self, flat: np.ndarray, limits: "Limited") -> tuple[np.ndarray, float]:
-        """Return the corners moved to the minimum of the augmented Lagrangian, and the cost.
-
-        The unknowns are the edges: so a step moves whole parts of the path, and the end with them,
-        as lightly as one corner (the length's second derivative is that of a chain of springs).
-        """
+        """Move corners to the minimum of the augmented Lagrangian; and its cost. Unknowns are
+        edges, so a step moves whole parts as lightly as a corner (a chain of springs)."""
         edges = np.diff(flat, axis=0)
         units = _FIRST_STEP * float(np.linalg.norm(edges, axis=1).mean()) * self.units
 
@@ -260,8 +245,7 @@ class _Line:
 @dataclass(frozen=True)
 class _Excess:
     """Relative excess of a path over a limit, ``values`` [k], and ``pull``, which maps weights [k]
-    on them to the gradient of the weighted sum at each of the path's points, [n, 3].
-    """
+    on them to the gradient of the weighted sum at each of the path's points, [n, 3]."""
 
     values: np.ndarray
     pull: Callable[[np.ndarray], np.ndarray]
@@ -280,11 +264,8 @@ def _load_slope(known: EnergyField, name: str, load: np.ndarray, points: np.ndar
 
 @dataclass
 class Limited:
-    """The limits on a path's points [n, 3] and their multipliers.
-
-    Points closer than ``margin`` [m] to the limit of the trusted region are over it; so is an end
-    outside the goal. Energy, force and length count relative to their limits.
-    """
+    """The limits on a path's points and their multipliers. Points within ``margin`` [m] of trust's
+    border, and an end off the goal, are over; energy, force and length are relative."""
 
     problem: GentleProblem
     margin: float
@@ -448,25 +429,15 @@ class GentlePath:
 
 def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, *,
                 enough: float = ENOUGH, progress: Progress = SILENT) -> GentlePath:
-    """Return the gentlest path found, and a lower bound on every path.
-
-    ``others`` are paths [n, 3] to start from besides the straight line; ``enough`` is the gap
-    below which the bound is refined no further.
-
-    Raises:
-        BlockedError: it is proven that there is none, or none was found; states which.
-    """
+    """Return the gentlest path found, from ``others`` [n, 3] too, and a bound, refined to a gap of
+    ``enough``. BlockedError if there is none, and whether that is proven."""
     return plan_gentle_all([problem], others, enough=[enough], progress=progress)[0]
 
 
 def plan_gentle_all(problems: Sequence[GentleProblem], others: list[np.ndarray] | None = None, *,
                     enough: Sequence[float], progress: Progress = SILENT) -> list[GentlePath]:
     """Return the same for each of problems that differ in the weight of length alone; their bounds
-    share the energies of the field.
-
-    Raises:
-        BlockedError: as for one.
-    """
+    share the energies of the field. BlockedError as for one."""
     found = [_Gentlest(problem, others or []) for problem in problems]
     certificates = certify_all(problems, found, enough=enough, progress=progress)
     return [GentlePath(present(one.points, "path"), one.cost, certificate)
@@ -504,8 +475,7 @@ class _Gentlest:
 
     def _starts(self) -> list[np.ndarray]:
         """Return the known paths that keep the limits; if none does, the path that exceeds them
-        least.
-        """
+        least."""
         # Those of planners first: mostly the straight line then leads to the same optimum.
         known = [path for path in [*self._others[::-1], _straight(self.problem)]
                  if len(path) > 1 and np.isfinite(self.problem.cost(path))]

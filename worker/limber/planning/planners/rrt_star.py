@@ -61,10 +61,8 @@ class Search:
 
 @dataclass(frozen=True)
 class SearchTree:
-    """A tree as it ended: ``nodes`` [n, 3] [m], and their ``parents`` [n].
-
-    A parent comes before its children; the first node is the start and has the parent -1.
-    """
+    """A tree as it ended: ``nodes`` [n, 3] [m], and their ``parents`` [n]. A parent comes before
+    its children; the first node is the start and has the parent -1."""
 
     nodes: np.ndarray
     parents: np.ndarray
@@ -85,10 +83,8 @@ class SearchTree:
         return cls(nodes[order], np.where(depth[order] > 0, index[parents[order]], -1))
 
     def pruned(self, most: int) -> "SearchTree":
-        """Return at most ``most`` of its nodes: those with the most descendants.
-
-        Its edges are all edges of the tree: a node has fewer descendants than its parent.
-        """
+        """Return at most ``most`` of its nodes: those with the most descendants. Its edges are all
+        edges of the tree: a node has fewer descendants than its parent."""
         if len(self.nodes) <= most:
             return self
         carried = np.ones(len(self.nodes))

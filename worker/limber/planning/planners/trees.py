@@ -190,17 +190,9 @@ def chosen_engine(engine: str) -> str:
 
 @dataclass(frozen=True)
 class FoundPath:
-    """A path and how it was found.
-
-    Attributes:
-        points: Polyline of grasp positions [m], evenly spaced, shape [n, 3].
-        cost: Its cost by the problem's weights.
-        tree_cost: Cost before shortcuts.
-        history: ``{"iteration", "cost"}``, cost of the best path so far (absent before the first).
-        engine: Which engine found it.
-        raw: The tree's polyline before shortcuts, shape [k, 3]; None from a search without trees.
-        tree: The whole search tree; None from a search without trees.
-    """
+    """A path of evenly spaced positions [n, 3] [m]. ``tree_cost`` and ``raw`` [k, 3] are those
+    before shortcuts, ``history`` has ``{"iteration", "cost"}`` of the best so far. None: no
+    tree."""
 
     points: np.ndarray
     cost: float
@@ -213,12 +205,8 @@ class FoundPath:
 
 def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
               progress: Progress = SILENT) -> FoundPath:
-    """Search for the path of least cost with one of ``PLANNERS``.
-
-    Raises:
-        NoPathError: no path was found within the iterations.
-        MissingDependencyError: the planner is not installed.
-    """
+    """Search for the path of least cost with one of ``PLANNERS``. NoPathError if none within the
+    iterations, MissingDependencyError if the planner is not installed."""
     found = PLANNERS[engine].search(problem, search, progress)
     raw, reached = found.path, len(found.tree.nodes) if found.tree else 1
     if raw is None:
