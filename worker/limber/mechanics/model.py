@@ -598,3 +598,25 @@ class BranchModel:
             ratio = self.density / before
             self.prestress = (self.prestress.with_density(float(ratio[0])) if np.ptp(ratio) < 1e-12
                             else carried(self))
+
+
+@dataclass
+class MotionState:
+    """One instant, arrays [node_count, 3]. Strains now and a step earlier (or derivatives) are
+    [tet_count, q, 6], empty without viscosity; ``step_before`` [s] is infinite without an earlier
+    state."""
+
+    time: float
+    displacement: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    strain: np.ndarray
+    strain_before: np.ndarray
+    step_before: float = np.inf
+
+    def rate_formula(self, dt: float) -> tuple[float, float, float]:
+        """Factors [1/s] of next, current and previous strain in the rate after ``dt``: the
+        second-order backward difference for unequal steps, first-order without a previous state."""
+        ratio = dt / self.step_before
+        return ((1 + 2 * ratio) / ((1 + ratio) * dt), -(1 + ratio) / dt,
+                ratio**2 / ((1 + ratio) * dt))

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.mechanics.dynamics.motion import MotionState
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Tangent, Viscous
 from limber.mechanics.materials.materials import lame_by_poisson
-from limber.mechanics.model import BranchModel, product_with
+from limber.mechanics.model import BranchModel, MotionState, product_with
 from limber.mechanics.statics.result import StaticResult
 
 PARAMETERS = ("log_young", "poisson", "log_density", "damping_mass", "damping_stiffness")

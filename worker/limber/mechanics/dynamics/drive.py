@@ -8,10 +8,9 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.not_none import present
-from limber.mechanics.dynamics.motion import MotionState
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Equations
-from limber.mechanics.model import BranchModel
+from limber.mechanics.model import BranchModel, MotionState
 from limber.mechanics.statics.equilibrium_path import checked_forces
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.solve import solve_static

@@ -5,31 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from limber.core.errors import ConvergenceError, InputError, Text
+from limber.mechanics.model import MotionState
 from limber.mechanics.statics.result import Status
-
-# One instant of a motion: the state for time steps and derivatives.
-
-
-@dataclass
-class MotionState:
-    """One instant, arrays [node_count, 3]. Strains now and a step earlier (or derivatives) are
-    [tet_count, q, 6], empty without viscosity; ``step_before`` [s] is infinite without an earlier
-    state."""
-
-    time: float
-    displacement: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    strain: np.ndarray
-    strain_before: np.ndarray
-    step_before: float = np.inf
-
-    def rate_formula(self, dt: float) -> tuple[float, float, float]:
-        """Factors [1/s] of next, current and previous strain in the rate after ``dt``: the
-        second-order backward difference for unequal steps, first-order without a previous state."""
-        ratio = dt / self.step_before
-        return ((1 + 2 * ratio) / ((1 + ratio) * dt), -(1 + ratio) / dt,
-                ratio**2 / ((1 + ratio) * dt))
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from limber.mechanics.dynamics.drive import Drive
-from limber.mechanics.dynamics.motion import MotionState, NewmarkSettings
+from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.linear.equations import Tangent, Viscous
+from limber.mechanics.model import MotionState
 from limber.mechanics.sensitivities import (
     ParameterSet,
     explicit_forces,
