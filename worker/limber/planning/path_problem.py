@@ -42,8 +42,8 @@ class BlockedError(NoPathError):
 
 @dataclass(frozen=True)
 class GentleProblem:
-    """Any path from ``start`` into ``goal`` within ``limits`` (see ``EnergyField.limited``). A bound
-    is for the whole ``asked_goal``, any length, and every branch whose energy is within
+    """Any path from ``start`` into ``goal`` within ``limits`` (see ``EnergyField.limited``). The
+    bound is for the whole ``asked_goal``, any length, and every branch whose energy is within
     ``field_error`` [J] of the field. ``beyond`` (:meth:`~.limits.Limits.beyond`) are limits that
     prove something; ``errors`` say by limit how much less the field errs at a position."""
 
