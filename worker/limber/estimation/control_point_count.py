@@ -35,13 +35,8 @@ ALIKE = 1.0
 
 @dataclass(frozen=True)
 class Support:
-    """What one fit says about the number of control points.
-
-    Attributes:
-        fractions: Their positions on the main path.
-        evidence: Log evidence by number.
-        start: Values near the solution with these control points.
-    """
+    """What one fit says about the number of control points: their positions on the main path, log
+    evidence by number, and values near the solution with them."""
 
     fractions: tuple[float, ...]
     evidence: dict[int, float]
@@ -50,9 +45,7 @@ class Support:
 
 def is_open(settings: FitSpec) -> bool:
     """Whether the number of control points is to be chosen: it is not given, and can be.
-
-    Nelder-Mead has no derivatives; the paper's field and a reduced model have no bumps.
-    """
+    Nelder-Mead has no derivatives; the paper's field and a reduced model have no bumps."""
     return (not settings.fractions and settings.method == "gauss-newton"
             and settings.forward == "full" and settings.field == "open")
 
@@ -63,14 +56,8 @@ def equal_fractions(count: int) -> tuple[float, ...]:
 
 
 def supported(found: Estimate) -> Support:
-    """Return as many control points as the pulls support.
-
-    Args:
-        found: A fit with the control points at ``FRACTIONS``.
-
-    Raises:
-        InputError: the fit has no derivatives, or its field no bumps.
-    """
+    """Return as many control points as the pulls support, by a fit with those at ``FRACTIONS``.
+    InputError if it has no derivatives, or its field no bumps."""
     problem = _Problem.of(found)
     parts = {count: problem.posterior(equal_fractions(count)) for count in range(1, MOST + 1)}
     evidence = {count: part[0] for count, part in parts.items()}
@@ -83,15 +70,8 @@ def supported(found: Estimate) -> Support:
 
 @dataclass(frozen=True)
 class _Problem:
-    """A fit's residuals as linear in log E at stations and in the other unknowns.
-
-    Attributes:
-        stations: Positions on the main path, ascending, shape [S].
-        log_young: At the stations, at the end of the fit, shape [S].
-        residual: Of measurements and of the other unknowns' priors, over deviations, shape [r].
-        by_young: Its derivative to log E at the stations, shape [r, S].
-        by_others: The same to the other unknowns, shape [r, q].
-    """
+    """A fit as linear in log E at stations [S], ascending, and in q other unknowns: standardised
+    residual [r] with the others' priors, and its derivatives [r, S] and [r, q]."""
 
     stations: np.ndarray
     log_young: np.ndarray

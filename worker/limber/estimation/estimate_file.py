@@ -189,13 +189,8 @@ class _Estimate(_Told):
 
 
 def read_estimate(path: Path) -> dict[str, Any]:
-    """Return the content of ``estimate.json`` after checking finite values and consistent sizes.
-
-    A number that was not measured is None.
-
-    Raises:
-        InputError: the file cannot be read or is not an estimate. The message states the position.
-    """
+    """Return a checked ``estimate.json``; a number that was not measured is None. InputError with
+    the position if it cannot be read or is not an estimate."""
     content = read_json(path, "an estimate")
     checked_as(path, _Estimate, content, "an estimate", strict=True)
     return content

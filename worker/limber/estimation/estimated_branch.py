@@ -154,15 +154,8 @@ def neck(skeleton: Skeleton) -> list[str]:
 
 def forwards_of(pulls: list[Pull], subject: Subject, settings: FitSpec,
                 shifts: Mapping[str, np.ndarray] | None = None) -> list[Forward]:
-    """Make the forward simulation of each pull.
-
-    Args:
-        shifts: Name of a pull to distances by which its observed points are farther along the
-            branch than stated [m], shape [m].
-
-    Raises:
-        InputError: a pull has no measurements to compare, or observes other points.
-    """
+    """Make each pull's simulation. ``shifts`` [m] [m] by name are how much farther along the branch
+    points are. InputError if nothing is measured, or the observed points differ."""
     forwards = []
     for pull in pulls:
         frames = frames_of(pull)
@@ -190,11 +183,8 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: FitSpec,
 
 
 def require_scale_in_principle(forwards: list[Forward]) -> None:
-    """Reject pulls that cannot determine the scale of Young's modulus.
-
-    Raises:
-        InputError: all pulls are slow and pose-driven, without gravity or measured force.
-    """
+    """Reject pulls that cannot determine the scale of Young's modulus. InputError if all pulls are
+    slow and pose-driven, without gravity or measured force."""
     for forward in forwards:
         entry = forward.entry
         if forward.uses_force or entry.drive == "force" or entry.motion == "dynamic" or (
@@ -227,12 +217,8 @@ def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subj
 
 
 def observes_path(entry: PullEntry, frames: Frames, settings: FitSpec) -> bool:
-    """Whether a slow pull's force is prescribed and the gripper's recorded path is observed.
-
-    This is so if the force was measured (for a clamped grasp the torque too) and the gripper's
-    frame may have an error. Without a force only the path can drive the simulation; it then counts
-    as exact.
-    """
+    """Whether a slow pull's force drives and the recorded path is observed: the force (clamped,
+    torque too) is measured and the gripper's frame may err. Else the path drives, as exact."""
     measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
     known = calibration_of(entry)
     return (entry.drive == "pose" and settings.drive is None and settings.forward == "full"
@@ -243,12 +229,8 @@ def observes_path(entry: PullEntry, frames: Frames, settings: FitSpec) -> bool:
 
 def parameter_space(subject: Subject, forwards: list[Forward], settings: FitSpec,
                     ) -> ParameterSpace:
-    """Return the free parameters, with the priors of those that were not requested.
-
-    Poisson's ratio, the density if weight or inertia acts, and the form of the field are free
-    within their priors; requested ones (``--also``) are free without a
-    prior.
-    """
+    """Return the free parameters: Poisson's ratio, density if weight or inertia acts, and the
+    field's form within their priors; requested ones (``--also``) without a prior."""
     fitted = {name: part in settings.also for name, part in (
         ("poisson", "poisson"), ("density", "density"), ("alpha", "damping"),
         ("beta", "damping"))}
@@ -295,10 +277,7 @@ def _rest_points(entry: PullEntry, subject: Subject) -> np.ndarray:
 
 def _off_at_rest(pull: Pull, frames: Frames, rest: np.ndarray) -> np.ndarray | None:
     """Distance of each observed point at rest from its position on the branch [m]; None: unknown.
-
-    Raises:
-        InputError: all of them are farther away than the branch is long.
-    """
+    InputError if all of them are farther away than the branch is long."""
     at_rest = np.linalg.norm(frames.poses[:, :3] - pull.entry.grasp.point_m, axis=1) < 2e-3
     seen = frames.positions[at_rest]
     if seen.shape[1:2] != (len(rest),) or pull.entry.gravity_m_s2 is not None or (

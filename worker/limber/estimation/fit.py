@@ -199,16 +199,9 @@ def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
               progress: Progress = SILENT, *, cache: Path | None = None, digest: str = "",
               near: Values | None = None, far: FarPoints | None = None, quick: bool = False,
               ) -> Estimate:
-    """Check what the data determine, fit the moduli, and compute their uncertainty.
-
-    Args:
-        quick: Leave Gauss' approximation of the intervals as it is, and judge nothing; see
-            :func:`complete`.
-        near: Values near the solution, to start from if they have an equilibrium.
-        far: Ends the fit if it finds points far from where they were simulated.
-        cache, digest: Folder of the reduced bases, and digest of their dependencies; see
-            :class:`limber.estimation.fitting.reduced_fit.Reduction`.
-    """
+    """Check what the data determine, fit, and compute intervals; ``quick`` leaves Gauss' and judges
+    nothing (:func:`complete`). ``near`` is a start if it has an equilibrium; ``far`` ends a fit
+    whose points are far off. ``cache`` and ``digest`` are of reduced bases."""
     require_scale_in_principle(objective.forwards)
     require_own_frame(objective, start)
     reduction = (Reduction(objective.forwards, cache, digest) if settings.forward == "reduced"
@@ -252,10 +245,8 @@ def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
 
 
 def complete(found: Estimate, settings: FitSpec, progress: Progress = SILENT) -> None:
-    """Compute the intervals of a quick fit by the profile of its likelihood, and judge it.
-
-    A fit without a valid result has no intervals.
-    """
+    """Compute the intervals of a quick fit by the profile of its likelihood, and judge it. A fit
+    without a valid result has no intervals."""
     is_sound = not found.stopped and found.is_bad is None
     if is_sound:
         found.uncertainty = profiled(found.uncertainty, found.fit.evaluation, found.objective,
@@ -378,10 +369,8 @@ def _refined(fit: Fit, objective: Objective, settings: FitSpec,
 
 def _linked_at_the_end(fit: Fit, objective: Objective, settings: FitSpec,
                        progress: Progress) -> tuple[Fit, Objective]:
-    """Link what the data do not determine at the solution, and fit again if the links differ.
-
-    After the first round links are only added; otherwise the iteration might not end.
-    """
+    """Link what the data do not determine at the solution, and fit again if the links differ. After
+    the first round links are only added; otherwise the iteration might not end."""
     messages: list[str] = []
     for attempt in range(objective.space.group_count):
         space, messages = link_unresolved(fit.evaluation, objective.space)

@@ -260,10 +260,8 @@ def hold_out(found: Estimate, progress: Progress) -> None:
 
 
 def _score(forward: Forward, distance: float, force: float, *, in_fit: bool) -> dict[str, Any]:
-    """Score the prediction of a pull by a fit without it.
-
-    ``in_fit``: the pull is one of the estimate's, left out for this score alone.
-    """
+    """Score the prediction of a pull by a fit without it. ``in_fit``: the pull is one of the
+    estimate's, left out for this score alone."""
     moved = forward.frames.positions - forward.rest_points
     size = float(np.sqrt(np.nanmean(np.sum(moved**2, axis=2)))) if (
         np.isfinite(moved).any()) else np.nan
@@ -276,10 +274,7 @@ def _score(forward: Forward, distance: float, force: float, *, in_fit: bool) -> 
 
 def score_unused(pull: Pull, subject: Subject, found: Estimate, settings: FitSpec) -> None:
     """Score the prediction of a pull that the estimate does not use, into ``found.held_out``.
-
-    Raises:
-        LimberError: the pull has no measurement to compare.
-    """
+    LimberError if the pull has no measurement to compare."""
     forward = forwards_of([pull], subject, settings)
     alone = Objective(forward, found.objective.space,
                       force_sigma=[pull.entry.sensor.force_sigma_n])
@@ -288,12 +283,8 @@ def score_unused(pull: Pull, subject: Subject, found: Estimate, settings: FitSpe
 
 
 def require_result(found: Estimate, skeleton: Skeleton) -> None:
-    """Reject a fit without a valid result.
-
-    Raises:
-        WorkError: the fit has no valid result; states the reason.
-        InputError: the measured force is too uncertain for the scale of the moduli.
-    """
+    """Reject a fit without a valid result. WorkError says why, InputError if the measured force is
+    too uncertain for the moduli's scale."""
     reason = found.is_bad
     if reason is None:
         return
@@ -350,10 +341,7 @@ def _points_off(forwards: Sequence[Forward]) -> list[str]:
 
 def require_one_explanation(free: Estimate, as_stated: Estimate) -> None:
     """Refuse a free frame where points that are off along the branch explain the pulls as well.
-
-    Raises:
-        WorkError: with the frame as stated the fit is as good, with moduli outside the intervals.
-    """
+    WorkError if with the frame as stated the fit is as good, with moduli outside the intervals."""
     loss, other = (each.fit.evaluation.objective for each in (free, as_stated))
     if free.stopped or as_stated.is_bad is not None or other - loss > AS_LIKELY:
         return
@@ -376,12 +364,8 @@ def _listed(young: np.ndarray) -> str:
 def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: FitSpec,
                 *, axes: Path | None, cloud: np.ndarray | None,
                 progress: Progress = SILENT) -> None:
-    """Compute the errors of shape and mesh, which residuals do not show.
-
-    Args:
-        axes: Table of the cylinders fitted to the scan, or None.
-        cloud: The scan's points [m], shape [n, 3], or None.
-    """
+    """Compute errors of shape and mesh, which residuals do not show, from the table of fitted
+    cylinders and the scan's points [n, 3] [m], where they exist."""
     subject = subject.without_weight() if found.is_weightless else subject
     found.sections = SectionMean.of(subject.skeleton, subject.mesh, subject.weights,
                                     strain_energy(found.objective, found.values))
@@ -443,11 +427,7 @@ def _geometry_error(subject: Subject, found: Estimate, settings: FitSpec,
 
 
 def _tell_largest_part(parts: dict[str, np.ndarray], progress: Progress) -> None:
-    """Report how to narrow a wide interval, from the causes of most of its variance.
-
-    Args:
-        parts: Variance of log E at the control points by cause, each of shape [K].
-    """
+    """Say how to narrow a wide interval, from the causes of most of the variance [K] of log E."""
     total = np.sqrt(np.sum(list(parts.values()), axis=0))
     worst = int(np.argmax(total))
     if total[worst] < WIDE:

@@ -52,12 +52,8 @@ _SECONDS = 6.0
 
 @dataclass(frozen=True)
 class Known:
-    """Covariance of log E at the K control points and of the form of their field, F numbers.
-
-    Attributes:
-        measured: Covariance from pulls, shape [K + F, K + F]: another pull reduces it.
-        common: Covariance of log E that all pulls of this scan have in common, shape [K, K].
-    """
+    """Covariance of log E at K points and F numbers of their field's form [K + F, K + F] from
+    pulls, which another pull reduces, and of log E that all pulls of a scan share [K, K]."""
 
     measured: np.ndarray
     common: np.ndarray
@@ -65,8 +61,7 @@ class Known:
     @classmethod
     def nothing(cls, count: int, form_count: int = 0) -> "Known":
         """Before any pull: moduli within a factor of ten, neighbours similar as on branches, the
-        form of their field within its deviations.
-        """
+        form of their field within its deviations."""
         link_covariance = 0.5 * LINK_DEVIATION**2 * np.eye(count)
         return cls(block_diag(UNKNOWN_SCALE**2 + link_covariance, np.eye(form_count)),
                    np.zeros((count, count)))
@@ -119,8 +114,7 @@ class Cell:
     @classmethod
     def of(cls, pull: Pull | None) -> "Cell":
         """Return the cell of an earlier pull, with that pull's length; without one, a carefully
-        calibrated cell.
-        """
+        calibrated cell."""
         if pull is None:
             return cls()
         seen, entry = pull.observations, pull.entry
@@ -130,9 +124,7 @@ class Cell:
 
     def in_frames(self, count: int) -> "Cell":
         """Return the cell in which ``count`` frames contain the information of all of this one's.
-
-        Errors that vary from frame to frame average out; constant ones do not.
-        """
+        Errors that vary from frame to frame average out; constant ones do not."""
         part = (count / self.frame_count)**0.5
         sensor, known = self.sensor, self.calibration
         torque = sensor.torque_sigma_nm
@@ -155,17 +147,8 @@ class PullChoice:
 
 @dataclass(frozen=True)
 class ExpectedPull:
-    """Expected result of a candidate pull.
-
-    Attributes:
-        choice: The candidate pull.
-        point, end: Positions of the grasp before and after [m], shape [3].
-        peak_force: Peak force of the gripper [N].
-        peak_strain: Largest principal strain anywhere in the branch.
-        information: Information on log E at the control points and the form of their field, shape
-            [K + F, K + F].
-        bits: Information gained beyond what is known.
-    """
+    """A candidate's result: grasp positions [3] [m], the gripper's peak force [N], the largest
+    principal strain, information [K + F, K + F] on log E and form, and bits gained."""
 
     choice: PullChoice
     point: np.ndarray
@@ -193,18 +176,8 @@ class Suggested:
 def suggest(subject: Subject, values: Values, known: Known, cell: Cell,
             fractions: tuple[float, ...], *, max_strain: float, max_force: float = np.inf,
             workers: int | None = None, progress: Progress = SILENT) -> Suggested:
-    """Return pulls in the order of their information per percent of strain.
-
-    Positions and directions are compared at one travel; for the best of them other travels are
-    tried.
-
-    Args:
-        values: Estimated or assumed values.
-        fractions: Positions on the main path at which the branch may be held.
-
-    Raises:
-        WorkError: no pull is within the limits.
-    """
+    """Return pulls by information per percent of strain: places and directions at one travel, other
+    travels for the best. WorkError if no pull is within the limits."""
     phases = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
     first = [PullChoice(fraction, float(phase), _PROBE_REACH)
              for fraction in fractions for phase in phases]
@@ -261,11 +234,8 @@ def _tried(choice: PullChoice, subject: Subject, values: Values, known: Known, c
 
 def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: Known,
                   cell: Cell) -> ExpectedPull:
-    """Simulate a pull on the branch as estimated, and return its information.
-
-    Raises:
-        WorkError: the branch cannot be pulled that way.
-    """
+    """Simulate a pull on the branch as estimated, and return its information. WorkError if the
+    branch cannot be pulled that way."""
     simulated = cell.in_frames(_FRAMES)
     pull, displacements = _without_noise(choice, subject, values, simulated)
     settings = FitSpec(key_frames=4)
@@ -297,9 +267,7 @@ def _own_rows(space: ParameterSpace, known_count: int) -> np.ndarray:
 
 def _of_field(jacobian: np.ndarray, count: int, form_count: int, repeat_sigma: float) -> np.ndarray:
     """Return the information on log E and form, the first free values, with all others unknown.
-
-    Shape [count + form_count] twice.
-    """
+    Shape [count + form_count] twice."""
     whole, kept = jacobian.T @ jacobian, count + form_count
     cross = whole[:kept, kept:]
     found = whole[:kept, :kept]

@@ -23,16 +23,8 @@ nine ratios in the paper's table have a root mean square of 1.1.
 
 @dataclass(frozen=True)
 class Values:
-    """Physical values of all parameters.
-
-    Attributes:
-        young: At the control points [Pa], shape [K].
-        poisson: Poisson's ratio.
-        density: [kg/m^3].
-        damping: Rayleigh's alpha [1/s] and beta [s].
-        form: Interpolation of the modulus between the control points, in deviations from the
-            expected one (:mod:`limber.estimation.parameters`); empty: as expected.
-    """
+    """Physical values: moduli [K] [Pa], Poisson's ratio, density [kg/m^3], Rayleigh's alpha [1/s]
+    and beta [s]. ``form`` is the field's, in deviations from the expected (empty: as expected)."""
 
     young: np.ndarray
     poisson: float
@@ -130,10 +122,8 @@ class ParameterSpace:
         return rows
 
     def own_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Prior information as standardised rows: priors, then links; R and d of R x - d.
-
-        Shapes [priors + links, p] and [priors + links].
-        """
+        """Prior information as standardised rows: priors, then links; R and d of R x - d. Shapes
+        [priors + links, p] and [priors + links]."""
         rows = np.zeros((len(self.priors), self.size))
         offsets = np.zeros(len(self.priors))
         for number, (name, mean, sigma) in enumerate(self.priors):
@@ -236,8 +226,7 @@ class YoungField:
 
     def shares(self, values: Values, extra: tuple[str, ...]) -> np.ndarray:
         """Derivative of log E of the tetrahedra to log E at the control points and, if they are
-        among the ``extra`` parameters, to the further unknowns, shape [K + B + 1, tet_count].
-        """
+        among the ``extra`` parameters, to the further unknowns, shape [K + B + 1, tet_count]."""
         plain = self.weights @ values.young
         shares = (self.weights * values.young).T / plain
         if self.straight is None:
@@ -258,8 +247,7 @@ class YoungField:
 
     def growth(self, values: Values) -> np.ndarray:
         """Derivative of the logarithm of each further unknown's effect on the field to log E at the
-        control points, shape [B + 1, K].
-        """
+        control points, shape [B + 1, K]."""
         plain = self.weights @ values.young
         deviation = self._deviation(values)
         by_young = self.straight - self.weights * values.young / plain[:, None]
@@ -270,14 +258,8 @@ class YoungField:
 
     def order_moduli(self, values: Values, deviation: Mapping[str, float],
                      ) -> list[dict[str, Any]]:
-        """Modulus of the side branches of each order over that of the main path.
-
-        Args:
-            deviation: Name of a free parameter to its standard deviation.
-
-        Returns:
-            Of each order ``order``, ``factor`` and its 95 % ``interval``.
-        """
+        """Modulus of each order's side branches over the main path's, with 95 % interval, from the
+        free parameters' ``deviation`` by name."""
         found = []
         sizes = self.deviations(values)
         for number, name in enumerate(self.names[1:]):
@@ -312,13 +294,9 @@ class YoungField:
 def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
                fractions: tuple[float, ...], *, log_factor: np.ndarray | float = 0.0,
                by_order: bool = False) -> YoungField:
-    """Return the field with an unknown interpolation; for a single modulus, the uniform one.
-
-    Args:
-        fractions: Positions of the control points on the main path, ascending, shape [K].
-        log_factor: Log of the factor of a layered section that is in the weights, [tet_count].
-        by_order: Whether side branches of each order have a modulus of their own.
-    """
+    """Return the field with unknown interpolation (one modulus: uniform). ``log_factor``
+    [tet_count] of a layered section is in the weights; ``by_order`` gives side branches moduli of
+    their own."""
     positions = np.asarray(fractions, float)
     is_uniform = len(positions) < 2 or bool(np.any(np.diff(positions) <= 0))
     along, order = _element_positions(mesh, skeleton)
@@ -349,8 +327,7 @@ def stations_of(fractions: tuple[float, ...]) -> np.ndarray:
 def bump_deviations(fractions: tuple[float, ...], log_young: np.ndarray,
                     ) -> tuple[list[int], np.ndarray]:
     """Return which stations have a bump, and their deviations of log E for these moduli; none for a
-    single control point.
-    """
+    single control point."""
     if len(fractions) < 2:
         return [], np.zeros(0)
     places, widths, steps = _bumps(fractions)

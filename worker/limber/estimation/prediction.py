@@ -17,11 +17,7 @@ from limber.recordings.synchronisation import Frames
 
 
 def require_one_load(settings: PredictSettings) -> None:
-    """Require exactly one load.
-
-    Raises:
-        InputError: there is no load, or there are two.
-    """
+    """Require exactly one load. InputError if there is no load, or there are two."""
     if (settings.weight is None) == (settings.load is None):
         raise InputError("A prediction needs exactly one load.",
                          "The prediction differs from the recording by this load.",
@@ -101,12 +97,9 @@ def _space(known: dict[str, Any], values: Values) -> ParameterSpace:
 
 def _uncertain(moved: np.ndarray, slope: np.ndarray, down: np.ndarray, space: ParameterSpace,
                known: dict[str, Any]) -> tuple[float, np.ndarray, float]:
-    """Mean drop [m], standard deviations of each point's displacement and of the drop [m].
-
-    Only the uncertainty of the modulus from the data: an error of radius or mesh is in the modulus
-    and in this prediction with opposite signs. Under another load the stiffness varies again as it
-    does between recordings.
-    """
+    """Mean drop, deviations of each point and of the drop [m] from the modulus's data alone: radius
+    and mesh err oppositely in modulus and prediction. Stiffness varies again, as between
+    recordings."""
     count = len(space.groups)
     free = np.concatenate([slope[..., :count] @ space.membership, slope[..., count:]], axis=-1)
     covariance = np.array(known["covariance"])[:space.size, :space.size].copy()

@@ -42,15 +42,8 @@ HALVINGS = 6
 
 @dataclass(frozen=True)
 class RodMotion:
-    """A pull of a rod at each time.
-
-    Attributes:
-        poses: Poses of the grasp point [m, rad], shape [n, 6].
-        wrenches: Wrenches of the gripper on it [N, N m], torque about the pose, shape [n, 6].
-        places: Positions of the stations [m], shape [n, S, 3].
-        turns: Rotations of the sections there, shape [n, S, 3, 3].
-        axis: The stations as scanned [m], shape [S, 3].
-    """
+    """A pull of a rod: poses [n, 6] of the grasp point, wrenches [n, 6] on it about the pose,
+    stations [n, S, 3] with sections' rotations [n, S, 3, 3], and as scanned [S, 3]."""
 
     poses: np.ndarray
     wrenches: np.ndarray
@@ -67,13 +60,8 @@ class RodMotion:
 
 @dataclass(frozen=True)
 class _State:
-    """An equilibrium.
-
-    Attributes:
-        along: Nodes of the collocation [m], shape [N].
-        values: Position, rotation (row by row) and moment at them, shape [15, N].
-        force: Of the gripper [N], shape [3].
-    """
+    """An equilibrium: at collocation nodes [N] [m] position, rotation (by rows) and moment [15, N],
+    and the gripper's force [3] [N]."""
 
     along: np.ndarray
     values: np.ndarray
@@ -113,14 +101,8 @@ class Rod:
     def of(cls, skeleton: Skeleton, young_at: Callable[[np.ndarray], np.ndarray], poisson: float,
            density: float, gravity: np.ndarray, grasp_fraction: float, *, as_scanned: bool,
            ) -> "Rod":
-        """Make the rod of a skeleton.
-
-        Args:
-            young_at: Young's modulus [Pa], [n], at positions [m], [n, 3].
-            gravity: [m/s^2], shape [3]; zero: the rod has no weight.
-            grasp_fraction: Position of the grasp on the main path.
-            as_scanned: The scanned shape is that under its weight.
-        """
+        """Make a skeleton's rod, from modulus [n] [Pa] at [n, 3] [m]. Zero gravity: weightless;
+        ``as_scanned``: the scan's shape is that under its weight."""
         path = skeleton.main_path()
         arc, along_all = skeleton.arc_length[path], skeleton.arc_length
         end = grasp_fraction * arc[-1]
@@ -149,11 +131,8 @@ class Rod:
                    np.asarray(gravity, float), outer)
 
     def pulled(self, requested: MotionWanted, *, progress: Progress = SILENT) -> RodMotion:
-        """Pull it slowly as requested (``pull``, ``turned`` or ``weight``).
-
-        Raises:
-            WorkError: no force moves the grasp that far, or no equilibrium is found.
-        """
+        """Pull it slowly as requested (``pull``, ``turned`` or ``weight``). WorkError if no force
+        moves the grasp that far, or no equilibrium is found."""
         count = len(requested.times)
         if requested.kind == "weight":
             forces = np.linspace(0.0, 1.0, count)[:, None] * requested.weight
@@ -238,11 +217,8 @@ class Rod:
 
     def _solved(self, near: _State, force: np.ndarray | None,
                 pose: tuple[np.ndarray, Rotation] | None = None) -> _State:
-        """The state near another one, under a force or held at a pose.
-
-        Raises:
-            WorkError: the collocation does not converge.
-        """
+        """The state near another one, under a force or held at a pose. WorkError if the collocation
+        does not converge."""
         base = np.r_[self.axis[0], np.eye(3).ravel()]
 
         def off(begin: np.ndarray, end: np.ndarray, *unknown: np.ndarray) -> np.ndarray:
@@ -312,13 +288,8 @@ def _from_end(values: np.ndarray, along: np.ndarray) -> np.ndarray:
 def _hung(skeleton: Skeleton, path: np.ndarray, along: np.ndarray, radius: np.ndarray, end: float,
           grasp: np.ndarray, curve: CubicSpline, density: float,
           ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Masses that hang on the rod.
-
-    Returns:
-        Mass [kg/m], [S], and mass moment [kg], [S, 3], of side branches per length, each spread
-        over the diameter of the rod at its fork; mass [kg] and mass moment [kg m], [3], of the part
-        beyond the grasp.
-    """
+    """Masses on the rod: side branches' per length, mass [S] [kg/m] and moment [S, 3] [kg], each
+    spread over the diameter at its fork, and of the part beyond the grasp [kg], [3] [kg m]."""
     arc, on_path = skeleton.arc_length, np.isin(np.arange(skeleton.node_count), path)
     root = np.arange(skeleton.node_count)
     for node in range(1, skeleton.node_count):

@@ -49,14 +49,8 @@ from limber.recordings.recording import (
 
 @dataclass(frozen=True)
 class CellErrors:
-    """Errors of one cell; they stay the same in all its recordings.
-
-    Attributes:
-        calibration: Their standard deviations.
-        gripper_offset, gripper_turn: Errors of the gripper's frame [m, rad], shape [3] each.
-        force_gain: Factor of the force.
-        camera_offset, camera_turn: Errors of the observer's frame [m, rad], shape [3] each.
-    """
+    """Errors of one cell that all recordings share: gripper's and camera's frame [m, rad] [3], a
+    factor on force; ``calibration`` has their deviations."""
 
     calibration: CalibrationEntry
     gripper_offset: np.ndarray
@@ -83,11 +77,8 @@ class CellErrors:
                 "camera_turn_rad": self.camera_turn.tolist()}
 
     def recorded(self, pull: Pull, rng: np.random.Generator) -> Pull:
-        """Return an exact pull as the cell records it, with zero and drift of this recording.
-
-        Noise of the sensors is not included. The gripper's frame is rotated about the grasp, the
-        observer's about the centre of the points.
-        """
+        """Record an exact pull with this cell and a zero and drift of its own, without noise. The
+        gripper's frame turns about the grasp, the observer's about the points' centre."""
         known, times = self.calibration, pull.times
         wrenches = pull.wrenches.copy()
         wrenches[:, :3] = self.force_gain * wrenches[:, :3] + self._zero(times, rng)
@@ -124,13 +115,8 @@ class CellErrors:
 
 def marked_points(skeleton: Skeleton, fractions: Sequence[float],
                   shifts: np.ndarray | float) -> np.ndarray:
-    """Return where points really are that were meant to be on the control points [m], shape [K, 3].
-
-    Args:
-        skeleton: The true axes.
-        fractions: Positions of the control points on the main path.
-        shifts: Distances along the branch from there [m], shape [K], or of all.
-    """
+    """Return true positions [K, 3] [m] of points meant for control points, ``shifts`` [K] [m] along
+    the branch from them."""
     length = skeleton.arc_length[skeleton.main_path()[-1]]
     return control_points(skeleton, tuple(np.clip(
         np.array(fractions) + shifts / length, 0.01, 0.99).tolist()))
@@ -147,19 +133,8 @@ _PULL_TURN = 2.0  # angle by which the direction of a pull turns [rad]: both ben
 
 @dataclass(frozen=True)
 class TrueBranch:
-    """The branch of a virtual pull.
-
-    Attributes:
-        mesh: With point data ``fixed``.
-        skeleton: True axes.
-        control_points: [m], shape [K, 3].
-        fractions: Positions of the control points on the main path.
-        young: [Pa], shape [K].
-        gravity: In the branch's frame [m/s^2].
-        is_weightless: Whether it has no weight, regardless of the settings.
-        is_assumed: Whether its moduli are assumed: the scan is of a branch without pulls.
-        is_meshed: Whether its body was meshed directly, and need not be round.
-    """
+    """The branch of a virtual pull. ``is_weightless`` overrides settings; ``is_assumed``: moduli
+    are, as a scan has no pulls; ``is_meshed``: meshed directly, so perhaps not round."""
 
     mesh: TetMesh
     skeleton: Skeleton
@@ -284,11 +259,8 @@ def _requested(truth: TrueBranch, settings: PullSpec, entry: PullEntry,
 
 
 def _rod(truth: TrueBranch, settings: PullSpec, is_weightless: bool) -> Rod:
-    """The true branch as a rod, with the same moduli between the control points.
-
-    Raises:
-        InputError: a rod cannot move as requested.
-    """
+    """The true branch as a rod, with the same moduli between the control points. InputError if a
+    rod cannot move as requested."""
     if settings.motion == "dynamic" or settings.camera or truth.is_meshed:
         raise InputError(
             Text(Option("model", "rod"), " was given with ", "a fast motion"
@@ -304,8 +276,7 @@ def _rod(truth: TrueBranch, settings: PullSpec, is_weightless: bool) -> Rod:
 
 def _marked(truth: TrueBranch, settings: PullSpec) -> tuple[np.ndarray, np.ndarray]:
     """Distances of the observed points along the branch from the control points [m], [K], and where
-    they are [m], [K, 3].
-    """
+    they are [m], [K, 3]."""
     rng = np.random.default_rng([settings.seed, 4])
     shifts = settings.calibration.point_sigma_m * rng.standard_normal(len(truth.fractions))
     points = (marked_points(truth.skeleton, truth.fractions, shifts) if shifts.any()

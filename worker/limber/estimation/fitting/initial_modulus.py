@@ -48,11 +48,8 @@ times in the one fit seen, where a branch folded up; otherwise it decreases.
 
 
 def scaled_start(objective: Objective, values: Values) -> Values:
-    """Return ``values`` with all moduli scaled to the measurements, and so that the branch stands.
-
-    The displacement under a force depends on force over modulus alone: the linear response at rest
-    gives the scale, whatever the moduli were. Without measured force some decades are tried.
-    """
+    """Scale all moduli to the measurements, so that the branch stands: by the linear response at
+    rest, as displacement depends on force over modulus. Without a force some decades are tried."""
     if any(forward.is_dynamic for forward in objective.forwards):
         return _step_by_step(objective, values)
     return _scaled(objective, values)
@@ -74,14 +71,8 @@ def set_all_keys(objective: Objective, count: int) -> None:
 
 
 def prescribed_start(objective: Objective, values: Values) -> tuple[Values, bool]:
-    """Fit pulls with an observed path by their force alone first, without the path.
-
-    Far from the solution no force explains both the path and the points; the measured force merely
-    moves a branch of wrong moduli too far. Near the solution, force and path are fitted together.
-
-    Returns:
-        The values, and whether they explain the pulls.
-    """
+    """Fit pulls with an observed path by force alone first, and whether that explains them. Far
+    from the solution no force explains path and points; near it both are fitted together."""
     observed = [forward for forward in objective.forwards if is_path_observed(forward)]
     if not observed:
         return values, True
@@ -151,12 +142,8 @@ def standing(objective: Objective, values: Values) -> Values:
 
 
 def _step_by_step(objective: Objective, values: Values) -> Values:
-    """Fit the beginning of fast pulls first, then increasing parts of them.
-
-    A branch with wrong moduli oscillates at other frequencies. Later in the motion its phase is
-    arbitrary, and a fit to all frames at once ends at a wrong solution. Over a quarter of the
-    frames it cannot be a whole period off; its result predicts the next part.
-    """
+    """Fit fast pulls by growing parts, as wrong moduli give a wrong frequency and later an
+    arbitrary phase. Over a quarter of the frames it is not a period off, and predicts the next."""
     space = objective.space
     likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
     for number, part in enumerate(PARTS):
@@ -174,9 +161,7 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
 
 def _scanned(objective: Objective, values: Values) -> Values:
     """Descend over decades, then halve the step: the objective has one valley along the scale.
-
-    Moduli without equilibrium are too soft: the search begins at the first with one.
-    """
+    Moduli without equilibrium are too soft: the search begins at the first with one."""
     tried: dict[float, float | None] = {}
 
     def scaled(shift: float) -> Values:
@@ -202,16 +187,9 @@ def _scanned(objective: Objective, values: Values) -> Values:
 
 def standing_start(objective: Objective, start: Values, uniform: Values, *, explains: bool = True,
                    ) -> tuple[Values, Evaluation] | None:
-    """Return the start, or values near it that have an equilibrium, and their evaluation.
-
-    A fit by force alone can end at moduli that carry no force at all, or far from the path. Then
-    these moduli, and the uniform one, are led along the recorded path; the better result is
-    returned. If no force leads them there, the uniform modulus and one that decreases outwards,
-    softer and stiffer, are tried under the measured force. None: none of them has an equilibrium.
-
-    Args:
-        explains: Whether the start explains the pulls; otherwise it is led at once.
-    """
+    """Return values near the start with an equilibrium, and their evaluation; None: no equilibrium.
+    Unless the start ``explains`` the pulls, it and the uniform modulus are led along the path, and
+    the better counts. Last, uniform and outward softer moduli are tried under the force."""
     if explains:
         found = objective.evaluate(objective.space.pack(start), jacobian=True)
         if found is not None:
@@ -270,13 +248,8 @@ square is 0.05 mm.
 
 def far_points(cell_errors: Sequence[dict], known: Mapping[str, np.ndarray],
                ) -> dict[str, np.ndarray] | None:
-    """Return each pull's fitted distances of its points along the branch [m], shape [m].
-
-    None: they are near those at which the pulls were simulated.
-
-    Args:
-        known: These, by the pull's name; zero where it has none.
-    """
+    """Return each pull's fitted distances of points along the branch [m] [m]; None if near those
+    simulated, ``known`` by the pull's name (absent: zero)."""
     found: dict[str, list[float]] = {}
     for each in cell_errors:
         if re.fullmatch("position of point [0-9]+ along the branch", each["name"]):
@@ -343,10 +316,7 @@ class FarPoints:
 
 def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float, float]:
     """RMS distance [m] of points and RMS force error [N] of one pull that was not used in a fit.
-
-    Raises:
-        WorkError: the pull has no equilibrium under these values.
-    """
+    WorkError if the pull has no equilibrium under these values."""
     forward = objective.forwards[index]
     simulated = forward.simulate(objective.space.unpack(free), (), False)
     if simulated is None:

@@ -41,15 +41,9 @@ CREEP_SIGMA = 0.1
 
 @dataclass(frozen=True)
 class Nuisance:
-    """One error that is constant during a recording.
-
-    Attributes:
-        name: As text, such as "gripper position x".
-        unit: "m", "rad", "N", "N m", "s" or "" (relative).
-        sigma: Its prior standard deviation, in that unit.
-        pull: The pull that has it. None: it is an error of the cell in all pulls of one
-        calibration.
-    """
+    """An error that is constant during a recording, with its prior deviation in ``unit`` ("m",
+    "rad", "N", "N m", "s", or "" for relative). Of ``pull``; None: of the cell in one
+    calibration."""
 
     name: str
     unit: str
@@ -59,14 +53,8 @@ class Nuisance:
 
 @dataclass(frozen=True)
 class ErrorSlopes:
-    """Change of a pull's predicted measurements by k errors, each in units of its deviation.
-
-    Attributes:
-        points: [m], shape [f, m, 3, k].
-        forces: [N], shape [f, 3, k].
-        torques: [N m], shape [f, 3, k].
-        grasps: Simulated minus recorded grasp point [m], shape [f, 3, k].
-    """
+    """Change of predicted measurements by k errors, each in its deviations: points [f, m, 3, k],
+    forces and torques [f, 3, k], and simulated less recorded grasp point [f, 3, k] [m]."""
 
     points: np.ndarray
     forces: np.ndarray
@@ -76,13 +64,8 @@ class ErrorSlopes:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """Estimated errors for given values of the free vector.
-
-    Attributes:
-        values: In units of their deviations, shape [k].
-        covariance: Covariance of these for a fixed free vector, shape [k, k].
-        gain: Their derivative to the free vector, shape [k, p]; None without derivatives.
-    """
+    """Estimated errors [k] in their deviations for a given free vector, covariance [k, k] with it
+    fixed, and derivative to it [k, p] (None: without derivatives)."""
 
     values: np.ndarray
     covariance: np.ndarray
@@ -97,17 +80,8 @@ class Eliminated:
 
 def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.ndarray,
                known: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray | None, Eliminated]:
-    """Eliminate k errors of unit standard deviation from the residuals.
-
-    Args:
-        residual: Standardised, shape [r].
-        jacobian: Derivative to the free vector, shape [r, p], or None.
-        columns: Derivative to the errors, shape [r, k].
-        known: Parts of the errors that are in the simulation already, in deviations, [k].
-
-    Returns:
-        Residual [r + k] and Jacobian [r + k, p] with the rows of the priors, and the errors.
-    """
+    """Eliminate k errors of unit deviation with slopes ``columns`` [r, k]: residual [r + k] and
+    Jacobian [r + k, p] with the priors' rows, and the errors. The simulation has ``known`` [k]."""
     count = columns.shape[1]
     basis, triangle = np.linalg.qr(np.vstack([columns, np.eye(count)]))
     residual = np.concatenate([residual, np.broadcast_to(known, count)])
@@ -160,11 +134,7 @@ class _Pull:
 
 
 class CellErrors:
-    """The errors of all pulls of a fit.
-
-    Args:
-        forwards: Forward simulations of the pulls.
-    """
+    """The errors of all pulls of a fit."""
 
     def __init__(self, forwards: Sequence[Forward]):
         self.nuisances: list[Nuisance] = []
@@ -317,16 +287,9 @@ def _late(pull: _Pull) -> dict[str, np.ndarray]:
 
 
 def relaxed(times: np.ndarray, forces: np.ndarray, seconds: float) -> np.ndarray:
-    """Part of a force that a standard linear solid relaxes, per share of the relaxation, [f, 3].
-
-    The integral of (1 - exp(-(t - s) / seconds)) dF(s), exact for forces that are linear between
-    the frames; the force of the first frame has acted for long.
-
-    Args:
-        times: [s], shape [f].
-        forces: Of the elastic branch [N], shape [f, 3].
-        seconds: Time constant [s].
-    """
+    """Part of a force [f, 3] [N] that a standard linear solid relaxes, per share: the integral of
+    (1 - exp(-(t - s) / seconds)) dF(s), exact if linear between frames. The first force has acted
+    for long."""
     found = np.zeros_like(forces)
     waiting = np.zeros(forces.shape[1])
     for frame in range(1, len(times)):
@@ -340,13 +303,8 @@ def relaxed(times: np.ndarray, forces: np.ndarray, seconds: float) -> np.ndarray
 
 def nuisance_records(nuisances: Sequence[Nuisance], found: Eliminated,
                      free: np.ndarray) -> list[dict]:
-    """Return each error with its value, 95 % interval and prior deviation, in its own unit.
-
-    Args:
-        nuisances: As eliminated.
-        found: Errors at the end of the fit.
-        free: Covariance of the free vector, shape [p, p].
-    """
+    """Return each error with its value, 95 % interval and prior deviation in its own unit; ``free``
+    [p, p] is the free vector's covariance."""
     deviation = np.sqrt(np.diag(found.total_covariance(free)))
     listed = []
     for nuisance, value, sure in zip(nuisances, found.values, deviation, strict=True):

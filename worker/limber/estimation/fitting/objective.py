@@ -24,12 +24,7 @@ from limber.recordings.synchronisation import Frames
 
 
 class Residuals:
-    """Compares a simulated pull with its measurements.
-
-    Args:
-        forward: The pull.
-        force_sigma: Standard deviation of its force sensor [N].
-    """
+    """Compares a simulated pull with its measurements; the force sensor's deviation is in N."""
 
     def __init__(self, forward: Forward, force_sigma: float):
         self._forward, frames = forward, forward.frames
@@ -98,8 +93,7 @@ class Residuals:
 
     def span(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Orthonormal columns of all changes that the unknowns of the input force can cause, and
-        their triangle; None if there are no unknowns.
-        """
+        their triangle; None if there are no unknowns."""
         response = self._forward.response
         if response is None:
             return None
@@ -144,10 +138,8 @@ def seen_in(frames: Frames) -> np.ndarray:
 
 @dataclass(frozen=True)
 class EvaluationEntry:
-    """One evaluation: free vector, objective, the paper's loss [m^2] and time [s].
-
-    Objective and loss are None if the simulation found no equilibrium.
-    """
+    """One evaluation: free vector, objective, the paper's loss [m^2] and time [s]. Objective and
+    loss are None if the simulation found no equilibrium."""
 
     parameters: tuple[float, ...]
     objective: float | None
@@ -236,18 +228,9 @@ SETTLED_FORCE_M = 5e-4
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All pulls simulated with one free vector.
-
-    Attributes:
-        free: Shape [p].
-        residual: Differences over standard deviations, shape [r].
-        jacobian: Its derivative to the free vector, shape [r, p], or None.
-        loss: The paper's J: sum of squared distances of all observed points [m^2].
-        pulls: The simulated pulls as cell and sensors would show them, with the fitted errors.
-        unknown_count: Unknowns of measured input forces, and errors of cell and sensors, that
-            were eliminated from it.
-        errors: These errors; None: there are none.
-    """
+    """All pulls simulated with one free vector [p]: standardised residual [r], Jacobian [r, p], and
+    the paper's J [m^2], the points' squared distances. ``pulls`` are as cell and sensors show them;
+    ``unknown_count`` unknowns of force and errors were eliminated."""
 
     free: np.ndarray
     residual: np.ndarray
@@ -270,11 +253,8 @@ class Evaluation:
 
     @property
     def slopes(self) -> np.ndarray:
-        """The Jacobian of an evaluation with derivatives, shape [r, p].
-
-        Raises:
-            ValueError: the evaluation has no derivatives.
-        """
+        """The Jacobian of an evaluation with derivatives, shape [r, p]. ValueError if the
+        evaluation has no derivatives."""
         return present(self.jacobian, "derivative of this evaluation")
 
     @property
@@ -287,15 +267,9 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class RawSlopes:
-    """Derivatives of a pull's r standardised residuals.
-
-    Attributes:
-        free: Derivative to the free vector, shape [r, p].
-        errors: Derivative to the errors of cell and sensors, shape [r, k].
-        response: Derivative to the unknowns of its force, shape [r, L]; None: it has none.
-        residual: With the fitted errors, shape [r].
-        kinds: Measured quantity of each residual, as a cause of uncertainty; length r.
-    """
+    """Slopes of a pull's r standardised residuals to the free vector [r, p], errors of cell and
+    sensors [r, k] and its force's unknowns [r, L] (None: none). ``kinds`` name causes of
+    uncertainty."""
 
     free: np.ndarray
     errors: np.ndarray
@@ -343,8 +317,7 @@ class Objective:
 
     def on_copies(self) -> "Objective":
         """Return an objective on copies of the pulls with its own log; evaluating it does not
-        change this one.
-        """
+        change this one."""
         return Objective([copy.copy(forward) for forward in self.forwards], self.space,
                          force_sigma=self.force_sigma)
 
@@ -353,11 +326,8 @@ class Objective:
         self._last = None
 
     def evaluate(self, free: np.ndarray, *, jacobian: bool = False) -> Evaluation | None:
-        """Simulate all pulls. Return None if one has no equilibrium.
-
-        Raises:
-            Stopped: by Ctrl-C or by cancelling the progress.
-        """
+        """Simulate all pulls. Return None if one has no equilibrium. Stopped by Ctrl-C or by
+        cancelling the progress."""
         free = np.array(free, float)
         last = self._last
         if last is not None and np.array_equal(last.free, free) and (
@@ -400,10 +370,8 @@ class Objective:
                 for points, forces in self.standardised(evaluation)]
 
     def follow_forces(self, evaluation: Evaluation) -> bool:
-        """Move measured input forces to their values in an evaluation.
-
-        Returns whether there are any; earlier evaluations then belong to another linearisation.
-        """
+        """Move measured input forces to their values in an evaluation. Returns whether there are
+        any; earlier evaluations then belong to another linearisation."""
         moved = False
         for index, forward in enumerate(self.forwards):
             if forward.response is None or forward.watches_pose:
@@ -526,11 +494,8 @@ class Objective:
         return Evaluation(free, residual, jacobian, loss, tuple(pulls), unknown_count, errors)
 
     def raw_slopes(self, evaluation: Evaluation) -> list[RawSlopes]:
-        """Derivatives of each pull's standardised residuals before elimination.
-
-        Args:
-            evaluation: With derivatives.
-        """
+        """Slopes of each pull's standardised residuals before elimination, of an evaluation with
+        derivatives."""
         found = []
         for index, simulated in enumerate(evaluation.pulls):
             residual, jacobian = self._residuals[index].rows(simulated)
@@ -545,14 +510,8 @@ class Objective:
 
     def residual_slopes(self, evaluation: Evaluation, changes: Sequence[ErrorSlopes],
                         ) -> np.ndarray:
-        """Change of an evaluation's residuals by S changes of its pulls, shape [r, S].
-
-        Without the part that unknowns of a force and errors of cell and sensors would explain.
-
-        Args:
-            evaluation: With derivatives.
-            changes: Changes of each pull's predicted measurements.
-        """
+        """Change [r, S] of residuals by S changes of the pulls' predictions, without the part that
+        unknowns of a force and errors of cell and sensors would explain."""
         rows, columns = [], []
         for compared, piece, simulated, change in zip(
                 self._residuals, self.raw_slopes(evaluation), evaluation.pulls, changes,

@@ -63,13 +63,8 @@ class FitStatus(StrEnum):
 
 @dataclass(frozen=True)
 class Fit:
-    """End of an optimiser.
-
-    Attributes:
-        evaluation: The best one, with derivatives if they were requested.
-        status: Status at the end.
-        reason: Reason for the end, as text with numbers.
-    """
+    """End of an optimiser: the best evaluation, with derivatives if requested, and the reason as
+    text with numbers."""
 
     evaluation: Evaluation
     status: FitStatus
@@ -83,22 +78,9 @@ class Fit:
 def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True,
                  evaluation_limit: int = 40, tolerance: float = 3e-5, is_near: bool = False,
                  force_rounds: int = FORCE_ROUNDS, shortest: float = SETTLED_STEP) -> Fit:
-    """Levenberg-Marquardt in a trust region (scipy's ``least_squares``) on the free vector.
-
-    Args:
-        objective: Computes residuals and derivatives.
-        start: Free vector.
-        robust: Residuals beyond ``OUTLYING`` count linearly (``soft_l1``), so that an outlier
-            cannot dominate the fit.
-        evaluation_limit: Largest number of forward simulations.
-        tolerance: Relative change of the cost at which the fit ends.
-        is_near: Whether the start is close to the solution.
-        force_rounds: Largest number of linearisations of a measured input force.
-        shortest: Length of the remaining step, in standard deviations, at which it ends.
-
-    Raises:
-        WorkError: the start has no equilibrium.
-    """
+    """Levenberg-Marquardt in a trust region (``least_squares``). ``robust``: residuals beyond
+    ``OUTLYING`` count linearly (``soft_l1``). It ends at a relative change ``tolerance`` of the
+    cost or a step ``shortest`` in deviations. WorkError if the start has no equilibrium."""
     # Far from the solution all residuals are large, and a robust loss would only slow convergence.
     phases = [("linear", ROUGH_ENDING), ("soft_l1", tolerance)]
     if not robust:
@@ -125,10 +107,8 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
 
 
 class _Search:
-    """Searches by scipy use shifted vectors: scipy limits the first step by the length of the first
-    vector. The shift allows a change of the moduli by about a factor of e in all; log E itself
-    would allow any.
-    """
+    """Scipy's searches use shifted vectors, as it limits the first step by the vector's length: to
+    about a factor of e in all moduli, while log E itself would allow any."""
 
     def __init__(self, objective: Objective, start: np.ndarray, evaluation_limit: int,
                  shortest: float):
@@ -206,20 +186,11 @@ def _wanted_step(found: Evaluation, loss: str) -> tuple[np.ndarray, float]:
 def nelder_mead(objective: Objective, start: np.ndarray, *,
                 evaluation_limit: int = EVALUATION_LIMIT, delta_m2: float | None = None,
                 tolerance: float = 1e-3) -> Fit:
-    """The paper's estimator (Algorithm 1): scipy's Nelder-Mead on the free vector.
-
-    Values that are free only within their priors, such as the form of the field, stay at the start:
-    no simplex finds them beside the moduli. A settled search begins again from its best values with
-    a simplex of full size, until that gains nothing: a simplex may collapse far from the minimum.
-
-    A search stops when the mean squared error of the points falls below ``delta_m2`` [m^2], the
-    algorithm's delta; when the error settles, that is, no longer decreases by an amount that is
-    relevant compared to the noise; or when the simplex spans less than ``tolerance`` in every log E
-    and in the objective. Settled above ``delta_m2`` is not converged.
-
-    Raises:
-        WorkError: no candidate had an equilibrium.
-    """
+    """The paper's estimator (Algorithm 1): Nelder-Mead, restarted from its best with a full simplex
+    until that gains nothing. Values free only within priors stay. It stops below ``delta_m2``
+    [m^2], the algorithm's delta; when the error settles against the noise (above delta: not
+    converged); or when log E and objective span ``tolerance``. WorkError if no candidate has an
+    equilibrium."""
     lower, upper = objective.space.bounds()
     rule = _Settling(objective, delta_m2)
     if any(forward.drive == "force" for forward in objective.forwards):
@@ -361,11 +332,7 @@ def _required(objective: Objective, free: np.ndarray) -> Evaluation:
 
 
 def best_so_far(objective: Objective) -> Fit:
-    """Return the best evaluation of a stopped fit.
-
-    Raises:
-        Cancelled: there is no evaluation yet.
-    """
+    """Return the best evaluation of a stopped fit. Cancelled if there is no evaluation yet."""
     best = objective.log.best
     if best is None or len(best.parameters) != objective.space.size:
         raise Cancelled("The estimate was stopped before the first step of the fit.",

@@ -57,17 +57,8 @@ Optimise = Callable[..., Fit]
 
 
 class Reduction:
-    """Reduced models of the pulls of an estimate.
-
-    Args:
-        forwards: Forward simulations of the full model; pulls of one grasp and one gravity share a
-        basis.
-        cache: Folder in which bases are kept for the next estimate, or None.
-        digest: Digest of the other dependencies of a basis, besides branch and grasp.
-
-    Raises:
-        InputError: a pull is force-driven or dynamic.
-    """
+    """Reduced models of pulls; those of one grasp and gravity share a basis, kept in ``cache`` by
+    ``digest`` of its other dependencies. InputError if a pull is force-driven or dynamic."""
 
     def __init__(self, forwards: list[Forward], cache: Path | None = None, digest: str = ""):
         self.forwards = [_required(forward) for forward in forwards]
@@ -119,17 +110,9 @@ class Reduction:
 def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rough: Optimise,
                 reduction: Reduction, progress: Progress = SILENT,
                 ) -> tuple[Fit, Objective]:
-    """Fit on reduced models of the pulls; return the fit and its objective.
-
-    If the reduced model does not cover the pulls, the full model fits them, with a warning.
-
-    Args:
-        objective: On the full model.
-        start: Free vector.
-        optimise: The requested fit.
-        rough: A quick fit of the full model, around which missing bases are made.
-        reduction: The reduced models.
-    """
+    """Fit on reduced models of the pulls, with bases around a ``rough`` quick fit of the full
+    model; return fit and objective. If they do not cover the pulls, the full model fits, with a
+    warning."""
     free = start
     if not reduction.is_built:
         counts = [forward.key_count for forward in reduction.forwards]

@@ -27,11 +27,8 @@ from limber.recordings.synchronisation import Frames
 
 
 class DynamicForward(Forward):
-    """Simulates one pull by Newmark steps.
-
-    Arguments as for :class:`limber.estimation.forward.quasi_static.QuasiStaticForward`. Every
-    frame is simulated.
-    """
+    """Simulates one pull by Newmark steps. Arguments as for
+    :class:`limber.estimation.forward.quasi_static.QuasiStaticForward`. Every frame is simulated."""
 
     is_dynamic = True
 
@@ -112,11 +109,8 @@ class DynamicForward(Forward):
         return carries_its_weight(self._model_with(values))
 
     def until(self, count: int) -> "DynamicForward":
-        """Return the first ``count`` frames, driven by force if that is known.
-
-        With a prescribed path, wrong moduli stretch the branch and give a thousandfold force. With
-        a prescribed force, the branch merely moves too far.
-        """
+        """Return the first frames, driven by force if known: on a prescribed path wrong moduli give
+        a thousandfold force, under a force the branch merely moves too far."""
         name, model, weights, entry = self._arguments
         measured = np.isfinite(self.frames.wrenches[:, :3]).all()
         if measured and entry.grasp.mode == "point":

@@ -39,12 +39,8 @@ STEP = 0.25
 
 @dataclass(frozen=True)
 class PointDirections:
-    """Directions of the branch at m points.
-
-    Attributes:
-        rest: Unit vectors at rest, away from the base, shape [m, 3].
-        operator: Their change by nodal displacements, shape [3 m, 3 n].
-    """
+    """Directions of the branch at m points: unit vectors [m, 3] at rest, away from the base, and
+    their change by nodal displacements [3 m, 3 n]."""
 
     rest: np.ndarray
     operator: sparse.csr_matrix
@@ -71,11 +67,9 @@ class PointDirections:
 
 
 def _axis(mesh: TetMesh, point: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, float]:
-    """Direction of the branch near a point, and the radius of the ball that shows it [m].
-
-    The ball grows until the tetrahedra in it extend along the branch more than across. They count
-    less towards its edge: cut off sharply, a coarse mesh tilted the direction by up to 15 degrees.
-    """
+    """Direction at a point, and radius [m] of the ball that shows it: its tetrahedra extend more
+    along than across. They count less at its edge: cut sharply, a coarse mesh tilted it by up to 15
+    degrees."""
     centres, volumes = mesh.centroids, np.abs(mesh.volumes)
     away = np.linalg.norm(centres - point, axis=1)
     extent = float(np.sort(away)[min(FEWEST_TETS, len(away) - 1)])
@@ -106,17 +100,8 @@ ITERATIONS = 8
 
 def motion_response(model: BranchModel, loads: np.ndarray, observed: object, times: np.ndarray,
                     ) -> np.ndarray:
-    """Return the change of observed points during a motion by the force at each frame.
-
-    Args:
-        model: The branch, with its damping.
-        loads: Nodal forces of each of the force's components, shape [c, node_count, 3].
-        observed: Displacement of the points from the nodes', shape [3 m, 3 n]; sparse.
-        times: Times of the frames [s], shape [f]; the force is linear between them.
-
-    Returns:
-        [m per N], shape [f, m, 3, f c]; the force's columns by frame, then component.
-    """
+    """Return the change [f, m, 3, f c] [m per N] of observed points by nodal forces [c, node_count,
+    3] at each frame, linear between frames; columns by frame, then component."""
     squares, modes, static = _modes(model, loads)
     at_points = np.array([observed @ mode.ravel() for mode in modes])
     pushed = np.einsum("qni,cni->qc", modes, loads)
@@ -145,14 +130,8 @@ def _modes(model: BranchModel, loads: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _swing(squares: np.ndarray, damping: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Each mode's motion under a unit force at one frame that falls linearly to zero at its
-    neighbours.
-
-    By Newmark's average acceleration with the steps of the simulation, starting in equilibrium.
-
-    Returns:
-        Shape [modes, f, f]: at each frame, for the force at each frame.
-    """
+    """Each mode's motion [modes, f, f] at each frame, from equilibrium, under a unit force at one
+    frame that falls linearly to zero at its neighbours. By Newmark, in the simulation's steps."""
     count = len(times)
     k, d = squares[:, None], damping[:, None]
     hats = np.eye(count)
@@ -203,16 +182,8 @@ def travel(poses: np.ndarray, step_m: float = 5e-4) -> np.ndarray:
 
 
 def key_frames(along: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the frames to simulate, and the interpolation of all frames.
-
-    Args:
-        along: A parameter that increases along the path, shape [n].
-        count: Largest number of frames to simulate.
-
-    Returns:
-        Indices of the key frames, shape [k], and S, shape [n, k]: values at all frames are
-        S @ values at the key frames.
-    """
+    """Choose at most ``count`` key frames [k] by a parameter that increases along the path [n], and
+    S [n, k] with values at all frames = S @ those at key frames."""
     distances, first = np.unique(along, return_index=True)
     if len(distances) > count:
         targets = np.linspace(distances[0], distances[-1], count)
@@ -228,13 +199,8 @@ def key_frames(along: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def smoothed(times: np.ndarray, values: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """Return noisy measurements at given instants, each from a local quadratic fit.
-
-    Args:
-        times: [s], shape [n].
-        values: Shape [n, c]; rows with NaN are discarded.
-        keys: Requested instants [s], shape [k].
-    """
+    """Return noisy values [n, c] at given instants [k] [s], each by a local quadratic fit; rows
+    with NaN are left out."""
     known = np.isfinite(values).all(axis=1)
     times, values = times[known], values[known]
     width = max(2.0 * np.ptp(times) / max(len(keys) - 1, 1), 1e-9)
@@ -271,15 +237,8 @@ CLIPPED = 4.0
 
 @dataclass(frozen=True)
 class Response:
-    """Response of a simulated pull to its L force unknowns, at the point of linearisation.
-
-    Attributes:
-        points: Response of the observed points [m per N], shape [f, m, 3, L].
-        wrenches: Response of force, and of torque if it acts too, at the frames, shape [f, c, L]; c
-            is 3 or 6.
-        grasps: Response of the gripper's position [m per N], shape [f, 3, L]; None if it is not
-        observed.
-    """
+    """Response to L force unknowns where linearised [per N]: points [f, m, 3, L], force or with
+    torque too [f, 3 or 6, L], and gripper's position [f, 3, L] (None: not observed)."""
 
     points: np.ndarray
     wrenches: np.ndarray
@@ -288,14 +247,8 @@ class Response:
 
 @dataclass(frozen=True)
 class Course:
-    """Force over time, and torque of a clamped grasp.
-
-    Attributes:
-        keys: Key frames, shape [k].
-        spread: Values at all frames from those at the key frames, shape [f, k].
-        values: At the key frames [N, N m], shape [k, c].
-        exact: Whether it is a stated load, not a reading. It then has no unknowns.
-    """
+    """Force over time, with torque if clamped: values [k, c] [N, N m] at key frames, spread to all
+    by [f, k]. ``exact``: a stated load without unknowns, not a reading."""
 
     keys: np.ndarray
     spread: np.ndarray
@@ -304,17 +257,9 @@ class Course:
 
 
 def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int) -> Course:
-    """Fit a smooth course to the readings of the force.
-
-    A noisy force does not define a path, so the frames are ordered by time. If ``count`` key frames
-    cannot follow the readings to within their noise, there are more.
-
-    Args:
-        frames: Readings may be missing.
-        sigma: Deviation of each reading [N, N m], shape [f, c].
-        count: Requested number of key frames.
-        components: c: 3 for the force, 6 with the torque.
-    """
+    """Fit a smooth course to readings of deviation [f, c] [N, N m], some missing; c is 3, or 6 with
+    torque. A noisy force defines no path, so time orders; it takes over ``count`` key frames if
+    needed to follow readings within noise."""
     readings = frames.wrenches[:, :components]
     known = np.isfinite(readings).all(axis=1)
     if np.ptp(readings[known], axis=0).max() == 0.0:
@@ -339,16 +284,8 @@ def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int) ->
 
 def nodal_loads(grasp: Grasp, entry: GraspEntry, pose: np.ndarray, rest: np.ndarray,
                 components: int) -> np.ndarray:
-    """Nodal forces of each component of the gripper's wrench, shape [c, node_count, 3].
-
-    A force acts on the patch's weighted centre. A clamped gripper's torque, about the recorded
-    point, rotates the patch by couples of forces on its nodes, with their arms at the recorded
-    rotation.
-
-    Args:
-        pose: Recorded [m, rad], shape [6].
-        rest: Nodes of the mesh [m], shape [node_count, 3].
-    """
+    """Nodal forces [c, node_count, 3] of a wrench: force at the patch's weighted centre; a clamped
+    one's torque, about the recorded point, by couples with arms at the recorded rotation."""
     loads = np.zeros((components, *rest.shape))
     for axis in range(3):
         loads[axis, grasp.nodes, axis] = grasp.weights
@@ -382,12 +319,8 @@ def compliance(model: BranchModel, displacement: np.ndarray, loads: np.ndarray) 
 
 
 def response_of(spread: np.ndarray, at_keys: np.ndarray) -> Response:
-    """Return the response at all frames.
-
-    Args:
-        spread: Values at f frames from those at k key frames, shape [f, k].
-        at_keys: Response of the points at the key frames [m per N], shape [k, c, m, 3].
-    """
+    """Return the response at f frames from [k, c, m, 3] [m per N] at k key frames, by spread [f,
+    k]."""
     keys, components = at_keys.shape[:2]
     points = np.einsum("fk,kcmi->fmikc", spread, at_keys)
     wrenches = np.einsum("fk,cd->fckd", spread, np.eye(components))
@@ -450,11 +383,8 @@ class Simulated:
 
 
 def under_its_weight(model: BranchModel, entry: PullEntry) -> BranchModel:
-    """Return the model with the weight that acted in a pull.
-
-    Usually the scanned shape is prestressed by gravity, as in ``model``. The gravity of the pull
-    bends a shape that was drawn. A simulated pull may have no gravity.
-    """
+    """Return the model with the weight that acted in a pull: usually the shape is prestressed, a
+    drawn shape is bent by it, and a simulated pull may have none."""
     if entry.gravity_m_s2 is not None:
         return model.with_parameters(gravity=entry.gravity_m_s2)
     return model.with_parameters(gravity=(0.0, 0.0, 0.0)) if entry.weightless else model
@@ -470,22 +400,9 @@ def carries_its_weight(model: BranchModel) -> bool:
 
 
 class Forward(ABC):
-    """Simulates one pull for given values.
-
-    Attributes:
-        name: The pull's name.
-        entry: Its settings.
-        frames: Its aligned frames.
-        rest_points: Observed points at rest [m], shape [m, 3].
-        uses_force: Whether the force was measured in any frame, and is compared there.
-        response: Response of the pull to errors of the measured force that drives it, once
-            derivatives have been requested; None: no such force, or not yet.
-        uses_torque: Whether the torque is compared too.
-        grasp_tangent: Direction of the branch at the grasp, at all frames of the last simulation,
-            shape [f, 3], if the gripper's path is an observation.
-        point_directions: Direction of the branch at the observed points, at all frames of the last
-            simulation, shape [f, m, 3], if these points may be off along the branch.
-    """
+    """Simulates one pull. ``uses_force``: measured in any frame, and compared there. ``response``:
+    to errors of a measured force that drives, once derivatives were asked. ``grasp_tangent`` [f, 3]
+    and ``point_directions`` [f, m, 3] are of the last simulation, if path or points may be off."""
 
     is_dynamic = False
     """Whether inertia acts; a frame then depends on all earlier ones."""
@@ -510,13 +427,8 @@ class Forward(ABC):
     @abstractmethod
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
-        """Return the pull under ``values``. None: it finds no equilibrium or motion.
-
-        Args:
-            values: The physical parameters.
-            extra: Parameters of the derivatives in addition to Young's modulus.
-            sensitivities: Whether to compute derivatives.
-        """
+        """Return the pull under ``values``, with derivatives to Young's modulus and ``extra`` if
+        asked. None: no equilibrium or motion."""
 
     @property
     def may_be_off_along(self) -> bool:
@@ -565,16 +477,12 @@ class Forward(ABC):
     @property
     def reduction_error(self) -> tuple[float, float] | None:
         """Largest error of the reduced model relative to the full one, in position [m] and in force
-        over the largest force; None if the full model itself is simulated, or could not be.
-        """
+        over the largest force; None if the full model itself is simulated, or could not be."""
         return None
 
     def shift_force(self, change: np.ndarray) -> None:
-        """Change the force by the fitted amount, and linearise at the new force.
-
-        Args:
-            change: Change of the unknowns, in the order of the response's columns, shape [L].
-        """
+        """Change the force's unknowns [L], in the order of the response's columns, and linearise
+        there."""
         raise NotImplementedError(f"{type(self).__name__} is not driven by a measured force.")
 
     def under_readings(self, simulated: Simulated) -> Simulated:
@@ -582,9 +490,8 @@ class Forward(ABC):
         return simulated
 
     def force_ratio(self, values: Values) -> float | None:
-        """Measured force over the force that moves a branch of these ``values`` equally far, by
-        its linear response at rest; None if the pull does not determine it.
-        """
+        """Measured force over the force that moves a branch of these ``values`` equally far, by its
+        linear response at rest; None if the pull does not determine it."""
         return None
 
     def stands(self, values: Values) -> bool:
@@ -601,13 +508,11 @@ class Forward(ABC):
 
     def with_prescribed_poses(self, poses: np.ndarray) -> "Forward":
         """Return the same pull, on the full model, with other recorded poses [m, rad], [f, 6]; a
-        slow one at few key frames, enough to show a difference.
-        """
+        slow one at few key frames, enough to show a difference."""
         raise NotImplementedError(f"{type(self).__name__} cannot be simulated with other recorded "
                                   "poses.")
 
     def until(self, count: int) -> "Forward":
         """Return the part of a pull used by the first of several fits: the first ``count`` frames
-        of a dynamic pull, all of a slow one.
-        """
+        of a dynamic pull, all of a slow one."""
         return self

@@ -65,14 +65,8 @@ class MotionWanted:
 
 @dataclass(frozen=True)
 class MotionMade:
-    """Resulting motion at each time.
-
-    Attributes:
-        poses: Poses of the grasp point [m, rad], shape [n, 6].
-        wrenches: Wrenches of the gripper on the branch [N, N m], torque about the pose, shape [n,
-        6].
-        displacements: Displacements of all nodes [m], each of shape [node_count, 3].
-    """
+    """The motion at each time: poses of the grasp point [n, 6] [m, rad], wrenches on the branch [n,
+    6], torque about the pose, and displacements [node_count, 3] [m]."""
 
     poses: np.ndarray
     wrenches: np.ndarray
@@ -81,11 +75,8 @@ class MotionMade:
 
 def moved(model: BranchModel, grasp: Grasp, requested: MotionWanted, *,
           progress: Progress = SILENT) -> MotionMade:
-    """Move a branch as requested.
-
-    Raises:
-        WorkError: no force moves the grasp that far, or the motion cannot be computed.
-    """
+    """Move a branch as requested. WorkError if no force moves the grasp that far, or the motion
+    cannot be computed."""
     count = len(requested.times)
     if requested.kind == "weight":
         share = np.linspace(0.0, 1.0, count)
@@ -197,14 +188,8 @@ def _made(poses: np.ndarray, held: np.ndarray, forces: np.ndarray, torques: np.n
 
 def sideways_forces(axis: np.ndarray, frame_count: int, *, turn: float, phase: float,
                     ) -> np.ndarray:
-    """Return forces across ``axis`` that grow from 0 to 1 N while rotating, shape [n, 3].
-
-    Args:
-        axis: From base to grasp, shape [3].
-        frame_count: The first force is 0.
-        turn: Rotation of the direction about the axis [rad].
-        phase: Initial direction [rad].
-    """
+    """Return forces [n, 3] across ``axis`` (base to grasp) that grow from 0 to 1 N and rotate by
+    ``turn`` [rad] from ``phase`` [rad]."""
     axis = axis / np.linalg.norm(axis)
     first = any_normal(axis)
     second = np.cross(axis, first)
@@ -218,10 +203,7 @@ def sideways_forces(axis: np.ndarray, frame_count: int, *, turn: float, phase: f
 def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, travel: float,
                      ) -> float:
     """Return the factor of ``direction`` [N] that moves the grasp by ``travel`` [m], to 3 %.
-
-    Raises:
-        WorkError: there is no such factor, or the branch does not carry its own weight.
-    """
+    WorkError if there is no such factor, or the branch does not carry its own weight."""
     rest = solve_static(model).require().displacement
     load = np.zeros_like(rest)
     load[grasp.nodes] = grasp.weights[:, None] * direction

@@ -108,11 +108,8 @@ class ObservedPathForward(QuasiStaticForward):
             self._drives_for = other._drives_for
 
     def is_held_against_its_force(self, values: Values) -> bool:
-        """Whether a clamping gripper holds states that its force and torque alone would let go.
-
-        A branch that is compressed buckles under a steady force and torque, but not between base
-        and gripper. Simulated by force, it would end in another state.
-        """
+        """Whether a clamp holds states that its wrench alone lets go: a compressed branch buckles
+        under a steady wrench, not between base and gripper, and by force ends elsewhere."""
         if self.grasp.mode != "rigid":
             return False
         held = QuasiStaticForward(self.name, self._model, self.weights, self.entry, self.frames,
@@ -141,16 +138,9 @@ class ObservedPathForward(QuasiStaticForward):
         self.set_key_count(self.key_count)
 
     def lead_along_path(self, values: Values) -> bool:
-        """Find the force that leads a branch of these values along the recorded path.
-
-        From rest in short steps, each by the compliance at the last: the path tells the force
-        across the branch, and the sum of squares is least along it, where the path is too uncertain
-        to tell any. Unlike the readings, whose zero may be as large as the force, such a force
-        folds no branch.
-
-        Returns:
-            Whether there are equilibria; otherwise force and states are those before.
-        """
+        """Find the force that leads a branch along the recorded path in short steps from rest, by
+        compliance: across it the path tells it, along it least squares. Unlike readings, whose zero
+        may be large, it folds no branch. False: no equilibria, force and states as before."""
         model, place = self.model_with(values), self.frames.poses[:, :3]
         offset = self.entry.grasp.point_m - place[0]
         if np.linalg.norm(offset) < AT_REST_M:
@@ -231,11 +221,8 @@ class ObservedPathForward(QuasiStaticForward):
 
     def _enter_slopes(self, found: Simulated, key: int, model: BranchModel, values: Values,
                       extra: tuple[str, ...], result: StaticResult) -> None:
-        """Enter the derivatives by adjoints.
-
-        Few coordinates are observed, and a load on one of them is zero at most nodes: the branch's
-        response to it is cheaper than that to a parameter, and serves all parameters.
-        """
+        """Enter the derivatives by adjoints: few coordinates are observed, and the response to a
+        load on one, zero at most nodes, is cheap and serves all parameters."""
         state, count = result.displacement, self._operator.shape[0]
         loads = np.zeros((count + 3, *state.shape))
         loads[:count] = self._operator.toarray().reshape(count, -1, 3)

@@ -40,18 +40,14 @@ from limber.recordings.synchronisation import Frames
 
 def uses_torque(entry: PullEntry, frames: Frames) -> bool:
     """Whether the gripper's torque counts: for a clamped grasp, and a sensor with a stated torque
-    noise. Driven by pose it is an observation; driven by force it acts as a load.
-    """
+    noise. Driven by pose it is an observation; driven by force it acts as a load."""
     return (entry.grasp.mode == "rigid" and entry.sensor.torque_sigma_nm is not None
             and bool(np.isfinite(frames.wrenches[:, 3:]).all(axis=1).any()))
 
 
 def require_torque(name: str, entry: PullEntry, frames: Frames) -> None:
     """Refuse a clamped gripper without torque: its force alone does not determine the motion.
-
-    Raises:
-        InputError: its torque was not measured.
-    """
+    InputError if its torque was not measured."""
     if not uses_torque(entry, frames):
         raise InputError(
             f"{name}: the force of a clamped gripper drives the simulation, but its torque is not "
@@ -65,16 +61,8 @@ def require_torque(name: str, entry: PullEntry, frames: Frames) -> None:
 
 def torque_slopes(model: BranchModel, grasp: Grasp, parameters: ParameterSet,
                   displacement: np.ndarray, slope: np.ndarray, about: np.ndarray) -> np.ndarray:
-    """Return the derivatives of the gripper's torque [N m] about a fixed point, shape [3, p].
-
-    Args:
-        model: The branch.
-        grasp: The grasp that exerts the torque.
-        parameters: The p parameters.
-        displacement: Of the nodes [m], shape [n, 3].
-        slope: Its derivatives, shape [n, 3, p].
-        about: The point [m], shape [3].
-    """
+    """Return the slopes [3, p] of the gripper's torque [N m] about a fixed point, from nodes
+    displaced [n, 3] [m] and their slopes [n, 3, p]."""
     held = grasp.nodes
     arm = model.mesh.nodes[held] + displacement[held] - about
     columns = []
@@ -111,22 +99,9 @@ class _Memory:
 
 
 class QuasiStaticForward(Forward):
-    """Simulates one pull in equilibrium.
-
-    States of the key frames are kept between calls: parameters change little from one evaluation to
-    the next, so two Newton iterations per frame are enough.
-
-    Args:
-        name: The pull's name.
-        model: The branch; its Young's modulus is replaced.
-        weights: Map Young's modulus from the control points to the tetrahedra, [tet_count, K].
-        entry: The pull's settings.
-        frames: Aligned frames.
-        rest_points: Observed points at rest [m], shape [m, 3].
-        key_count: Largest number of simulated frames.
-        field: Interpolation of Young's modulus between the control points; without it as
-        ``weights``.
-    """
+    """Simulates one pull in equilibrium, at most at ``key_count`` frames. Their states are kept:
+    parameters change little, so two Newton steps are enough. ``weights`` [tet_count, K] map moduli
+    to tetrahedra, unless ``field`` does."""
 
     def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
                  frames: Frames, rest_points: np.ndarray, *, key_count: int = 12,
@@ -311,11 +286,7 @@ class QuasiStaticForward(Forward):
         return drive if self.drive == "pose" else np.tensordot(drive, self._loads[key], axes=1)
 
     def aside(self, nodes: np.ndarray) -> "QuasiStaticForward":
-        """Return the same pull of the branch with slightly moved nodes [m], [n, 3].
-
-        The gripper holds the same nodes at the same positions. Each tetrahedron keeps its material,
-        and a branch that hung as scanned still does.
-        """
+        """Return the same pull with moved nodes [n, 3] [m]: gripper, material and hanging stay."""
         other = copy.copy(self)
         model = self._model.with_rest_nodes(nodes)
         other._model = model if self._model.prestress is None else model.as_scanned()
@@ -368,23 +339,16 @@ class QuasiStaticForward(Forward):
 
     def force_ratio(self, values: Values) -> float | None:
         """As in the base class: a bent branch is stiffer, so the ratio errs to the stiff side,
-        where a branch does not fold.
-        """
+        where a branch does not fold."""
         change, at, seen = self.linear_motion(values)
         moved = np.where(np.isfinite(seen), change @ at, 0.0)
         along = float(np.sum(moved * np.nan_to_num(seen)))
         return float(np.sum(moved**2)) / along if along > 0 else None
 
     def linear_motion(self, values: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Measured forces and motions, and the linear response between them.
-
-        It is that of the branch at rest without weight, which exists for every modulus.
-
-        Returns:
-            Forces (and torques) [N, N m], shape [n, c]; response [m/N], shape [c, d]; motions [m],
-            shape [n, d]: of the gripper, in changes since the first frame, or of the points since
-            rest if the force drives.
-        """
+        """Forces [n, c], response [c, d] [m/N] at rest without weight, which any modulus has, and
+        motions [n, d]: the gripper's since the first frame; if the force drives, the points' from
+        rest."""
         frames = self.frames
         known = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
         components = 6 if self.uses_torque else 3

@@ -20,21 +20,8 @@ STEPS = {"poisson": 2e-3, "density": 2e-2}
 
 
 class ReducedForward(Forward):
-    """Simulates one pose-driven pull on the reduced model.
-
-    Args:
-        name: The pull's name.
-        reduced: Reduced model of the branch held at the recorded grasp.
-        mesh: Its mesh.
-        entry: The pull's settings.
-        frames: Aligned frames.
-        rest_points: Observed points at rest [m], shape [m, 3].
-        density: Density of the branch of the reduced model [kg/m^3].
-        key_count: Largest number of simulated frames; a spline gives the others.
-
-    Raises:
-        InputError: the pull is driven by force; a reduced model is held at poses.
-    """
+    """Simulates one pose-driven pull on the reduced model of a branch held at the grasp, at most at
+    ``key_count`` frames; a spline gives the others. InputError if driven by force."""
 
     def __init__(self, name: str, reduced: ReducedModel, mesh: TetMesh, entry: PullEntry,
                  frames: Frames, rest_points: np.ndarray, *, density: float = 900.0,
@@ -102,8 +89,7 @@ class ReducedForward(Forward):
 
     def displacements(self, frames: np.ndarray) -> list[np.ndarray]:
         """Nodal displacements [m] at the simulated frames nearest to ``frames``, from the last
-        simulation.
-        """
+        simulation."""
         nearest = [int(np.argmin(np.abs(self.keys - frame))) for frame in frames]
         return [self._reduced.displacement(present(self._states[index], "state of a key frame"))
                 for index in nearest]

@@ -30,14 +30,8 @@ from limber.reduced.reduced_model import ReducedModel, ReducedState, ReducedStat
 
 @dataclass(frozen=True)
 class OnlineFrame:
-    """Measurements at one instant.
-
-    Attributes:
-        time: [s].
-        pose: Pose of the grasp point [m, rad], shape [6].
-        force: Force of the gripper on the branch [N], shape [3]; NaN if not measured.
-        positions: Observed points [m], shape [m, 3]; NaN if not observed.
-    """
+    """Measurements at one instant: pose of the grasp point [6] [m, rad], force on the branch [3]
+    and points [m, 3], NaN where not measured."""
 
     time: float
     pose: np.ndarray
@@ -47,14 +41,8 @@ class OnlineFrame:
 
 @dataclass
 class Kept:
-    """A frame as linearised at ``centre``, log E of shape [K].
-
-    Attributes:
-        state: State of the reduced model; None: it belongs to another basis.
-        normal, gradient: Normal matrix and gradient of half its squared residuals, shapes [K, K]
-        and [K].
-        residual: Root mean square of the standardised residuals.
-    """
+    """A frame as linearised at ``centre``, log E [K]: normal matrix [K, K] and gradient [K] of half
+    its squares, and RMS. ``state`` None: of another basis."""
 
     frame: OnlineFrame
     state: ReducedState | None
@@ -65,13 +53,8 @@ class Kept:
 
 
 class Information:
-    """The information on log E: a prior, kept frames, and merged frames.
-
-    Args:
-        centre: Mean of the prior, shape [K].
-        deviation: Its standard deviation.
-        kept_count: Largest number of frames that are kept for another linearisation.
-    """
+    """Information on log E: a prior about ``centre`` [K], merged frames, and at most ``kept_count``
+    frames kept for another linearisation."""
 
     def __init__(self, centre: np.ndarray, deviation: float, kept_count: int):
         count = len(centre)
@@ -137,11 +120,8 @@ class _Correction:
 
 
 class Corrections:
-    """Measured at frames of the full model, interpolated between them.
-
-    Args:
-        sigmas: Standard deviations of a frame's measurements, shape [r].
-    """
+    """Measured at frames of the full model, interpolated between; ``sigmas`` [r] are a frame's
+    deviations."""
 
     def __init__(self, sigmas: np.ndarray):
         self._sigmas = sigmas
@@ -230,19 +210,9 @@ IDLE_GAIN = 0.01
 
 @dataclass(frozen=True)
 class OnlineState:
-    """The estimate after a frame.
-
-    Attributes:
-        time: [s].
-        young: [Pa], shape [K].
-        interval: 95 % [Pa], shape [K, 2].
-        residual: Root mean square of this frame's standardised residuals before the update; NaN if
-            the frame could not be used.
-        trusted: Whether the reduced model covers such states; False if the frame found none (it is
-            used again with another basis).
-        enough: Whether every modulus is known so well that another pull is not worthwhile.
-        idle: Whether continuing this pull adds nothing; another pull might.
-    """
+    """The estimate after a frame: moduli [K] [Pa], 95 % [K, 2], RMS before the update (NaN:
+    unused). ``trusted`` False: no reduced state, to try on another basis; ``enough``: another pull
+    is not worthwhile; ``idle``: this one adds nothing."""
 
     time: float
     young: np.ndarray
@@ -447,8 +417,7 @@ class OnlineEstimator:
 
     def _ask(self, whole: bool = False) -> bool:
         """Solve the stored frame that is farthest from the solved ones; return whether there was
-        one.
-        """
+        one."""
         if self._exact is None or self._asked is not None or self._making is not None:
             return False
         if not whole and self._is_strange():

@@ -48,23 +48,9 @@ PRIOR_DEVIATION = 0.4
 def follow(where: Callable[[], Path], name: str, subject: Subject, settings: FitSpec, *,
            axes: Path | None = None, pace: float = 1.0, training_count: int = 60,
            progress: Progress = SILENT) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Estimate frame by frame from a pull.
-
-    A pull that is still being recorded is read as it grows, as fast as it arrives; a finished one
-    is replayed at ``pace`` times its own speed (0: as fast as possible). The full model corrects
-    the reduced one from a second process; after the pull, its results are awaited.
-
-    Args:
-        where: Returns the pull's current folder: when a recording ends, its files move.
-        name: Name in messages.
-        axes: The table of cylinders that were fitted to the scan, or None.
-
-    Returns:
-        The result, and the estimate after every frame.
-
-    Raises:
-        InputError: the pull has no markers or no frames.
-    """
+    """Estimate from a pull as it is recorded, or replayed at ``pace`` (0: fast), and corrected by a
+    full-model process. ``where`` finds its folder, which moves when it ends. Result, and the state
+    after every frame. InputError if it has no markers or frames."""
     size = _size(where())
     first = read_pull(where())
     if first.observations is None:
@@ -109,10 +95,8 @@ def follow(where: Callable[[], Path], name: str, subject: Subject, settings: Fit
 
 
 def begun_sentences(pull: Pull, progress: Progress) -> set[str]:
-    """Say what live intervals leave out; return the sentences that are then not to be said.
-
-    Where a cell has constant errors, noise alone does not say when enough is known.
-    """
+    """Say what live intervals leave out; return the sentences that are then not to be said. Where a
+    cell has constant errors, noise alone does not say when enough is known."""
     known = calibration_of(pull.entry)
     if not any((known.pose_sigma_m, known.pose_sigma_rad, known.force_gain_sigma,
                 known.force_bias_sigma_n, known.force_drift_sigma_n, known.camera_sigma_m,
@@ -148,14 +132,8 @@ def _with_radii(axes: Path | None, subject: Subject, last: OnlineState) -> dict[
 
 @dataclass(frozen=True)
 class Begun:
-    """Initial state of an online estimate.
-
-    Attributes:
-        reduced: The reduced model.
-        branch: Data from which the full model is made.
-        pull: The recording so far.
-        prior_deviation: Standard deviation of log E.
-    """
+    """Initial state of an online estimate: reduced model, what the full one needs, the recording so
+    far, and the prior deviation of log E."""
 
     reduced: ReducedModel
     branch: FullBranch
@@ -176,12 +154,8 @@ class Begun:
 
 def begin(pull: Pull, subject: Subject, settings: FitSpec, progress: Progress,
           training_count: int) -> Begun:
-    """Build the reduced model around an earlier estimate or a rough fit.
-
-    A basis is valid for moduli within its training's spread; around a uniform guess that spread
-    would be so wide that the basis is inaccurate everywhere. Without any motion yet there is no
-    better guess; the basis is then made again during the pull.
-    """
+    """Build the reduced model about an earlier estimate or a rough fit: spread to cover a uniform
+    guess, a basis is inaccurate. Without motion it is built again during the pull."""
     start, deviation, spread = subject.start, PRIOR_DEVIATION, 2.0
     field = subject.mesh.cell_data["young"]
     if settings.young is None and np.ptp(field) > 0.02 * field.mean():

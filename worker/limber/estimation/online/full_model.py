@@ -30,14 +30,8 @@ REFRESH_SPREAD = 1.5
 
 @dataclass(frozen=True)
 class ExactFrame:
-    """One frame of the full model.
-
-    Attributes:
-        log_young: At the control points, shape [K].
-        moved: Displacement of the observed points [m], shape [m, 3].
-        force: Force of the gripper on the branch [N], shape [3].
-        d_moved, d_force: Derivatives to log E, shape [m, 3, K] and [3, K].
-    """
+    """A frame of the full model at log E [K]: points' displacement [m, 3] [m], the gripper's force
+    on the branch [3] [N], and derivatives [m, 3, K] and [3, K]."""
 
     log_young: np.ndarray
     moved: np.ndarray
@@ -48,16 +42,8 @@ class ExactFrame:
 
 @dataclass(frozen=True)
 class FullBranch:
-    """The full model of a branch held at a recorded grasp, from data that a process can be sent.
-
-    Attributes:
-        mesh: With Poisson's ratio and density.
-        weights: From control points to tetrahedra, shape [tet_count, K].
-        entry: The recorded grasp.
-        rest_points: Observed points at rest [m], shape [m, 3].
-        poisson, density, gravity, point_masses: Those of the branch.
-        hangs: Whether the mesh's shape includes the bending by its weight.
-    """
+    """The full model at a recorded grasp, as data for a process; ``weights`` [tet_count, K] are
+    from control points to tetrahedra. ``hangs``: the mesh includes bending by weight."""
 
     mesh: TetMesh
     weights: np.ndarray

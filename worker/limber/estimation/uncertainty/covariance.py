@@ -49,14 +49,9 @@ class Uncertainty:
 
 
 def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.95) -> Uncertainty:
-    """Gauss' approximation at the end of the fit.
-
-    The stated noise is scaled according to the residuals, each kind of residual weighted as in the
-    fit; a robust fraction of the residuals is used, so that outliers do not widen the interval.
-    Errors that persist from frame to frame, such as those of points found in depth images, do not
-    average out: the covariance is multiplied by the number of frames with the same error. The error
-    of the mesh is not included (:mod:`limber.estimation.uncertainty.model_error`).
-    """
+    """Gauss' approximation at a fit's end. Noise is scaled by a robust part of the residuals,
+    weighted as in the fit. Errors that persist over frames do not average out: the covariance is
+    multiplied by their number. The mesh's error is not in it (:mod:`.model_error`)."""
     # Priors and links are not measurements: they do not determine the noise, and its scale does not
     # apply to them.
     count = len(evaluation.residual) - objective.space.own_row_count
@@ -95,13 +90,8 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
 
 
 def scaled_rows(rows: np.ndarray, own_row_count: int, scale: float) -> np.ndarray:
-    """Standardised residuals, or their slopes, scaled by the noise of the residuals.
-
-    Args:
-        rows: As of an evaluation; the last are priors and links, which are not scaled.
-        own_row_count: Number of these.
-        scale: Variance of the measurements over the stated one.
-    """
+    """Standardised residuals, or slopes, by the noise's variance over the stated one; the last
+    ``own_row_count``, priors and links, stay."""
     scaled, count = rows.copy(), len(rows) - own_row_count
     scaled[:count] /= np.sqrt(max(scale, 1e-300))
     return scaled
@@ -115,15 +105,8 @@ def inverse_information(slopes: np.ndarray) -> np.ndarray:
 
 
 def recording_spread(evaluation: Evaluation, objective: Objective, scale: float) -> float:
-    """Standard deviation of log E between recordings, common to all moduli.
-
-    Each pull alone gives a step of the common scale, known to within its own noise; the excess
-    scatter of these steps is the spread (DerSimonian and Laird's random effect). Few pulls
-    determine it badly, so the calibration's value counts as one further recording.
-
-    Args:
-        scale: Variance of the measurements over the stated one.
-    """
+    """Deviation of log E between recordings: scatter of pulls' steps of the scale beyond noise
+    (DerSimonian and Laird's random effect). The calibration's value counts as one recording."""
     stated = float(np.mean([calibration_of(forward.entry).repeat_sigma
                             for forward in objective.forwards]))
     count = len(objective.forwards)
@@ -141,15 +124,8 @@ def recording_spread(evaluation: Evaluation, objective: Objective, scale: float)
 
 
 def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Integrated autocorrelation of residuals over the frames, all points and axes together.
-
-    1 + 2 sum of the correlations at increasing lags, up to the first that is below its own noise,
-    or well beyond the current result (Sokal's estimate of the number of samples of a sequence per
-    independent sample).
-
-    Args:
-        series: Per pull, residuals of points [f, m, 3] and of force [f, 3], NaN if there are none.
-    """
+    """Integrated autocorrelation over frames, all points and axes [f, m, 3], [f, 3] with NaN: 1 + 2
+    sum of correlations to the first below its noise or well beyond the result (Sokal)."""
     product, count = np.zeros(0), np.zeros(0)
     for points, forces in series:
         columns = np.hstack([points.reshape(len(points), -1), forces])
@@ -222,8 +198,7 @@ LONGEST_STEP = 0.5
 
 def averaged(fit: Fit, objective: Objective) -> Fit:
     """Return the fit moved to the mode of the moduli's marginal density; unchanged if the form of
-    the field is not an unknown.
-    """
+    the field is not an unknown."""
     full = objective.forwards[0].full
     if not isinstance(full, QuasiStaticForward | DynamicForward):
         return fit
@@ -239,12 +214,8 @@ def averaged(fit: Fit, objective: Objective) -> Fit:
 
 
 def marginal_step(evaluation: Evaluation, space: ParameterSpace, field: YoungField) -> np.ndarray:
-    """Step from the joint mode to the marginal one in the free vector, shape [p].
-
-    Args:
-        evaluation: At the end of the fit, with derivatives.
-        field: Its further unknowns are among the free ones.
-    """
+    """Step [p] from the joint mode to the marginal one, of an evaluation with derivatives; the
+    field's further unknowns are free."""
     count = space.group_count
     information = evaluation.slopes.T @ evaluation.slopes
     left_open = np.diag(np.linalg.inv(information[count:, count:]))
@@ -308,14 +279,8 @@ _GROUPS = (("camera clock", "clock"), ("camera", "camera frame"), ("gripper", "g
 
 @dataclass(frozen=True)
 class InformationRows:
-    """Rows of the information on all unknowns, with one origin.
-
-    Attributes:
-        cause: Cause of uncertainty.
-        rows: Over the free vector, the errors, and the unknowns of each pull's force.
-        name: Unknown of which they are the prior; empty: measurements, or a link.
-        pull: Number of the pull that they were measured in; None: a prior, or a link.
-    """
+    """Rows of information from one origin over free vector, errors and force unknowns. ``name`` is
+    the unknown of a prior (empty: measured, or a link), ``pull`` None for priors and links."""
 
     cause: str
     rows: np.ndarray
@@ -325,13 +290,8 @@ class InformationRows:
 
 def variance_parts(evaluation: Evaluation, objective: Objective, scale: float = 1.0,
                    ) -> dict[str, np.ndarray]:
-    """Return the part of each cause in the variance of log E at the control points, [K] each.
-
-    Args:
-        evaluation: At the end of the fit, with derivatives.
-        objective: The minimised objective.
-        scale: Variance of the measurements over the stated one.
-    """
+    """Return each cause's part [K] in the variance of log E; ``scale`` is the measurements'
+    variance over the stated one."""
     rows = information_rows(evaluation, objective, scale)
     covariance = inverse_information(np.vstack([each.rows for each in rows]))
     total = covariance[list(objective.space.groups)]
@@ -352,11 +312,8 @@ class Cause(TypedDict):
 
 
 def largest(parts: dict[str, np.ndarray], count: int = 3) -> list[Cause]:
-    """Return the causes of most of the variance over all moduli, with a remedy for each.
-
-    Each has ``cause``, ``share`` (its fraction of the variance, mean over the moduli),
-    ``deviation`` (largest standard deviation of a log E from it) and ``advice``.
-    """
+    """Return the causes of most variance: ``share`` (mean over moduli), ``deviation`` (largest of a
+    log E from it) and ``advice``."""
     total = np.sum(list(parts.values()), axis=0)
     share = {cause: float(np.mean(part / np.maximum(total, 1e-300)))
              for cause, part in parts.items()}
@@ -374,9 +331,7 @@ def cause_of(name: str) -> str:
 def information_rows(evaluation: Evaluation, objective: Objective, scale: float,
                      ) -> list[InformationRows]:
     """Return rows of all unknowns: free vector, errors, and each pull's course of the force.
-
-    Arguments as for :func:`variance_parts`.
-    """
+    Arguments as for :func:`variance_parts`."""
     space, count = objective.space, objective.cell_errors.count
     pieces = objective.raw_slopes(evaluation)
     unknowns = [0 if piece.response is None else piece.response.shape[1] for piece in pieces]
@@ -427,16 +382,8 @@ NEAR = 0.1
 
 def profiled(sure: Uncertainty, evaluation: Evaluation, objective: Objective,
              progress: Progress = SILENT) -> Uncertainty:
-    """Return the uncertainty with the limits of wide intervals from the profile likelihood.
-
-    The covariance is not changed. It applies to quantities that depend on the moduli as the
-    measurements do. These are linear in the compliance, and change by as much as the covariance
-    states even if the modulus is already far beyond it.
-
-    Args:
-        evaluation: At the end of the fit, with derivatives.
-        objective: The minimised objective. It is not changed.
-    """
+    """Return wide intervals by the profile likelihood. The covariance stays, for what depends on
+    moduli as measurements do: linear in compliance, even if the modulus is far beyond it."""
     space = objective.space
     found = _Profile(sure, evaluation, objective, progress)
     interval = sure.young_interval.copy()
@@ -516,12 +463,8 @@ class _Profile:
 
     def _rise(self, objective: Objective, group: int, at: float, others: np.ndarray,
               ) -> tuple[float, np.ndarray] | None:
-        """Rise of the squared residuals with log E shifted by ``at`` deviations, and the offset of
-        the others from the linear path there; None if no equilibrium exists.
-
-        Args:
-            others: Expected offset of the others, shape [p].
-        """
+        """Rise of squared residuals with log E ``at`` deviations off, and the others' offset [p]
+        from the linear path; ``others`` is expected. None: no equilibrium."""
         best = self._best
         direction = at * self._covariance[group] / self.deviations[group]
         free = np.clip(best.free + direction + others, *objective.space.bounds())
@@ -546,15 +489,9 @@ class _Profile:
 
 
 def bend_of(at: float, root: float) -> float:
-    """Curvature of a profile through a point: a of (1 - exp(-a x)) / a.
-
-    That is the root of the rise if the measurements are linear in a power of the modulus: its
-    exponent is -a over the deviation of log E; -1 is the compliance, 0 log E itself.
-
-    Args:
-        at: Shift x of log E in its deviations, not 0.
-        root: Root of the rise of the squared residuals there, with the sign of the shift.
-    """
+    """Curvature a of a profile (1 - exp(-a x)) / a through the root of its rise at x deviations:
+    the root's form if measurements are linear in the modulus's power -a over log E's deviation (-1:
+    compliance, 0: log E)."""
     ratio = float(np.clip(root / at, 0.01, 100.0))
     if abs(ratio - 1) < 1e-6:
         return 0.0

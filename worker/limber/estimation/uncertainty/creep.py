@@ -40,15 +40,8 @@ def with_creep(fit: Fit, objective: Objective) -> tuple[Fit, Objective]:
 
 
 def shown_creep(evaluation: Evaluation, objective: Objective) -> float | None:
-    """Return the time constant of the creep that the residuals show [s]; None if they do not.
-
-    Linear in the share: its evidence is that of one more direction of the residuals, with a normal
-    prior, divided among the tested time constants.
-
-    Args:
-        evaluation: At the end of a fit, with derivatives.
-        objective: The minimised objective.
-    """
+    """Return the time constant of creep [s] that residuals show, or None: evidence of one more
+    direction, linear in the share with a normal prior, divided among those tried."""
     lasting = [float(np.ptp(each.frames.times)) for each in objective.forwards if _may_show(each)]
     if not lasting:
         return None
@@ -72,12 +65,8 @@ def shown_creep(evaluation: Evaluation, objective: Objective) -> float | None:
 
 
 def _noise(residual: np.ndarray, kinds: list[np.ndarray], objective: Objective) -> float:
-    """Variance of the forces' residuals over the stated one, times that of correlated ones.
-
-    Args:
-        residual: Of all measurements and priors, shape [r].
-        kinds: Of each pull, the measured quantity of each of its residuals.
-    """
+    """Variance of forces' residuals over the stated one, times that of correlated ones; ``kinds``
+    by pull."""
     start, series, fitted = 0, [], 0
     for each, forward in zip(kinds, objective.forwards, strict=True):
         forces = residual[start:start + len(each)][each == "noise of the force"]

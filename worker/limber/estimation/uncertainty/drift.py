@@ -19,13 +19,8 @@ _WIDEST = 1.0  # half width of the interval of a stated rate: a factor of e a da
 
 @dataclass(frozen=True)
 class ScaleStep:
-    """Step of the common log E by which one pull differs from the fit of all.
-
-    Attributes:
-        pull: Number of the pull.
-        step: In log E.
-        variance: Of the step, from the pull's noise and its own errors.
-    """
+    """Step of the common log E by which a pull differs from all, with variance from its noise and
+    own errors."""
 
     pull: int
     step: float
@@ -49,13 +44,8 @@ class Drift(TypedDict):
 
 
 def scale_steps(evaluation: Evaluation, objective: Objective, scale: float) -> list[ScaleStep]:
-    """Return the step of each pull that determines one.
-
-    Args:
-        evaluation: At the end of the fit, with derivatives.
-        objective: The minimised objective.
-        scale: Variance of the measurements over the stated one.
-    """
+    """Return the step of each pull that determines one; ``scale`` is the measurements' variance
+    over the stated one."""
     found, group_count = [], objective.space.group_count
     for number, piece in enumerate(objective.raw_slopes(evaluation)):
         others = [piece.errors] + ([] if piece.response is None else [piece.response])
@@ -86,14 +76,8 @@ def pull_moduli(steps: Sequence[ScaleStep], objective: Objective) -> list[PullMo
 
 def drift(steps: Sequence[ScaleStep], recorded: Sequence[str | None], spread: float,
           ) -> Drift | None:
-    """Return the change per day by weighted regression; None without two times, or if the pulls
-    do not determine it: those of one hour say nothing about days.
-
-    Args:
-        steps: Of the pulls.
-        recorded: When each of them was recorded (ISO 8601).
-        spread: Standard deviation of log E between recordings of one day.
-    """
+    """Return the change per day by weighted regression over times (ISO 8601), None without two, or
+    within an hour. ``spread`` is log E's between a day's recordings."""
     times = [None if each is None else datetime.fromisoformat(each).timestamp() / _DAY_S
              for each in recorded]
     known = [(step, time) for step, time in zip(steps, times, strict=True) if time is not None]

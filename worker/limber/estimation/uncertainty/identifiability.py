@@ -28,12 +28,8 @@ CLEAR = 3.0
 
 
 def too_little_said(objective: Objective, evaluation: Evaluation, limit: float) -> InputError:
-    """Return why forces that were recorded leave the scale of the moduli open.
-
-    Args:
-        evaluation: With derivatives.
-        limit: Standard deviation of the common log E below which it is determined.
-    """
+    """Return why recorded forces leave the moduli's scale open, whose deviation in log E must be
+    below ``limit``."""
     forwards = [forward for forward in objective.forwards if forward.uses_force]
     peaks = [float(np.nanmax(np.linalg.norm(forward.frames.wrenches[:, :3], axis=1)))
              for forward in forwards]
@@ -72,11 +68,8 @@ def too_little_said(objective: Objective, evaluation: Evaluation, limit: float) 
 
 
 def require_own_frame(objective: Objective, values: Values) -> None:
-    """Refuse a force that is far above its errors and clearly given in another frame.
-
-    Raises:
-        InputError: says which.
-    """
+    """Refuse a force that is far above its errors and clearly given in another frame. The
+    InputError says which."""
     for forward in objective.forwards:
         if not forward.uses_force or forward.force_is_stated:
             continue
@@ -94,10 +87,8 @@ def require_own_frame(objective: Objective, values: Values) -> None:
 
 
 def other_frame(forward: Forward, values: Values) -> str | None:
-    """Return the frame in which the force would explain the motion, as sentences.
-
-    None: the force explains it as given, or in no frame.
-    """
+    """Return the frame in which the force would explain the motion, as sentences. None: the force
+    explains it as given, or in no frame."""
     if not isinstance(forward, QuasiStaticForward) or forward.entry.drive != "pose":
         return None
     change, at, seen = forward.linear_motion(values)
@@ -171,14 +162,8 @@ two. Chosen, not measured.
 
 @dataclass(frozen=True)
 class Identifiability:
-    """Singular values of the sensitivity matrix and the resulting standard deviations.
-
-    Attributes:
-        singular_values: Singular values of the derivative of the standardised residuals to the free
-            vector, largest first, shape [p].
-        deviations: Standard deviation of each free value, shape [p].
-        scale_deviation: Standard deviation of the common scale of all moduli.
-    """
+    """Singular values [p], largest first, of standardised residuals to free values, deviations [p],
+    and that of the moduli's common scale."""
 
     singular_values: np.ndarray
     deviations: np.ndarray
@@ -197,14 +182,7 @@ def identifiability(evaluation: Evaluation, space: ParameterSpace) -> Identifiab
 
 
 def require_scale(found: Identifiability, objective: Objective, evaluation: Evaluation) -> None:
-    """Reject data that do not determine the overall scale of Young's modulus.
-
-    Args:
-        evaluation: With derivatives.
-
-    Raises:
-        InputError: the data do not determine it; states the reason.
-    """
+    """Reject data that do not determine the moduli's scale. InputError says why."""
     if found.scale_deviation <= SCALE_DEVIATION:
         return
     if any(forward.uses_force for forward in objective.forwards):
@@ -220,16 +198,9 @@ def require_scale(found: Identifiability, objective: Objective, evaluation: Eval
 
 def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
                     ) -> tuple[ParameterSpace, list[str]]:
-    """Link control points that the data do not determine to a neighbour.
-
-    A link is not an equality: the two may differ by a factor of ten, and the interval includes
-    that. With an equality both moduli would be wrong, with intervals that are too narrow. The
-    worst-determined modulus is linked to the better-known neighbour, until all others are resolved.
-    Returns the space, with a sentence for each link.
-
-    Args:
-        evaluation: With derivatives; its last rows are those of the space's links.
-    """
+    """Link moduli that data leave open to better-known neighbours, worst first, until all others
+    are resolved; the space, and a sentence each. A link lets them differ tenfold; equality would
+    give wrong moduli and intervals."""
     rows = evaluation.slopes[:len(evaluation.slopes) - len(space.links)]
     links: list[tuple[int, int]] = []
     messages = []
@@ -257,10 +228,7 @@ def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
 
 def force_is_measured(objective: Objective) -> bool:
     """Whether the measured force is well above its noise: it determines the scale wherever a fit
-    starts.
-
-    Sensitivities at a start that is far too soft would not show that.
-    """
+    starts. Sensitivities at a start that is far too soft would not show that."""
     for forward, sigma in zip(objective.forwards, objective.force_sigma, strict=True):
         force = forward.frames.wrenches[:, :3]
         if forward.uses_force and np.nanmax(np.abs(force), initial=0.0) > 5 * sigma:

@@ -42,26 +42,10 @@ slowly.
 
 @dataclass(frozen=True)
 class ModelError:
-    """Relative standard deviations of Young's modulus that no residual shows.
-
-    Attributes:
-        geometry: At the control points, from the uncertainty of the scan, shape [K]; None if the
-            branch's radii have no deviation.
-        bending: Remainder of ``geometry`` in the bending stiffness E I, shape [K]; 0 if an error of
-            the radii is constant over a control point's section of the branch.
-        mesh: From the mesh, shape [K]; None if it was not measured.
-        axis_is_exact: Whether ``geometry`` is of the radii alone (:func:`geometry_error`), not
-            of axis and radii (:func:`limber.estimation.uncertainty.shape_error.shape_error`).
-        mesh_factor: Young's modulus of the material over that of the model on its mesh, which is
-            too stiff by this factor; shape [K]. ``mesh`` is its uncertainty.
-        path: From the gripper's frame if its path drives the fit, shape [K]; None if no path does
-            (:func:`limber.estimation.uncertainty.model_error.path_error`).
-        hung: From the mass of twigs and leaves outside the mesh, shape [K]; None if there are none
-            (:func:`limber.estimation.uncertainty.shape_error.hung_error`).
-        grip: From the length of the piece in a clamping gripper, shape [K]; None if none clamps
-            (:func:`limber.estimation.uncertainty.grip_error.grip_error`).
-        graph: From other likely skeletons of the scan, shape [K]; None if none matters.
-    """
+    """Relative deviations [K] of E that no residual shows; None: no such error, or not measured.
+    ``bending`` is what is left of ``geometry`` in E I, 0 if radii err alike over a section; if
+    ``axis_is_exact``, geometry is of radii alone. ``mesh_factor`` is the material's modulus over
+    the model's."""
 
     geometry: np.ndarray | None = None
     bending: np.ndarray | float = 0.0
@@ -85,19 +69,8 @@ class ModelError:
 
 
 def geometry_error(cylinders: Path, mesh: TetMesh, weights: np.ndarray) -> np.ndarray | None:
-    """Relative standard deviation of E at the control points from that of the radii.
-
-    Errors of neighbouring radii come from the same side of the same scan: within a control point's
-    section of the branch they are assumed to be equal, and do not average out.
-
-    Args:
-        cylinders: ``skeleton.csv`` of a branch folder.
-        mesh: The branch's tetrahedra.
-        weights: Weight of each control point in each tetrahedron, shape [tet_count, K].
-
-    Returns:
-        Shape [K], or None if no radius has a deviation.
-    """
+    """Relative deviation of E [K] from radii of ``skeleton.csv``, None if they have none.
+    Neighbours err alike, from one side of one scan: they do not average out within a section."""
     names = ("sx", "sy", "sz", "ex", "ey", "ez", "radius")
     table = read_columns(cylinders, names, "a cylinder model")
     if "radius_sigma" not in table:
@@ -114,13 +87,8 @@ def geometry_error(cylinders: Path, mesh: TetMesh, weights: np.ndarray) -> np.nd
 
 @dataclass(frozen=True)
 class MeshStiffness:
-    """Excess stiffness of a mesh.
-
-    Attributes:
-        factor: Young's modulus of the material over that for which the mesh bends as the material
-            does, at the control points, shape [K].
-        deviation: Relative standard deviation of that factor, shape [K].
-    """
+    """Excess stiffness of a mesh: factor [K] of the material's modulus over that with which the
+    mesh bends alike, and its relative deviation [K]."""
 
     factor: np.ndarray
     deviation: np.ndarray
@@ -128,12 +96,7 @@ class MeshStiffness:
 
 @dataclass(frozen=True)
 class SmallLoad:
-    """Small loads on a branch: a force at the grasp, and weight.
-
-    Attributes:
-        force: Shape [3].
-        gravity: Shape [3].
-    """
+    """Small loads on a branch: a force at the grasp [3], and weight [3]."""
 
     force: np.ndarray
     gravity: np.ndarray
@@ -141,24 +104,9 @@ class SmallLoad:
 
 def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.ndarray,
                young: np.ndarray, loads: Sequence[SmallLoad] = ()) -> MeshStiffness | None:
-    """Find the excess stiffness of the mesh.
-
-    Small loads bend the branch on this mesh and on a refined one; the moduli for which this one
-    bends like the refined one differ by the mesh's error. The error varies along the branch (most
-    of it is at the clamp) and between loads, so it is evaluated for the observations and loads of
-    the fit.
-
-    Args:
-        model: The branch; its own gravity is left out.
-        grasp: Grasp at which a force acts.
-        operator: Displacement of the observations from the nodes', shape [3 m, 3 n]; sparse.
-        weights: Weight of each control point in each tetrahedron, shape [tet_count, K].
-        young: At the control points [Pa], shape [K].
-        loads: Loads of any size; without them two forces across the branch.
-
-    Returns:
-        None if the refined mesh is too large, or gives no result.
-    """
+    """Find the mesh's excess stiffness: moduli for which it bends as a refined one, at the fit's
+    observations and loads, as the error varies along the branch (most at the clamp) and by load. No
+    ``loads``: two across. None if the refined mesh is too large or fails."""
     mesh = model.mesh
     if 8 * mesh.tet_count > REFINED_LIMIT or not mesh.is_quadratic:
         return None
@@ -203,13 +151,8 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
 
 def observer(mesh: TetMesh, forwards: Sequence[Forward], grasp: Grasp, points: np.ndarray,
              ) -> sparse.csr_matrix:
-    """Displacement of the pulls' observations from that of the nodes, shape [3 m, 3 n].
-
-    The points; and the gripper, if its path and force were measured together.
-
-    Args:
-        points: Used if no pull observes any [m], shape [k, 3].
-    """
+    """Displacement [3 m, 3 n] of pulls' observations from nodes': points (``points`` if no pull has
+    any), and the gripper if path and force were measured together."""
     rest_points = [forward.rest_points for forward in forwards if len(forward.rest_points)]
     rows = [point_operator(mesh, np.unique(np.vstack(rest_points), axis=0) if rest_points
                            else points)]
@@ -252,21 +195,14 @@ def refined(mesh: TetMesh) -> TetMesh:
 
 
 def total_interval(young: np.ndarray, sensor: np.ndarray, error: ModelError) -> np.ndarray:
-    """95 % interval [Pa] of the material's modulus, with all parts combined, shape [K, 2].
-
-    Args:
-        young: Estimated on the mesh [Pa], shape [K].
-        sensor: 95 % interval from the sensors alone [Pa], shape [K, 2].
-        error: Errors that the fit does not show.
-    """
+    """95 % interval [K, 2] [Pa] of the material's modulus, all parts combined, from that on the
+    mesh by sensors alone."""
     return _interval(young, sensor, error.total(np.zeros(len(young))), error.mesh_factor)
 
 
 def bending_interval(young: np.ndarray, sensor: np.ndarray, error: ModelError) -> np.ndarray:
-    """95 % interval of E I over the I of the skeleton [Pa], shape [K, 2].
-
-    Arguments as for :func:`total_interval`.
-    """
+    """95 % interval of E I over the I of the skeleton [Pa], shape [K, 2]. Arguments as for
+    :func:`total_interval`."""
     return _interval(young, sensor, error.total_of_bending(np.zeros(len(young))),
                      error.mesh_factor)
 
@@ -305,18 +241,8 @@ def path_prescribed(forwards: Sequence[Forward]) -> list[Forward]:
 
 
 def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | None:
-    """Relative standard deviation of E at the control points from the gripper's frame, shape [K].
-
-    Linear in the change of the residuals r: d log E = -(J^T J)^-1 J^T dr for each of the frame's
-    six errors, of its deviation in the calibration.
-
-    Args:
-        evaluation: At the end of the fit.
-        objective: The minimised objective.
-
-    Returns:
-        None if a simulation finds no equilibrium.
-    """
+    """Relative deviation of E [K] from the gripper's frame, linear: d log E = -(J^T J)^-1 J^T dr
+    for six errors of the calibration's deviations. None: no equilibrium."""
     slopes = path_slopes(evaluation, objective)
     if slopes is None:
         return None
@@ -327,10 +253,8 @@ def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
 
 def path_slopes(evaluation: Evaluation, objective: Objective,
                 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Slopes of the residuals to the free vector, [r, p], and to the errors of the gripper's frame
-    in their deviations, [r, S]; None if a simulation finds no equilibrium. Arguments as for
-    :func:`path_error`.
-    """
+    """Slopes of residuals to the free vector [r, p] and to errors of the gripper's frame in
+    deviations [r, S]; None: no equilibrium."""
     known = {calibration_of(forward.entry): np.array(forward.entry.grasp.point_m)
              for forward in reversed(path_prescribed(objective.forwards))}
     base = _evaluated(evaluation, objective, [forward.with_prescribed_poses(forward.frames.poses)

@@ -40,13 +40,8 @@ REGISTER = "register the camera"
 
 @dataclass(frozen=True)
 class _Measurement:
-    """A measurement of unknowns that the fit otherwise knows by their priors.
-
-    Attributes:
-        action: What is done.
-        how: How, and where to state it.
-        sigmas: Beginning of an unknown's name to its standard deviation afterwards, in its unit.
-    """
+    """A measurement of unknowns that are known by priors alone: how, where to state it, and the
+    deviation afterwards by beginning of their names, in their units."""
 
     action: str
     how: str
@@ -87,15 +82,8 @@ class NextAction(TypedDict):
 
 
 class Prospects:
-    """Intervals to expect after actions.
-
-    Args:
-        evaluation: At the end of the fit, with derivatives.
-        objective: The minimised objective.
-        sure: The fit's uncertainty.
-        error: Errors of shape and mesh.
-        young: Estimated moduli on the mesh [Pa], shape [K].
-    """
+    """Intervals to expect after actions, from the fit's end with derivatives, shape and mesh
+    errors, and moduli on the mesh [K] [Pa]."""
 
     def __init__(self, evaluation: Evaluation, objective: Objective, sure: Uncertainty,
                  error: ModelError, young: np.ndarray):
@@ -183,8 +171,7 @@ class Prospects:
 
     def _with_torque(self) -> np.ndarray | None:
         """Standard deviation of log E if the torque of each clamped grasp had been recorded too,
-        shape [K]; None if there is no such grasp without torque, or no equilibrium.
-        """
+        shape [K]; None if there is no such grasp without torque, or no equilibrium."""
         values = self._objective.space.unpack(self._evaluation.free)
         forwards, is_new = [], False
         for forward in self._objective.forwards:
@@ -245,11 +232,8 @@ class Prospects:
 
 
 def _torque_recorded(pull: QuasiStaticForward, values: Values) -> QuasiStaticForward:
-    """A pose-driven pull of a clamped grasp as if its torque had been recorded.
-
-    Raises:
-        ValueError: the pull has no equilibrium under the values.
-    """
+    """A pose-driven pull of a clamped grasp as if its torque had been recorded. ValueError if the
+    pull has no equilibrium under the values."""
     asked = copy.copy(pull)
     asked.uses_torque = True
     simulated = present(asked.simulate(values, (), False), "equilibrium of the pull")

@@ -53,19 +53,8 @@ response of a branch turned by a radian to the whole change of a radius is far f
 
 def compensation(evaluation: Evaluation, objective: Objective,
                  slopes: Callable[[QuasiStaticForward, Values], ErrorSlopes]) -> np.ndarray | None:
-    """Change of log E at the control points by which a fit compensates S changes, [K, S].
-
-    Linear in the change of the residuals r: d log E = -(J^T J)^-1 J^T dr, at few key frames:
-    differences vary slowly along a pull.
-
-    Args:
-        evaluation: At the end of the fit.
-        objective: The minimised objective.
-        slopes: Change of a pull, simulated for these values, by each of the S.
-
-    Returns:
-        None if a pull is dynamic, since that would take too long, or has no equilibrium.
-    """
+    """Change of log E [K, S] by which a fit compensates S changes: -(J^T J)^-1 J^T dr at few key
+    frames, as differences vary slowly. None if a pull is dynamic (too long), or no equilibrium."""
     if any(forward.entry.motion == "dynamic" for forward in objective.forwards):
         return None
     forwards = [forward.with_prescribed_poses(forward.frames.poses) for forward
@@ -83,13 +72,8 @@ def compensation(evaluation: Evaluation, objective: Objective,
 
 def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[TetMesh],
                  ) -> ErrorSlopes:
-    """Return the change of a pull's observations by each of S other shapes.
-
-    Args:
-        forward: Last simulated for ``values``.
-        values: The physical parameters.
-        meshes: The same tetrahedra with other node positions.
-    """
+    """Return the change of a pull, last simulated for ``values``, by each of S shapes of its
+    mesh."""
     nodes = forward.mesh.nodes
     operator = point_operator(forward.mesh, forward.rest_points)
     return _slopes(forward, values,
@@ -99,18 +83,14 @@ def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[T
 
 def hung_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
     """Return the change of a pull's observations by the relative mass of the added masses.
-
-    Arguments as for :func:`shape_slopes`.
-    """
+    Arguments as for :func:`shape_slopes`."""
     size = 3 * len(forward.rest_points), forward.mesh.nodes.size
     return _slopes(forward, values, [forward.with_hung_mass(1 + STEP)], [sparse.csr_matrix(size)])
 
 
 def grip_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
     """Return the change of a pull's observations by the deviation of the length in its gripper.
-
-    Arguments as for :func:`shape_slopes`.
-    """
+    Arguments as for :func:`shape_slopes`."""
     size = 3 * len(forward.rest_points), forward.mesh.nodes.size
     longer = STEP * calibration_of(forward.entry).held_length_sigma_m
     return _slopes(forward, values, [forward.with_longer_grip(longer)], [sparse.csr_matrix(size)])
@@ -159,8 +139,7 @@ class _Pulled:
 
     def hold(self, key: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Displacement of the clamped nodes [n, 3], and missing displacement of the means of the
-        pinned ones [p, 3].
-        """
+        pinned ones [p, 3]."""
         held, grasp = np.zeros_like(state), self.forward.grasp
         if not self.is_held:
             return held, np.empty((0, 3))
@@ -173,10 +152,7 @@ class _Pulled:
     def seen(self, key: int, state: np.ndarray, out: np.ndarray,
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The gripper's force [N], its torque about the recorded position [N m], and its position
-        [m].
-
-        If a force drives, force and torque do not change.
-        """
+        [m]. If a force drives, force and torque do not change."""
         grasp, position = self.forward.grasp, self.forward.grasp_position(state)
         if not self.is_held:
             return np.zeros(3), np.zeros(3), position
@@ -188,8 +164,7 @@ class _Pulled:
 def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndarray,
               tangent: Tangent, before: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Response of the state to each of the others [m over the whole path], and the imbalance there
-    after a step.
-    """
+    after a step."""
     held, missing = here.hold(key, state)
     moved, rights, pins, after = [], [], [], []
     for forward in others:
@@ -204,20 +179,9 @@ def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndar
 
 
 def grip_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | None:
-    """Relative standard deviation of E from the length in a clamping gripper, shape [K].
-
-    Because of soft pads and the position where the branch leaves the jaws, that length is never
-    known to a millimetre (``held_length_sigma_m`` of the calibration). Its error is the same in all
-    pulls.
-
-    Args:
-        evaluation: At the end of the fit.
-        objective: The minimised objective.
-
-    Returns:
-        None if no gripper clamps or its length is known, or as for
-        :func:`limber.estimation.uncertainty.shape_error.compensation`.
-    """
+    """Relative deviation of E [K] from the held length (``held_length_sigma_m``), which pads and
+    jaws hide, alike in all pulls. None if no gripper clamps or it is known, or as
+    :func:`compensation`."""
     if not any(forward.entry.grasp.mode == "rigid"
                and calibration_of(forward.entry).held_length_sigma_m > 0
                for forward in objective.forwards):
@@ -239,26 +203,16 @@ def grip_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
 
 @dataclass(frozen=True)
 class SectionMean:
-    """Computes the mean over a control point's section of the main path.
-
-    Attributes:
-        share: Share of each skeleton node in the mean of each control point, [K, node_count].
-    """
+    """Mean over control points' sections of the main path, by ``share`` [K, node_count] of skeleton
+    nodes."""
 
     share: np.ndarray
 
     @classmethod
     def of(cls, skeleton: Skeleton, mesh: TetMesh, weights: np.ndarray,
            energy: np.ndarray | None = None) -> "SectionMean":
-        """Prepare the mean for a branch.
-
-        Args:
-            skeleton: The axes and radii of the mesh.
-            mesh: The branch's tetrahedra.
-            weights: Weight of each control point in each tetrahedron, shape [tet_count, K].
-            energy: Strain energy of each tetrahedron [J], shape [tet_count]; None: each piece of
-                the branch counts by its length, as where there is no energy.
-        """
+        """Prepare the mean, weighted by strain energy [tet_count] [J]; None: by length, as where
+        there is none. ``weights`` [tet_count, K] are of control points."""
         low, high, fraction, _ = on_cylinders(skeleton, mesh.centroids)
         radius = (1 - fraction) * skeleton.radius[low] + fraction * skeleton.radius[high]
         # A twig's own bending does not contribute to that of the branch which carries it.
@@ -274,25 +228,15 @@ class SectionMean:
 
     def log_second_moment(self, radius: np.ndarray, section: LayeredSection | None = None,
                           ) -> np.ndarray:
-        """Return the mean log of the second moment of area [log m^4], shape [K].
-
-        Args:
-            radius: At the skeleton's nodes [m], shape [node_count].
-            section: Its layers; their moment is that of as much wood.
-        """
+        """Return the mean log second moment [K] [log m^4] by radius [node_count] [m]; layers count
+        as so much wood."""
         carrying = 1.0 if section is None else section.bending_factor(radius)
         return self.share @ np.log(np.pi / 4 * radius**4 * carrying)
 
 
 def strain_energy(objective: Objective, values: Values) -> np.ndarray | None:
-    """Strain energy of each tetrahedron, summed over the simulated frames [J], shape [tet_count].
-
-    Args:
-        objective: Its pulls were simulated for ``values``.
-
-    Returns:
-        None if a pull is dynamic.
-    """
+    """Strain energy [tet_count] [J] summed over the frames simulated for ``values``; None if a pull
+    is dynamic."""
     forwards = [forward.full for forward in objective.forwards
                 if isinstance(forward.full, QuasiStaticForward)]
     if len(forwards) < len(objective.forwards):
@@ -313,26 +257,9 @@ logarithm, as E I is. Over the whole way, radii off by a fifth would seem to cha
 def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
                 points: np.ndarray, count: int, mean: SectionMean, *, seed: int = 0,
                 progress: Progress = SILENT) -> tuple[np.ndarray, np.ndarray] | None:
-    """Relative standard deviations of E and of E I at the control points from axis and radii.
-
-    Root mean square over the shapes of the changes that the fit would have made, times Student's
-    quantile over the normal one since the shapes are few. A uniformly thicker shape changes E as it
-    changes I, so that E I is unchanged.
-
-    Args:
-        evaluation: At the end of the fit.
-        objective: The minimised objective.
-        subject: The branch that was fitted.
-        points: Its scan [m], shape [m, 3].
-        count: Number of shapes.
-        mean: Takes the means that E I is made of.
-        seed: Seed of the shapes.
-        progress: Called during the work.
-
-    Returns:
-        Those of E and of E I, shape [K] each; None if there are too few shapes, or as for
-        :func:`compensation`.
-    """
+    """Relative deviations of E and E I [K] from axis and radii: RMS of a fit's changes over drawn
+    shapes, times Student's quantile as they are few; even thickening leaves E I. None if too few
+    shapes, or as :func:`compensation`."""
     if count < FEWEST:
         return None
     progress(0.0, "evaluating posterior samples of the shape")
@@ -359,15 +286,8 @@ def _towards(skeleton: Skeleton, shape: Skeleton) -> Skeleton:
 
 
 def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np.ndarray | None:
-    """Relative standard deviation of E from the mass of twigs and leaves outside the mesh, [K].
-
-    Args:
-        evaluation, objective: As for :func:`shape_error`.
-        sigma: Relative standard deviation of that mass, common to all.
-
-    Returns:
-        None if nothing hangs on the branch or there is no gravity, or as :func:`compensation`.
-    """
+    """Relative deviation of E [K] from twigs and leaves outside the mesh, of common relative
+    deviation ``sigma``. None if nothing hangs or no gravity, or as :func:`compensation`."""
     models = [forward.full.model for forward in objective.forwards
               if isinstance(forward.full, QuasiStaticForward)]
     # Stated masses are known; those of twigs and leaves come from their volume.

@@ -53,26 +53,16 @@ _SAME = 1e-6  # norm of a column that the others already contain
 
 @dataclass(frozen=True)
 class Ends:
-    """Equilibria at the release and at the end of a swing.
-
-    Attributes:
-        begin: Displacement at the release [m], shape [n, 3]; zero: held in its shape at rest.
-        end: Displacement in which the branch comes to rest [m], shape [n, 3].
-    """
+    """Displacements [n, 3] [m] at release (zero: held in the rest shape) and where the swing
+    ends."""
 
     begin: np.ndarray
     end: np.ndarray
 
 
 class ModalSwing:
-    """Displacements of the markers in small vibrations.
-
-    Args:
-        model: The branch, with undamped values about which the factors count.
-        ends: Its equilibria.
-        denser: The same for a branch of 1 % more density.
-        operator: Displacements of the markers from those of the nodes, shape [3 m, 3 n].
-    """
+    """Markers' displacements in small vibrations. ``denser`` is the same with 1 % more density,
+    ``operator`` [3 m, 3 n] from nodes to markers."""
 
     def __init__(self, model: BranchModel, ends: Ends, denser: Ends, operator: sparse.csr_matrix):
         shapes = lowest_modes(model, MODES, ends.end).shapes
@@ -91,15 +81,9 @@ class ModalSwing:
 
     def moved(self, times: np.ndarray, stretch: float, damping: tuple[float, float],
               heavier: float, creep: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
-        """Return the markers' displacements from the shape at rest [m], shape [f, m, 3].
-
-        Args:
-            times: Since the release [s], shape [f].
-            stretch: Logarithm of the factor on the modulus.
-            damping: Rayleigh's alpha [1/s] and beta [s].
-            heavier: Logarithm of the factor on the density.
-            creep: Share of the stiffness that a lasting load relaxes, and its time constant [s].
-        """
+        """Return markers' displacements [f, m, 3] [m] since release; ``stretch`` and ``heavier``
+        are logs of factors on modulus and density, ``creep`` the share that relaxes and its time
+        [s]."""
         stiffness = np.exp(stretch) * self._stiffness
         squares, shapes = scipy.linalg.eigh(stiffness, np.exp(heavier) * self._body + self._added)
         begin, end = (np.linalg.solve(stiffness, force + heavier * change)
@@ -115,8 +99,7 @@ class ModalSwing:
     def slopes(self, times: np.ndarray, stretch: float, damping: tuple[float, float],
                heavier: float, creep: tuple[float, float] | None = None) -> np.ndarray:
         """Return derivatives to log factor, log alpha, log beta and log density, [f, m, 3, 4]; with
-        creep also to its share, [f, m, 3, 5].
-        """
+        creep also to its share, [f, m, 3, 5]."""
         share, seconds = creep or (0.0, 1.0)
         centre = np.array([stretch, *np.log(damping), heavier, share])
         columns = []
@@ -134,13 +117,8 @@ class ModalSwing:
 
 
 def _released(times: np.ndarray, squares: np.ndarray, decay: np.ndarray) -> np.ndarray:
-    """Return oscillators that start at 1 without speed; overdamped ones too.
-
-    Args:
-        times: [s], shape [f, 1].
-        squares: Squared angular frequencies without damping [1/s^2], shape [k].
-        decay: Rates of decay [1/s], shape [k].
-    """
+    """Return oscillators that start at 1 without speed, overdamped too, at times [f, 1] [s] with
+    undamped squares [k] [1/s^2] and decay rates."""
     root = np.sqrt((decay**2 - squares).astype(complex))
     # At the limit of overdamping both roots are equal, and the motion is the same beside it.
     root = np.where(np.abs(root) < 1e-6 * np.sqrt(squares), 1e-6 * np.sqrt(squares), root)
@@ -152,8 +130,7 @@ def _released(times: np.ndarray, squares: np.ndarray, decay: np.ndarray) -> np.n
 def _creeping(times: np.ndarray, squares: np.ndarray, decay: np.ndarray, share: float,
               seconds: float) -> np.ndarray:
     """Return such oscillators of standard linear solids, shape [f, k]: part of the spring force
-    follows the motion late, y'' + 2 d y' + w^2 (y - share z) = 0 with z' = (y - z) / seconds.
-    """
+    follows the motion late, y'' + 2 d y' + w^2 (y - share z) = 0 with z' = (y - z) / seconds."""
     system = np.zeros((len(squares), 3, 3))
     system[:, 0, 1] = 1.0
     system[:, 1] = np.column_stack([-squares, -2 * decay, share * squares])
@@ -193,20 +170,9 @@ _GONE = 0.3
 
 @dataclass(frozen=True)
 class SwingSeen:
-    """Observations of a swing.
-
-    Attributes:
-        times: [s], shape [n].
-        moved: Displacement of the markers from the branch's shape at rest [m], shape [n, m, 3]; NaN
-            if a marker was not observed.
-        rest_points: Positions of the markers on the branch [m], shape [m, 3].
-        start: "held": in the shape at rest until weight and load act; "loaded": bent by the load
-            until it is removed.
-        load: The load [N], shape [3].
-        load_mass: Mass that swings with the branch [kg]; 0 if the load is a pull, or removed.
-        noise: Noise of one reading [m].
-        registration: RMS distance of the markers from their positions [m], None: not known.
-    """
+    """A swing's markers [n, m, 3] [m] from rest (NaN: unseen). ``start``: "held" in the rest shape
+    until weight acts, or "loaded" until released. ``load_mass`` [kg] swings too (0: a pull, or
+    removed); ``registration`` is RMS [m] from stated positions."""
 
     times: np.ndarray
     moved: np.ndarray
@@ -264,11 +230,8 @@ class SwingFit:
 
 
 def first_guess(seen: SwingSeen) -> tuple[float, float]:
-    """Return a branch's time of release and its period [s], from the tracks alone.
-
-    Raises:
-        InputError: no motion is found, or the branch does not oscillate.
-    """
+    """Return a branch's time of release and its period [s], from the tracks alone. InputError if no
+    motion is found, or the branch does not oscillate."""
     travel = np.linalg.norm(seen.moved - np.nanmedian(seen.moved[:3], axis=0), axis=2)
     # From the marker that moves farthest: others are disturbed while the branch is still held.
     far = travel[:, np.argmax(np.nan_to_num(travel).max(axis=0))]
@@ -328,17 +291,8 @@ _MARGIN = 0.1
 
 def fit_swing(model: BranchModel, grasp: Grasp, seen: SwingSeen, *, periods: float = 6.0,
               density_sigma: float = 0.1, progress: Progress = SILENT) -> SwingFit:
-    """Fit Young's modulus and damping of a branch to a swing.
-
-    Args:
-        model: The branch, with the initial moduli (their ratios are kept) and its weight.
-        grasp: Point where the load hangs or pulls.
-        periods: Number of fitted periods of the swing.
-        density_sigma: Relative standard deviation of the branch's density.
-
-    Raises:
-        InputError: the recording shows no swing. WorkError: the simulation fails.
-    """
+    """Fit modulus (ratios kept) and damping to a swing, with density within its relative deviation.
+    InputError if no swing shows, WorkError if the simulation fails."""
     swing = _Swing(model, grasp, seen, density_sigma)
     released, period = first_guess(seen)
     swing.scale_to(period, released)
@@ -368,8 +322,7 @@ def fit_swing(model: BranchModel, grasp: Grasp, seen: SwingSeen, *, periods: flo
 
 class _Swing:
     """The model fitted to the tracks; free: log factor, release, log alpha/w, log beta w, log
-    density, and each marker's gain.
-    """
+    density, and each marker's gain."""
 
     def __init__(self, model: BranchModel, grasp: Grasp, seen: SwingSeen, density_sigma: float):
         share = np.maximum(grasp.weights, 0.0) / np.maximum(grasp.weights, 0.0).sum()
@@ -459,11 +412,8 @@ class _Swing:
         self._correction, self.creep_time = self._full(found.free, times) - moved, creep_time
 
     def with_creep(self, released: float, found: "_Found") -> "_Found":
-        """Return a fit with creep if it is more likely, else the same.
-
-        The evidence of one more parameter and its time constant (Schwarz 1978), for as many
-        readings as count as independent.
-        """
+        """Return a fit with creep if likelier, by evidence of a parameter and its time (Schwarz
+        1978) for independent readings; else the same."""
         best, best_time, likeliest = found, None, LIKELIER
         for share in TIME_SHARES:
             self.creep_time = share * found.duration
@@ -496,11 +446,8 @@ class _Swing:
             density=self.model.density * np.exp(free[4]))
 
     def simulated(self, free: np.ndarray, duration: float) -> tuple[np.ndarray, ...]:
-        """Return times from the release [s], displacements of markers, and their derivatives.
-
-        To log factor, log alpha, log beta, log density, and with creep its share: shapes [f],
-        [f, m, 3], [f, m, 3, 4 or 5].
-        """
+        """Return times since release [f], markers [f, m, 3], and slopes [f, m, 3, 4 or 5] to log
+        factor, alpha, beta, density, and creep's share."""
         step = self.period / STEPS_PER_PERIOD
         times = step * np.arange(int(np.ceil(duration / step)) + 2)
         damping = self.with_values(free).damping
@@ -595,8 +542,7 @@ class _Swing:
 
     def left_over(self, found: "_Found") -> tuple[float, float, float]:
         """Return the residual's RMS [m], the number of readings that count as one, and the
-        deviation [m] of each reading if they are to count as independent.
-        """
+        deviation [m] of each reading if they are to count as independent."""
         model, _ = self.rows(found.free, found.chosen, found.duration + self.period)
         left = np.where(found.known, model - self.seen.moved[found.chosen], np.nan)
         rms, stretch = float(np.sqrt(np.nanmean(left**2))), _correlated(left)
@@ -653,9 +599,7 @@ class _Found:
 
 def _correlated(left: np.ndarray) -> float:
     """Return the number of readings that count as one: the sum of the residual's autocorrelation.
-
-    Over time, and over markers and axes, which all follow the same motion.
-    """
+    Over time, and over markers and axes, which all follow the same motion."""
     flat = np.nan_to_num(left.reshape(len(left), -1))
     power = float((flat**2).sum())
     if power == 0:

@@ -56,14 +56,8 @@ class _Spectrum:
 
 
 def ringing_columns(record: _Record) -> _Record:
-    """Return the record with the columns that ring, and a sentence on those that do not.
-
-    A logger's table may also contain accelerations of other directions, a temperature, a voltage or
-    a counter. If no column rings clearly, all columns that change are kept.
-
-    Raises:
-        InputError: no column changes, all of them are counters, or a reading is impossible.
-    """
+    """Return the columns that ring, and a sentence on others: loggers add directions, temperature,
+    counters. None clear: all that change. InputError if none does, or a reading is impossible."""
     if not (np.abs(record.values[np.isfinite(record.values)]) < _LARGEST).all():
         raise InputError(f"The record has a reading over {_LARGEST:g}.",
                          "No sensor gives such a number.", "Check the file and its units.")
@@ -96,10 +90,8 @@ def _is_counter(values: np.ndarray) -> bool:
 
 
 def _is_magnitude(values: np.ndarray, k: int) -> bool:
-    """Whether column ``k`` is the magnitude of the others, as telephones add it.
-
-    It tells nothing more, and rings at twice the frequency.
-    """
+    """Whether column ``k`` is the magnitude of the others, as telephones add it. It tells nothing
+    more, and rings at twice the frequency."""
     own, others = values[:, k], np.delete(values, k, axis=1)
     # Of two equal columns, neither is the magnitude of the other.
     return bool((others.shape[1] > 1 or (others < 0).any()) and (own >= 0).all() and own.any()
@@ -132,14 +124,8 @@ def _spectrum(times: np.ndarray, values: np.ndarray) -> _Spectrum:
 
 
 def plucks(channels: np.ndarray, period: float) -> list[tuple[int, int]]:
-    """Return the first reading of each pluck and the end of its decay.
-
-    A pluck starts within half a period. The beat of two close vibrations grows more slowly.
-
-    Args:
-        channels: Shape [n, c].
-        period: Period of the vibration, in readings.
-    """
+    """Return first reading and end of decay of each pluck, which starts within half a period
+    [readings]; beats of close vibrations grow slower."""
     width, half = max(round(period), 8), max(round(period / 2), 4)
     if len(channels) < 4 * width:
         return [(0, len(channels))]
@@ -167,15 +153,8 @@ def _extent(channels: np.ndarray, width: int) -> np.ndarray:
 
 
 def cut_off(channels: np.ndarray, period: float) -> np.ndarray:
-    """Whether each reading is one of several equal ones at a channel's limit, shape [n] of bool.
-
-    A vibration rounded by a converter has equal readings at its extremes too, but only as many as
-    are within one of its steps.
-
-    Args:
-        channels: Shape [n, c].
-        period: Period of the vibration, in readings.
-    """
+    """Mask [n] of readings among equal ones at a channel's limit; a rounded vibration has equal
+    extremes too, but only as many as a converter's step explains."""
     found = np.zeros(len(channels), bool)
     for values in channels.T:
         steps = np.abs(np.diff(np.unique(values)))
@@ -207,15 +186,8 @@ _SURE = 6.0
 
 @dataclass(frozen=True)
 class Packets:
-    """A record in packets, and the times of its readings by their count.
-
-    Attributes:
-        shared: Number of readings that come with, or right after, another one.
-        times: [s], even steps, shape [n].
-        rate_hz: Readings per second.
-        deviation: Relative standard deviation of the rate.
-        missing: Times before which readings are missing [s].
-    """
+    """A record's readings by their count: times [n] [s] in even steps, rate with relative
+    deviation, times before which some are missing; ``shared`` come with or right after another."""
 
     shared: int
     times: np.ndarray
@@ -225,12 +197,8 @@ class Packets:
 
 
 def packets_of(times: np.ndarray, number: np.ndarray) -> Packets | None:
-    """Return the packets of a record; None if its readings do not come in packets.
-
-    Args:
-        times: Ascending stamps, also equal ones [s], shape [n].
-        number: Ascending numbers of the readings, shape [n].
-    """
+    """Return the packets of a record by stamps [n] [s] ascending, also equal, and readings'
+    numbers; None if not in packets."""
     mean = (times[-1] - times[0]) / max(number[-1] - number[0], 1)
     starts = np.flatnonzero(np.diff(times, prepend=-np.inf) > mean / 2)
     if not _FEWEST <= len(starts) < len(times):
@@ -252,12 +220,8 @@ def packets_of(times: np.ndarray, number: np.ndarray) -> Packets | None:
 
 
 def _jumps(arrival: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return the packets before which readings are missing: they come too late for their number.
-
-    Args:
-        arrival: [s], shape [p].
-        last: Number of the last reading in each packet, shape [p].
-    """
+    """Return packets before which readings are missing: too late [s] for the number of their last
+    reading."""
     steps, counts = np.diff(arrival), np.diff(last)
     late = arrival - float(np.median(steps / counts)) * last
     if len(late) < 2 * _BESIDE:
@@ -333,27 +297,15 @@ class Ringing:
 
 @dataclass(frozen=True)
 class Record(Stream):
-    """Readings over time.
-
-    Attributes:
-        rate_deviation: Relative standard deviation of the rate at which they were taken.
-    """
+    """Readings over time, with the relative standard deviation of their rate."""
 
     rate_deviation: float = 0.0
 
 
 def read_record(path: Path, rate_hz: float | None = None) -> Record:
-    """Read a record: a table of times and readings in any unit, or a C3D file's marker tracks.
-
-    Columns with gaps, such as those of a hidden marker, are discarded, and those that do not ring
-    (:func:`.ringing_detection.ringing_columns`). Readings that come in packets are taken at even
-    steps, where they ring better so. ``rate_hz``, if given, is the rate of all readings, whatever
-    their stamps.
-
-    Raises:
-        InputError: it cannot be read, has no times or no readings, or its times do not ascend in
-            even steps.
-    """
+    """Read times and readings in any unit, or a C3D file's tracks. Columns with gaps or without
+    ringing go; packets count as even where that rings better; ``rate_hz`` overrides stamps.
+    InputError if unreadable, without times, readings or even steps."""
     tracks = [one for one in RECORDINGS.readers() if path.suffix.lower() in one.suffixes
               and one.holds == "markers" and one.name != "markers"]
     if tracks:
@@ -378,11 +330,8 @@ def read_record(path: Path, rate_hz: float | None = None) -> Record:
 
 
 def _stamped(path: Path, record: Record) -> Record:
-    """The record by its stamps, with the columns that ring.
-
-    Raises:
-        InputError: they do not ascend in even steps.
-    """
+    """The record by its stamps, with the columns that ring. InputError if they do not ascend in
+    even steps."""
     doubled = int(np.sum(np.diff(record.times) == 0))
     if 2 * doubled >= len(record):
         raise InputError(f"{path}: {doubled} of {len(record)} readings have the time of another.",
@@ -399,11 +348,8 @@ def _stamped(path: Path, record: Record) -> Record:
 
 
 def _of_packets(path: Path, record: Record, packets: Packets) -> Record:
-    """The record by its stamps or by the count of its readings, whichever rings better.
-
-    Raises:
-        InputError: both ring about as well, with different frequencies.
-    """
+    """The record by its stamps or by the count of its readings, whichever rings better. InputError
+    if both ring about as well, with different frequencies."""
     gone = "".join(f" Readings are missing before {time:.4g} s." for time in packets.missing[:3])
     seen = (f"{path.name}: {packets.shared} of {len(record)} readings have the time of another, or "
             f"nearly so. They came in packets.{gone}")
@@ -439,18 +385,8 @@ def _first_of(record: Record) -> Ringing | None:
 
 def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None, *,
              rate_deviation: float = 0.0) -> Ringing:
-    """Return the vibrations of a free decay.
-
-    Args:
-        times: [s], ascending, shape [n].
-        channels: Displacements, accelerations or strains, shape [n, c].
-        start: Start of the free decay [s]. Default: the time of the largest motion. If the branch
-            is plucked again, each decay is used.
-        rate_deviation: Relative standard deviation of the rate of the times.
-
-    Raises:
-        InputError: the record is too short, shows no free vibration, or is sampled too slowly.
-    """
+    """Return a free decay's vibrations from ``start`` [s] (None: the largest motion; again plucked,
+    each decay). InputError if too short, no free vibration, or sampled too slowly."""
     channels = channels / np.maximum(channels.std(axis=0), 1e-300)
     begin = 0 if start is None else int(np.searchsorted(times, start))
     if len(times) - begin < _LEAST_READINGS:
@@ -622,11 +558,8 @@ def _judged(free: np.ndarray, times: np.ndarray, channels: np.ndarray, power: fl
 
 def _first_line(frequencies: np.ndarray, shares: np.ndarray, order: list[int],
                 ) -> tuple[list[int], tuple[str, ...]]:
-    """The vibrations from the first one on, by frequency, and what makes that one doubtful.
-
-    A branch that is plucked vibrates most in its first modes. A line far below the strongest one
-    is the wind, the support, or drift.
-    """
+    """Vibrations from the first by frequency, and what makes it doubtful: plucked branches vibrate
+    in first modes; a line far below the strongest is wind, support, or drift."""
     largest = order[int(np.argmax(shares[order]))]
     at = next(n for n, k in enumerate(order) if shares[k] >= _FIRST_SHARE * shares[largest])
     first, warnings = order[at], []
