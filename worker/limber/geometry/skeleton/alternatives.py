@@ -39,12 +39,8 @@ _Combination = tuple[float, tuple[Edit, ...]]
 
 @dataclass(frozen=True)
 class SearchDoubts:
-    """What the search for a skeleton left open, in the skeleton's frame [m].
-
-    Attributes:
-        bridges, unlikely, other_root, root_probability: As in
-            :class:`~limber.geometry.skeleton.search_result.SkeletonResult`.
-    """
+    """What the search for a skeleton left open, in the skeleton's frame [m]: fields of
+    :class:`~limber.geometry.skeleton.search_result.SkeletonResult`."""
 
     bridges: Sequence[dict[str, Any]] = ()
     unlikely: Sequence[dict[str, Any]] = ()
@@ -62,14 +58,8 @@ class SearchDoubts:
 
 @dataclass(frozen=True)
 class Attachment:
-    """A bridged piece that may be attached elsewhere.
-
-    Attributes:
-        node: Its first node, at the bridge's outer end.
-        to: The other place [m], shape [3].
-        probability: That it is attached where it is.
-        longer: By how much the axes would be longer [m].
-    """
+    """A bridged piece, its first node at the bridge's outer end. It is there with ``probability``,
+    or else at ``to`` [3] [m], where the axes would be ``longer`` [m]."""
 
     node: int
     to: np.ndarray
@@ -79,13 +69,8 @@ class Attachment:
 
 @dataclass(frozen=True)
 class Alternative:
-    """One graph.
-
-    Attributes:
-        probability: That this is the true graph.
-        length: Of all its axes [m].
-        edits: What makes it of the skeleton in use; none for that skeleton itself.
-    """
+    """A graph that is the true one with ``probability``, the ``length`` [m] of all its axes, and
+    the edits that make it of the skeleton in use: none for that skeleton itself."""
 
     probability: float
     length: float
@@ -93,10 +78,8 @@ class Alternative:
 
 
 def attachments(skeleton: Skeleton, bridges: Iterable[dict[str, Any]]) -> list[Attachment]:
-    """Return the bridged pieces with a rival place that are still attached by their bridge.
-
-    A user who confirms such a branch, or attaches it elsewhere, has settled the question.
-    """
+    """Return the bridged pieces with a rival place that are still attached by their bridge. A user
+    who confirms such a branch, or attaches it elsewhere, has settled the question."""
     tree, along, found = cKDTree(skeleton.nodes), skeleton.arc_length, []
     for bridge in bridges:
         if bridge.get("rival_to") is None:
@@ -119,13 +102,8 @@ def attachments(skeleton: Skeleton, bridges: Iterable[dict[str, Any]]) -> list[A
 
 
 def alternatives(skeleton: Skeleton, doubts: SearchDoubts, count: int = 5) -> list[Alternative]:
-    """Return the most likely graphs, the one in use first and the others by their probability.
-
-    Args:
-        skeleton: The skeleton in use, with the probabilities of its nodes.
-        doubts: What else its search left open, in the same frame.
-        count: How many.
-    """
+    """Return the ``count`` most likely graphs: first the one in use, then the others by their
+    probability. ``doubts`` is what its search left open, in the same frame."""
     decisions, root = _decisions(skeleton, doubts), _root_edit(skeleton, doubts)
     existing = probability_given_carrier(skeleton)
     rooted = doubts.root_probability if root else 1.0

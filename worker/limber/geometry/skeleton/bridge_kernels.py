@@ -17,17 +17,9 @@ _LEAF = 8  # most points of the last boxes
 
 @compiled_exactly
 def boxes(points: np.ndarray, label: np.ndarray) -> Boxes:
-    """Halve the points along their longest side, again and again.
-
-    Args:
-        points: Positions [m], shape [n, 3].
-        label: Piece of each point, shape [n].
-
-    Returns:
-        An order of the points, shape [n]; and of each box, children of box i being 2 i + 1 and
-        2 i + 2: first and last place in that order, shape [b, 2], lower and upper corner [m], both
-        of shape [b, 3], and the label of all of its points, -1 if they differ, shape [b].
-    """
+    """Halve points [n, 3] along their longest side, again and again: their order [n], and boxes,
+    where 2 i + 1 and 2 i + 2 are parts of i. Of each: first and last place in that order [b, 2],
+    corners [b, 3] [m], and its points' label [b], -1 if they differ."""
     total, depth = len(points), 0
     while total > _LEAF << depth:
         depth += 1
@@ -96,24 +88,9 @@ def priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: n
            label: np.ndarray, end_node: np.ndarray, end_direction: np.ndarray,
            end_radius: np.ndarray, end_of: np.ndarray, limit: float, tree: Boxes,
            ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Price the paths from all ends with a direction to other pieces; keep the cheapest of each.
-
-    Args:
-        nodes: Positions [m], shape [n, 3].
-        thickness: First radii [m], shape [n].
-        axis: Direction of the axis at each node, zero where there is none, shape [n, 3].
-        single: Whether a node's piece has neither direction nor thickness, shape [n].
-        label: Which piece each node belongs to, shape [n].
-        end_node: Nodes of the ends, shape [k].
-        end_direction: Outwards, zero where there is none, shape [k, 3].
-        end_radius: Typical thickness [m], shape [k].
-        end_of: Which end a node is, -1 if none, shape [n].
-        limit: Longest path [m], unless an end points straight at its target.
-        tree: Of :func:`.boxes.boxes`, around the nodes.
-
-    Returns:
-        Columns of :class:`.bridges.Hypotheses`, without the last.
-    """
+    """Price the paths from the k ends to the n nodes of other pieces; keep the cheapest of each.
+    Returns the columns of Hypotheses but the last. Directions are zero and ``end_of`` is -1 where
+    there is none. Only an end that points straight at its target goes beyond ``limit`` [m]."""
     most = min(max(_KEPT_OF_ALL // max(len(end_node), 1), _KEPT_OF_PIECE), _KEPT)
     total = most * len(end_node)
     one, other, meets = (np.empty(total, np.int64), np.empty(total, np.int64),
@@ -170,8 +147,7 @@ def _path(vector: np.ndarray, out: np.ndarray, radius: float, limit: float, thic
           axis: np.ndarray, single: bool, end: int, end_direction: np.ndarray,
           end_radius: np.ndarray) -> tuple[float, float, float, float]:
     """Length [m], price [m] (infinite: too long) and turn of a path from an end, and whether its
-    target is an end that comes towards it.
-    """
+    target is an end that comes towards it."""
     far = max(math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]),
               _LEAST)
     if far > _FARTHER * limit:
@@ -198,11 +174,8 @@ def _path(vector: np.ndarray, out: np.ndarray, radius: float, limit: float, thic
 @compiled_exactly
 def _least_price(here: np.ndarray, out: np.ndarray, radius: float, limit: float, low: np.ndarray,
                  high: np.ndarray) -> float:
-    """A lower bound of the price [m] of paths from an end into a box; infinite: none is allowed.
-
-    The bound is the length's and the turn's share of the price, the latter from a ball around the
-    box.
-    """
+    """A lower bound of the price [m] of paths from an end into a box: shares of the length, and of
+    the turn into a ball around the box. Infinite: none is allowed."""
     far = nearest_in_box(here, low, high)
     if far > _FARTHER * limit:
         return np.inf
@@ -249,19 +222,8 @@ def _cheapest(price: np.ndarray, label: np.ndarray, of_piece: np.ndarray, most: 
 @compiled_exactly
 def nearest_others(nodes: np.ndarray, label: np.ndarray, own: np.ndarray, limit: float,
                    count: int, tree: Boxes) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nodes of other pieces nearest to each of some nodes, nearest first.
-
-    Args:
-        nodes: Positions [m], shape [n, 3].
-        label: Which piece each node belongs to, shape [n].
-        own: The querying nodes, shape [m].
-        limit: Only nodes nearer than that [m].
-        count: Most nodes to find.
-        tree: Of :func:`.boxes.boxes`, around the nodes.
-
-    Returns:
-        Nodes, -1 where there are fewer, and distances [m], both of shape [m, count].
-    """
+    """Find up to ``count`` nodes of other pieces within ``limit`` [m] of each node in ``own``,
+    nearest first: nodes, -1 where there are fewer, and distances [m], shape [own, count] each."""
     near = np.full((len(own), count), -1)
     distance = np.full((len(own), count), limit)
     waiting = np.empty(2 * len(tree[1]), np.int64)
@@ -301,14 +263,8 @@ def nearest_others(nodes: np.ndarray, label: np.ndarray, own: np.ndarray, limit:
 @compiled_exactly
 def far_sides(nodes: np.ndarray, spread: np.ndarray, label: np.ndarray, own: np.ndarray,
               ) -> np.ndarray:
-    """Largest distance of the points of a node's piece from it [m], for each of ``own``, shape [m].
-
-    Args:
-        nodes: Positions [m], shape [n, 3].
-        spread: Largest distance of each node's points from it [m], shape [n].
-        label: Which piece each node belongs to, shape [n].
-        own: The querying nodes, in any order, repeats allowed, shape [m].
-    """
+    """Largest distance [m] of the points of a node's piece from it, for each node in ``own``.
+    ``spread`` [n] [m] is that of each node's own points."""
     order = np.argsort(label, kind="mergesort")
     start = np.searchsorted(label[order], np.arange(label.max() + 2))
     known = np.full(len(nodes), -1.0)

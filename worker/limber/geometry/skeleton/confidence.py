@@ -59,16 +59,9 @@ class _Shown:
 
 def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool = False,
              one_sided: bool = False, view: View | None = None) -> Skeleton:
-    """Return the skeleton with the likeliest axes and radii, intervals, states, probabilities.
-
-    Args:
-        skeleton: Fitted to the points.
-        points: The scan [m], shape [m, 3].
-        noise: Standard deviation of the points [m].
-        rays: One sensor's rays made the points, whose noise widens no branch.
-        one_sided: The points show one side of the branches.
-        view: The depth camera's view, if there was one.
-    """
+    """Return the skeleton with the likeliest axes and radii, intervals, states and probabilities.
+    ``noise`` is the points' standard deviation [m]; with ``rays`` of one sensor it widens no
+    branch."""
     shown = _Shown.of(skeleton, points, noise)
     spacing, count = shown.spacing, shown.count
     # A quarter of a circle is off together; the four average.
@@ -99,37 +92,24 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool
 
 
 def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
-    """Return the skeleton with gaps and the probabilities of its nodes; radii stay as they are.
-
-    Args:
-        skeleton: Axes through the points; its radii are not fitted.
-        points: The scan [m], shape [m, 3].
-        noise: Standard deviation of the points [m].
-    """
+    """Return the skeleton with gaps and its nodes' probabilities; radii, which were not fitted,
+    stay. ``noise`` is the standard deviation of the points [m, 3] [m]."""
     return _with_probability(skeleton, _Shown.of(skeleton, points, noise), noise)
 
 
 def evidence(skeleton: Skeleton, points: np.ndarray, noise: float,
              ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the evidence for the probabilities: of runs [runs, 1] and of nodes [n, 3].
-
-    Args:
-        skeleton: As :func:`assessed` returned it.
-        points: The scan [m], shape [m, 3].
-        noise: Standard deviation of the points [m].
-    """
+    """Return the evidence for the probabilities of an assessed skeleton: of runs [runs, 1] and of
+    nodes [n, 3]. ``noise`` is the standard deviation of the points [m, 3] [m]."""
     shown = _Shown.of(skeleton, points, noise)
     return np.log1p(shown.unexplained)[:, None], _node_evidence(
         skeleton, _gaps(skeleton, shown), noise)
 
 
 def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
-    """Drop side runs with a probability below ``least``, and what they carry.
-
-    Returns:
-        The skeleton, and for each dropped run its ``length`` [m], the positions ``from`` [m] of
-        its fork and ``at`` of its tip, its median ``radius`` [m] and its ``probability``.
-    """
+    """Drop side runs with a probability below ``least``, and what they carry. Lists each with
+    ``length`` [m], its fork ``from`` and tip ``at`` [m], median ``radius`` [m] and
+    ``probability``."""
     runs = skeleton.runs()
     probability = np.ones(len(runs))
     for run, members in enumerate(runs[1:], start=1):
@@ -145,10 +125,8 @@ def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
 
 
 def probability_given_carrier(skeleton: Skeleton) -> np.ndarray:
-    """Probability of each run, given that its carrier exists, shape [runs]; 1 for the main run.
-
-    The probability of a run's nodes includes that of its carriers.
-    """
+    """Probability [runs] of each run, given that its carrier exists; 1 for the main run. That of a
+    run's nodes includes its carriers'."""
     runs = skeleton.runs()
     stated = np.array([skeleton.probability[members[1:]].max() for members in runs])
     probability = np.ones(len(runs))
@@ -168,11 +146,8 @@ def shares(skeleton: Skeleton) -> dict[str, float]:
 
 def _unexplained_by_carriers(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
                              noise: float) -> np.ndarray:
-    """Number of points of each side run that its carrier does not explain, shape [runs].
-
-    They lie farther from the carrier's surface than its scatter. Of those at one node no more than
-    ``_TOGETHER`` count: what they are off has one cause.
-    """
+    """Number [runs] of points of each side run farther from its carrier's surface than that
+    scatters. At most ``_TOGETHER`` count at one node: what they are off has one cause."""
     count, run = np.zeros(skeleton.branch_count), skeleton.branch[segment]
     order = np.argsort(run, kind="stable")
     first = np.searchsorted(run[order], np.arange(skeleton.branch_count + 1))
@@ -193,11 +168,8 @@ def _unexplained_by_carriers(skeleton: Skeleton, points: np.ndarray, segment: np
 
 
 def _node_evidence(skeleton: Skeleton, gap: np.ndarray, noise: float) -> np.ndarray:
-    """Evidence against each node's position on its run, shape [n, 3].
-
-    ln(1 + 5 noise / radius), ln(1 + length of the gap that it bridges / radius), and whether its
-    radius is not resolved.
-    """
+    """Evidence [n, 3] against each node's position on its run: ln(1 + 5 noise / radius), ln(1 +
+    length of the gap that it bridges / radius), and whether its radius is not resolved."""
     radius = np.maximum(skeleton.radius, 1e-12)
     return np.column_stack([np.log1p(5 * np.minimum(noise / radius, _NOISE_MOST)),
                             np.log1p(gap / radius), skeleton.radius_state == UNRESOLVED])
@@ -212,11 +184,9 @@ def _with_probability(skeleton: Skeleton, shown: _Shown, noise: float) -> Skelet
 
 
 def _probability(skeleton: Skeleton, twig: np.ndarray, node: np.ndarray) -> np.ndarray:
-    """Probability that each node exists, with its run and carriers, and is in its position.
-
-    A run's first node stands for its fork. The run's own evidence was fitted to the existence and
-    position of that fork. The node's gap and noise would count against it twice.
-    """
+    """Probability that each node exists, with its run and carriers, and is in its position. A run's
+    first node stands for its fork: the run's own evidence was fitted to that, and the node's gap
+    and noise would count twice."""
     own = PLACED * _logistic(twig, _TWIG_ODDS)
     own[0] = 1.0
     placed, runs = _logistic(node, _NODE_ODDS), skeleton.runs()
@@ -270,18 +240,9 @@ class DoubtfulKind(StrEnum):
 
 @dataclass(frozen=True)
 class DoubtfulPart:
-    """One uncertain part.
-
-    Attributes:
-        kind: Why it is uncertain.
-        branch: Its run.
-        at: A position on it [m], shape [3].
-        length: Length of the part [m]; 0 for a single node.
-        radius: Median radius there [m].
-        value: Probability of an unlikely branch, an attachment or a root; standard deviation over
-            radius of an unresolved or limited one; factor of a radius jump outwards; angle [rad]
-            of a kink; NaN for a gap.
-    """
+    """An uncertain part, ``at`` [3], with length (0: a node) and median radius [m]. ``value`` is
+    the probability of a branch, attachment or root, a radius's deviation over it, the factor of a
+    jump outwards, the angle of a kink [rad], or NaN for a gap."""
 
     kind: DoubtfulKind
     branch: int
@@ -340,11 +301,8 @@ def _stretches(nodes: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
 
 
 def jumps(skeleton: Skeleton, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Factor by which the radius changes outwards around each node of a run, and whether wood
-    hardly does so, shape [k] each.
-
-    Measured over two radii to each side. At a fork a radius may change more.
-    """
+    """Factor [k] by which the radius changes outwards around each node of a run, over two radii to
+    each side, and whether wood hardly does so [k]. At a fork a radius may change more."""
     along, log = skeleton.arc_length[own], np.log(skeleton.radius[own])
     reach = _CHORD * skeleton.radius[own]
     change = np.interp(along + reach, along, log) - np.interp(along - reach, along, log)
@@ -355,11 +313,8 @@ def jumps(skeleton: Skeleton, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def turns(skeleton: Skeleton, members: np.ndarray) -> np.ndarray:
-    """Angle [rad] between the axis before and after each node of a run, shape [k].
-
-    Measured over two radii to each side, so that the roughness of single nodes is not a kink. Nodes
-    nearer than that to an end have no turn.
-    """
+    """Angle [k] [rad] between the axis two radii before and after each node of a run, so that the
+    roughness of single nodes is no kink. Nodes nearer to an end have no turn."""
     nodes = skeleton.nodes[members]
     along = arc_lengths(nodes)
     chord = _CHORD * skeleton.radius[members]

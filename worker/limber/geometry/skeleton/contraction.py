@@ -51,13 +51,9 @@ _STILL_THICK = 0.6  # fraction of points not yet on a line down to which the wei
 
 
 class ContractionStatus(StrEnum):
-    """How a contraction ended; each value is its own text.
-
-    contracted: nearly all points lie on lines.
-    stalled: points no longer moved.
-    iteration_limit: the maximum number of solves was reached.
-    given: the skeleton was given, so there was no contraction.
-    """
+    """How a contraction ended. contracted: nearly all points lie on lines; stalled: points no
+    longer moved; iteration_limit: all solves were used; given: the skeleton was, nothing was
+    contracted."""
 
     contracted = "contracted"
     stalled = "stalled"
@@ -67,17 +63,9 @@ class ContractionStatus(StrEnum):
 
 @dataclass(frozen=True)
 class Contraction:
-    """Result of the contraction.
-
-    Attributes:
-        points: Contracted points [m], shape [n, 3], in the order of the input.
-        linearity: Fraction of the variance around each point that lies along one line, 1/3 to 1,
-            shape [n]; 1 where the cloud has become a curve.
-        iterations: Number of linear solves.
-        status: Status at the end.
-        history: One dict an iteration: ``moved`` [m], ``active`` (fraction of points not yet on a
-            curve), ``seconds``.
-    """
+    """Contracted points [n, 3] [m], and their linearity [n]: the share of the variance around each
+    along one line, 1/3 to 1 (a curve). ``history`` has for each linear solve ``moved`` [m],
+    ``active`` (fraction of points not on a curve yet) and ``seconds``."""
 
     points: np.ndarray
     linearity: np.ndarray
@@ -88,22 +76,12 @@ class Contraction:
 
 def contract(points: np.ndarray, *, weight: float = 1.0, progress: Progress = SILENT,
              ) -> Contraction:
-    """Contract points to the axes of their branches.
-
-    The contraction weight of a point grows while the points around it do not lie on a line yet,
-    and shrinks once they do, so that thin twigs are not shortened while thick ones still close.
-    The attraction W_H is constant. On 4 generated branches the growing one of Cao et al. (section
-    4) was as good where all sides were seen; from one side radii were 2.6 instead of 2.0 % off, and
-    one fork of 12 was lost.
-
-    Args:
-        points: Positions [m], shape [n, 3].
-        weight: Of W_L relative to W_H at the start.
-        progress: Called each iteration.
-
-    Raises:
-        WorkError: the linear system could not be solved.
-    """
+    """Contract points [n, 3] [m] to the axes of their branches. ``weight`` is that of W_L relative
+    to W_H at the start. WorkError if the linear system cannot be solved."""
+    # A point's weight grows while the points around it are on no line, and shrinks once they are:
+    # thin twigs are not shortened, and thick ones still close. W_H is constant. On 4 generated
+    # branches the growing one of Cao et al. (section 4) was as good where all sides were seen; from
+    # one side radii were 2.6 instead of 2.0 % off, and one fork of 12 was lost.
     scale = float(np.linalg.norm(np.ptp(points, axis=0)))
     centre = points.mean(axis=0)
     positions = (points - centre) / scale
@@ -138,11 +116,8 @@ def contract(points: np.ndarray, *, weight: float = 1.0, progress: Progress = SI
 
 
 def cloud_laplacian(points: np.ndarray) -> sparse.csc_matrix:
-    """Return the cotangent Laplacian of a cloud (rows sum to 0), shape [n, n].
-
-    Uses ``robust_laplacian`` (Sharp and Crane 2020) if installed, else triangles of each point's
-    neighbours in its tangent plane.
-    """
+    """Return the cotangent Laplacian [n, n] of a cloud; rows sum to 0. By ``robust_laplacian``
+    (Sharp and Crane 2020) if installed, else of triangles in each point's tangent plane."""
     try:
         import robust_laplacian
     except ImportError:
@@ -164,8 +139,7 @@ def local_linearity(points: np.ndarray) -> np.ndarray:
 
 def _largest_eigenvalues(matrix: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """Largest eigenvalues of symmetric matrices [n, 3, 3] with mean eigenvalues ``mean`` [n], by
-    Smith's closed form (1961, doi:10.1145/355578.366316): a tenth of LAPACK's time.
-    """
+    Smith's closed form (1961, doi:10.1145/355578.366316): a tenth of LAPACK's time."""
     rest = matrix - mean[:, None, None] * np.eye(3)
     spread = np.sqrt((rest**2).sum(axis=(1, 2)) / 6)
     unit = rest / np.maximum(spread, 1e-300)[:, None, None]
@@ -209,15 +183,9 @@ def _finite(points: np.ndarray) -> np.ndarray:
 
 
 def tangent_laplacian(points: np.ndarray, neighbours: int) -> sparse.csc_matrix:
-    """Return a cotangent Laplacian: Delaunay triangles around each point in its tangent plane.
-
-    Belkin, Sun, Wang: Constructing Laplace operator from point clouds in R^d (2009); Cao et al. use
-    it for contraction. Each triangle is seen from up to three points, hence the third.
-
-    Args:
-        points: Positions, shape [n, 3].
-        neighbours: How many neighbours of each point are triangulated.
-    """
+    """Return a cotangent Laplacian of Delaunay triangles of each point's ``neighbours`` in its
+    tangent plane (Belkin, Sun, Wang 2009, as in Cao et al.). Up to three points see each triangle,
+    hence the third."""
     count = min(neighbours + 1, len(points))
     _, near = cKDTree(points).query(points, k=count)
     offset = points[near] - points[near].mean(axis=1, keepdims=True)
@@ -270,15 +238,9 @@ _SPARSE_QUANTILE = 0.1
 
 
 def is_sparse(points: np.ndarray, contracted: np.ndarray) -> bool:
-    """Whether part of the scan shows branches too sparsely for contraction to separate them.
-
-    There, points moved towards an axis by less than their spacing. For that tenth of the points the
-    ratio is over 0.75 in scans of single branches, under 0.57 in trees and in sparse scans.
-
-    Args:
-        points: Scanned points [m], shape [n, 3].
-        contracted: The same points after contraction [m], shape [n, 3].
-    """
+    """Whether a tenth of the points moved to an axis by less than their spacing: contraction cannot
+    separate their branches. The ratio is over 0.75 in scans of single branches, under 0.57 in trees
+    and sparse scans."""
     drawn = np.linalg.norm(points - contracted, axis=1)
     _, near = cKDTree(contracted).query(contracted, k=min(16, len(points)))
     thickness = np.median(drawn[near], axis=1)
@@ -290,18 +252,9 @@ def is_sparse(points: np.ndarray, contracted: np.ndarray) -> bool:
 def level_graph(points: np.ndarray, source: np.ndarray, *, gap_factor: float,
                 bridge_limit: float, up: np.ndarray, join_plants: bool = False,
                 width: float | None = None) -> CurveGraph:
-    """Make the tree of a scan's levels.
-
-    Args:
-        points: Scanned points [m], shape [n, 3].
-        source: Position of the root [m], shape [3].
-        gap_factor: The paper's gamma: a step longer than this many median steps is a gap.
-        bridge_limit: Gaps up to this length [m] are bridged; beyond it, the smaller piece is
-        discarded.
-        up: The up direction, shape [3].
-        join_plants: Join even pieces that look like two plants.
-        width: Width of a level [m]; None: as narrow as the points' spacing allows.
-    """
+    """Make the tree of a scan's levels from the root ``source`` [3] [m]; for the rest see
+    :func:`~limber.geometry.skeleton.curve_graph.curve_graph`. ``width`` is a level's [m]; None: as
+    narrow as the points' spacing allows."""
     links, spacing = neighbour_links(points)
     distance, before = _along_plant(points, links, source)
     level = np.floor(distance / max(width or 0.0, _WIDTH * spacing)).astype(np.int64)
@@ -325,10 +278,8 @@ def level_graph(points: np.ndarray, source: np.ndarray, *, gap_factor: float,
 
 def _along_plant(points: np.ndarray, links: np.ndarray, source: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of each point along the scan, and the previous point on its path, -1 at starts.
-
-    An unconnected piece starts again where it is nearest to those already processed.
-    """
+    """Distance [m] of each point along the scan, and the point before it, -1 at starts. An
+    unconnected piece starts where it is nearest to those done."""
     length = np.linalg.norm(points[links[:, 0]] - points[links[:, 1]], axis=1)
     graph = edge_matrix(len(points), links, np.maximum(length, 1e-12))
     graph = graph.maximum(graph.T)
@@ -389,16 +340,8 @@ _EVENED = 3  # rounds of smoothing
 
 def through_leaves(skeleton: Skeleton, points: np.ndarray, noise: float,
                    radius_limits: tuple[float, float]) -> Skeleton:
-    """Place axes in the middle of stem and leaves, without a fit: leaves are not cylinders.
-
-    A leaf gets the radius of its stalk, for lack of a better one, marked as not measured.
-
-    Args:
-        skeleton: With first radii.
-        points: The scan, thinned [m], shape [m, 3].
-        noise: Standard deviation of the points [m].
-        radius_limits: Least and largest radius [m].
-    """
+    """Place axes in the middle of stem and leaves without a fit, as leaves are no cylinders. A leaf
+    gets its stalk's radius, for lack of a better one, marked as not measured."""
     skeleton = attached(resampled(skeleton))
     for _ in range(_EVENED):
         skeleton = skeleton.moved(_evened(skeleton))

@@ -26,11 +26,9 @@ _Z = np.array([0.0, 0.0, 1.0])
 
 @dataclass
 class CurveGraph:
-    """Nodes on the axes and the tree between them.
+    """Nodes [n, 3] [m] on the axes and the edges [e, 2] of the forest between them.
 
     Attributes:
-        nodes: Positions [m], shape [n, 3].
-        edges: Node pairs of the forest, shape [e, 2].
         thickness: Distance [m] by which a node's points were contracted: a first radius, shape [n].
         support: Number of points of each node, shape [n].
         bridges: Each closed gap: ``from``, ``to`` [m, 3], ``length`` [m], ``price`` (1: a straight
@@ -39,8 +37,7 @@ class CurveGraph:
             ``rival_to`` [m, 3], ``rival_price`` [m], or None.
         split_off: Each discarded piece: ``points``, ``distance`` [m], ``at``.
         loops: Length of each closed loop that was opened [m].
-        plants: Pieces that look like plants of their own: ``points`` of the smaller, ``distance``
-            [m], ``at``.
+        plants: Pieces that look like plants of their own, as ``split_off``; the smaller's points.
         owner: The node that each point belongs to, -1 for a discarded point, shape [m].
     """
 
@@ -58,17 +55,9 @@ class CurveGraph:
 def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float,
                 bridge_limit: float, up: np.ndarray = _Z, join_plants: bool = False,
                 ) -> CurveGraph:
-    """Cover contracted points by nodes and connect them to one tree.
-
-    Args:
-        points: Scanned points [m], shape [n, 3].
-        contracted: The same points after contraction [m], shape [n, 3].
-        gap_factor: The paper's gamma: a step longer than this many median steps is a gap.
-        bridge_limit: Gaps up to this length [m] are bridged; beyond it, the smaller piece is
-        discarded.
-        up: The up direction, shape [3].
-        join_plants: Join even pieces that look like two plants.
-    """
+    """Cover contracted points by nodes and connect them to one tree. A gap is a step over
+    ``gap_factor`` (the paper's gamma) median steps. Gaps up to ``bridge_limit`` [m] are bridged;
+    beyond it the smaller piece is discarded."""
     links, spacing = neighbour_links(points)
     drawn = np.linalg.norm(points - contracted, axis=1)
     thickness = _smoothed(drawn, contracted)
@@ -101,11 +90,8 @@ def spreads(points: np.ndarray, owner: np.ndarray, nodes: np.ndarray) -> np.ndar
 
 
 def neighbour_links(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Pairs of near points, shape [m, 2], and the median distance to the nearest neighbour [m].
-
-    A link is at most four times as long as the neighbourhoods of its ends are wide. So sparse twigs
-    stay connected and neighbouring twigs stay apart.
-    """
+    """Pairs [m, 2] of near points, and the median distance [m] to the nearest. A link is at most
+    four times as long as its ends' neighbourhoods are wide, so neighbouring twigs stay apart."""
     count = min(11, len(points))
     distance, near = cKDTree(points).query(points, k=count)
     spacing = float(np.median(distance[:, 1]))
@@ -185,11 +171,8 @@ def _spanning_forest(nodes: np.ndarray, edges: np.ndarray, length: np.ndarray,
 
 
 def keep_largest(graph: CurveGraph, joined: Joined, gap: float) -> np.ndarray:
-    """Take the bridges of the largest piece and discard the other pieces.
-
-    Returns:
-        Whether each node was kept.
-    """
+    """Take the bridges of the largest piece, discard the others, and return whether each node was
+    kept."""
     weight = np.bincount(joined.label, joined.support)
     main = joined.label == int(np.argmax(weight))
     graph.nodes, graph.thickness, graph.support = joined.nodes, joined.thickness, joined.support

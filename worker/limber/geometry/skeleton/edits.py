@@ -63,10 +63,8 @@ class DeleteBranch(_Edit):
 
 
 class MergeBranch(_Edit):
-    """Merge a branch up to ``at`` with the branch at ``to``, from which it then continues.
-
-    What it carried before ``at`` is attached to the nearest nodes of that other branch.
-    """
+    """Merge a branch up to ``at`` with the branch at ``to``, from which it then continues. What it
+    carried before ``at`` is attached to the nearest nodes of that other branch."""
 
     do: Literal["merge"] = "merge"
     to: Place
@@ -119,11 +117,8 @@ Edit = Annotated[AddBranch | MoveNode | DeleteBranch | MergeBranch | Bridge | Sp
 
 
 def read_edits(path: Path) -> list[Edit]:
-    """Read a file of edits.
-
-    Raises:
-        InputError: the file cannot be read, is not JSON, or has an invalid edit, which is named.
-    """
+    """Read a file of edits; InputError if it cannot be read, is not JSON, or has an invalid edit,
+    which is named."""
     try:
         return validated(list[Edit], read_json(path, "a JSON file of edits"))
     except ValidationError as error:
@@ -146,17 +141,9 @@ def edits_text(edits: Sequence[Edit]) -> str:
 
 def edited(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str] | None = None,
            ) -> Skeleton:
-    """Apply edits in order.
-
-    Args:
-        skeleton: In the frame of the edits' positions [m].
-        edits: What to change.
-        misfits: Receives the message of each edit that does not fit and is skipped; None
-            raises the error.
-
-    Raises:
-        InputError: a position is not on an axis, or the result would not be a tree.
-    """
+    """Apply edits with positions [m] in the skeleton's frame, in order. InputError if a position is
+    on no axis or the result is no tree; with ``misfits``, which receives the message, such an edit
+    is skipped."""
     doing: dict[str, Callable[[Skeleton, Any], Skeleton]] = {
         "add": _added, "move": _moved, "delete": _deleted, "merge": _merged,
         "bridge": _bridged, "split": _split, "root": _rooted, "radius": _with_radius,
@@ -174,14 +161,8 @@ def edited(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str] | None 
 
 @dataclass(frozen=True)
 class EditEffect:
-    """What one edit did.
-
-    Attributes:
-        do: Kind of the edit.
-        node: Position of the node that it took [m], shape [3].
-        distance: From that node to the requested position [m].
-        length_change: Change of the length of all branches [m]; negative: it removed something.
-    """
+    """What an edit did: the node [3] [m] that it took, that node's distance [m] from the requested
+    position, and the change of all branches' length [m], negative where it removed something."""
 
     do: str
     node: np.ndarray
@@ -379,10 +360,8 @@ def _remade(skeleton: Skeleton, *, nodes: np.ndarray | None = None,
 
 
 def differing(skeleton: Skeleton, found: Skeleton) -> np.ndarray:
-    """Return which nodes of an edited skeleton differ from the found skeleton, shape [n].
-
-    A node is unchanged if a node with its position, radius, parent and probability was found.
-    """
+    """Mask [n] of an edited skeleton's nodes that differ from the found one's. A node is unchanged
+    if one with its position, radius, parent and probability was found."""
     distance, same = cKDTree(found.nodes).query(skeleton.nodes)
 
     def carrier(tree: Skeleton, nodes: np.ndarray) -> np.ndarray:

@@ -13,13 +13,8 @@ _BEYOND, _LONG = 3, 0.9  # nodes past a fork that show the axis's direction; rat
 
 @dataclass(frozen=True)
 class Ends:
-    """Free ends of pieces.
-
-    Attributes:
-        node: Which node each is, shape [k].
-        direction: Outwards, a unit vector; zero where there is none, shape [k, 3].
-        radius: Typical thickness near it [m], shape [k].
-    """
+    """Free ends of pieces: nodes [k], outward unit vectors [k, 3], zero where there is none, and
+    the typical thickness near each [k] [m]."""
 
     node: np.ndarray
     direction: np.ndarray
@@ -29,17 +24,9 @@ class Ends:
 def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
               joints: np.ndarray | None = None, known: "Known | None" = None,
               ) -> Ends:
-    """Find the ends of all pieces and where they point.
-
-    Args:
-        nodes: Positions [m], shape [n, 3].
-        edges: Node pairs of a forest, shape [e, 2].
-        thickness: First radii [m], shape [n].
-        joints: Edges by which a bridge joined the side of a piece, the bridge's node first, shape
-            [j, 2]: a twig that joined a stem's end does not close that end.
-        known: Results of earlier calls, with fewer edges between the same nodes; those of this call
-            are added.
-    """
+    """Find the ends of all pieces and where they point. A twig that joined a stem's end by an edge
+    of ``joints`` [j, 2], the bridge's node first, does not close that end. ``known`` comes from
+    calls with fewer edges between the same nodes, and gets these results."""
     found = {} if known is None else known.ends
     near: list[list[int]] = [[] for _ in range(len(nodes))]
     for a, b in edges.tolist():
@@ -61,13 +48,8 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
 
 @dataclass
 class Known:
-    """Results of earlier calls, valid where nothing has changed since.
-
-    Attributes:
-        ends: Results for each end.
-        sums: Squares of the edges at each node [m^2], shape [n, 3, 3].
-        axes: Direction of the axis from these sums, shape [n, 3].
-    """
+    """Results of earlier calls, valid where nothing has changed since: of each end, the sums
+    [n, 3, 3] of squares of each node's edges [m^2], and the axes' directions [n, 3] from them."""
 
     ends: dict[int, "KnownEnd"] = field(default_factory=dict)
     sums: np.ndarray = field(default_factory=lambda: np.empty((0, 3, 3)))
@@ -115,10 +97,8 @@ def _end(nodes: np.ndarray, near: _Neighbours, thickness: np.ndarray, end: int) 
 
 def _straight_chain(nodes: np.ndarray, near: _Neighbours, end: int, reach: float,
                     before: int = -1) -> list[int]:
-    """Nodes inwards from an end, straight on at forks, as far as ``reach`` [m].
-
-    With ``before``, the chain starts at a node within a piece and runs away from that neighbour.
-    """
+    """Nodes inwards from an end, straight on at forks, as far as ``reach`` [m]; with ``before``,
+    from a node within a piece and away from that neighbour."""
     chain, length = [end], 0.0
     while length < reach or len(chain) < _CHAIN_NODES:
         ahead = [node for node in near[chain[-1]] if node != before]
@@ -137,11 +117,8 @@ def _straight_chain(nodes: np.ndarray, near: _Neighbours, end: int, reach: float
 
 def _beside(nodes: np.ndarray, near: _Neighbours, thickness: np.ndarray, chain: list[int],
             ) -> int:
-    """Number of an end's nodes that belong to a stub beside a longer axis; all if it is not a stub.
-
-    At a fork on the chain, that axis continues along another arm, which is longer than the stub and
-    turns less.
-    """
+    """Number of an end's nodes that belong to a stub beside a longer axis; all if it is no stub. At
+    a fork, that axis goes on along an arm that is longer than the stub and turns less."""
     length = 0.0
     for k in range(1, len(chain) - 1):
         fork, ahead = chain[k], chain[k + 1]

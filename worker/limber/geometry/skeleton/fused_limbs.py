@@ -36,9 +36,8 @@ _FORK_SECTIONS = 3  # sections in a row that must show two: a few stray points a
 
 @dataclass(frozen=True)
 class FusedFork:
-    """The axes of a side run beside its carrier: carrier's nodes from the fork down, shape [k],
-    and of both limbs there the positions [m], [k, 3], and radii [m], [k].
-    """
+    """The axes of a side run beside its carrier: carrier's nodes from the fork down, shape [k], and
+    of both limbs there the positions [m], [k, 3], and radii [m], [k]."""
 
     nodes: np.ndarray
     carrier: np.ndarray
@@ -49,16 +48,8 @@ class FusedFork:
 
 def separate_fused_forks(skeleton: Skeleton, points: np.ndarray, noise: float,
                          ) -> tuple[Skeleton, int]:
-    """Return the skeleton with side runs that start where their points meet the carrier's.
-
-    Args:
-        skeleton: Fitted to the points.
-        points: Scanned points [m], shape [m, 3].
-        noise: Standard deviation of the points [m].
-
-    Returns:
-        The skeleton, and the number of side runs that were followed down.
-    """
+    """Return the skeleton with side runs that start where their points meet the carrier's, and the
+    number of those followed down. ``noise`` is the points' standard deviation [m]."""
     run = skeleton.branch[nearest_cylinders(skeleton, points)[0]]
     done, forks, starts = np.zeros(skeleton.node_count, bool), [], []
     for members in skeleton.runs()[1:]:
@@ -74,13 +65,8 @@ def separate_fused_forks(skeleton: Skeleton, points: np.ndarray, noise: float,
 
 def with_side_axes(skeleton: Skeleton, forks: list[FusedFork], starts: Sequence[int | None],
                    ) -> Skeleton:
-    """Return the skeleton with a second axis beside each of some stretches of runs.
-
-    Args:
-        skeleton: With radii.
-        forks: The stretches.
-        starts: For each the first node of the side run that goes on from it; None: it ends there.
-    """
+    """Return the skeleton with a second axis beside each stretch in ``forks``. Its side run goes on
+    at the node in ``starts``; None: it ends there."""
     nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
     parent, below, first = skeleton.parent.copy(), [], skeleton.node_count
     for fork, start in zip(forks, starts, strict=True):
@@ -125,12 +111,8 @@ def _fused_fork(skeleton: Skeleton, members: np.ndarray, points: np.ndarray, noi
 
 def _two_limbs(skeleton: Skeleton, node: int, at: np.ndarray, side: float, points: np.ndarray,
                noise: float) -> tuple[np.ndarray, np.ndarray, float, float] | None:
-    """Axes and radii of carrier and side limb in the section at a node; None if it shows one.
-
-    Args:
-        at: Where the side limb's axis is expected [m], shape [3].
-        side: Its radius above [m].
-    """
+    """Axes [3] and radii [m] of carrier and side limb in the section at a node; None if it shows
+    one. The side limb is expected ``at`` [3] [m], with its radius above, ``side`` [m]."""
     thick = float(skeleton.radius[node])
     seen = section(skeleton, node, points, 3 * thick + 2 * side, _HALF * min(thick, side))
     if seen is None:
@@ -154,13 +136,9 @@ def _two_limbs(skeleton: Skeleton, node: int, at: np.ndarray, side: float, point
 
 def section(skeleton: Skeleton, node: int, points: np.ndarray, reach: float, half: float,
             ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Points in the section at a node, in its plane [m], shape [k, 2], and the plane's two unit
-    vectors; None where the axis has no direction.
-
-    Args:
-        reach: Largest distance of points from the node [m].
-        half: Half the section's thickness [m], or that of the node's step if larger.
-    """
+    """Points [k, 2] [m] of the section at a node, up to ``reach`` [m] from it, and the plane's two
+    unit vectors; None where the axis has no direction. ``half`` is half the section's
+    thickness [m]; the node's step counts if larger."""
     axis = skeleton.nodes[node] - skeleton.nodes[int(skeleton.parent[node])]
     size = float(np.linalg.norm(axis))
     if size == 0:
@@ -183,17 +161,9 @@ def _outwards(skeleton: Skeleton, node: int) -> int:
 
 def fitted_circles(flat: np.ndarray, first: np.ndarray, spread: float, known: float,
                    ) -> tuple[np.ndarray, float] | None:
-    """Circles fitted to points of a section, each point to the nearest, and the log-likelihood.
-
-    Args:
-        flat: Points [m], shape [k, 2].
-        first: Middle and radius of each circle to start from [m], shape [c, 3].
-        spread: Standard deviation of the points [m].
-        known: Deviation of the radii's logarithms from the first.
-
-    Returns:
-        None if a circle has too few points.
-    """
+    """Circles (middle and radius) [c, 3] [m] fitted to points [k, 2] [m], each point to the
+    nearest, and the log-likelihood; None if a circle has too few points. ``known`` is the deviation
+    of the radii's logarithms from those of ``first``."""
     circles = first.copy()
     for _ in range(_ROUNDS):
         offset = flat[:, None] - circles[:, :2]
@@ -233,12 +203,7 @@ _FREE = 1.0  # deviation of the limbs' radii from half of the common one, logari
 def with_split_limbs(skeleton: Skeleton, points: np.ndarray, noise: float,
                      ) -> tuple[Skeleton, int]:
     """Return the skeleton with runs split where their points show two limbs, and their number.
-
-    Args:
-        skeleton: Fitted to the points.
-        points: Scanned points [m], shape [m, 3].
-        noise: Standard deviation of the points [m].
-    """
+    ``noise`` is the points' standard deviation [m]."""
     segment, residual = nearest_cylinders(skeleton, points)
     count = np.maximum(np.bincount(segment, minlength=skeleton.node_count), 1)
     off = np.bincount(segment, np.abs(residual), skeleton.node_count) / count
@@ -267,8 +232,7 @@ def _stretches(chosen: np.ndarray) -> list[slice]:
 
 def _two(skeleton: Skeleton, node: int, points: np.ndarray) -> np.ndarray | None:
     """Middles [m] and radii [m] of two limbs in the section at a node, shape [2, 4]; None where one
-    circle may explain it.
-    """
+    circle may explain it."""
     thick = float(skeleton.radius[node])
     seen = section(skeleton, node, points, 2 * thick, thick / 2)
     if seen is None or len(seen[0]) < _POINTS:

@@ -29,19 +29,9 @@ _STRAIGHT = np.deg2rad(45.0)  # ends that turn more give a bridge no direction
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Possible bridges, cheapest for their thickness first.
-
-    Attributes:
-        one: Node at the end that reaches out, shape [h].
-        other: Node that it reaches, shape [h].
-        length: [m], shape [h].
-        price: Length times the implausibility of the bridge [m], shape [h].
-        turn: Angle between the end's direction and the bridge [rad], pi where it has none,
-            shape [h].
-        meets: 1 where the other node is an end that comes towards this one, else 0, shape [h].
-        thick: Thickness of the end that reaches out [m]; for a blind one, of the thinner, shape
-        [h].
-    """
+    """Possible bridges [h], cheapest for their thickness first. ``meets`` is 1 where the other node
+    is an end that comes towards this one. ``price`` is length times implausibility [m], ``turn``
+    the angle to the end's direction [rad] (pi: none), ``thick`` the end's or the thinner's [m]."""
 
     one: np.ndarray
     other: np.ndarray
@@ -55,18 +45,9 @@ class Hypotheses:
 def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, label: np.ndarray,
                weight: np.ndarray, limit: float, ends: Ends, known: Known | None = None,
                ) -> Hypotheses:
-    """Price the paths by which pieces can be joined.
-
-    Args:
-        nodes: Positions [m], shape [n, 3].
-        edges: Node pairs of a forest, shape [e, 2].
-        thickness: First radii [m], shape [n].
-        label: Which piece each node belongs to, shape [n].
-        weight: Points of each piece, shape [pieces].
-        limit: Longest bridge [m], unless an end points straight at its target.
-        ends: The pieces' free ends.
-        known: Results of earlier calls; those of this call are added.
-    """
+    """Price the paths by which pieces of the forest can be joined. ``weight`` has the points of
+    each piece. Only an end that points straight at its target bridges more than ``limit`` [m].
+    Results are added to ``known``."""
     axes = _axes(nodes, edges, known or Known())
     end_of = np.full(len(nodes), -1)
     end_of[ends.node] = np.arange(len(ends.node))
@@ -88,11 +69,8 @@ def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, labe
 
 def filled(nodes: np.ndarray, thickness: np.ndarray, ends: Ends, one: int, other: int,
            step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [m], shape [k, 3], and radii [m] along a bridge, about ``step`` [m] apart.
-
-    A cubic from end to end in their directions. If only one end has a direction, the curve leaves
-    in that direction, and its arrival is free.
-    """
+    """Nodes [k, 3] and radii [m] along a bridge, about ``step`` [m] apart, on a cubic in the
+    directions of both ends. If only one has a direction, the arrival is free."""
     start, stop = nodes[one], nodes[other]
     vector = stop - start
     length = float(np.linalg.norm(vector))
@@ -164,24 +142,18 @@ _SPECK, _SPECK_FEW, _FEW = 5.0, 10.0, 30
 
 @dataclass
 class Joined:
-    """Result of joining the pieces.
+    """All nodes [n, 3] [m], those along bridges after the given ones, and all edges [e, 2].
 
     Attributes:
-        nodes: All nodes [m], those along bridges after the given ones, shape [n, 3].
         thickness: First radii [m], shape [n].
         support: Number of points of each node, none along bridges, shape [n].
         spread: Largest distance of each node's points from it [m], 0 along bridges, shape [n].
-        edges: All edges, the bridges included, shape [e, 2].
         bridges: Node pairs that were joined, shape [b, 2].
         prices: Cost of each bridge over its length, shape [b]: 1 where an end continues straight
             into another of equal thickness, higher for less plausible bridges.
         plants: Node pairs between pieces that are plants of their own, shape [p, 2].
-        label: Which piece each node belongs to now, shape [n].
-        joints: Edges by which bridges joined the side of a piece, the bridge's node first, shape
-            [j, 2].
-        piece: The given piece of each node, -1 along bridges, shape [n].
-        known: Results for ends and axes found during joining.
-        rounds: The rounds that led to this state, see :class:`Round`.
+        joints: Edges by which bridges joined the side of a piece, the bridge's node first, [j, 2].
+        piece: The given piece of each node, -1 along bridges, shape [n]; ``label``: the one now.
         rivals: For each bridge the other place for the piece that it attaches, if there is one.
     """
 
@@ -240,16 +212,9 @@ class Joined:
 
 @dataclass(frozen=True)
 class Round:
-    """A round of bridges.
-
-    Attributes:
-        before: The state before it.
-        alone: Whether pieces without a direction had to wait.
-        decisive: The pairs of given pieces between which a hypothesis mattered. Without the
-            hypotheses of any other pair, the round is the same.
-        found: All hypotheses, those of refused pairs included.
-        work: Its work, in paths between ends and nodes: these, and what each node costs besides.
-    """
+    """A round of bridges: it is the same without the hypotheses of any pair of pieces that is not
+    ``decisive``. While ``alone``, pieces without a direction wait. ``found`` has refused pairs too.
+    ``work`` counts paths between ends and nodes, and what each node costs besides."""
 
     before: Joined
     alone: bool
@@ -288,11 +253,9 @@ def edge_matrix(count: int, edges: np.ndarray, weight: np.ndarray | None = None,
 
 def specks(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
            ) -> np.ndarray:
-    """A number for each node, shape [n]: its own, but one per piece too short for a direction.
-
-    From a few points of a branch, contraction makes a short line in a random direction. A piece
-    joined to its middle finds no end to continue from.
-    """
+    """A number [n] for each node: its own, but one per piece too short for a direction. Contraction
+    makes a line in a random direction of a few points; a piece joined to its middle finds no
+    end."""
     label = labels(len(nodes), edges)
     low, high = np.full((label.max() + 1, 3), np.inf), np.full((label.max() + 1, 3), -np.inf)
     np.minimum.at(low, label, nodes)
@@ -316,13 +279,8 @@ BRIDGE_ODDS = (7.64, 0.08, -3.39, -1.47)
 
 @dataclass(frozen=True)
 class Rival:
-    """Another place for a piece.
-
-    Attributes:
-        end: The end of the smaller piece that the bridge attaches [m], shape [3].
-        to: The other place [m], shape [3].
-        price: Cost of the bridge to it [m].
-    """
+    """Another place ``to`` [3] [m] for the end [3] [m] of the smaller piece that a bridge attaches,
+    and the cost of a bridge to it [m]."""
 
     end: np.ndarray
     to: np.ndarray
@@ -330,11 +288,8 @@ class Rival:
 
 
 def rivals(state: Joined, rules: Rules) -> list[Rival | None]:
-    """The rival of each bridge over a gap, None where there is none.
-
-    Each is sought among the hypotheses of the round in which the bridge was made, including those
-    of pairs that were refused later.
-    """
+    """The rival of each bridge over a gap, None where there is none. It is sought among all
+    hypotheses of the round in which the bridge was made, later refused ones included."""
     found: list[Rival | None] = [None] * len(state.bridges)
     long = state.lengths() > rules.gap
     for number, past in enumerate(state.rounds):
@@ -374,17 +329,9 @@ def _rival(state: Joined, able: Hypotheses, end: int, onto: int) -> Rival | None
 
 def bridge_evidence(price: float, length: float, thickness: float, rival_price: float | None,
                     ) -> np.ndarray:
-    """Evidence for a bridge, shape [3].
-
-    ln of the rival's price over its own, ln of its price over its length, and
-    ln(1 + length / thickness).
-
-    Args:
-        price: Its cost over its length.
-        length: Its length [m].
-        thickness: Of the thinner of its ends [m].
-        rival_price: Cost of the rival [m]; None: there is none.
-    """
+    """Evidence [3] for a bridge with ``price`` (cost over length): ln of ``rival_price`` [m] (None:
+    no rival) over its own cost, ln of ``price``, and ln(1 + length / thickness of the thinner
+    end)."""
     ratio = _MOST if rival_price is None else rival_price / max(price * length, 1e-300)
     return np.array([np.log(np.clip(ratio, 1 / _MOST, _MOST)), np.log(max(price, 1e-12)),
                      np.log1p(length / max(thickness, 1e-12))])
@@ -449,11 +396,8 @@ def _base(nodes: np.ndarray, thickness: np.ndarray, up: np.ndarray) -> np.ndarra
 
 
 def second_base(skeleton: Skeleton, up: np.ndarray) -> np.ndarray | None:
-    """Position where a tree reaches the ground a second time [m], shape [3]; None if it does not.
-
-    A tip that is about as thick and as low as the root, and that its branch runs down to, is the
-    base of another plant or stem.
-    """
+    """Position [3] [m] where a tree reaches the ground again, or None: a tip about as thick and low
+    as the root, that its branch runs down to, is the base of another plant or stem."""
     nodes, parent, radius = skeleton.nodes, skeleton.parent, skeleton.radius
     height = nodes @ up / np.linalg.norm(up)
     extent = float(np.ptp(height))
@@ -485,19 +429,11 @@ _AT_ONCE = 1024  # hypotheses evaluated together
 
 def mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, rules: Rules,
            alone: bool) -> tuple[list[int], set[tuple[int, int]]]:
-    """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first.
-
-    A piece with a bridge takes another one in the same round if the newly joined part is so far
-    from all bridges of the round that none of them can offer it a cheaper one. Otherwise a stem
-    with many twigs would take as many rounds.
-
-    Stems are joined before twigs. Where two pieces belong together, the price counts more than the
-    thickness of the end that proposes the bridge: a knob of the stem that points past a twig is not
-    its foot.
-
-    Returns:
-        Their indices, and the pairs of given pieces whose hypotheses were decisive.
-    """
+    """Indices of the hypotheses that are the cheapest allowed for both of their pieces, cheapest
+    first; and the pairs of given pieces whose hypotheses were decisive."""
+    # A piece takes a second bridge in a round if no bridge of the round can offer its new part a
+    # cheaper one: else a stem with many twigs would take as many rounds. Stems join before twigs: a
+    # knob of a stem that points past a twig is not its foot.
     pairs = np.sort(state.label[np.stack([found.one, found.other])], axis=0)
     own_price = found.price / np.sqrt(found.thick)
     best: dict[int, int] = {}
@@ -556,10 +492,8 @@ class _Made:
         return a in self._joined or b in self._joined
 
     def is_clear(self, found: Hypotheses, index: int, piece: int) -> bool:
-        """Whether all bridges are farther from a piece than its hypothesis costs.
-
-        No path to their added nodes is cheaper then. Blind paths are compared with blind ones.
-        """
+        """Whether all bridges are farther from a piece than its hypothesis costs: no path to their
+        added nodes is cheaper. Blind paths are compared with blind ones."""
         own = self._state.nodes[self._by_label[self._start[piece]:self._start[piece + 1]]]
         gap = np.linalg.norm(own[:, None] - np.array(self._middles), axis=2).min(axis=0)
         blind = found.turn[index] == np.pi
@@ -569,14 +503,8 @@ class _Made:
 
 def _unsettled(pairs: np.ndarray, likely: np.ndarray, best: dict[int, int], count: int,
                ) -> Iterator[tuple[int, int, int]]:
-    """Hypotheses, in their order, for pairs of pieces not both of which have a ``best`` by then.
-
-    Args:
-        pairs: The pieces of each, shape [2, h].
-        likely: Which of them are considered, shape [h].
-        best: Updated by the caller during the iteration.
-        count: Number of pieces.
-    """
+    """Those of the ``likely`` hypotheses, in order, whose ``pairs`` [2, h] of pieces do not both
+    have a ``best`` by then; the caller updates it during the iteration."""
     has = np.zeros(count, bool)
     for start in range(0, pairs.shape[1], _AT_ONCE):
         if len(best) == count:
@@ -590,11 +518,8 @@ def _unsettled(pairs: np.ndarray, likely: np.ndarray, best: dict[int, int], coun
 
 
 class _Allowed:
-    """Whether the smaller piece of a bridge is large enough for it, and not a plant of its own.
-
-    Attributes:
-        likely: Hypotheses that may hold, judged by the lengths and prices of all, shape [h].
-    """
+    """Whether the smaller piece of a bridge is large enough for it, and not a plant of its own;
+    ``likely`` [h] judges it by the lengths and prices of all."""
 
     def __init__(self, found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray,
                  rules: Rules, alone: bool) -> None:
@@ -648,24 +573,9 @@ _MOST_WORK, _NODE_WORK = 150_000_000, 1500
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
                 spread: np.ndarray, *, gap: float, bridge_limit: float, up: np.ndarray,
                 join_plants: bool) -> Joined:
-    """Join pieces over gaps by the bridges that their directions and radii support.
-
-    The smaller piece of a long bridge must itself have some length: so a severed twig is joined to
-    its branch again, and a stray clump of pixels is not joined to anything far away.
-
-    Two large pieces that are each on the ground are two plants and are not joined.
-
-    Args:
-        nodes: Positions [m], shape [n, 3].
-        edges: Node pairs of a forest, shape [e, 2].
-        thickness: First radii [m], shape [n].
-        support: Number of points of each node, shape [n].
-        spread: Largest distance of each node's points from it [m], shape [n].
-        gap: Steps up to this length [m] are no gap (the paper's gamma rule).
-        bridge_limit: Longest bridge [m], unless its end points straight at its target.
-        up: The up direction, shape [3].
-        join_plants: Join even what looks like two plants.
-    """
+    """Join pieces over gaps, steps over ``gap`` [m] (the paper's gamma), as directions and radii
+    say. Two large pieces on the ground join only with ``join_plants``. Only an end that points
+    straight at its target bridges more than ``bridge_limit`` [m]."""
     label = labels(len(nodes), edges)
     first = Joined(nodes, thickness, support, spread, edges, np.empty((0, 2), np.int64),
                    np.empty(0), np.empty((0, 2), np.int64), label, np.empty((0, 2), np.int64),
@@ -680,11 +590,9 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
 
 def _joined(first: Joined, rules: Rules, refused: frozenset[tuple[int, int]] = frozenset(),
             dearest: float = np.inf, alone: bool = True) -> Joined:
-    """Make bridge after bridge from the given state, but none between ``refused`` pieces.
-
-    It ends early once they cost ``dearest`` [m]. One or two nodes have no direction: while
-    ``alone`` holds, they are joined only to ends that continue straight to them.
-    """
+    """Make bridges from the given state, none between ``refused`` pieces, until they cost
+    ``dearest`` [m]. While ``alone``, pieces without a direction are joined only to ends that point
+    straight at them."""
     state = first.copy(first.rounds)
     while True:
         weight = np.bincount(state.label, state.support)
@@ -710,10 +618,8 @@ def _joined(first: Joined, rules: Rules, refused: frozenset[tuple[int, int]] = f
 
 def _without(state: Joined, pair: tuple[int, int], rules: Rules,
              refused: frozenset[tuple[int, int]], dearest: float) -> Joined:
-    """The state joined like ``state``, but without bridges between this ``pair`` of pieces.
-
-    The rounds before the first one in which such a bridge mattered stay the same.
-    """
+    """The state joined like ``state``, but without bridges between this ``pair`` of pieces. Rounds
+    before the first in which such a bridge mattered stay the same."""
     at = _start(state, pair)
     past = state.rounds[at]
     start = past.before.copy(state.rounds[:at])
@@ -726,12 +632,9 @@ def _start(state: Joined, pair: tuple[int, int]) -> int:
 
 
 def _reconsidered(state: Joined, rules: Rules) -> Joined:
-    """Return the bridges without one that forced others to be odd, if the total cost falls.
-
-    A stem's end may take the foot of a twig that is nearer than the stem's next patch. That patch
-    can then only join the twig from the side. A failed attempt is repeated only after bridges of
-    its pieces have changed.
-    """
+    """Return the bridges without one that forced others to be odd, if the total cost falls: a
+    stem's end at the foot of a near twig leaves the stem's next patch only the twig's side. A
+    failed attempt is repeated only after bridges of its pieces have changed."""
     refused: frozenset[tuple[int, int]] = frozenset()
     vain: set[tuple[int, int]] = set()
     done = 0

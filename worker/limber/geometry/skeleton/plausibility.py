@@ -27,18 +27,8 @@ _FIX = Text("Crop the scan to one branch (", Option("crop_low"), ", ", Option("c
 
 def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
                     where: Where) -> None:
-    """Refuse a ball, and two plants unless ``plants`` states which one to use.
-
-    Args:
-        graph: Nodes and edges of the cloud.
-        count: Number of points of the cloud.
-        diagonal: Size of the cloud [m].
-        plants: ``refuse``, ``largest`` or ``joined``.
-        where: Transforms a position in the graph to the user's coordinates.
-
-    Raises:
-        InputError: one of these.
-    """
+    """InputError for a ball, and for two plants unless ``plants`` states which one to use
+    (``refuse``, ``largest``, ``joined``). ``where`` leads to the user's coordinates."""
     if len(graph.nodes) < 4:
         raise InputError(f"The cloud contracts to {len(graph.nodes)} points.",
                          "The cloud does not have the shape of a branch: it has no axis (a ball "
@@ -105,12 +95,7 @@ def _sheet_share(points: np.ndarray, reach: float) -> float:
 
 
 def warnings(result: Any, where: Where) -> list[str]:
-    """Return the warnings about a skeleton.
-
-    Args:
-        result: The skeleton and the report of its reconstruction.
-        where: Transforms its positions to the user's coordinates.
-    """
+    """Return the warnings about a skeleton; ``where`` leads to the user's coordinates."""
     texts = []
     if result.contraction.status is ContractionStatus.given:
         far = float(np.mean(np.abs(result.residual) > 3 * result.skeleton.radius[
@@ -181,16 +166,8 @@ def _doubt_texts(result: Any, where: Where) -> list[str]:
 
 
 def check_surface(share: float, count: int, length: float) -> None:
-    """Refuse points of which none show a surface.
-
-    Args:
-        share: Fraction of the volume that they show.
-        count: Number of points.
-        length: Length of all axes [m].
-
-    Raises:
-        InputError: they show none.
-    """
+    """InputError if no points show a surface: ``share`` is the fraction of the volume that they
+    show, ``length`` that of all axes [m]."""
     if share == 0:
         raise InputError(f"The {count} points show no surface along {length:.3g} m of axes.",
                          "Around every axis they scatter as points all through its section would, "
@@ -223,10 +200,8 @@ def _ends_text(ends: list[dict], where: Where) -> str:
 
 
 def shows_round(result: Any) -> bool:
-    """Whether points lie close enough to the surface around their axes to show round sections.
-
-    A leaf's points do not: it becomes a rod that they fill.
-    """
+    """Whether points lie close enough to the surface around their axes to show round sections. A
+    leaf's do not: it becomes a rod that they fill."""
     radius = result.skeleton.radius[result.node_of_point]
     return bool(result.noise <= _ROUND * float(np.median(radius)))
 
@@ -247,21 +222,9 @@ def off_axes(result: Any) -> np.ndarray:
 
 def check_explained(result: Any, limit: float, points: np.ndarray, where: Where,
                     not_wood: Callable[[np.ndarray], bool]) -> None:
-    """Refuse a scan with too many points that belong to no round axis.
-
-    Noise alone takes up to half of the points off the axes of thin branches: these are accepted,
-    with the warning and the probabilities of the skeleton, unless the points show something else.
-
-    Args:
-        result: The skeleton with the residuals of its points.
-        limit: Largest accepted fraction of such points.
-        points: The points [m], shape [m, 3].
-        where: Transforms positions to the user's coordinates.
-        not_wood: Whether points, of which it takes the mask [m], show leaves or supports.
-
-    Raises:
-        InputError: the fraction exceeds ``limit``.
-    """
+    """InputError if over ``limit`` of the points belong to no round axis. Noise alone puts up to
+    half of them off thin branches: they are accepted, unless ``not_wood``, of a mask of the points,
+    says that they are leaves or supports."""
     off = off_axes(result)
     share = float(np.mean(off))
     if share <= limit or (share <= _MOST_OFF and not not_wood(off)):
@@ -300,17 +263,9 @@ _FAR = 0.05  # fraction of points, the farthest, that do not count: leaves, othe
 
 
 def surface_share(skeleton: Skeleton, node_of_point: np.ndarray, residual: np.ndarray) -> float:
-    """Fraction of the volume in stretches whose points show a surface.
-
-    Models of the distances from the axis are compared: a mean and a scatter around it, or points
-    all through the section. A stretch shows a surface if the first is 19 times as likely. One depth
-    camera shows it as well as a scan from all around.
-
-    Args:
-        skeleton: Axes and radii [m].
-        node_of_point: Node of each point, shape [m].
-        residual: Distance of each point from the surface of its cylinder [m], shape [m].
-    """
+    """Fraction of the volume in stretches whose points show a surface: their distances from the
+    axis are 19 times as likely with a mean and a scatter as all through the section. One depth
+    camera shows it as well as a scan from all around."""
     stretch = _stretches(skeleton)
     of_point = stretch[node_of_point]
     away = np.maximum(1 + residual / skeleton.radius[node_of_point], 1e-3)

@@ -19,12 +19,7 @@ _THICKEST = 3.0  # m
 
 @dataclass(frozen=True)
 class Caliper:
-    """One measured diameter.
-
-    Attributes:
-        along: Distance from the root along the main path [m].
-        diameter: [m].
-    """
+    """A diameter [m] measured ``along`` the main path [m], counted from the root."""
 
     along: float
     diameter: float
@@ -32,9 +27,7 @@ class Caliper:
 
 def cylinders(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
     """Length [m] and volume [m^3] of the cylinder below each node but the root, shape [n - 1] each.
-
-    They taper evenly; the first of a twig has the twig's radius all along.
-    """
+    They taper evenly; the first of a twig has the twig's radius all along."""
     step, foot, radius = skeleton.steps[1:], _feet(skeleton), skeleton.radius[1:]
     return step, np.pi / 3 * step * (foot**2 + foot * radius + radius**2)
 
@@ -73,13 +66,8 @@ def diameters_at_heights(skeleton: Skeleton) -> list[dict[str, float]]:
 
 
 def against_calipers(skeleton: Skeleton, measured: list[Caliper]) -> list[dict[str, Any]]:
-    """Our diameter at each measured one: difference, relative and in standard deviations.
-
-    ``sigmas`` is None where the skeleton's deviation is not known.
-
-    Raises:
-        InputError: a position is beyond the main path.
-    """
+    """Our diameter at each measured one: difference, relative and in ``sigmas``, None where no
+    deviation is known. InputError if a position is beyond the main path."""
     total = float(skeleton.arc_length[skeleton.main_path()[-1]])
     along = np.array([one.along for one in measured])
     outside = along[(along < 0) | (along > total)]
@@ -95,13 +83,8 @@ def against_calipers(skeleton: Skeleton, measured: list[Caliper]) -> list[dict[s
 
 
 def read_calipers(path: Path) -> list[Caliper]:
-    """Read caliper values: a CSV file with the columns ``along_m`` and ``diameter_mm``.
-
-    ``along_m`` is counted from the root along the main path; other columns are ignored.
-
-    Raises:
-        InputError: a column is missing, or a value is not a positive number.
-    """
+    """Read a CSV file of ``along_m``, from the root along the main path, and ``diameter_mm``.
+    InputError if a column is missing or a value not positive."""
     rows = csv_records(path, "a CSV file of caliper values")
     if not rows:
         raise InputError(f"{path} has no values.",

@@ -41,13 +41,7 @@ _HOOK, _ASIDE, _STEP = 4.0, np.deg2rad(55.0), 1.5  # hook's radii; its turn; ste
 
 
 def untied(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> np.ndarray:
-    """Return the edges of a forest without those that connect two ends, shape [e, 2].
-
-    Args:
-        nodes: Positions [m], shape [n, 3].
-        edges: Node pairs, shape [e, 2].
-        thickness: First radii [m], shape [n].
-    """
+    """Return the edges [e, 2] of a forest without those that connect two ends."""
     near: list[list[int]] = [[] for _ in nodes]
     for a, b in edges.tolist():
         near[a].append(b)
@@ -113,7 +107,7 @@ def _arm(nodes: np.ndarray, near: list[list[int]], start: int, before: int, thic
     return vector / size if size > 0 else None
 
 
-# Attachment of twigs to their carriers: the contraction draws a fork towards the twig.
+# Attachment of twigs to their carriers.
 
 
 # Nodes at a twig's start that may mislead, and nodes that show its direction.
@@ -125,11 +119,9 @@ _LINE = 2.0  # length of a twig's start in carrier radii over which its directio
 
 
 def attached(skeleton: Skeleton) -> Skeleton:
-    """Attach each side run where its own direction meets the carrier's axis.
-
-    The contraction draws a fork towards the twig. The twig's nodes inside the carrier are dropped,
-    and its line is extended back to the carrier's axis.
-    """
+    """Attach each side run where its own direction meets the carrier's axis. The contraction draws
+    a fork towards the twig: its nodes inside the carrier are dropped and its line is extended
+    back."""
     parent, keep = skeleton.parent.copy(), np.ones(skeleton.node_count, bool)
     runs = skeleton.runs()
     for run in range(1, len(runs)):
@@ -158,11 +150,8 @@ def attached(skeleton: Skeleton) -> Skeleton:
 
 
 def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
-    """The position in a twig from which its direction continues: its start may be a hook.
-
-    Where the scan lacks a twig's base, the twig is attached to its carrier by a short path across,
-    with a kink where its own axis begins.
-    """
+    """The position in a twig from which its direction continues. Where the scan lacks its base, a
+    short path across attaches it to its carrier, with a kink where its own axis begins."""
     nodes = skeleton.nodes
     last = min(first + _MISLEADING_NODES, len(members) - _NODES_AHEAD)
     start = max(first, last)
@@ -189,11 +178,8 @@ def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
 
 
 def _meeting(skeleton: Skeleton, carrier: np.ndarray, first: int, direction: np.ndarray) -> int:
-    """Carrier node nearest to the twig's line, extended back from its first node outside.
-
-    A twig grows away from its fork: a node that its line meets ahead is excluded, unless all are
-    ahead.
-    """
+    """Carrier node nearest to the twig's line, extended back from its first node outside. Nodes
+    that it meets ahead do not count unless all are ahead: a twig grows away from its fork."""
     offset = skeleton.nodes[carrier] - skeleton.nodes[first]
     back = -(offset @ direction)
     across = np.linalg.norm(offset + back[:, None] * direction, axis=1)
@@ -241,7 +227,7 @@ def _is_duplicate(skeleton: Skeleton, run: int) -> bool:
     return float(np.median(share)) < 1.3
 
 
-# Kinks within a branch that wood does not make: folded ends are dropped, others rounded.
+# Kinks within a branch that wood does not make.
 
 _END = 8.0  # radii from a kink to the tip below which the rest is a folded end
 _ROUNDED = 4.0  # radii on each side of a kink that are smoothed
@@ -249,15 +235,8 @@ _ROUNDS = 60
 
 
 def without_kinks(skeleton: Skeleton) -> tuple[Skeleton, int]:
-    """Repair kinks of over 70 degrees within runs.
-
-    Where a run folds back near its tip and carries nothing beyond, contraction led it back along
-    itself: it ends at the kink. Elsewhere nodes around the kink are smoothed to a bend that wood
-    can make.
-
-    Returns:
-        The skeleton, and the number of repaired kinks.
-    """
+    """Repair kinks of over 70 degrees within runs, and count them. A run that folds back near its
+    tip and carries nothing beyond ends there. Elsewhere nodes are smoothed to a bend of wood."""
     count = 0
     while True:
         folded = _folded(skeleton)
@@ -313,18 +292,8 @@ SPUR_REACH = 2.5
 
 def prune_spurs(nodes: np.ndarray, parent: np.ndarray, thickness: np.ndarray, factor: float,
                 ) -> tuple[np.ndarray, int]:
-    """Mark the nodes to keep when twigs shorter than ``factor`` radii of their carrier are dropped.
-
-    Args:
-        nodes: Positions [m], shape [n, 3].
-        parent: Parents, -1 for the root, shape [n].
-        thickness: Radii [m], shape [n].
-        factor: A side twig is kept if it reaches this many times the radius of the node it starts
-            from beyond that node.
-
-    Returns:
-        Mask [n], and the number of dropped spurs.
-    """
+    """Mask [n] of the nodes that stay, and the number of dropped spurs: twigs that reach less than
+    ``factor`` radii of the node they start from beyond it. ``parent`` is -1 for the root."""
     keep, pruned = np.ones(len(nodes), bool), 0
     step = np.where(parent >= 0, np.linalg.norm(nodes - nodes[parent], axis=1), 0.0)
     children = np.bincount(parent[parent >= 0], minlength=len(nodes))
@@ -368,13 +337,8 @@ _NEAR = 8  # points around a node that count
 
 def resampled(skeleton: Skeleton, spacing: float = 1.0, least: np.ndarray | float = 0.0,
               ) -> Skeleton:
-    """Return the skeleton with nodes ``spacing`` local radii apart along each run.
-
-    Args:
-        skeleton: Any.
-        spacing: Distance of nodes in local radii.
-        least: Smallest distance of nodes [m] at each node of ``skeleton``, shape [n], or at all.
-    """
+    """Return the skeleton with nodes ``spacing`` local radii apart along each run, but at least
+    ``least`` [m], for each of its nodes [n] or for all."""
     least = np.broadcast_to(least, skeleton.node_count)
     nodes: list[np.ndarray] = []
     radius: list[np.ndarray] = []
@@ -403,12 +367,8 @@ def resampled(skeleton: Skeleton, spacing: float = 1.0, least: np.ndarray | floa
 
 @dataclass(frozen=True)
 class PointSpacing:
-    """How far apart the points of a scan are.
-
-    Attributes:
-        tree: Of the points [m].
-        distance: Mean distance of each point from its nearest neighbours [m], shape [m].
-    """
+    """How far apart a scan's points are: each one's mean ``distance`` [m] from its nearest
+    neighbours."""
 
     tree: cKDTree
     distance: np.ndarray
@@ -442,7 +402,6 @@ class Repaired:
     """A skeleton between two passes, and the state that they use.
 
     Attributes:
-        skeleton: Its current state.
         points: The scan, thinned [m], shape [m, 3].
         radius_limits: Least and largest radius [m].
         view: The depth camera's view of the points, if they are one's.
@@ -452,7 +411,6 @@ class Repaired:
             far too thin.
         duplicates: Number of duplicate axes that the last search dropped.
         pruned: Number of twigs dropped.
-        progress: Called during a fit.
         apart: How far apart the points are; None: not known yet.
     """
 
@@ -505,14 +463,8 @@ class Repaired:
 
 @dataclass(frozen=True)
 class Pass:
-    """One repair.
-
-    Attributes:
-        name: Its name, for tests and developers.
-        repairs: The fault that it repairs, a sentence.
-        run: The repair.
-        until: Fraction of all passes' work that is done after it; None: it takes hardly any time.
-    """
+    """A repair, and the fault that it ``repairs``, a sentence. ``until`` is the fraction of all
+    passes' work that is done after it; None: it takes hardly any time."""
 
     name: str
     repairs: str
@@ -618,15 +570,8 @@ PASSES = (
 
 def repaired(skeleton: Skeleton, points: np.ndarray, radius_limits: tuple[float, float],
              view: View | None, progress: Progress = SILENT) -> Repaired:
-    """Run all passes on the skeleton of the contracted points.
-
-    Args:
-        skeleton: With first radii.
-        points: The scan, thinned [m], shape [m, 3].
-        radius_limits: Least and largest radius [m].
-        view: The depth camera's view of the points, if they are one's.
-        progress: Called during fits.
-    """
+    """Run all passes on the skeleton, with first radii, of the contracted points. ``points``
+    [m, 3] [m] are the scan, thinned; ``view`` is the depth camera's, if they are one's."""
     now = Repaired(skeleton, points, radius_limits, view, apart=PointSpacing.of(points))
     done = 0.0
     for each in PASSES:

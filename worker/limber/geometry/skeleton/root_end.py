@@ -27,14 +27,8 @@ _NAMED = 5  # of them
 
 
 class RootChoice(NamedTuple):
-    """The chosen root.
-
-    Attributes:
-        node: Its node.
-        ends: The likeliest ends, the chosen one first: ``at`` [m], shape [3], and ``probability``
-            to be the root, among all ends. Together they hold 95 %, if five of them do; none if
-            the user stated the root.
-    """
+    """The chosen root, and the likeliest ends, the chosen one first, with ``at`` [3] [m] and their
+    ``probability`` among all: 95 % together, or five; none if the user stated the root."""
 
     node: int
     ends: list[dict[str, Any]]
@@ -59,10 +53,8 @@ def root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up
 
 
 def _apart(graph: CurveGraph, tips: np.ndarray, share: np.ndarray) -> tuple[list[int], list[float]]:
-    """Ends at different places, the likeliest first, and their probabilities.
-
-    Strands of one foot are one place: the likeliest of them stands for all.
-    """
+    """Ends at different places, the likeliest first, and their probabilities. The likeliest of the
+    strands of one foot stands for all."""
     nodes: list[int] = []
     chances: list[float] = []
     for end in np.argsort(-share, kind="stable"):
@@ -80,17 +72,9 @@ def _apart(graph: CurveGraph, tips: np.ndarray, share: np.ndarray) -> tuple[list
 
 def root_evidence(graph: CurveGraph, points: np.ndarray, up: np.ndarray,
                   ) -> tuple[np.ndarray, np.ndarray]:
-    """The ends of a graph, shape [tips], and what speaks for each as the root, shape [tips, 4].
-
-    An end that is shorter than it is thick is a spur, not an end. For the root speak:
-
-    - its thickness, as the logarithm of its share of the thickest end's;
-    - that no end is lower, 1 to 0;
-    - that at all forks the other arms point away from it;
-    - that the axes become thinner away from it, as a correlation.
-
-    Each counts the less, the fewer points show it.
-    """
+    """Ends [tips] longer than they are thick, and what speaks for each as the root [tips, 4]: ln of
+    its share of the thickest end's, that none is lower (1 to 0), that other arms point away from it
+    at forks, that axes become thinner away from it. Few points count less."""
     tips, neighbours, parent = _ends(graph, up)
     thick = _end_thickness(graph, points, neighbours, tips)
     # Where few points show a thick foot, contraction leaves strands around its rim. Each strand
@@ -128,8 +112,7 @@ def _size(graph: CurveGraph) -> float:
 def _paths(graph: CurveGraph, neighbours: list[list[int]], tips: np.ndarray,
            ) -> tuple[np.ndarray, np.ndarray]:
     """Distance along the axes [m] from each tip to each node, and the node before it on the way
-    there, shape [tips, n].
-    """
+    there, shape [tips, n]."""
     one, other = np.array([(node, near) for node, all_near in enumerate(neighbours)
                            for near in all_near]).T
     # Steps of length 0 would count as none.
@@ -151,11 +134,8 @@ def _taper(graph: CurveGraph, neighbours: list[list[int]], distance: np.ndarray)
 
 def _pointing_away(graph: CurveGraph, neighbours: list[list[int]], before: np.ndarray,
                    ) -> np.ndarray:
-    """Over all forks, the mean cosine between the way from each tip and the other arms there.
-
-    Shape [tips]. An arm counts the less, the shorter it is in radii of the fork, and the fewer
-    points show it.
-    """
+    """Mean cosine [tips] over all forks between the way from each tip and the other arms there. An
+    arm counts less if it is short, in radii of the fork, or if few points show it."""
     total = np.zeros(len(before))
     reach = 2 * _END_SIZE * _size(graph)
     for fork in (node for node, near in enumerate(neighbours) if len(near) > 2):
@@ -209,15 +189,8 @@ def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[
 
 def _end_chain(edges: list[list[int]], nodes: np.ndarray, start: int, reach: float,
                before: int = -1) -> list[int]:
-    """Nodes from ``start`` to the first fork, or up to a length of ``reach`` [m].
-
-    Args:
-        edges: Neighbours of each node.
-        nodes: Positions [m], shape [n, 3].
-        start: Where to start.
-        reach: How far to go.
-        before: The node from which it comes to ``start``; -1: that is a tip.
-    """
+    """Nodes from ``start`` to the first fork, or up to a length of ``reach`` [m]. It comes there
+    from the node ``before``; -1: it starts at a tip."""
     chain, length = [start], 0.0
     while length < reach:
         ahead = [node for node in edges[chain[-1]] if node != before]

@@ -54,13 +54,8 @@ def ends_within(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
 
 
 def with_full_tips(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
-    """Lengthen ends that the contraction shortened, as far as there are points.
-
-    Args:
-        skeleton: With radii.
-        points: Scanned points [m], shape [m, 3].
-        noise: Standard deviation of the points [m].
-    """
+    """Lengthen ends that the contraction shortened, as far as there are points [m, 3] [m], whose
+    standard deviation is ``noise`` [m]."""
     nodes = skeleton.nodes.copy()
     segment, _ = nearest_cylinders(skeleton, points)
     inner = int(np.flatnonzero(skeleton.parent == 0)[0])
@@ -112,16 +107,9 @@ _SPEAK = 1 / 8  # fraction of a run's nodes, and of its points, that decide for 
 
 
 def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
-    """Return the skeleton with each radius the median of those around it that have points.
-
-    Where points are missing, a first radius may be a tenth of its neighbours'. The spacing of nodes
-    and the smoothing depend on the radius: such a stretch would be free to follow the noise and
-    stay far too thin.
-
-    Args:
-        skeleton: With first radii.
-        points: Scanned points [m], shape [m, 3].
-    """
+    """Return the skeleton with each first radius the median of those around it that have points.
+    Without points it may be a tenth of that; nodes and smoothing go by it, so the stretch would
+    follow the noise and stay far too thin."""
     count = point_counts(skeleton, points)
     radius = skeleton.radius.copy()
     for members, own in zip(skeleton.runs(), skeleton.own_runs(), strict=True):
@@ -142,15 +130,9 @@ def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
 
 
 def unpinched(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
-    """Return the skeleton with no first radius below the median of its run farther out.
-
-    From a strip along a stem whose rest is hidden, contraction leaves a very thin run, too many of
-    its radii from the axis for the fit to move it there.
-
-    Args:
-        skeleton: With first radii.
-        points: Scanned points [m], shape [m, 3].
-    """
+    """Return the skeleton with no first radius below the median of its run farther out. From a
+    strip along a hidden stem, contraction makes a run too thin for the fit to move it to the
+    axis."""
     count, radius = point_counts(skeleton, points), skeleton.radius.copy()
     for own in skeleton.own_runs():
         for k, node in enumerate(own):
@@ -161,28 +143,21 @@ def unpinched(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
 
 
 def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:
-    """Return the skeleton with radii limited to [low, high] [m], those nodes marked.
-
-    The paper's rule r in [alpha D, beta D], with the cloud's scale D.
-    """
+    """Return the skeleton with radii limited to [low, high] [m], those nodes marked: the paper's
+    rule r in [alpha D, beta D], with the cloud's scale D."""
     outside = (skeleton.radius < low) | (skeleton.radius > high)
     state = np.where(outside, LIMITED, skeleton.radius_state).astype(np.int8)
     return replace(skeleton, radius=np.clip(skeleton.radius, low, high), radius_state=state)
 
 
 def tapered(skeleton: Skeleton, count: np.ndarray | None = None) -> Skeleton:
-    """Return the skeleton with radii that hardly grow towards the tips, changed nodes marked.
-
-    A run is no thicker than its carrier at its start, nor than 1.25 times the median of its
-    measured radii so far, nor at its tip than that median. Otherwise a bunch of twigs that the scan
-    did not resolve would become a fat cylinder. The limiting radius counts at the upper end of its
-    interval: a foot with few points gives little information on the twig. A radius far below most
-    of the run does not count: a ragged stem foot does not make the stem thin. Nor do a few points.
-
-    Args:
-        skeleton: Fitted.
-        count: Points on each node, shape [n]; None: equal on all.
-    """
+    """Return the skeleton with radii that hardly grow towards tips, changed nodes marked: no more
+    than the carrier's at a run's start, nor than 1.25 times the median so far, at its tip that
+    median."""
+    # Else a bunch of twigs that the scan did not resolve would become a fat cylinder. The limiting
+    # radius counts at the upper end of its interval, as a foot with few points says little about
+    # the twig. A radius far below most of the run does not count, as a ragged stem foot does not
+    # make the stem thin; nor do a few points.
     radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
     at_most = radius + _SURE * skeleton.radius_sigma
     count = np.ones(skeleton.node_count) if count is None else count

@@ -34,11 +34,9 @@ _PLACES = ("from", "to", "at", "rival_from", "rival_to")  # positions in the rep
 
 @dataclass(frozen=True)
 class SkeletonResult:
-    """A skeleton, and the report on its search.
+    """A skeleton in the cloud's frame, and the report on its search.
 
     Attributes:
-        skeleton: Axes and radii [m] in the cloud's frame.
-        contraction: Contracted points and history.
         node_of_point: Skeleton node of each point, shape [m].
         residual: Distance of each point from its cylinder [m], shape [m].
         noise: Robust standard deviation of the residuals [m].
@@ -47,8 +45,7 @@ class SkeletonResult:
         split_off: Discarded pieces: ``points``, ``distance`` [m], ``at``.
         loops: Lengths [m] of closed loops that were opened.
         pruned: Number of spurs pruned.
-        second_base: Position where the plant seems to reach the ground a second time [m], shape
-        [3].
+        second_base: Where the plant seems to reach the ground a second time [m], shape [3].
         root_ends: The likeliest ends, as in
             :class:`~limber.geometry.skeleton.root_end.RootChoice`.
         unlikely: Dropped twigs, more likely absent than not, as
@@ -146,12 +143,8 @@ _Place = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FoundSkeleton:
-    """A skeleton in the prepared cloud's frame, and the part of the cloud that belongs to it.
-
-    Attributes:
-        result: Result of the search.
-        leaves: Leaves that were removed from the prepared cloud first.
-    """
+    """A skeleton in the prepared cloud's frame, from the part of the cloud without the
+    ``leaves``."""
 
     result: SkeletonResult
     leaves: list[Leaf]
@@ -177,11 +170,7 @@ class FoundSkeleton:
 
     @classmethod
     def read(cls, path: Path) -> "FoundSkeleton":
-        """Read a file that :meth:`write` has written.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """Read a file that :meth:`write` has written; InputError if it is damaged."""
         arrays = read_arrays(path, _WHAT)
         require_shapes(path, arrays, _SKELETON | _POINTS, _WHAT)
         skeleton = Skeleton(**{name: arrays[name] for name in _SKELETON})

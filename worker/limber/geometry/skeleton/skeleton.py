@@ -323,17 +323,9 @@ def control_points(skeleton: Skeleton, fractions: tuple[float, ...] = FRACTIONS)
 
 
 def upright_rotation(skeleton: Skeleton, up: np.ndarray, upright: bool) -> np.ndarray:
-    """Return the rotation to the branch's frame, shape [3, 3].
-
-    The paper aligns the principal growth direction with the global z axis; that is the first
-    principal axis of the main path, from root to tip. The rotation is the shortest one after ``up``
-    of the file has become z.
-
-    Args:
-        skeleton: In the file's axes.
-        up: The up direction in the file's axes, shape [3].
-        upright: False only rotates ``up`` to z.
-    """
+    """Return the rotation [3, 3] from the file's axes to the branch's frame: ``up`` [3] becomes z.
+    If ``upright``, the shortest one follows that turns the main path's first principal axis, from
+    root to tip, to z: the paper's principal growth direction."""
     first = shortest_turn(np.asarray(up, float), np.array([0.0, 0.0, 1.0]))
     if not upright:
         return first

@@ -54,24 +54,9 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                 view: View | None = None, where: Where | None = None,
                 show_apart: Apart | None = None, twig_probability: float = _TWIG_PROBABILITY,
                 progress: Progress = SILENT) -> SkeletonResult:
-    """Find the rooted skeleton of a cloud.
-
-    Args:
-        points: Scanned points [m], shape [n, 3].
-        settings: Settings to use.
-        root: A point [m] near the root, shape [3]; None: the end with the best odds.
-        up: The up direction, shape [3]; None: z.
-        view: The depth camera's view of the points, if they are one's: they scatter only along its
-            sight.
-        where: Transforms positions of the cloud to its file's coordinates, for errors; None: the
-            same.
-        show_apart: Receives the points of another plant, if the cloud is refused for it.
-        twig_probability: Twigs that are less probable are dropped.
-        progress: Called during the work.
-
-    Raises:
-        InputError: the cloud is not branch-like.
-    """
+    """Find the rooted skeleton of points [n, 3] [m]; InputError if they are no branch's. ``root``
+    [3] [m] is near the root; None: the likeliest end. ``where`` leads to the file's coordinates,
+    for errors. ``show_apart`` receives another plant's points if they are the reason."""
     # In the cloud's own frame: bounding boxes and the triangles of the Laplacian would differ for a
     # rotated one.
     own = OwnFrame.of(points)
@@ -92,14 +77,8 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
 
 @dataclass(frozen=True)
 class _Search:
-    """A cloud in its own frame, and the search for its skeleton.
-
-    Attributes:
-        points: [m], shape [m, 3].
-        settings: Settings to use.
-        up: The up direction, shape [3].
-        diagonal: Size of the cloud [m].
-    """
+    """A cloud [m, 3] [m] in its own frame, and the search for its skeleton. ``diagonal`` is the
+    cloud's size [m]."""
 
     points: np.ndarray
     settings: SkeletonSettings

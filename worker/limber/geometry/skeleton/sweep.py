@@ -28,18 +28,9 @@ def tangents(points: np.ndarray) -> np.ndarray:
 
 def frames(points: np.ndarray, tangent: np.ndarray, normal: np.ndarray | None = None,
            ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation-minimising frames by double reflection.
-
-    Wang, Jüttler, Zheng, Liu: Computation of Rotation Minimizing Frames, ACM TOG 27 (2008).
-
-    Args:
-        points: Polyline [m], shape [n, 3].
-        tangent: Unit tangents, shape [n, 3].
-        normal: First normal, shape [3]; made orthogonal to the first tangent. None: any.
-
-    Returns:
-        Normals and binormals, shape [n, 3] each.
-    """
+    """Rotation-minimising frames by double reflection (Wang et al., ACM TOG 27, 2008): normals and
+    binormals [n, 3] along points [n, 3] with unit tangents. The first ``normal`` [3] is made
+    orthogonal to the tangent; None: any."""
     normals = np.empty_like(points)
     first = any_normal(tangent[0]) if normal is None else normal - tangent[0] * (
         normal @ tangent[0])
@@ -65,20 +56,15 @@ def _reflections(across: np.ndarray) -> np.ndarray:
 
 
 def polygon_factor(sides: int) -> float:
-    """Circumradius of the regular polygon with the area of the unit circle.
-
-    An inscribed polygon would make a branch too thin: a hexagon has 17 % less area than its
-    circle. At equal area the hexagon's second moment is 0.8 % over the circle's.
-    """
+    """Circumradius of the regular polygon with the area of the unit circle. An inscribed hexagon
+    has 17 % less; at equal area its second moment is 0.8 % over the circle's."""
     return float(np.sqrt(np.pi / (sides / 2 * np.sin(2 * np.pi / sides))))
 
 
 def bending_factor(sides: int) -> float:
-    """Circumradius of the regular polygon with the second moment of area of the unit circle.
-
-    A branch then bends as the circle does; its area is 0.4 % under the circle's for a hexagon, 2.3
-    % for a square, whose second moment would be 4.7 % over at equal area.
-    """
+    """Circumradius of the regular polygon with the second moment of area of the unit circle, to
+    bend as it does. Area is 0.4 % under the circle's for a hexagon, 2.3 % for a square, whose
+    second moment is 4.7 % over at equal area."""
     turn = 2 * np.pi / sides
     # Second moment of a polygon of circumradius 1: n/48 (4 sin a + sin 2a) with a = 2 pi / n.
     return float((np.pi / 4 / (sides / 48 * (4 * np.sin(turn) + np.sin(2 * turn))))**0.25)
@@ -86,16 +72,9 @@ def bending_factor(sides: int) -> float:
 
 def rings(centres: np.ndarray, radius: np.ndarray, normals: np.ndarray, binormals: np.ndarray,
           sides: int, factor: float | None = None) -> np.ndarray:
-    """Polygons around ``centres``, shape [n, sides, 3].
-
-    Args:
-        centres: Positions [m], shape [n, 3].
-        radius: Radii of the circles that they represent [m], shape [n].
-        normals: Directions of their first corners, shape [n, 3].
-        binormals: Normals to these in the plane of the circle, shape [n, 3].
-        sides: Number of corners.
-        factor: Circumradius in radii; None: the one with the circle's area.
-    """
+    """Polygons [n, sides, 3] around ``centres``, for circles of ``radius`` [n] [m], their first
+    corners along ``normals``. ``factor`` is the circumradius in radii; None: that of the circle's
+    area."""
     factor = polygon_factor(sides) if factor is None else factor
     angle = 2 * np.pi * np.arange(sides) / sides
     around = (np.cos(angle)[None, :, None] * normals[:, None]

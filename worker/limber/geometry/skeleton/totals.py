@@ -28,12 +28,7 @@ _NOTHING_OPEN = SearchDoubts()
 
 @dataclass(frozen=True)
 class Total:
-    """An uncertain sum over all wood.
-
-    Attributes:
-        expected: Its mean [m or m^3].
-        sigma: Its standard deviation [m or m^3].
-    """
+    """Mean and standard deviation of a sum over all wood [m or m^3]."""
 
     expected: float
     sigma: float
@@ -46,12 +41,8 @@ class Total:
 
 
 def total_length(skeleton: Skeleton, doubts: SearchDoubts = _NOTHING_OPEN) -> Total:
-    """Return the length of all axes [m].
-
-    Args:
-        skeleton: With the probabilities of its nodes.
-        doubts: Twigs no longer in the skeleton, and pieces that may be attached elsewhere.
-    """
+    """Return the length of all axes [m], by the nodes' probabilities. ``doubts`` are twigs no
+    longer in the skeleton, and pieces that may be attached elsewhere."""
     runs = skeleton.runs()
     own, spread = np.empty(len(runs)), np.empty(len(runs))
     for run, members in enumerate(runs):
@@ -74,11 +65,8 @@ def total_length(skeleton: Skeleton, doubts: SearchDoubts = _NOTHING_OPEN) -> To
 
 
 def total_volume(skeleton: Skeleton) -> Total:
-    """Return the volume of all cylinders [m^3], without the parts of twigs inside their parents.
-
-    Args:
-        skeleton: With the deviations of its radii, and the probabilities of its nodes.
-    """
+    """Return the volume [m^3] of all cylinders without the parts of twigs inside their parents, by
+    the deviations of radii and the probabilities of nodes."""
     step, volume = cylinders(skeleton)
     runs = skeleton.runs()
     relative = skeleton.radius_sigma[1:] / np.maximum(skeleton.radius[1:], 1e-300)
@@ -102,9 +90,7 @@ def total_volume(skeleton: Skeleton) -> Total:
 
 def totals(skeleton: Skeleton, doubts: SearchDoubts = _NOTHING_OPEN) -> dict[str, Any]:
     """Return both as numbers of a stage's result, with intervals that cover 95 %.
-
-    ``volume_interval_m3`` is None where no radius has a deviation, as for a given skeleton.
-    """
+    ``volume_interval_m3`` is None where no radius has a deviation."""
     length, volume = total_length(skeleton, doubts), total_volume(skeleton)
     known = bool(skeleton.radius_sigma.any())
     return {"expected_length_m": length.expected, "length_interval_m": length.interval,
@@ -114,16 +100,9 @@ def totals(skeleton: Skeleton, doubts: SearchDoubts = _NOTHING_OPEN) -> dict[str
 
 def _of_tree(skeleton: Skeleton, own: np.ndarray, variance: np.ndarray, odds: float = 0.0,
              ) -> tuple[float, float]:
-    """Mean and variance of a sum over the existing runs; a run exists only if its carrier does.
-
-    Wood whose fork is elsewhere exists too.
-
-    Args:
-        skeleton: The skeleton of the runs.
-        own: Contribution of each run if it exists, shape [runs].
-        variance: Variance of that, shape [runs].
-        odds: What is added to the logarithm of all odds.
-    """
+    """Mean and variance of a sum of runs' ``own`` contributions [runs], with their ``variance``. A
+    run exists only if its carrier does, or its fork is elsewhere. ``odds`` is added to the
+    logarithm of all odds."""
     chance = _moved(np.minimum(probability_given_carrier(skeleton) / PLACED, 1.0), odds)
     mean, spread = own.astype(float), variance.astype(float)
     # A run carried by another one has a higher number.

@@ -53,19 +53,9 @@ _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise 
 
 def smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_node: np.ndarray,
                noise: float, stepped: bool = False) -> sparse.csc_matrix:
-    """Second differences along each run, weighted as a smoothing spline of a given bandwidth.
-
-    A spline with penalty lambda on the squared second derivative and rho data per length averages
-    over (lambda / rho)^(1/4). That length grows with the noise, in local radii.
-
-    Args:
-        skeleton: At the start of the fit.
-        nodes: Current positions [m], shape [n, 3].
-        radius: Current radii [m], shape [n].
-        per_node: Weight of the points at each node, shape [n].
-        noise: Standard deviation of the points [m].
-        stepped: Let the radius of a run that goes on from a fork fall in a step there.
-    """
+    """Second differences along each run, weighted as a smoothing spline: with penalty lambda and
+    rho data per length it averages over (lambda / rho)^(1/4), which grows with ``noise`` [m]. With
+    ``stepped``, the radius of a run that goes on from a fork may fall in a step there."""
     size = len(nodes)
     chains = [own for own in skeleton.own_runs() if len(own) > 2]
     if not chains:
@@ -160,11 +150,9 @@ _TRUE = (1.007, 1.016, 1.031, 1.052, 1.110, 1.155, 1.225, 1.333)
 
 
 def robust_sigma(residual: np.ndarray, radius: np.ndarray) -> float:
-    """Noise [m] of points on the thicker half: thin twigs' radii absorb part of it.
-
-    Points farther than a radius from the surface may belong to something else. Where noise reaches
-    that far, the result is corrected for those left out.
-    """
+    """Noise [m] of points on the thicker half, as thin twigs' radii absorb part of it. Points
+    farther than a radius off may belong to something else: the result is corrected for those left
+    out."""
     near = np.abs(residual) < radius
     if near.sum() < 10:
         near = np.ones(len(residual), bool)
@@ -188,10 +176,8 @@ def settled_weights(residual: np.ndarray, noise: float) -> np.ndarray:
 
 
 def residual_limit(spread: float, noise: float, trusted: float, radius: np.ndarray) -> np.ndarray:
-    """Residual [m] from which a point belongs to something else, shape [m].
-
-    Noise that is not trusted yet widens no limit by more than its radius.
-    """
+    """Residual [m] from which a point belongs to something else, shape [m]. Noise that is not
+    trusted yet widens no limit by more than its radius."""
     return np.minimum(_TUKEY * spread,
                       0.9 * radius + 3 * np.maximum(trusted, np.minimum(noise, radius)))
 
@@ -205,13 +191,8 @@ _PROBE = 128  # distance in nodes at which radii count as independent
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of one round in x, y, z and radius of n nodes.
-
-    Attributes:
-        matrix: Shape [4 n, 4 n].
-        right: Shape [4 n].
-        per_node: Weight of the points at each node, shape [n].
-    """
+    """Normal equations [4 n, 4 n] of one round in x, y, z and radius of n nodes, and the weight of
+    the points at each node [n]."""
 
     matrix: sparse.csc_matrix
     right: np.ndarray
@@ -226,11 +207,8 @@ class NormalEquations:
         return self.factor().solve(self.right).reshape(-1, 4)
 
     def inverse_blocks(self, chosen: np.ndarray) -> np.ndarray:
-        """Blocks of the inverse at each node, of the ``chosen`` k of x, y, z, radius, [n, k, k].
-
-        Nodes that far apart do not affect each other: the blocks come from one solve for all of
-        them. Nodes of a run have consecutive numbers.
-        """
+        """Blocks [n, k, k] of the inverse at each node, of the ``chosen`` k of x, y, z, radius. Far
+        nodes do not affect each other, and a run's numbers are consecutive: one solve gives all."""
         own = np.arange(len(self.per_node))
         period = min(_PROBE, len(own))
         rows = 4 * own[:, None] + chosen
@@ -246,22 +224,9 @@ def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, 
                      weight: np.ndarray, noise: float, positions: np.ndarray | None = None,
                      targets: TargetDistances | None = None, across: np.ndarray | None = None,
                      stepped: bool = False) -> NormalEquations:
-    """Set up a round: terms of the points, smoothness of runs, and constraints on bare nodes.
-
-    Args:
-        skeleton: At the start of the fit.
-        nodes: Current positions [m], shape [n, 3].
-        radius: Current radii [m], shape [n].
-        match: The cylinder of each point.
-        weight: Weight of each point, shape [m].
-        noise: Standard deviation of the points [m].
-        positions: Mean direction of each point's true position (:mod:`noisy_rings`), shape [m, 3];
-            None: the nearest position on the circle is the true one.
-        targets: Distances at which the points should lie; None: at the radius.
-        across: How firmly points hold the axis across their own direction, shape [m, 3]; None: not
-        at all.
-        stepped: Whether radii may fall in a step at each fork.
-    """
+    """Set up a round: points, smoothness of runs, constraints on bare nodes. ``positions`` [m, 3]
+    are mean directions of true positions (None: the nearest), ``targets`` where points should lie
+    (None: at the radius), ``across`` [m, 3] how firmly they hold the axis across (None: not)."""
     data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, positions, targets,
                                         across)
     smooth = smoothness(skeleton, nodes, radius, per_node, noise, stepped)
@@ -271,15 +236,13 @@ def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, 
 
 
 def fitted_system(skeleton: Skeleton, points: np.ndarray) -> tuple[NormalEquations, float]:
-    """The normal equations at the end of a fit to points, and their noise [m].
-
-    The covariance of (x, y, z, radius) of all nodes is noise^2 times the inverse of the matrix,
-    shape [4 n, 4 n], as for a smoothing spline (Wahba 1983). Its noise is that of single,
-    independent points. True errors of generated scans, averaged over ninths of the main axis, came
-    to 1.0 of the predicted deviations (medians over 0.6745) on 8 scans of both kinds, and to 1.2 to
-    1.4 on 6 more of one side only. Where the axis ran into a twig and back, at a fork that one side
-    hides, they were far larger.
-    """
+    """The normal equations at the end of a fit, and the noise [m] of single, independent points.
+    Noise^2 times the inverse is the covariance of (x, y, z, radius), as for splines (Wahba
+    1983)."""
+    # True errors of generated scans, averaged over ninths of the main axis, came to 1.0 of the
+    # predicted deviations (medians over 0.6745) on 8 scans of both kinds, and to 1.2 to 1.4 on 6
+    # more of one side only. Where the axis ran into a twig and back, at a fork that one side hides,
+    # they were far larger.
     (system,), noise = _systems(skeleton, points, (False,))
     return system, noise
 
@@ -304,13 +267,8 @@ def radius_deviations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
 
 
 def noise_covariance(system: NormalEquations, noise: float, radius: np.ndarray) -> np.ndarray:
-    """Covariance of each node's position and radius by the noise [m] alone [m^2], [n, 4, 4].
-
-    Args:
-        system: At the end of a fit.
-        noise: Standard deviation of the points [m].
-        radius: Fitted radii [m], shape [n].
-    """
+    """Covariance [n, 4, 4] [m^2] of each node's position and radius by the noise [m] alone, for the
+    ``system`` at the end of a fit."""
     covariance = noise**2 * system.inverse_blocks(np.arange(4))
     # Nodes that no points hold are nearly free: their inverses are rounding errors.
     values, vectors = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
@@ -320,12 +278,10 @@ def noise_covariance(system: NormalEquations, noise: float, radius: np.ndarray) 
 
 def fit_with_steps(skeleton: Skeleton, points: np.ndarray) -> tuple[Skeleton, np.ndarray]:
     """Return the skeleton with what steps of the radius at forks change in its fit to points, and
-    the covariance of each node's position and radius [m^2], shape [n, 4, 4].
-
-    The rounds of a fit have no steps: before the side branches are found, they would follow noise.
-    Where the skeleton states a larger deviation of the radius than noise with known positions on
-    the circle gives, the axis goes with the difference as it goes with the noise.
-    """
+    the covariance [n, 4, 4] of each node's position and radius [m^2]."""
+    # The rounds of a fit have no steps: before the side branches are found, they would follow
+    # noise. Where the skeleton states a larger deviation of the radius than noise with known
+    # positions on the circle gives, the axis goes with the difference as it goes with the noise.
     (smooth, stepped), noise = _systems(skeleton, points, (False, True))
     covariance = noise_covariance(stepped, noise, skeleton.radius)
     way = covariance[:, :, 3] / covariance[:, 3, 3, None]
@@ -387,15 +343,9 @@ _HELD = 2  # trusted rounds in which the limit keeps that of most sensors
 
 @dataclass(frozen=True)
 class AxisFit:
-    """A fitted skeleton and the evidence of the points.
-
-    Attributes:
-        skeleton: Axes, radii, their standard deviations and states.
-        segment: The node whose cylinder (to its parent) each point belongs to, shape [m].
-        residual: Distance of each point from that cylinder [m], positive outside, shape [m].
-        noise: Robust standard deviation of the residuals [m].
-        seen: From which side the branches were seen.
-    """
+    """A fitted skeleton. ``segment`` is the node whose cylinder (to its parent) each point belongs
+    to, ``residual`` its distance from that [m], positive outside, ``noise`` their robust standard
+    deviation [m]."""
 
     skeleton: Skeleton
     segment: np.ndarray
@@ -407,21 +357,9 @@ class AxisFit:
 def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
              settled: bool = False, along_sight: bool = False, uncertainty: bool = True,
              seen: SeenSides | None = None, progress: Progress = SILENT) -> AxisFit:
-    """Fit axes and radii of a skeleton's runs to points.
-
-    Args:
-        skeleton: Approximate axes, with first radii; its topology is kept.
-        points: Scanned points [m], shape [m, 3].
-        rounds: Gauss-Newton rounds; points choose their cylinder again in each.
-        settled: The axes are already near their final positions; only fine changes remain.
-        along_sight: The points are a depth camera's: they scatter only along its sight.
-        uncertainty: Compute each radius's standard deviation too; otherwise it and the states are
-            unchanged.
-        seen: The sides that an earlier fit found; None: estimated again in each round. Where noise
-            hides the rings, an estimate repeated in each round follows the axes of the last one,
-            and radii shrink from round to round.
-        progress: Called each round.
-    """
+    """Fit axes and radii of runs to points [m, 3] [m]; the topology stays. ``settled``: only fine
+    changes remain. ``along_sight``: a depth camera's points. Without ``uncertainty``, deviations
+    and states stay. None for ``seen``: sides are estimated in each round."""
     fit = _Rounds(skeleton, points, rounds, settled, along_sight, seen)
     for number in range(rounds):
         size = fit.step(number)
@@ -530,8 +468,7 @@ class _Rounds:
     def _asked(self, match: Match, weight: np.ndarray, limit: partial,
                ) -> tuple[np.ndarray, TargetDistances, np.ndarray | None]:
         """Where noise hides positions: each point's mean position, how far out it should lie, and
-        how firmly it holds the axis across.
-        """
+        how firmly it holds the axis across."""
         now, axis, sharpness, stout = self._sides(match, weight, self.noise)
         if now.one_sided and self._known is None:
             shown_weight = weight if self._even is None else weight * self._even[match.segment]
@@ -566,10 +503,8 @@ class _Rounds:
 
 def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
                 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keep axes within reach of the contracted ones, which are inside the branch or on its skin.
-
-    Without that limit, a run with few points may drift off and take other runs' points with it.
-    """
+    """Keep axes within reach of the contracted ones, which are inside the branch or on its skin: a
+    run with few points may drift off and take other runs' points with it."""
     moved = nodes - skeleton.nodes
     size = np.linalg.norm(moved, axis=1)
     reach = _REACH * skeleton.radius
@@ -592,12 +527,7 @@ _PATCHES = 30  # that tell
 
 def shared_error(skeleton: Skeleton, points: np.ndarray, noise: float) -> float:
     """Standard deviation [m] of what the points of a patch are off together; 0 if too few tell.
-
-    Args:
-        skeleton: Fitted to the points.
-        points: The scan [m], shape [m, 3].
-        noise: Standard deviation of the points [m].
-    """
+    ``noise`` is that of single points [m]."""
     low, high, share, offset = on_cylinders(skeleton, points)
     radius = share * skeleton.radius[high] + (1 - share) * skeleton.radius[low]
     residual = np.linalg.norm(offset, axis=1) - radius

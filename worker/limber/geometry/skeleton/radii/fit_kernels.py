@@ -19,20 +19,9 @@ _TOLD = 14.0  # log weight below the best position's at which a position still c
 def nearest_of(points: np.ndarray, near: np.ndarray, parent: np.ndarray, own_radius: np.ndarray,
                nodes: np.ndarray, radius: np.ndarray,
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Find the cylinder, among some candidates, whose surface is nearest to each point.
-
-    Args:
-        points: Positions [m], shape [m, 3].
-        near: Upper nodes of the candidates, shape [m, k].
-        parent: Lower node of each node's cylinder, shape [n].
-        own_radius: Whether a cylinder has its upper node's radius throughout, shape [n].
-        nodes: Positions [m], shape [n, 3].
-        radius: Radii [m], shape [n].
-
-    Returns:
-        Upper node, fraction of the path up to it, unit vector from the axis to the point, shape [m,
-        3], the distance from the surface [m], positive outside, and the radius [m].
-    """
+    """Find the cylinder nearest to each of m points among k candidates: its upper node, the
+    fraction of the path to it, unit vector from the axis [m, 3], distance from the surface [m],
+    positive outside, and radius. ``own_radius``: the cylinder has its upper node's throughout."""
     count = len(points)
     segment, share = np.empty(count, np.int64), np.empty(count)
     normal = np.empty((count, 3))
@@ -64,23 +53,9 @@ def nearest_of(points: np.ndarray, near: np.ndarray, parent: np.ndarray, own_rad
 def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high: np.ndarray,
                   normal: np.ndarray, across: np.ndarray, gradient: np.ndarray,
                   weight: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over each cylinder's points of the normal equations in (x, y, z, r) of both ends.
-
-    Args:
-        segment: Cylinder of each point, shape [m].
-        share: Fraction of the path up the cylinder, shape [m].
-        low: Derivative of the radius there with respect to the lower node's, shape [m].
-        high: With respect to the upper node's, shape [m].
-        normal: Unit vector from the axis to the point, shape [m, 3].
-        across: How firmly each point holds the axis across that direction, as a vector, shape [m,
-        3].
-        gradient: Derivatives of each point's residual at both ends, shape [m, 8].
-        weight: Weight of each point, shape [m].
-        count: Number of cylinders.
-
-    Returns:
-        Matrices, shape [count, 8, 8], and right-hand sides, shape [count, 8].
-    """
+    """Normal equations of each cylinder's points in (x, y, z, r) of both ends: [count, 8, 8],
+    [count, 8]. ``low`` and ``high`` are the radius's derivatives by the ends' radii, ``gradient``
+    those of the residual, ``across`` how firmly points hold the axis across their direction."""
     block, right = np.zeros((count, 8, 8)), np.zeros((count, 8))
     row, side = np.empty(8), np.zeros(8)
     for i in range(len(segment)):
@@ -107,20 +82,9 @@ def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high:
 @compiled_exactly
 def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
                    density: np.ndarray) -> np.ndarray:
-    """Mean of (cos, sin) over positions on a circle, each weighted by its likelihood for a point.
-
-    The weight is density times exp(sharpness (cos(place - angle) - 1)), a von Mises distribution.
-
-    Args:
-        cosine: Cosine of each point's own angle, shape [m].
-        sine: Sine of that angle, shape [m].
-        sharpness: Shape [m].
-        density: Density at evenly spaced positions around the circle, each in the middle of its
-            interval, shape [places].
-
-    Returns:
-        Shape [m, 2].
-    """
+    """Mean (cos, sin) [points, 2] of positions on a circle, by their likelihood for each point:
+    ``density``, in the middles of even intervals, times exp(sharpness (cos(place - angle) - 1)), a
+    von Mises distribution."""
     step_count = len(density)
     angle = 2 * np.pi * (np.arange(step_count) + 0.5) / step_count
     across, up, log = np.cos(angle), np.sin(angle), np.log(density)
@@ -156,21 +120,9 @@ def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
 @compiled_exactly
 def reach_on_circle(angle: np.ndarray, sharpness: np.ndarray, bessel: np.ndarray, limit: float,
                     least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Log-likelihood of points on a side seen up to a limit, and its derivatives.
-
-    Positions up to the limit count 1, those beyond it ``least``; each point's are blurred by a von
-    Mises distribution. Not divided by the sum over all positions.
-
-    Args:
-        angle: Angle of each point from the middle of the side that was seen [rad], shape [m].
-        sharpness: Shape [m].
-        bessel: I0(sharpness) exp(-sharpness), shape [m].
-        limit: Up to pi [rad].
-        least: Density of the positions beyond the limit.
-
-    Returns:
-        The logarithm, its derivative with respect to the angle and to the limit, shape [m] each.
-    """
+    """Log-likelihood of points on a side seen up to ``limit``, and its derivatives by angle and
+    limit. Positions beyond count ``least``, each is blurred by a von Mises distribution; the sum
+    over all does not divide it. ``bessel`` is I0(sharpness) exp(-sharpness). Angles in [rad]."""
     log, by_angle, by_limit = np.empty(len(angle)), np.empty(len(angle)), np.empty(len(angle))
     for i in range(len(angle)):
         k, low, high = sharpness[i], -limit - angle[i], limit - angle[i]
@@ -185,10 +137,8 @@ def reach_on_circle(angle: np.ndarray, sharpness: np.ndarray, bessel: np.ndarray
 
 @compiled_exactly
 def _below(angle: float, sharpness: float, bessel: float) -> float:
-    """Fraction of a von Mises distribution around 0 below an angle, counting whole turns.
-
-    Its series (Hill, ACM Algorithm 518, 1977), or the normal distribution that it approaches.
-    """
+    """Fraction of a von Mises distribution around 0 below an angle, counting whole turns: its
+    series (Hill, ACM Algorithm 518, 1977), or the normal distribution that it approaches."""
     turns = np.floor((angle + np.pi) / (2 * np.pi))
     angle -= 2 * np.pi * turns
     if sharpness > _NORMAL:
@@ -229,13 +179,9 @@ def point_counts(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
 
 def on_cylinders(skeleton: Skeleton, points: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions of points along the cylinders that they are nearest to, or inside.
-
-    Returns:
-        Lower and upper node of each, shape [m] each; the fraction of the path between them, shape
-        [m] (1 throughout in the first cylinder of a twig, which has the twig's radius); and the
-        vector from the axis to the point [m], shape [m, 3].
-    """
+    """Lower and upper node of the cylinder nearest to each point, or around it, the fraction of the
+    path between them (1 in the first of a twig, which has the twig's radius), and the vector from
+    the axis to the point [m]."""
     match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
                             points)
     low, high = skeleton.parent[match.segment], match.segment
@@ -248,8 +194,7 @@ def on_cylinders(skeleton: Skeleton, points: np.ndarray,
 class Match:
     """For each of m points: the upper node of its cylinder, the fraction of the path to it, the
     unit normal away from the axis [m, 3], the distance from the surface [m], the radius there [m],
-    and whether the cylinder has the twig's radius throughout.
-    """
+    and whether the cylinder has the twig's radius throughout."""
 
     segment: np.ndarray
     share: np.ndarray
@@ -261,11 +206,8 @@ class Match:
 
 def match_cylinders(parent: np.ndarray, order: np.ndarray, nodes: np.ndarray, radius: np.ndarray,
                     points: np.ndarray, near: np.ndarray | None = None) -> Match:
-    """Find the cylinder whose surface is nearest to each point.
-
-    Args:
-        near: Upper nodes of the candidate cylinders, shape [m, k]; None: those nearby.
-    """
+    """Find the cylinder whose surface is nearest to each point, among those of the upper nodes
+    ``near`` [m, k]; None: those nearby."""
     near = cylinders_around(parent, nodes, points) if near is None else near
     # The first cylinder of a side run has the twig's radius throughout, not its carrier's.
     own = order > order[parent]

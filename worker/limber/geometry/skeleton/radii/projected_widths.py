@@ -34,13 +34,8 @@ _HALF_CIRCLE = np.pi / 4  # length of the mean normal of points evenly spread ac
 
 @dataclass(frozen=True)
 class SightField:
-    """Directions towards one sensor: ``towards - nearer * (place - middle)``, made unit vectors.
-
-    Attributes:
-        towards: At the middle, shape [3].
-        nearer: Inverse of the sensor's distance [1/m].
-        middle: [m], shape [3].
-    """
+    """Directions towards one sensor: ``towards - nearer * (place - middle)``, made unit vectors;
+    ``nearer`` is the inverse of its distance [1/m]."""
 
     towards: np.ndarray
     nearer: float
@@ -53,10 +48,8 @@ class SightField:
 
 
 def sight_field(skeleton: Skeleton, points: np.ndarray, view: View | None = None) -> SightField:
-    """Where one sensor stood: its ``view``, or from the sides of the branches that have points.
-
-    Across each axis, the mean normal of its points points to the sensor.
-    """
+    """Where one sensor stood: its ``view``, or from the sides of branches that have points: across
+    each axis, the mean normal of its points points to the sensor."""
     if view is not None:
         middle = points.mean(axis=0)
         far = float(np.linalg.norm(view.eye - middle))
@@ -88,13 +81,8 @@ def sight_field(skeleton: Skeleton, points: np.ndarray, view: View | None = None
 
 def by_projected_widths(skeleton: Skeleton, points: np.ndarray, view: View | None = None,
                         ) -> tuple[Skeleton, SightField]:
-    """Return the skeleton with axes and radii by the width of its points, and the sight.
-
-    Args:
-        skeleton: Fitted by the distances of the points.
-        points: The scan [m], shape [m, 3].
-        view: The sensor's view, if it is known.
-    """
+    """Return the skeleton, fitted by distances, with axes and radii by the width of its points, and
+    the sight."""
     field, start = sight_field(skeleton, points, view), skeleton
     for _ in range(_ROUNDS):
         skeleton = _near(start, _moved(skeleton, points, field))
@@ -154,10 +142,8 @@ def _moved(skeleton: Skeleton, points: np.ndarray, field: SightField) -> Skeleto
 
 def cross_sections(skeleton: Skeleton, points: np.ndarray, field: SightField,
                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Each point's offset across the sight and towards the sensor [m], and the radius there [m].
-
-    Points of branches that point to the sensor have NaN.
-    """
+    """Each point's offset across the sight and towards the sensor [m], and the radius there [m];
+    NaN on branches that point to the sensor."""
     _, high, _, offset = on_cylinders(skeleton, points)
     beside, depth, aside = _across_sight(offset, skeleton.axes()[high], field.at(points))
     hidden = aside <= _ASIDE
@@ -178,15 +164,9 @@ def _across_sight(offset: np.ndarray, axis: np.ndarray, towards: np.ndarray,
 
 def _width(at: np.ndarray, beside: np.ndarray, depth: np.ndarray, here: float, thick: float,
            ) -> tuple[float, float, float, float]:
-    """Radius, shift across and shift in depth at one place, and the radius's deviation [m].
-
-    Args:
-        at: Places of a run's points along it [m], ascending, shape [m].
-        beside: Their offsets from the axis across the sight [m], shape [m].
-        depth: Their offsets towards the sensor [m], shape [m].
-        here: The place [m].
-        thick: The radius so far [m].
-    """
+    """Radius, shift across and in depth ``here``, and the radius's deviation [m], from a run's
+    points: ``at`` along it, ascending, ``beside`` the axis across the sight, ``depth`` to the
+    sensor, all [m]. ``thick`` is the radius so far [m]."""
     middle, (least, most) = int(np.searchsorted(at, here)), (
         np.searchsorted(at, [here - reach * thick, here + reach * thick])
         for reach in (_LONG, _REACH))
@@ -211,16 +191,9 @@ def _width(at: np.ndarray, beside: np.ndarray, depth: np.ndarray, here: float, t
 
 
 def width_covariance(skeleton: Skeleton, field: SightField, noise: float) -> np.ndarray:
-    """Covariance of each node's position and radius by their widths [m^2], shape [n, 4, 4].
-
-    Across the sight, the middle of a width is known as its half is. In depth the points show where
-    the front is: the axis is behind it by the mean rise of a circle.
-
-    Args:
-        skeleton: Fitted by widths.
-        field: The sight.
-        noise: Standard deviation of the ranges [m].
-    """
+    """Covariance [n, 4, 4] of positions and radii by widths [m^2]. Across, a width's middle is
+    known as its half is. In depth, the axis is behind the front by the mean rise of a circle.
+    ``noise`` is that of ranges [m]."""
     across = np.cross(skeleton.axes(), field.at(skeleton.nodes))
     across /= np.maximum(np.linalg.norm(across, axis=1), 1e-300)[:, None]
     towards = np.cross(across, skeleton.axes())
@@ -241,18 +214,8 @@ def width_covariance(skeleton: Skeleton, field: SightField, noise: float) -> np.
 
 def without_hidden_twigs(skeleton: Skeleton, view: View, factor: float,
                          ) -> tuple[Skeleton, list[dict]]:
-    """Drop twigs that do not leave their carrier's silhouette.
-
-    Args:
-        skeleton: Fitted to the cloud.
-        view: The camera's view of the cloud.
-        factor: A twig stays if, as the camera saw it, it or a twig on it reaches this many radii
-            of its carrier beyond the carrier's axis.
-
-    Returns:
-        The skeleton, and for each dropped twig its ``length`` [m] and the position ``at`` of its
-        tip.
-    """
+    """Drop twigs that do not reach, nor a twig on them, ``factor`` radii of their carrier beyond
+    its axis as the camera saw it. Lists each with ``length`` [m] and its tip ``at``."""
     runs = skeleton.runs()
     keep = np.ones(skeleton.node_count, bool)
     dropped = []

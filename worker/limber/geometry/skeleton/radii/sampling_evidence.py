@@ -33,14 +33,8 @@ _ALIKE = 3.0  # points whose errors are correlated, so that they count as one
 
 
 def rays_over_skin(fit: AxisFit, other: Skeleton, field: SightField, points: np.ndarray) -> float:
-    """Logarithm of how much likelier one sensor's rays are than points all over the skin.
-
-    Args:
-        fit: Axes and radii by the distances of the points.
-        other: Axes and radii by their width across the sight.
-        field: The sight.
-        points: The scan [m], shape [m, 3].
-    """
+    """Logarithm of how much likelier one sensor's rays are than points all over the skin. ``fit``
+    is by the points' distances, ``other`` by their width across the sight."""
     some = points[::max(len(points) // (2 * _SAMPLE), 1)]
     skin, rays = (cross_sections(skeleton, some, field) for skeleton in (fit.skeleton, other))
     # Thin branches show less of it: the thicker half by either model.
@@ -58,10 +52,8 @@ def rays_over_skin(fit: AxisFit, other: Skeleton, field: SightField, points: np.
 
 def _thinner(beside: np.ndarray, depth: np.ndarray, radius: np.ndarray, share: float,
              limit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The points about thinner branches as deep as the skin's half up to ``limit`` [rad] has them.
-
-    The fit by distances may have failed; its model is judged by its best, not by that.
-    """
+    """The points about thinner branches, as deep as the skin's half up to ``limit`` [rad] has them.
+    The fit by distances may have failed: its model is judged by its best."""
     thin = share * radius
     return beside, depth - radius * np.median(depth / radius) + thin * np.cos(limit / 2), thin
 
@@ -107,15 +99,8 @@ _LIKELIER = 3.0  # logarithm: twenty times
 
 def fit_of_rays(fit: AxisFit, points: np.ndarray, certain: bool, view: View | None = None,
                 ) -> AxisFit | None:
-    """Return the fit by the branches' widths across one sensor's sight.
-
-    Args:
-        fit: The fit by the points' distances.
-        points: The scan [m], shape [m, 3].
-        certain: Whether one sensor's rays are known to have made the points; otherwise None is
-            returned where the points do not support it.
-        view: The sensor's view, if it is known.
-    """
+    """Return the fit by the branches' widths across one sensor's sight. None if the points do not
+    support it, unless rays are ``certain`` to have made them."""
     skeleton, field = by_projected_widths(fit.skeleton, points, view)
     if not certain and rays_over_skin(fit, skeleton, field, points) < _LIKELIER:
         return None

@@ -36,25 +36,16 @@ _TURNS = 8  # of Newton's method
 
 @dataclass(frozen=True)
 class Smoothing:
-    """What a sensor does to radii.
-
-    Attributes:
-        shrink: The number c above.
-        sigma: Its standard deviation.
-        spacing: Spacing of the points [m].
-    """
+    """What a sensor does to radii: the number c above, its standard deviation, and the points'
+    spacing [m]."""
 
     shrink: float
     sigma: float
     spacing: float
 
     def undone(self, skeleton: Skeleton, covariance: np.ndarray) -> tuple[Skeleton, np.ndarray]:
-        """The skeleton with radii before the smoothing of its sensor, and its covariance [m^2].
-
-        Args:
-            skeleton: With radii as measured.
-            covariance: Of each node's position and radius [m^2], shape [n, 4, 4].
-        """
+        """The skeleton with radii before the smoothing of its sensor, and the covariance [n, 4, 4]
+        of each node's position and radius [m^2]."""
         radius = _undone(skeleton.radius, self.shrink, self.spacing)
         change = radius / skeleton.radius * self._slope(radius)
         scale = np.ones((len(radius), 4))
@@ -77,14 +68,8 @@ class Smoothing:
 
 def sensor_smoothing(skeleton: Skeleton, radius: np.ndarray, count: np.ndarray, spacing: float,
                      ) -> Smoothing:
-    """Estimate how far a sensor's smoothing drew the branches inwards.
-
-    Args:
-        skeleton: Fitted.
-        radius: Its radii [m] without their scatter, shape [n].
-        count: Number of points on each node, shape [n].
-        spacing: Spacing of the points [m].
-    """
+    """Estimate how far a sensor's smoothing drew branches inwards, from their radii [n] [m] without
+    scatter and the points on each node [n], which are ``spacing`` [m] apart."""
     stretch = _stretches(skeleton, count)
     points, length = np.bincount(stretch, count), np.bincount(stretch, skeleton.steps)
     thick = np.exp(np.bincount(stretch, np.log(radius)) / np.maximum(np.bincount(stretch), 1))
@@ -177,12 +162,8 @@ def position_uncertainty(seen: SeenSides, radius: np.ndarray, noise: float) -> n
 
 @dataclass(frozen=True)
 class TargetDistances:
-    """Distance from the axis at which points should lie on average [m], shape [m] each.
-
-    Attributes:
-        axis: For the equations that move the axis.
-        radius: For the equations that move the radius.
-    """
+    """Mean distance from the axis at which points should lie [m], shape [m] each, for the equations
+    that move the axis and for those that move the radius."""
 
     axis: np.ndarray
     radius: np.ndarray
@@ -191,23 +172,12 @@ class TargetDistances:
 def weighted_target_distances(radius: np.ndarray, noise: float,
                               limit: Callable[[np.ndarray], np.ndarray],
                               ) -> tuple[TargetDistances, TargetDistances]:
-    """Distances at which points should lie, if farther points count less.
-
-    Noise puts more points outside a thin branch than inside, and farther. Weights that fall with
-    the distance from the surface therefore reduce its radius: at one noise it came out at half, at
-    two noises at nine tenths. So the target of the points is their weighted mean where the radius
-    is right (the consistency of M-estimates, after Fisher).
-    It does not depend on the sides seen: it holds for each position on the circle separately.
-
-    Args:
-        radius: True radius of each point [m], shape [m].
-        noise: Standard deviation of the points [m].
-        limit: Residual [m] from which a point has no weight (Tukey's biweight), as a function of
-        radii [m].
-
-    Returns:
-        TargetDistances where mean positions are taken for the true ones, and where the nearest are.
-    """
+    """Distances at which points should lie if those farther off count less, to 0 at the residual
+    ``limit`` [m], a function of radii: where mean positions are taken for true, and the nearest."""
+    # Noise puts more points outside a thin branch than inside, and farther. Falling weights
+    # therefore reduce its radius: at one noise it came out at half, at two noises at nine tenths.
+    # So the target is the weighted mean where the radius is right (consistency of M-estimates,
+    # after Fisher). It holds for each position on the circle, whatever sides were seen.
     thick = _RADII[:, None]
     reach = limit(_RADII * noise)[:, None] / noise
     residual = reach * np.linspace(-1, 1, _DISTANCES)
@@ -229,18 +199,11 @@ def weighted_target_distances(radius: np.ndarray, noise: float,
 
 def held_across(out: np.ndarray, axis: np.ndarray, positions: np.ndarray, stout: np.ndarray,
                 ) -> np.ndarray:
-    """How firmly points hold the axis across their own direction, as vectors, shape [m, 3].
-
-    A point whose position along the circle is known gives no information across; where noise hides
-    it, or the seen side ends, it does. Without these terms in the equations, steps went twice as
-    far as they should and back again: one-sided radii came out right or a sixth too thin by turns.
-
-    Args:
-        out: Unit vectors from the axis to the points, shape [m, 3].
-        axis: Unit vectors along the axis at each, shape [m, 3].
-        positions: Mean direction of each point's true position, shape [m, 3].
-        stout: Square of radius over noise, shape [m].
-    """
+    """How firmly points hold the axis across their own direction, as vectors [m, 3]: only where
+    noise hides their position on the circle, or the seen side ends. ``stout`` is (radius /
+    noise)^2."""
+    # Without these terms, steps went twice as far as they should and back again: one-sided radii
+    # came out right or a sixth too thin by turns.
     known = np.clip(1 - stout * (1 - np.einsum("mj,mj->m", positions, positions)), 0.0, 1.0)
     # A position that is taken as certain is not searched for.
     known[np.einsum("mj,mj->m", positions, out) >= 1 - 1e-12] = 0.0
@@ -249,17 +212,9 @@ def held_across(out: np.ndarray, axis: np.ndarray, positions: np.ndarray, stout:
 
 def mean_positions(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: np.ndarray,
                    seen: SeenSides) -> np.ndarray:
-    """Return the mean direction from the axis to each point's true position, shape [m, 3].
-
-    It is the shorter, below 1, the less certain the position is.
-
-    Args:
-        out: Unit vectors from the axis to the points, shape [m, 3].
-        axis: Unit vectors along the axis at each, shape [m, 3].
-        sharpness: Radius times distance over the noise's square, shape [m].
-        stout: Square of radius over noise, shape [m].
-        seen: The sides that were seen.
-    """
+    """Mean direction [m, 3] from the axis to each point's true position, shorter than 1 where that
+    is uncertain. ``sharpness`` is radius times distance over noise^2, ``stout`` (radius /
+    noise)^2."""
     mean = out * np.where(sharpness > 1, 1 - 0.5 / np.maximum(sharpness, 1.0), 0.5)[:, None]
     if seen.along_sight:
         # Scatter along the sight does not widen a silhouette: its effect on the radius is bounded.

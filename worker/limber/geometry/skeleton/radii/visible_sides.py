@@ -56,7 +56,6 @@ class SeenSides:
             faces ``view``, shape [places].
         along_sight: Points scatter only along ``view``, as a depth camera's do.
         limit: Angle around the axis from ``view`` to the end of the side that was seen [rad].
-        limit_sigma: Its standard deviation [rad].
     """
 
     view: np.ndarray
@@ -77,24 +76,13 @@ SCATTERED_ALONG_SIGHT = SeenSides(np.array([0.0, 0.0, 1.0]), np.ones(PLACES), al
 
 def seen_sides(out: np.ndarray, axis: np.ndarray, residual: np.ndarray, sharpness: np.ndarray,
                stout: np.ndarray, weight: np.ndarray) -> SeenSides:
-    """Determine whether points show branches from all around or from one side.
-
-    A depth camera's readings scatter along its sight and show where a silhouette ends: all of their
-    positions are known.
-
-    Estimated as a density, the seen sides would grow with the noise that blurs them: a thin ring
-    with points all around it looks like half of a thicker one. So the result is one of the two.
-    Where noise fills the ring, an axis in the middle of half a circle also has points all around
-    it. There the cross-section's scatter decides: for a full circle it is equal in all directions.
-
-    Args:
-        out: Unit vectors from the axis to the points, shape [m, 3].
-        axis: Unit vectors along the axis at each, shape [m, 3].
-        residual: Distance of each point from its cylinder [m], shape [m].
-        sharpness: Radius times distance over the noise's square, shape [m].
-        stout: Square of radius over noise, shape [m].
-        weight: Weight of each point, shape [m].
-    """
+    """Determine whether points show branches from all around or from one side. ``sharpness`` is
+    radius times distance over noise^2, ``stout`` (radius / noise)^2."""
+    # A depth camera's readings scatter along its sight and show where a silhouette ends: all of
+    # their positions are known. Estimated as a density, the seen sides would grow with the noise
+    # that blurs them: a thin ring with points all around it looks like half of a thicker one. Where
+    # noise fills the ring, an axis in the middle of half a circle also has points all around it.
+    # There the cross-section's scatter decides: for a full circle it is equal in all directions.
     around = SeenSides(np.array([0.0, 0.0, 1.0]), np.ones(PLACES))
     clear = np.flatnonzero((sharpness > min(_CLEAR, float(np.quantile(sharpness, 0.7))))
                            & (weight > 0))
@@ -123,12 +111,9 @@ def _one_side(view: np.ndarray, limit: float = _GRAZING, sigma: float = _GRAZING
 
 def _flat_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: np.ndarray,
                weight: np.ndarray) -> SeenSides | None:
-    """One side, if noise fills the rings and points scatter less along one sight than across it.
-
-    For an arc of half-angle g, the variance along the sight is that of cos over (-g, g), 0.08 of
-    the squared radius at 84 degrees; across it that of sin, 0.46. Noise adds equally to both, and
-    nothing to the third moment, which a flat stem seen from all around does not have.
-    """
+    """One side, if noise fills the rings and points scatter less along one sight than across it: at
+    84 degrees 0.08 radius^2, the variance of cos, and 0.46, that of sin. Noise adds equally to
+    both, and nothing to the third moment, which a flat stem lacks."""
     near = np.flatnonzero(weight > 0)
     if len(near) == 0:
         return None
@@ -169,26 +154,14 @@ def _half_sphere() -> np.ndarray:
 
 def fit_seen_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight: np.ndarray,
                   mean: np.ndarray, first: SeenSides, limit_free: bool = True) -> SeenSides:
-    """Estimate the direction of view and the limit of one seen side from the points' angles.
-
-    The mean normal of the points is off where a scan has holes or branches lean (by 23 degrees at
-    most in generated ones), and the last grazing angle seen depends on the sensor. For a point at a
-    given distance, the angle around the axis is that of its true position, blurred by a von Mises
-    distribution. The density of angles over the seen side determines both.
-
-    Steps are Fisher's scoring with the scores' own outer products. The limit takes one step per
-    call, as far as the sight's direction leaves it open. The mean normal is the prior of the sight:
-    with parallel axes, no angle shows a turn along them.
-
-    Args:
-        out: Unit vectors from the axis to the points, shape [m, 3].
-        axis: Unit vectors along the axis at each, shape [m, 3].
-        sharpness: Radius times distance over the noise's square, shape [m].
-        weight: Weight of each point, shape [m].
-        mean: Mean normal of the points, shape [3].
-        first: The side as estimated so far.
-        limit_free: Whether axes and radii are accurate enough to estimate the limit.
-    """
+    """Estimate sight and limit of one seen side from the points' angles, by Fisher scoring, one
+    step a call for the limit, none without ``limit_free``. ``sharpness`` is radius times distance
+    over noise^2."""
+    # The mean normal is off where a scan has holes or branches lean (by 23 degrees at most in
+    # generated ones), and the last grazing angle depends on the sensor. For a point at a given
+    # distance, the angle is that of its true position, blurred by a von Mises distribution: the
+    # density over the seen side determines both. The mean normal is the sight's prior: with
+    # parallel axes, no angle shows a turn along them.
     use = np.flatnonzero(weight > 0)
     use = use[::max(len(use) // _TELL, 1)]
     out, axis, sharpness, weight = out[use], axis[use], sharpness[use], weight[use]
@@ -248,13 +221,7 @@ def side_uncertainty(seen: SeenSides, radius: np.ndarray, noise: float) -> np.nd
 
 
 def across_sight(out: np.ndarray, axis: np.ndarray, seen: SeenSides) -> np.ndarray:
-    """Sine of the angle around the axis between points and the viewer of one side, shape [m].
-
-    Args:
-        out: Unit vectors from the axis to the points, shape [m, 3].
-        axis: Unit vectors along the axis at each, shape [m, 3].
-        seen: The sides that were seen.
-    """
+    """Sine of the angle around the axis between points and the viewer of one side, shape [m]."""
     return np.einsum("mj,mj->m", out, sides_of(axis, seen.view)[1])
 
 
@@ -271,14 +238,13 @@ def sides_of(axis: np.ndarray, view: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def evenly_seen(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
                 weight: np.ndarray, across: np.ndarray, noise: float) -> np.ndarray:
-    """Whether enough points around each node show all of the side that was seen, shape [n].
-
-    The origin of a point is weighted by the sides that were seen. For a strip along a branch whose
-    rest is hidden, or for a few points, that makes a cylinder as thin as the strip is wide. Started
-    from the truth, twigs with under 7 points a radius of length shrank to 0.8 of theirs, and hidden
-    stems to a third. There the nearest positions are the better estimate (0.95). Where noise is as
-    wide as the branch, they carry little information, and points from farther along are used.
-    """
+    """Mask [n] of the nodes with enough points around them that show all of the side that was
+    seen."""
+    # Weights by the sides that were seen make a cylinder as thin as a strip is wide, where the rest
+    # is hidden or points are few. Started from the truth, twigs with under 7 points a radius of
+    # length shrank to 0.8 of theirs, and hidden stems to a third. There the nearest positions are
+    # the better estimate (0.95). Where noise is as wide as the branch, they carry little
+    # information, and points from farther along are used.
     sums = np.stack([np.bincount(match.segment, weight * value, len(nodes))
                      for value in (np.ones(len(across)), across, across**2)], axis=1)
     even = np.zeros(len(nodes), bool)

@@ -98,14 +98,8 @@ class Wood:
 
 def _pipes(parent: np.ndarray, radius: np.ndarray, forks: np.ndarray,
            ) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray]:
-    """Changes from forks to the wood of their children as a matrix over nodes, [f, n], and their
-    means and variances, shape [f].
-
-    Args:
-        parent: Of each node, shape [n].
-        radius: Current radii [m], shape [n].
-        forks: Nodes at which runs go on and others start, shape [f].
-    """
+    """Changes from ``forks`` [f], where runs go on and others start, to the wood of their children,
+    as a matrix over nodes [f, n], and their means and variances [f]."""
     count, child = len(radius), np.flatnonzero(np.isin(parent, forks))
     row, log, wood = np.full(count, -1), np.log(radius), radius[child]**_POWER
     row[forks] = np.arange(len(forks))
@@ -126,13 +120,9 @@ def _pipes(parent: np.ndarray, radius: np.ndarray, forks: np.ndarray,
 
 @dataclass(frozen=True)
 class Bends:
-    """The prior of the axes: directions change slowly along a run, with a few sharp bends.
-
-    Attributes:
-        turns: Change of direction at the inner nodes of runs, as a matrix over nodes, [k, n].
-        variance: Its variance in each component [rad^2], shape [k].
-        trust: Weight of each, by Student's distribution, shape [k].
-    """
+    """The prior of the axes, which turn slowly with a few sharp bends: changes of direction at
+    runs' inner nodes as a matrix over nodes [k, n], their variances by component [rad^2], and their
+    weights by Student's distribution."""
 
     turns: sparse.csr_matrix
     variance: np.ndarray
@@ -215,7 +205,6 @@ class ShapeEvidence:
         spacing: Spacing of the points around each node [m], shape [n].
         noise: Standard deviation of the points across the branches [m].
         shared: Standard deviation of what all points around a branch are off together [m].
-        one_sided: Whether one side was seen.
         pixel: Distance of neighbouring rays at each node [m], shape [n], if the edges of branches
             determine the radii, as in one sensor's scan; None: they do not.
         smoothing: What the sensor's smoothing did, which the radii are without; None: nothing.
@@ -231,12 +220,8 @@ class ShapeEvidence:
 
 
 def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
-    """Return the skeleton with the likeliest axes and radii, deviations of the radii, and states.
-
-    Args:
-        skeleton: Fitted. Nodes whose state is not measured count for nothing.
-        evidence: Its nodes' evidence.
-    """
+    """Return the fitted skeleton with the likeliest axes and radii, deviations of the radii, and
+    states. Nodes whose state is not measured count for nothing."""
     first = radius = skeleton.radius
     fitted = np.column_stack([skeleton.nodes, np.log(first)])
     resolution = _RESOLUTION * evidence.spacing if evidence.pixel is None else (
@@ -282,8 +267,7 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
 def _coupled(covariance: np.ndarray, radius: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Return the covariances, shape [n, 4, 4], without the part that ties axes to radii [m] where a
     fit counts for nothing, and with little of it where the radius is hardly known: there the bend
-    of an axis would decide the radius.
-    """
+    of an axis would decide the radius."""
     relative = np.sqrt(covariance[:, 3, 3]) / radius
     share = np.where(measured, np.minimum(_LINEAR / np.maximum(relative, 1e-12), 1.0)**2, 0.0)
     out = covariance.copy()
@@ -315,13 +299,9 @@ def point_spacing(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray, n
 
 def _information(skeleton: Skeleton, evidence: ShapeEvidence, local: np.ndarray,
                  measured: np.ndarray, share: np.ndarray) -> sparse.bsr_matrix:
-    """Information of the fits on nodes (x, y, z [m], logarithm of the radius), [4 n, 4 n].
-
-    Args:
-        local: Variance of the logarithms of fitted radii besides their covariance, shape [n].
-        measured: Nodes whose fits count, shape [n]. Others hold their axis to a radius.
-        share: Share of an independent fit that a node is, shape [n].
-    """
+    """Information [4 n, 4 n] of the fits on nodes (x, y, z [m], ln radius). ``local`` is the
+    variance of ln radius beside the covariance, ``share`` that of an independent fit which a node
+    is. Nodes that are not ``measured`` hold their axis to a radius."""
     radius, count = skeleton.radius, skeleton.node_count
     scale = np.ones((count, 4))
     scale[:, 3] = 1 / radius
@@ -345,10 +325,8 @@ def _of_axes(covariance: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 def _of_runs(skeleton: Skeleton, evidence: ShapeEvidence, radius: np.ndarray,
              ) -> sparse.csr_matrix:
-    """Effect on nodes of what each run's fits are off together, shape [4 n, runs].
-
-    Each has a standard deviation of 1. It is of the radii; how an axis bends must not decide it.
-    """
+    """Effect [4 n, runs] on nodes of what each run's fits are off together, per standard deviation.
+    It is of the radii; how an axis bends must not decide it."""
     # Their sum must not depend on single fits, or it would level their scatter.
     radius = typical_radius(skeleton, radius)
     noise = _BIAS * np.minimum(evidence.noise / radius, 1.0)**2
