@@ -40,10 +40,8 @@ their own.
 
 @dataclass(frozen=True)
 class GraspCoordinates:
-    """The coordinates a of a grasp: its translation and, if clamped, its rotation matrix less 1.
-
-    A clamped patch moves by t + (R - 1) arm: linear in these 12 numbers.
-    """
+    """The coordinates a of a grasp: its translation t and, if clamped, its rotation matrix R less
+    1. A clamped patch moves by t + (R - 1) arm: linear in these 12 numbers."""
 
     grasp: Grasp
 
@@ -59,10 +57,8 @@ class GraspCoordinates:
         return np.concatenate([move, (rotation_matrix(pose[3:]) - np.eye(3)).ravel()])
 
     def by_pose(self, pose: np.ndarray) -> np.ndarray:
-        """Return the change of a per translation [m] and turn [rad], shape [count, 3 or 6].
-
-        The turn is about the pose's own position: work-conjugate to the torque there.
-        """
+        """Return the change of a per translation [m] and turn [rad], shape [count, 3 or 6]. The
+        turn is about the pose's own position: work-conjugate to the torque there."""
         if self.grasp.mode == "point":
             return np.eye(3)
         result = np.zeros((12, 6))
@@ -89,7 +85,6 @@ class Basis:
 
     Attributes:
         columns: Lifts, then modes, shape [size, node_count, 3].
-        lift_count: Number of lifts.
         states: Coordinates of the training states, shape [s, size].
         captured: Fraction of the snapshots' H1 energy that the basis contains.
         reach: Largest size of each coordinate in training, swung states included, shape [size].
@@ -108,16 +103,9 @@ class Basis:
 
 def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int,
                vibration_count: int = 0) -> Basis:
-    """Return a basis of ``size`` columns, or as many as the snapshots of one grasp hold.
-
-    Args:
-        size: Lifts, modes of the states and their tangents, modes of the vibrations.
-        vibration_count: How many of the columns the vibrations get. They do not compete with
-            the states for the other columns: they are many, and statics does without them.
-
-    Raises:
-        InputError: fewer columns than lifts and vibrations need, or empty snapshots.
-    """
+    """Return a basis of ``size`` columns: lifts, modes of the states and their tangents, and of
+    vibrations, which get ``vibration_count`` to themselves, as statics does without them. Fewer
+    where the snapshots hold fewer. InputError if that is too few, or there are no snapshots."""
     coordinates = GraspCoordinates(grasp)
     count = coordinates.count
     if size <= count:

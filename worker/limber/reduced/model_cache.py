@@ -62,11 +62,8 @@ def write_model(model: ReducedModel, path: Path,
 
 
 def read_model(path: Path) -> ReducedModel:
-    """Read a model that :func:`write_model` wrote.
-
-    Raises:
-        InputError: it is not one, or of another format.
-    """
+    """Read a model that :func:`write_model` wrote; InputError if it is not one, or of another
+    format."""
     arrays = {name: values for name, values in read_arrays(path, "a reduced model").items()
               if not name.startswith("snapshot_")}
     if int(arrays.get("format", -1)) != FORMAT:
@@ -98,18 +95,9 @@ def build_reduced(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                   control_young: np.ndarray,
                   settings: ReducedSettings = _DEFAULT,
                   progress: Progress = SILENT) -> tuple[ReducedModel, Snapshots]:
-    """Solve the full model at training grasps and make the reduced model of them.
-
-    Args:
-        model: The branch (St. Venant-Kirchhoff).
-        grasp: The patch that is held, clamped or pinned.
-        weights: From control points to tetrahedra, shape [tet_count, K]
-            (limber.mechanics.young_weights).
-        control_young: Young's modulus at the control points [Pa], shape [K].
-
-    Raises:
-        ConvergenceError: no training grasp has an equilibrium. InputError: other materials.
-    """
+    """Solve the full model (St. Venant-Kirchhoff) at training grasps and make the reduced one.
+    ``weights`` [tet_count, K] lead from control points, with ``control_young`` [Pa], to tetrahedra.
+    ConvergenceError if no grasp has an equilibrium, InputError for other materials."""
     training = settings.training
     rng = np.random.default_rng(training.seed)
     trainer = Trainer(model, grasp, weights, control_young,
@@ -129,10 +117,8 @@ def build_reduced(model: BranchModel, grasp: Grasp, weights: np.ndarray,
 def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                      control_young: np.ndarray, snapshots: Snapshots,
                      settings: ReducedSettings, *, keeps_strain: bool = False) -> ReducedModel:
-    """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`.
-
-    ``keeps_strain``: Whether :meth:`ReducedModel.strains` is needed, which doubles its size.
-    """
+    """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`. With
+    ``keeps_strain`` it has :meth:`ReducedModel.strains` and twice the size."""
     control_young = np.asarray(control_young, float)
     if not settings.vibration_count:
         snapshots = snapshots.without_vibrations()
@@ -152,11 +138,9 @@ def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
 
 
 def as_control_points(model: BranchModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights [tet_count, K] and moduli [K] that give the model's Young's modulus.
-
-    Control points are the mesh's. If they cannot represent the field (or there are none), it
-    becomes one region with its own pattern, and only its level can change.
-    """
+    """Return weights [tet_count, K] and moduli [K] that give the model's Young's modulus, at the
+    mesh's control points. If they cannot, it becomes one region of which only the level can
+    change."""
     from limber.mechanics.materials.materials import young_weights
 
     marks = model.mesh.point_data.get("control_point")
@@ -202,14 +186,8 @@ def model_key(model: BranchModel, grasp: Grasp, weights: np.ndarray, control_you
 
 
 class ReducedCache:
-    """Reduced models in a folder, the least recently used removed where they take too much room.
-
-    Args:
-        folder: Where; made if it is not there.
-        limit_bytes: What all models may take; the one stored last always stays.
-        progress: Told of files that were damaged and are removed, and of a folder that cannot be
-            written: models are then trained, and not kept.
-    """
+    """Reduced models in a folder, the least recently used removed beyond ``limit_bytes``; the one
+    stored last stays. If the folder cannot be written, models are trained and not kept."""
 
     def __init__(self, folder: Path, *, limit_bytes: int = LIMIT_BYTES,
                  progress: Progress = SILENT):
@@ -232,10 +210,8 @@ class ReducedCache:
         return self.folder / f"{key}.npz"
 
     def load(self, key: str) -> tuple[ReducedModel, Snapshots] | None:
-        """Return a model and its full solutions; None if there is none.
-
-        A damaged file is removed, and said.
-        """
+        """Return a model and its full solutions; None if there is none. A damaged file is removed,
+        and said."""
         path = self.path(key)
         if not path.is_file():
             return None
@@ -269,13 +245,8 @@ class ReducedCache:
 
     @contextlib.contextmanager
     def learning(self, key: str) -> Iterator[None]:
-        """Hold the lock of a model's training, so that no other process trains it meanwhile.
-
-        If no lock can be made, each process trains its own.
-
-        Raises:
-            Timeout: another process holds it.
-        """
+        """Hold the lock of a model's training; Timeout if another process holds it. If no lock can
+        be made, each process trains its own."""
         lock = FileLock(self.folder / f"{key}.lock")
         try:
             lock.acquire(timeout=_WAIT_SECONDS)
@@ -308,11 +279,8 @@ class ReducedCache:
 
 @dataclass(frozen=True)
 class LearntModel:
-    """A reduced model and the full solutions that it was trained on.
-
-    Attributes:
-        was_known: It came from the cache.
-    """
+    """A reduced model and the full solutions that it was trained on; ``was_known``: from the
+    cache."""
 
     reduced: ReducedModel
     snapshots: Snapshots
@@ -322,14 +290,9 @@ class LearntModel:
 def learnt_model(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                  control_young: np.ndarray, settings: ReducedSettings, *,
                  cache: ReducedCache | None, progress: Progress = SILENT) -> LearntModel:
-    """Return the reduced model of a branch, from the cache or trained now and stored there.
-
-    Where another process is learning the same one, this waits for it. Arguments as for
-    :func:`limber.reduced.reduced_model.build_reduced`; without a ``cache`` nothing is kept.
-
-    Raises:
-        ConvergenceError: no training grasp has an equilibrium. InputError: other materials.
-    """
+    """Return the reduced model from the cache, or train and store it, where another process does so
+    after waiting for that. Without a ``cache`` nothing is kept. Arguments and errors are those of
+    :func:`build_reduced`."""
     if cache is None:
         return LearntModel(*build_reduced(model, grasp, weights, control_young, settings,
                                           progress), was_known=False)

@@ -36,13 +36,8 @@ class ReducedMotionState:
 
 
 class ReducedStepper:
-    """Steps the reduced model through time, driven at the grasp.
-
-    Args:
-        model: With the requested Young's modulus.
-        state: Where to start; a static state starts at rest.
-        nodal_forces: Dead loads [N] besides gravity, shape [node_count, 3].
-    """
+    """Steps the reduced model through time, driven at the grasp. A static ``state`` starts at rest;
+    ``nodal_forces`` [node_count, 3] [N] are dead loads besides gravity."""
 
     def __init__(self, model: ReducedModel, state: ReducedState | ReducedMotionState, *,
                  nodal_forces: np.ndarray | None = None,
@@ -74,11 +69,9 @@ class ReducedStepper:
         return 0.5 * float(velocity @ self.model.mass @ velocity)
 
     def move(self, pose: np.ndarray, step: float) -> bool:
-        """Step to a pose [m, rad] that is reached in ``step`` [s]; return whether it converged.
-
-        The grasp's velocity is that of the straight line to the pose, its acceleration 0: live
-        poses have noise, and their second difference must not shake the branch.
-        """
+        """Step to a pose [m, rad] reached in ``step`` [s]; return whether it converged. The grasp
+        moves straight there without acceleration: the noise of live poses must not shake the
+        branch."""
         return self._move(check_pose(pose), step, _LIVE_HALVINGS)
 
     def _move(self, pose: np.ndarray, step: float, halvings: int) -> bool:
@@ -96,12 +89,8 @@ class ReducedStepper:
 
     def step(self, held: np.ndarray, held_velocity: np.ndarray, held_acceleration: np.ndarray,
              step: float, *, foresee: bool = False) -> bool:
-        """Take one Newmark step with the grasp coordinates given at its end.
-
-        Args:
-            foresee: Whether the first iteration takes a jump of the grasp into account: for
-                motion that is not smooth.
-        """
+        """Take one Newmark step with the grasp coordinates given at its end. With ``foresee`` the
+        first iteration takes a jump of the grasp into account: for motion that is not smooth."""
         model, old, settings = self.model, self.state, self.settings
         count = len(held)
         free = slice(count, None)

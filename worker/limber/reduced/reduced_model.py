@@ -38,7 +38,6 @@ class ReducedSettings:
             motion in time better and cost statics little; where it changes they spoil the
             position of free ends.
         field_count: Strain fields; None: no projection, exact on the subspace and stiffer.
-        training: Which full solutions it learns from.
     """
 
     size: int = 64
@@ -58,8 +57,7 @@ class ReducedStaticSettings:
         start_count: How many starts are tried, the given state included.
         novelty_limit: Largest coordinate relative to the training's beyond which the state is
             taken for false and sought again from other starts.
-        iteration_limit: Newton iterations of the whole search; the best that was found by then
-            counts.
+        iteration_limit: Of the whole search; the best that was found by then counts.
     """
 
     tolerance: float = 1e-10
@@ -72,21 +70,19 @@ class ReducedStaticSettings:
 
 @dataclass(frozen=True)
 class ReducedState:
-    """A static state of the reduced model.
+    """A static state of the reduced model, at a pose [m, rad].
 
     Attributes:
         converged: Whether it is a stable equilibrium of the reduced model.
-        trusted: Whether it is also within the training of the basis; see ``doubt``.
-        doubt: Why it is not trusted, empty if it is.
+        trusted: Whether it is also within the training of the basis.
+        uncertainty: Why it is not trusted, empty if it is.
         coordinates: q, shape [size].
-        pose: [m, rad], shape [6].
         young: At the control points [Pa], shape [K].
         strain_energy: Energy of the strain relative to the model's mesh [J].
         energy: Potential of strain and weight, as in StaticResult [J].
         reaction_force, reaction_torque: Of the gripper on the branch [N, Nm], shape [3]; torque
             about the pose's position.
         novelty: Largest mode coordinate relative to the training's.
-        iterations, seconds: Effort.
     """
 
     converged: bool
@@ -106,13 +102,9 @@ class ReducedState:
 
 @dataclass(frozen=True)
 class ReducedSensitivities:
-    """Derivatives to log Young's modulus at the control points.
-
-    Attributes:
-        coordinates: Shape [size, K]; displacements by ``ReducedModel.displacement_of``.
-        reaction_force, reaction_torque: [N, Nm], shape [3, K]; about the pose's position.
-        strain_energy: With that of a carried weight [J], shape [K].
-    """
+    """Derivatives to log Young's modulus at the K control points: coordinates [size, K], reaction
+    [3, K] [N], [Nm] about the pose's position, and strain energy with that of a carried weight
+    [K] [J]."""
 
     coordinates: np.ndarray
     reaction_force: np.ndarray
@@ -175,15 +167,12 @@ class ReducedModel:
     """A branch held at one patch, in few coordinates.
 
     Attributes:
-        grasp: The patch.
         rest: Rest positions of all nodes [m], shape [node_count, 3].
-        basis: The subspace.
         polynomial: Strain as a polynomial of the coordinates.
         load: Weight that the mesh's shape does not carry, on the coordinates [N], shape [size].
         weight_stiffness: Of the weight that it carries (limber.mechanics.model) [N/m], shape
             [size, size].
         mass: Mass matrix of the coordinates, shape [size, size].
-        damping: Rayleigh damping.
         control_young: Young's modulus at the control points [Pa], shape [K].
         poses, training_young, energies: Of the training states.
         young_spread: Factor in Young's modulus within which the training sampled.
@@ -234,11 +223,8 @@ class ReducedModel:
         return self._work.jacobian
 
     def with_young(self, young: np.ndarray, poisson: float | None = None) -> "ReducedModel":
-        """Return the model with other moduli [Pa] at the control points, shape [K].
-
-        Raises:
-            InputError: wrong number, or not positive.
-        """
+        """Return the model with other moduli [K] [Pa] at the control points; InputError if their
+        number is wrong, or one not positive."""
         young = np.asarray(young, float)
         if young.shape != self.control_young.shape or not (young > 0).all():
             raise InputError(f"The given Young's moduli are {young}.",
@@ -270,12 +256,9 @@ class ReducedModel:
     def tangent(self, q: np.ndarray, increment: np.ndarray | None = None,
                 velocity: np.ndarray | None = None, by_rate: float = 0.0,
                 ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return energy, force and tangent (lower triangle); arrays are overwritten next time.
-
-        Energy and force with those of the weight that the mesh's shape carries. With ``increment``
-        the geometric stiffness is that of the mixed-integration-point Newton;
-        with ``velocity``, which changes by ``by_rate`` [1/s] with q, the stiffness damping acts.
-        """
+        """Return energy, force and tangent (lower triangle), with the weight that the mesh carries,
+        in arrays reused next time. ``increment``: stiffness of the mixed-integration-point Newton.
+        ``velocity``, which changes by ``by_rate`` [1/s] with q: stiffness damping acts."""
         work = self._work
         dq = _NO_INCREMENT if increment is None else increment
         moving = _NO_INCREMENT if velocity is None else velocity
@@ -296,10 +279,8 @@ class ReducedModel:
         return self.strain_energy(q) + 0.5 * float(q @ self.weight_stiffness @ q)
 
     def strains(self, q: np.ndarray) -> np.ndarray:
-        """Return the strain at the quadrature points, [tet_count, q, 6] (00 11 22 01 02 12).
-
-        As the model assumes it; its error is a tenth of that of the displacement's strain.
-        """
+        """Return the strain at the quadrature points as the model assumes it, [tet_count, q, 6] (00
+        11 22 01 02 12). Its error is a tenth of that of the displacement's strain."""
         self.strain_energy(q)
         shares = np.linalg.solve(self.root.T, self._work.strain).astype(np.float32)
         fields = present(self.strain_fields, "strain field of the reduced model")
@@ -321,12 +302,9 @@ class ReducedModel:
                      nodal_forces: np.ndarray | None = None,
                      settings: ReducedStaticSettings = _STATIC,
                      ) -> ReducedState:
-        """Return the equilibrium at a pose [m, rad]; look at ``converged`` and ``trusted``.
-
-        Starts from ``start`` or from the nearest training state. If the state fails, is unstable or
-        outside the training, the search is repeated from other states on longer paths; the state of
-        the lowest energy counts.
-        """
+        """Return the equilibrium at a pose [m, rad]; look at ``converged`` and ``trusted``. Starts
+        from ``start`` or the nearest training state. If that fails, is unstable or outside the
+        training, other states on longer paths are tried, and the lowest energy counts."""
         began = time.perf_counter()
         pose = check_pose(pose)
         load = self.load if nodal_forces is None else self.load + self.load_of(nodal_forces)
@@ -348,10 +326,8 @@ class ReducedModel:
     def followed(self, start: np.ndarray, pose: np.ndarray,
                  settings: ReducedStaticSettings = _STATIC) -> ReducedState:
         """Return the equilibrium that a pinned grasp comes to from coordinates ``start`` [size].
-
-        Unlike :meth:`solve_static` it searches for no other state, and its steps are so short that
-        none jumps; if one would, the state is not converged.
-        """
+        Unlike :meth:`solve_static` it seeks no other state; if even short steps jump, it has not
+        converged."""
         began, pose = time.perf_counter(), check_pose(pose)
         at_pose = np.concatenate([self.grasp.centre + start[:self.basis.lift_count], pose[3:]])
         found = self._follow(at_pose, start, pose, self.load, settings, settings.iteration_limit,
@@ -360,9 +336,8 @@ class ReducedModel:
 
     def pulled(self, start: np.ndarray, force: np.ndarray,
                settings: ReducedStaticSettings = _STATIC) -> ReducedState | None:
-        """Return the equilibrium under a force [3] on a pinned grasp, from the coordinates
-        ``start`` [size]; None if the path ends before, as at a snap.
-        """
+        """Return the equilibrium under a force [3] [N] on a pinned grasp, from the coordinates
+        ``start`` [size]; None if the path ends before, as at a snap."""
         count = self.basis.lift_count
         begin = (self.energy_force(start)[1] - self.load)[:count]
         q, reached, step = start, 0.0, 1.0
@@ -433,8 +408,7 @@ class ReducedModel:
                 settings: ReducedStaticSettings, most: int, *, steadily: bool = False,
                 ) -> "FoundState":
         """Newton to the pose in ``most`` iterations; if that fails, the step is halved, with
-        ``steadily`` also if the branch may have jumped.
-        """
+        ``steadily`` also if the branch may have jumped."""
         iterations, reached, step = 0, 0.0, 1.0
         while True:
             part = min(1.0, reached + step)
@@ -457,8 +431,7 @@ class ReducedModel:
 
     def _came_from(self, q: np.ndarray, found: "FoundState") -> bool:
         """Whether an equilibrium continues the one at ``q``: every tangent along the path was
-        positive definite, or the potential changed by the work of the gripper.
-        """
+        positive definite, or the potential changed by the work of the gripper."""
         if found.steady:
             return True
         count, energies, forces = self.basis.lift_count, [], []
@@ -513,10 +486,8 @@ class ReducedModel:
 
 
 def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Solve with the lower triangle; raise the diagonal until it is positive definite.
-
-    Returns the solution (NaN if there is none) and whether the diagonal stayed as it was.
-    """
+    """Solve with the lower triangle; raise the diagonal until it is positive definite. Return the
+    solution (NaN if there is none) and whether the diagonal stayed as it was."""
     from scipy.linalg.lapack import dposv
 
     _, solution, info = dposv(matrix, right, lower=1)

@@ -55,16 +55,11 @@ class ErrorEstimate:
 
 def estimate_error(model: BranchModel, weights: np.ndarray, reduced: ReducedModel,
                    state: ReducedState) -> ErrorEstimate:
-    """Return the error of a reduced static state by correcting it with the full model.
-
-    Later corrections take their geometric stiffness from the one before (mixed integration
-    points): the strain noise of the basis would spoil a plain tangent. Four at most: a free end
-    that points a little astray takes more than one.
-
-    Args:
-        model: The full model; its Young's modulus is replaced by the state's.
-        weights: From control points to tetrahedra.
-    """
+    """Return the error of a reduced static state by correcting it with the full model, which gets
+    the state's Young's modulus; ``weights`` lead from control points to tetrahedra."""
+    # Later corrections take their geometric stiffness from the one before (mixed integration
+    # points): the strain noise of the basis would spoil a plain tangent. Four at most: a free end
+    # that points a little astray takes more than one.
     full = model.with_young(weights @ state.young)
     start = reduced.displacement(state)
     equations = full.equations([reduced.grasp])
@@ -88,12 +83,9 @@ def estimate_error(model: BranchModel, weights: np.ndarray, reduced: ReducedMode
 
 def checked(state: ReducedState, estimate: ErrorEstimate, *, position_tolerance: float = _POSITION,
             energy_tolerance: float = _ENERGY) -> ReducedState:
-    """Return a state with the doubt that follows from its measured error; none if it is small.
-
-    The reduced model's own indicator (the distance of a state from its training) shows little: most
-    bad states are within the training, at moduli that the basis covers, with a free end slightly
-    misaligned.
-    """
+    """Return a state with the doubt that follows from its measured error; none if it is small. Its
+    distance from the training says little: most bad states are within it, at moduli that the basis
+    covers, with a free end slightly misaligned."""
     if not state.converged:
         uncertainty = "no stable equilibrium was found"
     elif not estimate.certain:
@@ -114,21 +106,13 @@ def checked(state: ReducedState, estimate: ErrorEstimate, *, position_tolerance:
 
 def corrected_once(model: BranchModel, reduced: ReducedModel, state: ReducedState,
                    ) -> tuple[StaticResult, np.ndarray] | None:
-    """Return a pinned state as one Newton step of the full model corrects it.
-
-    The step's tangent has the stress of the strain that the reduced model assumes, without the
-    noise that its displacement has. So one step does what takes :func:`estimate_error` four: of 40
-    states on a forked branch, the energy was then off by 5e-5 at most, the force by 0.13 %, nodes
-    by 0.006 mm.
-
-    Args:
-        model: The full model, of the state's Young's modulus.
-        reduced: Keeps its strain.
-
-    Returns:
-        The corrected state, and how it changes with the grasp's position, [3, node_count, 3]; None
-        where the state is off by more than a state may be unsaid, or not stable.
-    """
+    """Return a pinned state after one Newton step of the full model with the state's Young's
+    modulus, and its change [3, node_count, 3] with the grasp's position. None where it is off by
+    more than a state may be unsaid, or not stable. ``reduced`` keeps its strain."""
+    # The step's tangent has the stress of the strain that the reduced model assumes, without the
+    # noise that its displacement has. So one step does what takes `estimate_error` four: of 40
+    # states on a forked branch, the energy was then off by 5e-5 at most, the force by 0.13 %, nodes
+    # by 0.006 mm.
     problem = StaticProblem(model, reduced.grasp, True, DEFAULT_SETTINGS)
     equations, start = problem.equations, reduced.displacement(state)
     try:
@@ -155,16 +139,9 @@ def corrected_once(model: BranchModel, reduced: ReducedModel, state: ReducedStat
 
 @dataclass(frozen=True)
 class Answer:
-    """A static answer that is good enough, whichever model it is from.
-
-    Attributes:
-        source: ``reduced`` or ``full``.
-        state: The reduced state (also where it was not good enough).
-        displacement: [m], shape [node_count, 3].
-        strain_energy: [J].
-        reaction_force: Of the gripper on the branch [N], shape [3].
-        estimate: The error of the reduced state, if it was checked.
-    """
+    """A static answer that is good enough, from ``source`` reduced or full: displacement
+    [node_count, 3] [m], strain energy [J], force of the gripper on the branch [3] [N]; the reduced
+    state even if not good enough, and its error if it was checked."""
 
     source: str
     state: ReducedState
@@ -175,15 +152,9 @@ class Answer:
 
 
 class RefreshingModel:
-    """A reduced model and its full one; refreshed where its basis is not sufficient.
-
-    Args:
-        model, grasp, weights, control_young, settings: As for ``build_reduced``.
-        position_tolerance: Largest error of a node relative to the extent that is accepted.
-        energy_tolerance: Largest relative error of the energy.
-        refresh_every: New full solutions after which the basis is made again.
-        reduced, snapshots: An existing model with the solutions it was made from.
-    """
+    """A reduced model and its full one, with arguments as for ``build_reduced``. After
+    ``refresh_every`` new full solutions the basis is made again. Tolerances: a node's error
+    relative to the extent, and the energy's relative error."""
 
     def __init__(self, model: BranchModel, grasp: Grasp, weights: np.ndarray,
                  control_young: np.ndarray, settings: ReducedSettings | None = None, *,
@@ -213,15 +184,9 @@ class RefreshingModel:
 
     def solve(self, pose: np.ndarray, young: np.ndarray | None = None, *,
               check: bool = True) -> Answer:
-        """Return the equilibrium at a pose [m, rad] within the tolerances.
-
-        The reduced state is checked against the full model, and solved with that where it fails.
-        Without ``check`` a state within the training is taken as it is: in a millisecond, and
-        where E is not what the model was trained at, every eighth of them off by more.
-
-        Raises:
-            ConvergenceError: the full model was needed and found no equilibrium.
-        """
+        """Return the equilibrium at a pose [m, rad] within the tolerances, by the full model where
+        the check fails. Without ``check`` trained states are taken as they are, in a millisecond;
+        at a new E every eighth is off by more. ConvergenceError if the full model finds none."""
         reduced = self.reduced if young is None else self.reduced.with_young(young)
         state = reduced.solve_static(pose)
         if state.trusted and not check:

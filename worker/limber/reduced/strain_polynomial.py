@@ -69,10 +69,8 @@ class StrainPolynomial:
         return [lam * a + mu * b for a, b in zip(self.by_lambda, self.by_mu, strict=True)]
 
     def whitened(self, moduli: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return linear and quadratic parts in which H is the identity, and H's root.
-
-        With H = L L^T the strain coordinates become L^T e.
-        """
+        """Return linear and quadratic parts in which H is the identity, and H's root L: with H = L
+        L^T the strain coordinates become L^T e."""
         root = np.linalg.cholesky((moduli + moduli.T) / 2)
         return (np.ascontiguousarray(root.T @ self.linear),
                 np.ascontiguousarray(root.T @ self.quadratic), root)
@@ -81,14 +79,9 @@ class StrainPolynomial:
 @compiled
 def evaluate_strain(linear, quadratic, q, increment, velocity, damping, by_rate, strain, jacobian,
                     gradient, tangent):
-    """Evaluate whitened strain, force and tangent; return the energy [J].
-
-    Writes strain e [m], its derivative J [m, size], the force J^T e [size] and the lower triangle
-    of the tangent [size, size]. With an ``increment`` (else empty) the geometric part takes the
-    strain that the last linearisation predicted (mixed integration points). With a ``velocity``
-    (else empty) the stress ``damping`` [s] times the rate of the strain is added to force and
-    tangent; ``by_rate`` [1/s] is the change of the velocity with q.
-    """
+    """Return the energy [J]; write whitened strain, J, force J^T e and tangent (lower triangle).
+    ``increment``: geometric part of mixed integration points. ``velocity``, changing by ``by_rate``
+    [1/s] with q: stress ``damping`` [s] times the strain's rate. Empty arrays: neither."""
     count, size = linear.shape
     gradient[:] = 0.0
     tangent[:] = 0.0
@@ -172,20 +165,9 @@ def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
                     control_young: np.ndarray, snapshots: Snapshots | None,
                     field_count: int | None, *, keeps_fields: bool = False,
                     ) -> tuple[StrainPolynomial, np.ndarray | None]:
-    """Return the strain polynomial of a basis, and the fields on request.
-
-    Args:
-        weights: From control points to tetrahedra, shape [tet_count, K].
-        control_young: Young's modulus at the control points [Pa] that the projection's inner
-            product takes, shape [K].
-        snapshots: Whose strains the fields are made of.
-        field_count: Number of strain fields; None: all, no projection.
-        keeps_fields: Whether to return them, single precision, shape [tet_count, q, 6, m] (00 11 22
-            01 02 12); their sum by the polynomial's e is the strain.
-
-    Raises:
-        InputError: the material is not St. Venant-Kirchhoff.
-    """
+    """Return the strain polynomial; with ``keeps_fields`` also the fields, [tet_count, q, 6, m] (00
+    11 22 01 02 12), whose sum by e is the strain. ``field_count`` None: no projection.
+    ``control_young`` [Pa] weighs its product. InputError unless St. Venant-Kirchhoff."""
     if not model.material.has_cubic_force:
         raise InputError(f"A reduced model of the material {model.material.name} is requested.",
                          "Only the force of St. Venant-Kirchhoff is a cubic polynomial.",
@@ -255,9 +237,7 @@ def _green(H: np.ndarray) -> np.ndarray:
 @compiled
 def _green_change(H, D, owners, scales, strain):
     """Write the change of the strain (shear scaled) at states H [p, 3, 3, s] by D [p, 3, 3, f].
-
-    Field f belongs to state owners[f] and is scaled by scales[f].
-    """
+    Field f belongs to state owners[f] and is scaled by scales[f]."""
     root = np.sqrt(0.5)
     for p in range(D.shape[0]):
         for f in range(D.shape[3]):
@@ -272,10 +252,8 @@ def _green_change(H, D, owners, scales, strain):
 
 @dataclass(frozen=True)
 class _Sources:
-    """States, and changes with the state that each belongs to, whose strains are true ones.
-
-    The first ``rest_count`` states are at rest, the others swung out and weigh less.
-    """
+    """States, and changes with the state that each belongs to, whose strains are true ones. The
+    first ``rest_count`` states are at rest, the others swung out and weigh less."""
 
     states: np.ndarray
     rest_count: int

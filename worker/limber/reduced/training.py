@@ -45,8 +45,6 @@ class TrainingSettings:
             spread times its value for every second grasp; 1: it is known and stays.
         vibration_every: Number of states after which the lowest vibrations, and states displaced
             along them, are added, as motion in time needs; 0: none.
-        vibration_count: How many of them.
-        seed: Of the sampling.
     """
 
     grasp_count: int = 120
@@ -68,10 +66,9 @@ class TrainingSettings:
 
 @dataclass
 class Snapshots:
-    """Full static solutions and their tangents.
+    """Full static solutions at poses [s, 6] [m, rad] and their tangents.
 
     Attributes:
-        poses: [m, rad], shape [s, 6].
         young: At the control points [Pa], shape [s, K].
         displacement: [m], shape [s, node_count, 3].
         energy: [J], shape [s].
@@ -81,11 +78,9 @@ class Snapshots:
         young_tangents: Derivative to log Young at the control points, [s, K, node_count, 3];
             [s, 0, node_count, 3] where it is known.
         vibrations: Lowest modes about some of the states, scaled to a largest motion of 1 m,
-            shape [v, node_count, 3].
-        vibration_states: The states they belong to, shape [v].
-        swings: States with free ends swung out far along vibrations, held at rest there by the
-            loads that bend them so [m], shape [w, node_count, 3].
-        swing_states: The states they belong to, shape [w].
+            shape [v, node_count, 3]; ``vibration_states`` [v] are those states.
+        swings: States with free ends swung out far along vibrations of ``swing_states`` [w], held
+            at rest there by the loads that bend them so [m], shape [w, node_count, 3].
         failed: Number of requested grasps without an equilibrium.
     """
 
@@ -133,13 +128,9 @@ class Snapshots:
 
 def sample_poses(model: BranchModel, grasp: Grasp, count: int, rng: np.random.Generator,
                  settings: TrainingSettings) -> np.ndarray:
-    """Return random poses [m, rad] that the branch can be bent to, shape [count, 6].
-
-    Displacements go in all directions, their lengths spread so that large ones are the more
-    frequent; none beyond the rest distance from the base, where the branch would be stretched. A
-    clamped grasp turns with the chord from the base, as a bent branch does, and up to
-    ``settings.turn`` away from that.
-    """
+    """Return random poses [count, 6] [m, rad] to which the branch can be bent: displacements in all
+    directions, large ones more often, none that stretches it. A clamped grasp turns with the chord
+    from the base, and up to ``settings.turn`` away from that."""
     base = model.mesh.nodes[model.fixed].mean(axis=0)
     arm = grasp.centre - base
     reach = min(settings.reach * model.extent, 0.9 * np.linalg.norm(arm))
@@ -187,16 +178,9 @@ def pose_distance(model: BranchModel, poses: np.ndarray, young: np.ndarray, pose
 
 
 class Trainer:
-    """Solves the full model at requested grasps, each from the nearest known state.
-
-    Args:
-        model: The branch; its Young's modulus is replaced by ``weights @ control_young``.
-        grasp: The patch that is held.
-        weights: From control points to tetrahedra, shape [tet_count, K].
-        control_young: Young's modulus at the control points [Pa], shape [K].
-        young_tangents: Whether derivatives to Young's modulus are taken; where it is known they
-            would only take room in the basis.
-    """
+    """Solves the full model at requested grasps, each from the nearest known state. Its modulus is
+    ``weights`` [tet_count, K] times ``control_young`` [K] [Pa]. ``young_tangents``: take
+    derivatives to it; where it is known they would only take room in the basis."""
 
     def __init__(self, model: BranchModel, grasp: Grasp, weights: np.ndarray,
                  control_young: np.ndarray, *, young_tangents: bool = True):
@@ -220,16 +204,9 @@ class Trainer:
     def take(self, poses: np.ndarray, young: np.ndarray, known: Snapshots | None = None, *,
              vibration_every: int = 0, vibration_count: int = 0,
              progress: Progress = SILENT) -> Snapshots:
-        """Solve all requested grasps, nearest first, and differentiate each.
-
-        Args:
-            poses: [m, rad], shape [s, 6]. young: At the control points [Pa], shape [s, K].
-            known: States to start from where they are nearer.
-            vibration_every, vibration_count: See :class:`TrainingSettings`.
-
-        Raises:
-            ConvergenceError: none of them has an equilibrium.
-        """
+        """Solve all grasps at poses [s, 6] [m, rad] and moduli [s, K] [Pa], nearest first, and
+        differentiate each. ``known`` states are starts; for vibrations see
+        :class:`TrainingSettings`. ConvergenceError if none has an equilibrium."""
         starts = [] if known is None else list(zip(known.poses, known.young, known.displacement,
                                                    strict=True))
         left = list(range(len(poses)))
@@ -268,11 +245,8 @@ class Trainer:
 
     def differentiate(self, poses: np.ndarray, young: np.ndarray,
                       displacements: np.ndarray) -> Snapshots:
-        """Return full solutions that are there already, with their tangents.
-
-        Args:
-            displacements: Converged [m], shape [s, node_count, 3].
-        """
+        """Return full solutions with converged ``displacements`` [s, node_count, 3] [m] and their
+        tangents."""
         rows = []
         for pose, modulus, displacement in zip(poses, young, displacements, strict=True):
             model = self.model.with_young(self.weights @ modulus)
@@ -338,11 +312,9 @@ class Trainer:
 
     def _swings(self, state: np.ndarray, modes: np.ndarray, pose: np.ndarray, young: np.ndarray,
                 rng: np.random.Generator) -> list[np.ndarray]:
-        """Return states swung out from one along its vibrations, as far as motion does.
-
-        A vibration as it is would stretch what turns far; bent there by its own inertia load
-        (omega^2 M times the mode) the branch keeps its length.
-        """
+        """Return states swung out from one along its vibrations, as far as motion does. A vibration
+        as it is would stretch; bent by its own inertia load (omega^2 M times the mode) the branch
+        keeps its length."""
         model = self.model.with_young(self.weights @ young)
         mass, found = model.mass_matrix, []
         rate = np.array([(mode * model.tangent_times(state, mode)).sum()
