@@ -14,16 +14,9 @@ from limber.geometry.skeleton.skeleton import Skeleton
 
 @dataclass(frozen=True)
 class RestCurve:
-    """A branch at rest, resampled; what does not change while it moves.
-
-    Attributes:
-        nodes: Main path [m], shape [n, 3], evenly spaced.
-        arc: Arc length of the nodes [m], shape [n].
-        radius: [m], shape [n].
-        hats: Value of each knot's hat function at each segment's middle, shape [n - 1, knots].
-        side_nodes: Nodes of side branches [m], shape [s, 3].
-        side_root: Main-path node that each side node hangs on, shape [s].
-    """
+    """A branch at rest: main path [n, 3] and side nodes [s, 3] [m], arc length and radius of the
+    path [n] [m], each knot's hat function at segments' middles [n - 1, knots], and the path's node
+    that each side node hangs on [s]."""
 
     nodes: np.ndarray
     arc: np.ndarray
@@ -66,14 +59,9 @@ class RestCurve:
 
 @dataclass(frozen=True)
 class BentCurve:
-    """A state of a :class:`RestCurve`.
-
-    Attributes:
-        rest: The curve at rest.
-        turns: Rotation of each segment against rest, shape [n - 1, 3, 3].
-        knots: Sum of the rotation steps taken at each knot [rad], shape [knots, 3]; a measure
-            of how much the curve is bent, not a rotation vector.
-    """
+    """A state of a :class:`RestCurve`: rotation of each segment against rest [n - 1, 3, 3], and the
+    sum of rotation steps at each knot [knots, 3] [rad], a measure of the bend and no rotation
+    vector."""
 
     rest: RestCurve
     turns: np.ndarray
@@ -104,10 +92,8 @@ class BentCurve:
         return replace(self, turns=field @ self.turns, knots=self.knots + step)
 
     def jacobian(self) -> np.ndarray:
-        """Derivative of the nodes [m] to a rotation step at the knots: [n, 3, knots, 3].
-
-        A rotation d of a segment moves all nodes after it by d x (the segment's vector).
-        """
+        """Derivative [n, 3, knots, 3] of the nodes [m] to a rotation step at the knots. A rotation
+        d of a segment moves all nodes after it by d x (the segment's vector)."""
         steps = np.einsum("nij,nj->ni", self.turns, np.diff(self.rest.nodes, axis=0))
         cross = np.zeros((len(steps), 3, 3))
         cross[:, 0, 1], cross[:, 0, 2] = steps[:, 2], -steps[:, 1]

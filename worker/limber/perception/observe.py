@@ -32,24 +32,9 @@ class _Notes:
 
 def observe(folder: Path, pull: Pull, skeleton: Skeleton, fractions: tuple[float, ...], *,
             progress: Progress = SILENT) -> tuple[Observations, list[str]]:
-    """Find the control points in every frame of a pull's clouds or depth images.
-
-    The gripper's pose gives the position of the branch at the grasp; the first frame must show the
-    branch at rest: against it the camera's pose is checked and corrected.
-
-    Args:
-        folder: The pull's folder.
-        pull: The pull; its robot stream and ``entry`` are used.
-        skeleton: The branch at rest.
-        fractions: Positions of the control points along its main path.
-        progress: Reports each frame.
-
-    Returns:
-        Observations (a point that was not visible is NaN) and warnings.
-
-    Raises:
-        InputError: there are no frames, or the branch is in none of them.
-    """
+    """Find the control points, at ``fractions`` of the main path, in all frames of a pull; NaN
+    where not visible. Returns warnings too. The first frame shows the branch at rest: it corrects
+    the camera's pose. InputError if there are no frames, or the branch is in none."""
     frames = list_frames(folder, pull.entry.observation)
     load = _loader(folder, pull.entry.observation)
     tracker = CurveTracker(skeleton, fractions)

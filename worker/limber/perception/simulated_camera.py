@@ -7,16 +7,8 @@ from limber.geometry.cloud.camera import Camera, project
 
 
 def render_depth(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Render triangles into a depth image without noise; empty pixels are 0.
-
-    Args:
-        camera: Intrinsics and pose.
-        vertices: [m] in the branch's frame, shape [n, 3].
-        faces: Vertex indices, shape [m, 3].
-
-    Returns:
-        Depth [m], shape [height, width].
-    """
+    """Render triangles of ``vertices`` [n, 3] [m], in the branch's frame, into a depth image
+    [height, width] [m] without noise; empty pixels are 0."""
     pixels, depth = project(camera, vertices)
     image = np.full((camera.height, camera.width), np.inf)
     _rasterise(image, pixels, depth, np.ascontiguousarray(faces, np.int64))
@@ -27,19 +19,9 @@ def render_depth(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> np.
 def with_noise(camera: Camera, depth: np.ndarray, rng: np.random.Generator, *,
                flying_share: float = 0.05, flying_reach_m: float = 0.15,
                missing_share: float = 0.02) -> np.ndarray:
-    """Add a stereo camera's noise, flying pixels at silhouettes and missing readings.
-
-    Args:
-        camera: Gives the noise of depth, sigma = disparity_sigma z^2 / (f b).
-        depth: [m], 0 where nothing is seen.
-        rng: Source of randomness.
-        flying_share: Fraction of the branch's pixels that fly off, taken from its silhouette.
-        flying_reach_m: They lie up to so far behind the surface.
-        missing_share: Fraction of pixels without a reading.
-
-    Returns:
-        Depth [m] quantised to the camera's ``depth_scale``.
-    """
+    """Add to a depth image [m] a stereo camera's noise, sigma = disparity_sigma z^2 / (f b),
+    quantised to ``depth_scale``; a share of flying pixels at silhouettes, up to ``flying_reach_m``
+    behind the surface; and a share of missing readings (0)."""
     seen = depth > 0
     noisy = depth + seen * camera.depth_sigma(depth) * rng.standard_normal(depth.shape)
     inner = seen.copy()

@@ -31,15 +31,9 @@ MODEL_SIGMA_M = 5e-5
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """Control points in one frame.
-
-    Attributes:
-        positions: On the branch's axis [m], shape [K, 3].
-        covariance: [m^2], shape [K, 3, 3].
-        visible: Whether the cloud shows the branch around each point, shape [K].
-        inlier_share: Fraction of the cloud's points that the curve explains.
-        curve: The fitted curve; the start for the next frame.
-    """
+    """Control points on the axis [K, 3] [m] in a frame, their covariance [K, 3, 3] [m^2], and
+    whether the cloud shows the branch around each; the share of its points that the curve explains,
+    and that curve, the next frame's start."""
 
     positions: np.ndarray
     covariance: np.ndarray
@@ -50,13 +44,8 @@ class TrackedFrame:
 
 @dataclass(frozen=True)
 class Anchor:
-    """A material point with a known position: where the gripper holds.
-
-    Attributes:
-        arc: Arc length of the curve's point nearest to the grasp [m].
-        position: Where that point is now [m], shape [3].
-        sigma: Standard deviation [m].
-    """
+    """A material point with a known position [3] and deviation [m], where the gripper holds;
+    ``arc`` is the arc length [m] of the curve's point nearest to the grasp."""
 
     arc: float
     position: np.ndarray
@@ -75,10 +64,8 @@ class CurveTracker:
 
     def track(self, cloud: SeenCloud, before: BentCurve | None = None,
               anchor: Anchor | None = None) -> TrackedFrame:
-        """Fit the curve to a cloud, starting from the frame ``before`` (None: rest).
-
-        With fewer than 10 points the curve stays where it was, with nothing visible.
-        """
+        """Fit the curve to a cloud, starting from the frame ``before`` (None: rest). With fewer
+        than 10 points the curve stays where it was, with nothing visible."""
         curve = before or self.rest.start()
         cloud = self.thinned(cloud)
         if anchor is not None:
@@ -119,12 +106,8 @@ class CurveTracker:
 
 
 def rest_offset(tracker: CurveTracker, cloud: SeenCloud) -> tuple[np.ndarray, np.ndarray]:
-    """Find the offset of a cloud of the branch at rest from its skeleton: the camera pose's error.
-
-    Returns:
-        Rotation matrix [3, 3] and translation [m], shape [3], that take the cloud onto the
-        branch.
-    """
+    """Return rotation [3, 3] and translation [3] [m] that take a cloud of the branch at rest onto
+    its skeleton: the camera pose's error."""
     curve = tracker.rest.start()
     centre = curve.nodes.mean(axis=0)
     rotation, shift = np.eye(3), np.zeros(3)
@@ -172,13 +155,9 @@ def _equations(curve: BentCurve, cloud: SeenCloud, reach: float, anchor: Anchor 
 
 
 def _spread(curve: BentCurve, cloud: SeenCloud, anchor: Anchor | None) -> np.ndarray:
-    """Covariance of the knots' turns, from how the points scatter about the fitted curve.
-
-    Pixels lie side by side across the branch: their distances from its middle are wide, but they
-    add up to nearly nothing, and flying pixels do not. Taking each as an independent error makes
-    the covariance tenfold too large. The scatter is therefore that of whole pieces of the curve
-    (the sandwich of Huber and White, clustered by arc length).
-    """
+    """Covariance of the knots' turns, from the scatter of whole pieces of the curve (sandwich of
+    Huber and White, clustered by arc length). Pixels beside each other add up to nearly nothing,
+    flying ones do not: as independent errors they make it tenfold too large."""
     normal, _, _ = _equations(curve, cloud, 0.0, anchor)
     match = _match(curve, cloud, 0.0)
     at = _interpolated(curve, match.arcs).reshape(len(match.arcs), 3, -1)
@@ -203,16 +182,9 @@ def _spread(curve: BentCurve, cloud: SeenCloud, anchor: Anchor | None) -> np.nda
 
 @dataclass(frozen=True)
 class _Match:
-    """What the points of a cloud that belong to the main path say about the curve.
-
-    Attributes:
-        rows: Their indices in the cloud, shape [n].
-        arcs: Arc lengths of the nearest points of the curve [m], shape [n].
-        directions: Towards the back and towards the side, both across the axis, 2 x [n, 3].
-        residuals: 2 x [n]; [m].
-        weights: 2 x [n]; robust, over variance.
-        inlier: Whether the point counts, shape [n] of bool.
-    """
+    """What ``rows``, n points of a cloud on the main path, say: arc lengths of the curve's nearest
+    points [m]; directions [n, 3] towards the back and the side, across the axis, with residuals [m]
+    and robust weights over variance for both; and whether a point counts."""
 
     rows: np.ndarray
     arcs: np.ndarray
