@@ -50,10 +50,11 @@ class SceneSettings(Settings):
     """Content of a scene."""
 
     groups: ClassVar[Groups] = {
-        "picture": ("width", "color", "plan", "motion", "strength")}
+        "picture": ("width", "sides", "color", "plan", "motion", "strength")}
 
     width: int = Field(1120, ge=160, le=8192, description=(
         "Width of the picture [pixels]; the height is three quarters of it."))
+    sides: int = Field(48, ge=2, le=720, description="Number of frames of the turntable.")
     color: Literal["young", "strain_energy", "strain", "stress", "stress_over_strength", "det_f",
                    "residual"] = Field(
         "young", description="Quantity that the colours show. All but young and residual "
@@ -125,7 +126,7 @@ def _made(data: SceneData, output: Path, inputs: SceneInputs, settings: SceneSet
         if inputs.turntable is not None:
             _writable(inputs.turntable)
             frames.mkdir()
-            arguments += ["--round", frames]
+            arguments += ["--round", frames, "--sides", settings.sides]
         result = make_scene(arguments, progress)
         if inputs.turntable is not None:
             _write_moving(inputs.turntable, sorted(frames.glob("*.png")))

@@ -35,7 +35,7 @@ from pydantic import Field
 
 from limber.core.alignment import Alignment
 from limber.core.constants import FOUND_SKELETON
-from limber.core.errors import InputError, Option, Text
+from limber.core.errors import Command, InputError, Option, Text
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.stages.inputs import BranchInputs, NoOptions, NoSettings, by_name
@@ -257,7 +257,8 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
         raise InputError(
             f"{branch.folder} has no mesh of this skeleton.",
             "The last reconstruct failed. The scan is needed again.",
-            "Run `limber reconstruct CLOUD -o NAME.branch --edits FILE`.")
+            "Run ", Command("reconstruct", "CLOUD", "-o", "NAME.branch", Option("edits"), "FILE"),
+            ".")
     settings = _settings(made)
     alignment = branch.manifest.alignment
     digests = {name: value for name, value in made.reads.items() if name != "edits"}
