@@ -70,8 +70,8 @@ def supported(found: Estimate) -> Support:
 
 @dataclass(frozen=True)
 class _Problem:
-    """A fit as linear in log E at stations [S], ascending, and in q other unknowns: standardised
-    residual [r] with the others' priors, and its derivatives [r, S] and [r, q]."""
+    """A fit as linear in log E at stations [S], ascending, and q other unknowns: residual [r] over
+    deviations, with the others' priors, and its derivatives [r, S] and [r, q]."""
 
     stations: np.ndarray
     log_young: np.ndarray

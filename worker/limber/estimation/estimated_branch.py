@@ -154,8 +154,8 @@ def neck(skeleton: Skeleton) -> list[str]:
 
 def forwards_of(pulls: list[Pull], subject: Subject, settings: FitSpec,
                 shifts: Mapping[str, np.ndarray] | None = None) -> list[Forward]:
-    """Make each pull's simulation. ``shifts`` [m] [m] by name are how much farther along the branch
-    points are. InputError if nothing is measured, or the observed points differ."""
+    """Make each pull's simulation; by name, ``shifts`` [m] are how much farther along the branch
+    points are than stated. InputError if nothing is measured, or observed points differ."""
     forwards = []
     for pull in pulls:
         frames = frames_of(pull)
@@ -217,8 +217,8 @@ def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subj
 
 
 def observes_path(entry: PullEntry, frames: Frames, settings: FitSpec) -> bool:
-    """Whether a slow pull's force drives and the recorded path is observed: the force (clamped,
-    torque too) is measured and the gripper's frame may err. Else the path drives, as exact."""
+    """Whether a slow pull's force drives and the recorded path is observed: the force (clamped: and
+    torque) is measured, and the gripper's frame may err. Else the path drives as exact."""
     measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
     known = calibration_of(entry)
     return (entry.drive == "pose" and settings.drive is None and settings.forward == "full"

@@ -199,9 +199,9 @@ def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
               progress: Progress = SILENT, *, cache: Path | None = None, digest: str = "",
               near: Values | None = None, far: FarPoints | None = None, quick: bool = False,
               ) -> Estimate:
-    """Check what the data determine, fit, and compute intervals; ``quick`` leaves Gauss' and judges
-    nothing (:func:`complete`). ``near`` is a start if it has an equilibrium; ``far`` ends a fit
-    whose points are far off. ``cache`` and ``digest`` are of reduced bases."""
+    """Check what the data determine, fit, and compute intervals; ``quick`` keeps Gauss' and judges
+    nothing (:func:`complete`). It starts from ``near`` if that has an equilibrium; ``far`` ends it
+    if points are far off. ``cache`` and ``digest`` belong to reduced bases."""
     require_scale_in_principle(objective.forwards)
     require_own_frame(objective, start)
     reduction = (Reduction(objective.forwards, cache, digest) if settings.forward == "reduced"

@@ -35,20 +35,18 @@ class Values:
 
 @dataclass(frozen=True)
 class ParameterSpace:
-    """The free parameters, and the control points that share one modulus.
+    """The free parameters; ``base`` has the fixed ones and the free ones' initial values.
 
     The free vector contains log E of each group, then those of the form of the field, Poisson's
     ratio, log density, log alpha and log beta that are free.
 
     Attributes:
-        base: Values of the fixed parameters, and initial values of the free ones.
-        groups: Group of each control point, shape [K]; groups are numbered from 0.
+        groups: Group of each control point, from 0, shape [K]; a group shares one modulus.
         extra: Names of the free ones: all that describe the form, named "form ...", or none; then
             out of "poisson", "density", "alpha", "beta", in this order.
         links: Pairs of groups of which the data do not determine the first: it is assumed to differ
             from the second as neighbours do.
-        priors: Names out of ``extra`` with the prior of their free value: its mean and standard
-            deviation.
+        priors: Names out of ``extra`` with mean and standard deviation of their free value.
     """
 
     base: Values
@@ -192,18 +190,9 @@ _ORDER = "form of side branches of order "
 
 @dataclass(frozen=True)
 class YoungField:
-    """Young's modulus of the tetrahedra from that at the control points.
-
-    Attributes:
-        weights: The paper's inverse-distance weights, shape [tet_count, K].
-        straight: Weights of the logarithms in the log-linear field, shape [tet_count, K]; None: the
-            field is the paper's, without further unknowns.
-        bumps: Effect of each further unknown on log E, 1 at most, shape [tet_count, B].
-        widths: Deviations of these changes if all moduli are the same, shape [B].
-        steps: Increase of them by a change of log E at the control points, shape [B, K].
-        names: Names of the mixture and the bumps, B + 1; empty without ``straight``.
-        log_factor: Log of the factor of a layered section in ``weights``, shape [tet_count].
-    """
+    """Moduli of tetrahedra from the control points': paper's weights and log-linear ``straight``
+    [tet_count, K] (None: the paper's only), bumps [tet_count, B] on log E with deviations
+    ``widths`` [B] if moduli are equal, and ``steps`` [B, K] more by differences in log E."""
 
     weights: np.ndarray
     straight: np.ndarray | None = None
@@ -258,8 +247,8 @@ class YoungField:
 
     def order_moduli(self, values: Values, deviation: Mapping[str, float],
                      ) -> list[dict[str, Any]]:
-        """Modulus of each order's side branches over the main path's, with 95 % interval, from the
-        free parameters' ``deviation`` by name."""
+        """Return ``factor`` and 95 % ``interval`` of the modulus of each ``order`` of side branches
+        over that of the main path, by the free parameters' ``deviation``."""
         found = []
         sizes = self.deviations(values)
         for number, name in enumerate(self.names[1:]):
@@ -278,8 +267,7 @@ class YoungField:
             self.weights @ values.young)
 
     def _sizes(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
-        """Deviations of the bumps [B], and their derivative to log E at the control points [B, K].
-        """
+        """Deviations of the bumps [B], and their derivative to log E at control points [B, K]."""
         step = self.steps @ np.log(values.young)
         sizes = np.hypot(present(self.widths, "bump of the field"), step)
         return sizes, (step / sizes)[:, None] * self.steps
@@ -295,8 +283,7 @@ def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
                fractions: tuple[float, ...], *, log_factor: np.ndarray | float = 0.0,
                by_order: bool = False) -> YoungField:
     """Return the field with unknown interpolation (one modulus: uniform). ``log_factor``
-    [tet_count] of a layered section is in the weights; ``by_order`` gives side branches moduli of
-    their own."""
+    [tet_count] of layers is in the weights; ``by_order`` gives side branches their own moduli."""
     positions = np.asarray(fractions, float)
     is_uniform = len(positions) < 2 or bool(np.any(np.diff(positions) <= 0))
     along, order = _element_positions(mesh, skeleton)
@@ -351,8 +338,7 @@ def _bumps(fractions: tuple[float, ...]) -> tuple[list[int], list[float], list[n
 
 
 def _element_positions(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
-    """Position of each tetrahedron on the main path (0 to 1), and its branching order (0: main).
-    """
+    """Each tetrahedron's position on the main path (0 to 1) and branching order (0: main)."""
     path = np.asarray(skeleton.main_path())
     on_path = np.zeros(len(skeleton.nodes), bool)
     on_path[path] = True

@@ -97,9 +97,9 @@ def _space(known: dict[str, Any], values: Values) -> ParameterSpace:
 
 def _uncertain(moved: np.ndarray, slope: np.ndarray, down: np.ndarray, space: ParameterSpace,
                known: dict[str, Any]) -> tuple[float, np.ndarray, float]:
-    """Mean drop, deviations of each point and of the drop [m] from the modulus's data alone: radius
-    and mesh err oppositely in modulus and prediction. Stiffness varies again, as between
-    recordings."""
+    """Return the mean drop, deviations of each point's displacement, and that of the drop [m], from
+    the data's part alone: errors of radius and mesh cancel in modulus and prediction. Stiffness
+    varies as between recordings."""
     count = len(space.groups)
     free = np.concatenate([slope[..., :count] @ space.membership, slope[..., count:]], axis=-1)
     covariance = np.array(known["covariance"])[:space.size, :space.size].copy()

@@ -80,16 +80,9 @@ class _State:
 
 @dataclass(frozen=True)
 class Rod:
-    """A branch as a rod, with the load that it carries.
-
-    Attributes:
-        along: Arc lengths of the stations from the base to the grasp [m], shape [S].
-        table: At the stations, shape [S, 19]: t; compliances in stretch, shear, bending and twist
-            [1/N, 1/N, 1/(N m^2), 1/(N m^2)]; weight beyond [N]; n0 [N]; m0 [N m]; d [kg].
-        axis: The stations as scanned [m], shape [S, 3].
-        gravity: [m/s^2], shape [3].
-        outer: Mass beyond the grasp times the arm of its centre [kg m], shape [3].
-    """
+    """A branch as a rod: stations' arc lengths [S] from base to grasp [m], and ``table`` [S, 19]:
+    t; compliances in stretch, shear, bending, twist [1/N, 1/N, 1/(N m^2), 1/(N m^2)]; weight beyond
+    [N]; n0 [N]; m0 [N m]; d [kg]. ``outer`` [kg m] is the mass beyond times its arm."""
 
     along: np.ndarray
     table: np.ndarray
@@ -288,8 +281,8 @@ def _from_end(values: np.ndarray, along: np.ndarray) -> np.ndarray:
 def _hung(skeleton: Skeleton, path: np.ndarray, along: np.ndarray, radius: np.ndarray, end: float,
           grasp: np.ndarray, curve: CubicSpline, density: float,
           ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Masses on the rod: side branches' per length, mass [S] [kg/m] and moment [S, 3] [kg], each
-    spread over the diameter at its fork, and of the part beyond the grasp [kg], [3] [kg m]."""
+    """Masses that hang on the rod: side branches' per length [S] [kg/m] and their moment [S, 3]
+    [kg], spread over the diameter at the fork; beyond the grasp mass [kg], moment [3] [kg m]."""
     arc, on_path = skeleton.arc_length, np.isin(np.arange(skeleton.node_count), path)
     root = np.arange(skeleton.node_count)
     for node in range(1, skeleton.node_count):

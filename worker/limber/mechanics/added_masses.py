@@ -64,9 +64,8 @@ def _scaled(row: Place, factor: float) -> Place:
 
 @dataclass(frozen=True)
 class Tied:
-    """How an added mass follows the ``nodes`` [t, a] of its t elements (or one node), each with
-    ``share`` [t] of it: weights of its centre's move [t, a], and of the gradient [1/m] [t, 3,
-    a]."""
+    """An added mass on ``nodes`` [t, a] of t elements (or one node), each with ``share`` [t] of it:
+    the nodes' weights in its centre's displacement [t, a] and in the gradient [1/m] [t, 3, a]."""
 
     added: PointMass
     nodes: np.ndarray
@@ -101,8 +100,9 @@ class Tied:
 
 def tied(mesh: TetMesh, added: Iterable[PointMass], gradients: np.ndarray, weights: np.ndarray,
          volume_weights: np.ndarray) -> list[Tied]:
-    """Tie masses to a mesh by its shape functions' gradients [1/m] [tet_count, q, 3, a], quadrature
-    weights [m^3] and integrals [m^3] [tet_count, a]. InputError if a mass is negative."""
+    """Tie masses to a mesh by shape functions' gradients [1/m] [tet_count, q, 3, a], quadrature
+    weights [m^3] and integrals [m^3] [tet_count, a]. InputError if a mass is below 0 or not
+    finite."""
     found = []
     for one in added:
         if not (np.isfinite(one.mass) and one.mass >= 0):

@@ -74,8 +74,7 @@ def _placed(mesh: TetMesh, point: np.ndarray, half_length: float) -> tuple[np.nd
 
 
 def stiffening(parts: np.ndarray) -> np.ndarray:
-    """Return the stiffness factors of tetrahedra with these fractions inside a gripper.
-    """
+    """Return the stiffness factors of tetrahedra with these fractions in a gripper."""
     return 1.0 / np.maximum(1.0 - parts, 1.0 / STIFFEST)
 
 

@@ -603,8 +603,7 @@ class BranchModel:
 @dataclass
 class MotionState:
     """One instant, arrays [node_count, 3]. Strains now and a step earlier (or derivatives) are
-    [tet_count, q, 6], empty without viscosity; ``step_before`` [s] is infinite without an earlier
-    state."""
+    [tet_count, q, 6], empty without viscosity; ``step_before`` [s] is infinite without a state."""
 
     time: float
     displacement: np.ndarray

@@ -62,8 +62,7 @@ def _stalks(mesh: TetMesh, points: np.ndarray, outside: np.ndarray) -> sparse.cs
 
 
 def _slopes(mesh: TetMesh, tets: np.ndarray) -> np.ndarray:
-    """Gradients of the shape functions in space in the middle of tetrahedra [1/m], [t, nodes, 3].
-    """
+    """Gradients of the shape functions in space in the middle of tetrahedra [1/m] [t, nodes, 3]."""
     corners = mesh.nodes[mesh.tets[tets, :4]]
     edges = np.transpose(corners[:, 1:] - corners[:, :1], (0, 2, 1))
     # d xi / d x is the inverse of the edges.

@@ -158,9 +158,9 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
                  grasp_point: np.ndarray | Sequence[float] | None = None, *,
                  grasp_radius: float = GRASP_RADIUS_M, frame_rate: float = FRAME_RATE,
                  ) -> LoadCase:
-    """Return the load case of settings, or of a path instead of their motion. ``grasp_point`` [m]
-    None is the patch's centre. InputError if options do not fit, ConvergenceError if no
-    equilibrium."""
+    """Return the load case that settings request, or a path instead of their motion.
+    ``grasp_point`` [m] None is the patch's centre. InputError if options do not fit,
+    ConvergenceError if the branch has no equilibrium."""
     def patch(point: Point, mode: Literal["rigid", "point"]) -> Grasp:
         if mode == "rigid":
             return Grasp.gripping(model.mesh, np.array(point), grasp_radius)

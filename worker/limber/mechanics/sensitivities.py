@@ -113,9 +113,8 @@ def static_sensitivities(model: BranchModel, result: StaticResult,
 
 @dataclass(frozen=True)
 class GraspSlopes:
-    """Derivatives by the pose of a clamped grasp, position [m] and rotation [rad] about the
-    branch's axes: of force and torque about the moved pose [6, 6], and of all nodes [node_count, 3,
-    6]."""
+    """Derivatives by a clamped grasp's pose, position [m] and rotation [rad] about the branch's
+    axes: of force and torque about the moved pose [6, 6], and of nodes [node_count, 3, 6]."""
 
     wrench: np.ndarray
     displacement: np.ndarray
@@ -148,8 +147,7 @@ def grasp_slopes(model: BranchModel, grasp: Grasp, displacement: np.ndarray) -> 
 
 def refined_solve(tangent: Tangent, force: Callable[[np.ndarray], np.ndarray],
                   right: np.ndarray, tolerance: float = 1e-10) -> np.ndarray:
-    """Return x with force(x) = right on the free nodes, to ``tolerance``, from a nearby tangent.
-    """
+    """Return x with force(x) = right on free nodes, to ``tolerance``, from a nearby tangent."""
     equations, solution = tangent.equations, tangent.solve(right)
     scale = np.linalg.norm(equations.free_part(right))
     last = np.inf

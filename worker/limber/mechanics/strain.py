@@ -30,9 +30,9 @@ class Place:
 
 @dataclass(frozen=True)
 class StrainState:
-    """Means over tetrahedra [tet_count] or ascending [tet_count, 3], with those that carry a
-    hanging branch's weight. Energy [J/m^3] is relative to the mesh; det F is the smallest at a
-    point."""
+    """Means over each tetrahedron, principal values [tet_count, 3] ascending. They include strain
+    and stress that carry a hanging branch's weight. Energy [J/m^3] is relative to the mesh;
+    ``det_f`` is the smallest of the quadrature points."""
 
     energy_density: np.ndarray
     principal_strain: np.ndarray

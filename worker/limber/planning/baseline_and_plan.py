@@ -84,9 +84,9 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
                 limits: Limits, *, asked: Limits | None = None, asked_goal: Goal | None = None,
                 before: PathPair | None = None, is_bounded: bool = True,
                 progress: Progress = SILENT) -> PathPair:
-    """As :func:`plan_pair`, within the field's possible error; else on the field alone; else in
+    """Plan as :func:`plan_pair` within the field's possible error; else on the field alone; else in
     doubt (:meth:`~.limits.Limits.in_doubt`). A proof refers to ``asked``, the bound to
-    ``asked_goal``; ``before`` gives paths to start from, so that trees are kept."""
+    ``asked_goal``. ``before`` gives trees and paths to start from."""
     margins = limits.margins(field)
     check_start(field, start, limits.on(field))
     closed, is_open = _closed_by_field(field, start, goal, limits, asked or limits)

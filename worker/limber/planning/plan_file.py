@@ -63,22 +63,9 @@ _COLUMNS = {"poses": "poses", "energies": "energies_j", "strains": "strains", "t
 
 @dataclass(frozen=True)
 class PlanPath:
-    """States along a path; None if a file does not contain them.
-
-    Attributes:
-        poses: [m, rad], shape [n, 6].
-        energies: Potential of strain and weight above the hanging state [J], shape [n].
-        strains: Largest strain in the branch, shape [n].
-        forces, torques: Force and torque of the gripper on the branch [N, Nm], shape [n, 3].
-        times: [s], ascending, shape [n].
-        tips: Position of the branch's tip [m], shape [n, 3].
-        targets: Positions [m], shape [n, 3] each, by name.
-        field_energies: Energies predicted by the field [J], shape [n].
-        joints: Joint angles of the robot [rad], shape [n, joints].
-        stresses: Largest stress in the branch [Pa], shape [n].
-        axial_forces: Component of the force along the branch, outward [N], shape [n].
-        phases: ``approach``, ``path`` or ``return``, n of them.
-    """
+    """States along a path, None if a file does not have them: poses [n, 6] [m, rad], energies above
+    hanging [J], the largest strain and stress [Pa], forces and torques on the branch [n, 3], joints
+    [n, joints] [rad]. ``phases`` are ``approach``, ``path`` or ``return``."""
 
     poses: np.ndarray
     energies: np.ndarray
@@ -407,9 +394,9 @@ def summary_of(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair
 
 def _on_full_model(field: EnergyField, goal: Goal, pair: PathPair, found: PathMeasures,
                    ) -> dict[str, Any]:
-    """Bound for any branch with energy nowhere farther below the field's than 95 % of left-out
-    samples. As E falls by e, c falls to at least l / (l + w e) of itself, an integral by e times
-    length. None for targets, whose position the field knows too badly."""
+    """Return the bound for every branch whose energy is nowhere farther below the field's than 95 %
+    of left-out samples were, and the plan's gap to it. As E falls by e, c falls to at least l / (l
+    + w e) of itself, and an integral by e times the length. A target has no bound."""
     weights, detour = pair.cost.weights, pair.detour
     cheap = field.samples.energies <= 1.5 * max(found.peak_energy_j, 1e-12)
     missed = np.abs(field.missed[cheap & ~field.region.is_face(), 0])

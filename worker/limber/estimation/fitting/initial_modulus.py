@@ -71,8 +71,8 @@ def set_all_keys(objective: Objective, count: int) -> None:
 
 
 def prescribed_start(objective: Objective, values: Values) -> tuple[Values, bool]:
-    """Fit pulls with an observed path by force alone first, and whether that explains them. Far
-    from the solution no force explains path and points; near it both are fitted together."""
+    """Fit pulls with an observed path by force alone first; return if that explains them. Far from
+    the solution no force explains path and points; near it they are fitted together."""
     observed = [forward for forward in objective.forwards if is_path_observed(forward)]
     if not observed:
         return values, True
@@ -142,8 +142,9 @@ def standing(objective: Objective, values: Values) -> Values:
 
 
 def _step_by_step(objective: Objective, values: Values) -> Values:
-    """Fit fast pulls by growing parts, as wrong moduli give a wrong frequency and later an
-    arbitrary phase. Over a quarter of the frames it is not a period off, and predicts the next."""
+    """Fit the beginning of fast pulls first, then growing parts. A branch with wrong moduli
+    oscillates at other frequencies, and later its phase is arbitrary. In a quarter of the frames it
+    cannot be a whole period off; the result predicts the next part."""
     space = objective.space
     likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
     for number, part in enumerate(PARTS):
@@ -187,9 +188,9 @@ def _scanned(objective: Objective, values: Values) -> Values:
 
 def standing_start(objective: Objective, start: Values, uniform: Values, *, explains: bool = True,
                    ) -> tuple[Values, Evaluation] | None:
-    """Return values near the start with an equilibrium, and their evaluation; None: no equilibrium.
-    Unless the start ``explains`` the pulls, it and the uniform modulus are led along the path, and
-    the better counts. Last, uniform and outward softer moduli are tried under the force."""
+    """Return values near the start that have an equilibrium, and their evaluation, or None. If the
+    start does not explain the pulls, it and the uniform modulus are led along the path, and the
+    better is taken. At last uniform and outward softer moduli are tried under the force."""
     if explains:
         found = objective.evaluate(objective.space.pack(start), jacobian=True)
         if found is not None:
@@ -208,8 +209,7 @@ def standing_start(objective: Objective, start: Values, uniform: Values, *, expl
 
 
 def _along_recorded_path(objective: Objective, values: Values) -> tuple[Values, Evaluation] | None:
-    """Evaluate with pulls led along their recorded paths; None: there is none, or no equilibrium.
-    """
+    """Evaluate with pulls led along their recorded paths; None: no path or no equilibrium."""
     observed = [forward for forward in objective.forwards if is_path_observed(forward)]
     if not observed or not all(forward.lead_along_path(values) for forward in observed):
         return None
@@ -248,8 +248,8 @@ square is 0.05 mm.
 
 def far_points(cell_errors: Sequence[dict], known: Mapping[str, np.ndarray],
                ) -> dict[str, np.ndarray] | None:
-    """Return each pull's fitted distances of points along the branch [m] [m]; None if near those
-    simulated, ``known`` by the pull's name (absent: zero)."""
+    """Return each pull's fitted distances of its points along the branch [m]; None if they are near
+    those simulated, ``known`` by the pull's name (absent: zero)."""
     found: dict[str, list[float]] = {}
     for each in cell_errors:
         if re.fullmatch("position of point [0-9]+ along the branch", each["name"]):

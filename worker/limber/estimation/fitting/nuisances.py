@@ -41,9 +41,8 @@ CREEP_SIGMA = 0.1
 
 @dataclass(frozen=True)
 class Nuisance:
-    """An error that is constant during a recording, with its prior deviation in ``unit`` ("m",
-    "rad", "N", "N m", "s", or "" for relative). Of ``pull``; None: of the cell in one
-    calibration."""
+    """An error that is constant during a recording, and its prior deviation in ``unit`` (m, rad, N,
+    N m, s, or empty: relative). ``pull`` has it; None: the cell, in one calibration."""
 
     name: str
     unit: str
@@ -64,8 +63,8 @@ class ErrorSlopes:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """Estimated errors [k] in their deviations for a given free vector, covariance [k, k] with it
-    fixed, and derivative to it [k, p] (None: without derivatives)."""
+    """Estimated errors [k] in units of their deviations, their covariance [k, k] for a fixed free
+    vector, and their derivative to it [k, p] (None: without derivatives)."""
 
     values: np.ndarray
     covariance: np.ndarray
@@ -287,9 +286,8 @@ def _late(pull: _Pull) -> dict[str, np.ndarray]:
 
 
 def relaxed(times: np.ndarray, forces: np.ndarray, seconds: float) -> np.ndarray:
-    """Part of a force [f, 3] [N] that a standard linear solid relaxes, per share: the integral of
-    (1 - exp(-(t - s) / seconds)) dF(s), exact if linear between frames. The first force has acted
-    for long."""
+    """Return what a standard linear solid relaxes of a force [f, 3] [N], per share: the integral of
+    (1 - exp(-(t - s) / seconds)) dF(s), exact between frames. The first force acted for long."""
     found = np.zeros_like(forces)
     waiting = np.zeros(forces.shape[1])
     for frame in range(1, len(times)):

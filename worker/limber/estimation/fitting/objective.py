@@ -268,8 +268,7 @@ class Evaluation:
 @dataclass(frozen=True)
 class RawSlopes:
     """Slopes of a pull's r standardised residuals to the free vector [r, p], errors of cell and
-    sensors [r, k] and its force's unknowns [r, L] (None: none). ``kinds`` name causes of
-    uncertainty."""
+    sensors [r, k] and its force's unknowns [r, L] (None: none). ``kinds`` name causes."""
 
     free: np.ndarray
     errors: np.ndarray

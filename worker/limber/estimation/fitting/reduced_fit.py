@@ -110,9 +110,8 @@ class Reduction:
 def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rough: Optimise,
                 reduction: Reduction, progress: Progress = SILENT,
                 ) -> tuple[Fit, Objective]:
-    """Fit on reduced models of the pulls, with bases around a ``rough`` quick fit of the full
-    model; return fit and objective. If they do not cover the pulls, the full model fits, with a
-    warning."""
+    """Fit on the pulls' reduced models, with bases around a ``rough`` quick fit of the full model;
+    return fit and objective. If they do not cover the pulls, the full model fits and warns."""
     free = start
     if not reduction.is_built:
         counts = [forward.key_count for forward in reduction.forwards]

@@ -67,9 +67,9 @@ class PointDirections:
 
 
 def _axis(mesh: TetMesh, point: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, float]:
-    """Direction at a point, and radius [m] of the ball that shows it: its tetrahedra extend more
-    along than across. They count less at its edge: cut sharply, a coarse mesh tilted it by up to 15
-    degrees."""
+    """Return the direction of the branch near a point, and the radius [m] of the ball that shows
+    it: it grows until its tetrahedra extend more along than across. They count less at its edge:
+    cut sharply, a coarse mesh tilted it by up to 15 degrees."""
     centres, volumes = mesh.centroids, np.abs(mesh.volumes)
     away = np.linalg.norm(centres - point, axis=1)
     extent = float(np.sort(away)[min(FEWEST_TETS, len(away) - 1)])
@@ -238,7 +238,7 @@ CLIPPED = 4.0
 @dataclass(frozen=True)
 class Response:
     """Response to L force unknowns where linearised [per N]: points [f, m, 3, L], force or with
-    torque too [f, 3 or 6, L], and gripper's position [f, 3, L] (None: not observed)."""
+    torque too [f, 3 or 6, L], and the gripper's position [f, 3, L] (None: not observed)."""
 
     points: np.ndarray
     wrenches: np.ndarray
@@ -258,8 +258,8 @@ class Course:
 
 def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int) -> Course:
     """Fit a smooth course to readings of deviation [f, c] [N, N m], some missing; c is 3, or 6 with
-    torque. A noisy force defines no path, so time orders; it takes over ``count`` key frames if
-    needed to follow readings within noise."""
+    the torque. A noisy force defines no path, so frames are ordered by time; there are over
+    ``count`` key frames if they cannot follow the readings within the noise."""
     readings = frames.wrenches[:, :components]
     known = np.isfinite(readings).all(axis=1)
     if np.ptp(readings[known], axis=0).max() == 0.0:
@@ -337,19 +337,9 @@ def wrench_sigma(entry: PullEntry, frames: Frames, components: int) -> np.ndarra
 
 @dataclass(frozen=True)
 class Simulated:
-    """A simulated pull at all frames, and its derivative to the physical parameters.
-
-    Attributes:
-        positions: Observed points [m], shape [f, m, 3].
-        forces: Forces of the gripper on the branch [N], shape [f, 3].
-        d_positions: Shape [f, m, 3, P], or None; P parameters in the order log E_1..log E_K and
-            the extra ones of the parameter space.
-        d_forces: Shape [f, 3, P], or None.
-        torques: About the grasp point [N m], shape [f, 3]; None: not known.
-        d_torques: Shape [f, 3, P], or None.
-        grasps: The grasp point [m], shape [f, 3], if it is compared; else None.
-        d_grasps: Shape [f, 3, P], or None.
-    """
+    """A pull at all frames: points [f, m, 3], forces on the branch [f, 3], torques about the grasp
+    point (None: not known), grasp points (None: not compared). Slopes ``d_...`` [..., P], or None,
+    are in the order log E_1..log E_K and the extra parameters of the space."""
 
     positions: np.ndarray
     forces: np.ndarray

@@ -39,17 +39,13 @@ SHAKES = 2.0
 
 @dataclass(frozen=True)
 class MotionWanted:
-    """Requested motion of a virtual gripper.
+    """Requested motion of a virtual gripper from ``point`` [m]; ``axis`` is from base to grasp.
 
     Attributes:
         kind: ``pull`` (slow, the branch turns freely), ``turned`` (slow, rotation restrained),
             ``shake`` (fast, along the path of a pull), ``release`` (fast, pulled by force and let
             go), ``weight`` (a growing weight hangs on the grasp).
-        point: The grasp point at rest [m], shape [3].
-        axis: From base to grasp, shape [3].
-        travel: Travel of the grasp [m].
         turn, phase: See :func:`sideways_forces`.
-        times: [s], shape [n].
         weight: The largest weight's force [N], shape [3].
     """
 

@@ -108,8 +108,8 @@ class ObservedPathForward(QuasiStaticForward):
             self._drives_for = other._drives_for
 
     def is_held_against_its_force(self, values: Values) -> bool:
-        """Whether a clamp holds states that its wrench alone lets go: a compressed branch buckles
-        under a steady wrench, not between base and gripper, and by force ends elsewhere."""
+        """Whether a clamp holds states that its force and torque alone would let go: a compressed
+        branch buckles under them, though not between base and gripper."""
         if self.grasp.mode != "rigid":
             return False
         held = QuasiStaticForward(self.name, self._model, self.weights, self.entry, self.frames,
@@ -138,9 +138,9 @@ class ObservedPathForward(QuasiStaticForward):
         self.set_key_count(self.key_count)
 
     def lead_along_path(self, values: Values) -> bool:
-        """Find the force that leads a branch along the recorded path in short steps from rest, by
-        compliance: across it the path tells it, along it least squares. Unlike readings, whose zero
-        may be large, it folds no branch. False: no equilibria, force and states as before."""
+        """Find the force that leads the branch along the recorded path, by its compliance in short
+        steps from rest: least squares decide along the branch, where the path cannot. It folds no
+        branch, unlike readings with a large zero. False if no equilibria; state as before."""
         model, place = self.model_with(values), self.frames.poses[:, :3]
         offset = self.entry.grasp.point_m - place[0]
         if np.linalg.norm(offset) < AT_REST_M:
@@ -258,6 +258,5 @@ class ObservedPathForward(QuasiStaticForward):
 
 
 def is_path_observed(forward: Forward) -> TypeGuard[ObservedPathForward]:
-    """Whether the force of a pull is currently an unknown, and its gripper's path an observation.
-    """
+    """Whether a pull's force is currently an unknown, and its gripper's path observed."""
     return isinstance(forward, ObservedPathForward) and forward.watches_pose

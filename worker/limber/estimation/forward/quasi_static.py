@@ -346,9 +346,9 @@ class QuasiStaticForward(Forward):
         return float(np.sum(moved**2)) / along if along > 0 else None
 
     def linear_motion(self, values: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Forces [n, c], response [c, d] [m/N] at rest without weight, which any modulus has, and
-        motions [n, d]: the gripper's since the first frame; if the force drives, the points' from
-        rest."""
+        """Return forces [n, c], the response [c, d] [m/N] at rest without weight, which exists for
+        any modulus, and motions [n, d]: of the gripper since the first frame, or of the points
+        since rest if the force drives."""
         frames = self.frames
         known = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
         components = 6 if self.uses_torque else 3

@@ -42,7 +42,7 @@ class OnlineFrame:
 @dataclass
 class Kept:
     """A frame as linearised at ``centre``, log E [K]: normal matrix [K, K] and gradient [K] of half
-    its squares, and RMS. ``state`` None: of another basis."""
+    its squared residuals, and their RMS. ``state`` is None if it belongs to another basis."""
 
     frame: OnlineFrame
     state: ReducedState | None
@@ -120,8 +120,8 @@ class _Correction:
 
 
 class Corrections:
-    """Measured at frames of the full model, interpolated between; ``sigmas`` [r] are a frame's
-    deviations."""
+    """Corrections measured at frames of the full model and interpolated between them; ``sigmas``
+    [r] are the standard deviations of a frame's measurements."""
 
     def __init__(self, sigmas: np.ndarray):
         self._sigmas = sigmas
@@ -210,9 +210,9 @@ IDLE_GAIN = 0.01
 
 @dataclass(frozen=True)
 class OnlineState:
-    """The estimate after a frame: moduli [K] [Pa], 95 % [K, 2], RMS before the update (NaN:
-    unused). ``trusted`` False: no reduced state, to try on another basis; ``enough``: another pull
-    is not worthwhile; ``idle``: this one adds nothing."""
+    """The estimate after a frame: moduli [K] [Pa], 95 % interval [K, 2], and RMS of the
+    standardised residuals before the update (NaN: frame not used). ``trusted``: the reduced model
+    covers it; ``enough``: another pull is not worthwhile; ``idle``: this one adds nothing more."""
 
     time: float
     young: np.ndarray

@@ -48,9 +48,9 @@ PRIOR_DEVIATION = 0.4
 def follow(where: Callable[[], Path], name: str, subject: Subject, settings: FitSpec, *,
            axes: Path | None = None, pace: float = 1.0, training_count: int = 60,
            progress: Progress = SILENT) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Estimate from a pull as it is recorded, or replayed at ``pace`` (0: fast), and corrected by a
-    full-model process. ``where`` finds its folder, which moves when it ends. Result, and the state
-    after every frame. InputError if it has no markers or frames."""
+    """Estimate from a pull as it is recorded, or replayed at ``pace`` times its speed (0: as fast
+    as possible), while a full-model process corrects. ``where`` returns its folder, which moves
+    when it ends. InputError if it has no markers or frames."""
     size = _size(where())
     first = read_pull(where())
     if first.observations is None:
@@ -154,8 +154,8 @@ class Begun:
 
 def begin(pull: Pull, subject: Subject, settings: FitSpec, progress: Progress,
           training_count: int) -> Begun:
-    """Build the reduced model about an earlier estimate or a rough fit: spread to cover a uniform
-    guess, a basis is inaccurate. Without motion it is built again during the pull."""
+    """Build the reduced model around an earlier estimate or a rough fit. A basis wide enough for a
+    uniform guess would be inaccurate. Without motion it is built again during the pull."""
     start, deviation, spread = subject.start, PRIOR_DEVIATION, 2.0
     field = subject.mesh.cell_data["young"]
     if settings.young is None and np.ptp(field) > 0.02 * field.mean():

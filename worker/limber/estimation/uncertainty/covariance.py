@@ -49,9 +49,9 @@ class Uncertainty:
 
 
 def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.95) -> Uncertainty:
-    """Gauss' approximation at a fit's end. Noise is scaled by a robust part of the residuals,
-    weighted as in the fit. Errors that persist over frames do not average out: the covariance is
-    multiplied by their number. The mesh's error is not in it (:mod:`.model_error`)."""
+    """Return Gauss' approximation at a fit's end, without the mesh's error (:mod:`.model_error`).
+    Noise is scaled by a robust part of the residuals, weighted as in the fit. Errors that persist
+    over frames do not average out: their number multiplies the covariance."""
     # Priors and links are not measurements: they do not determine the noise, and its scale does not
     # apply to them.
     count = len(evaluation.residual) - objective.space.own_row_count
@@ -105,8 +105,8 @@ def inverse_information(slopes: np.ndarray) -> np.ndarray:
 
 
 def recording_spread(evaluation: Evaluation, objective: Objective, scale: float) -> float:
-    """Deviation of log E between recordings: scatter of pulls' steps of the scale beyond noise
-    (DerSimonian and Laird's random effect). The calibration's value counts as one recording."""
+    """Return the deviation of log E between recordings: scatter of the pulls' steps beyond noise
+    (DerSimonian and Laird's random effect), with the calibration's value as one more."""
     stated = float(np.mean([calibration_of(forward.entry).repeat_sigma
                             for forward in objective.forwards]))
     count = len(objective.forwards)
@@ -124,8 +124,8 @@ def recording_spread(evaluation: Evaluation, objective: Objective, scale: float)
 
 
 def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Integrated autocorrelation over frames, all points and axes [f, m, 3], [f, 3] with NaN: 1 + 2
-    sum of correlations to the first below its noise or well beyond the result (Sokal)."""
+    """Return the integrated autocorrelation of residuals [f, m, 3], [f, 3] (NaN: none): 1 + 2 sum
+    of correlations, to the first below its noise or well beyond the result (Sokal)."""
     product, count = np.zeros(0), np.zeros(0)
     for points, forces in series:
         columns = np.hstack([points.reshape(len(points), -1), forces])
@@ -159,8 +159,7 @@ class Outlier(TypedDict):
 
 
 def outliers(evaluation: Evaluation, objective: Objective, limit: int = 10) -> list[Outlier]:
-    """Name the measurements that do not fit, worst first: pull, time, point or force, deviations.
-    """
+    """Name the measurements that do not fit, worst first: pull, time, point or force, deviation."""
     found: list[Outlier] = []
     for forward, (points, forces) in zip(objective.forwards, objective.scored(evaluation),
                                          strict=True):
@@ -382,8 +381,8 @@ NEAR = 0.1
 
 def profiled(sure: Uncertainty, evaluation: Evaluation, objective: Objective,
              progress: Progress = SILENT) -> Uncertainty:
-    """Return wide intervals by the profile likelihood. The covariance stays, for what depends on
-    moduli as measurements do: linear in compliance, even if the modulus is far beyond it."""
+    """Return the uncertainty with wide intervals by the profile likelihood. The covariance stays:
+    it holds for what depends on the moduli as measurements do, linear in the compliance."""
     space = objective.space
     found = _Profile(sure, evaluation, objective, progress)
     interval = sure.young_interval.copy()
@@ -463,8 +462,8 @@ class _Profile:
 
     def _rise(self, objective: Objective, group: int, at: float, others: np.ndarray,
               ) -> tuple[float, np.ndarray] | None:
-        """Rise of squared residuals with log E ``at`` deviations off, and the others' offset [p]
-        from the linear path; ``others`` is expected. None: no equilibrium."""
+        """Return the rise of squared residuals ``at`` deviations of log E, and the others' offset
+        [p] from the linear path, guessed as ``others``; None if there is no equilibrium."""
         best = self._best
         direction = at * self._covariance[group] / self.deviations[group]
         free = np.clip(best.free + direction + others, *objective.space.bounds())
@@ -489,9 +488,9 @@ class _Profile:
 
 
 def bend_of(at: float, root: float) -> float:
-    """Curvature a of a profile (1 - exp(-a x)) / a through the root of its rise at x deviations:
-    the root's form if measurements are linear in the modulus's power -a over log E's deviation (-1:
-    compliance, 0: log E)."""
+    """Return the curvature a of (1 - exp(-a x)) / a through the ``root`` of the rise at x = ``at``
+    deviations. The root has this form if measurements are linear in a power of the modulus: -a over
+    the deviation of log E (-1: compliance, 0: log E)."""
     ratio = float(np.clip(root / at, 0.01, 100.0))
     if abs(ratio - 1) < 1e-6:
         return 0.0

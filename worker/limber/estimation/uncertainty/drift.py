@@ -76,8 +76,8 @@ def pull_moduli(steps: Sequence[ScaleStep], objective: Objective) -> list[PullMo
 
 def drift(steps: Sequence[ScaleStep], recorded: Sequence[str | None], spread: float,
           ) -> Drift | None:
-    """Return the change per day by weighted regression over times (ISO 8601), None without two, or
-    within an hour. ``spread`` is log E's between a day's recordings."""
+    """Return the change per day by weighted regression over times (ISO 8601); None without two, or
+    if they do not determine it. ``spread`` is that of log E between recordings of one day."""
     times = [None if each is None else datetime.fromisoformat(each).timestamp() / _DAY_S
              for each in recorded]
     known = [(step, time) for step, time in zip(steps, times, strict=True) if time is not None]

@@ -28,7 +28,7 @@ CLEAR = 3.0
 
 
 def too_little_said(objective: Objective, evaluation: Evaluation, limit: float) -> InputError:
-    """Return why recorded forces leave the moduli's scale open, whose deviation in log E must be
+    """Return why recorded forces leave the scale of the moduli open: the deviation of log E must be
     below ``limit``."""
     forwards = [forward for forward in objective.forwards if forward.uses_force]
     peaks = [float(np.nanmax(np.linalg.norm(forward.frames.wrenches[:, :3], axis=1)))
@@ -198,9 +198,9 @@ def require_scale(found: Identifiability, objective: Objective, evaluation: Eval
 
 def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
                     ) -> tuple[ParameterSpace, list[str]]:
-    """Link moduli that data leave open to better-known neighbours, worst first, until all others
-    are resolved; the space, and a sentence each. A link lets them differ tenfold; equality would
-    give wrong moduli and intervals."""
+    """Link the moduli that the data leave open to better-known neighbours, the worst first, until
+    all others are resolved; a sentence for each link. The two may differ tenfold: as equal, both
+    would be wrong, with intervals too narrow."""
     rows = evaluation.slopes[:len(evaluation.slopes) - len(space.links)]
     links: list[tuple[int, int]] = []
     messages = []

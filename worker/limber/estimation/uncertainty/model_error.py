@@ -104,9 +104,9 @@ class SmallLoad:
 
 def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.ndarray,
                young: np.ndarray, loads: Sequence[SmallLoad] = ()) -> MeshStiffness | None:
-    """Find the mesh's excess stiffness: moduli for which it bends as a refined one, at the fit's
-    observations and loads, as the error varies along the branch (most at the clamp) and by load. No
-    ``loads``: two across. None if the refined mesh is too large or fails."""
+    """Find the excess stiffness of the mesh from moduli for which it bends as a refined one does,
+    at the observations and loads of the fit: the error is mostly at the clamp, and varies by load.
+    No ``loads``: two across. None if the refined mesh is too large or gives no result."""
     mesh = model.mesh
     if 8 * mesh.tet_count > REFINED_LIMIT or not mesh.is_quadratic:
         return None
@@ -241,8 +241,8 @@ def path_prescribed(forwards: Sequence[Forward]) -> list[Forward]:
 
 
 def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | None:
-    """Relative deviation of E [K] from the gripper's frame, linear: d log E = -(J^T J)^-1 J^T dr
-    for six errors of the calibration's deviations. None: no equilibrium."""
+    """Return the relative deviation of E [K] from the gripper's frame: d log E = -(J^T J)^-1 J^T dr
+    for its six errors, of the calibration's deviation. None if a pull has no equilibrium."""
     slopes = path_slopes(evaluation, objective)
     if slopes is None:
         return None

@@ -69,11 +69,8 @@ _MEASUREMENTS = (
 
 
 class NextAction(TypedDict):
-    """An action and its expected result.
-
-    Keys: ``action``, ``how``; ``young_interval_pa``: 95 % interval to expect at the control points
-    [Pa], [K][2]; ``width_share``: mean half width of log E over that of today.
-    """
+    """An action with its expected 95 % interval [K][2] [Pa] at the control points; ``width_share``
+    is the mean half width of log E over today's."""
 
     action: str
     how: str
@@ -82,8 +79,8 @@ class NextAction(TypedDict):
 
 
 class Prospects:
-    """Intervals to expect after actions, from the fit's end with derivatives, shape and mesh
-    errors, and moduli on the mesh [K] [Pa]."""
+    """Intervals to expect after actions, from the end of the fit with derivatives, its errors of
+    shape and mesh, and the moduli on the mesh [K] [Pa]."""
 
     def __init__(self, evaluation: Evaluation, objective: Objective, sure: Uncertainty,
                  error: ModelError, young: np.ndarray):

@@ -53,8 +53,8 @@ response of a branch turned by a radian to the whole change of a radius is far f
 
 def compensation(evaluation: Evaluation, objective: Objective,
                  slopes: Callable[[QuasiStaticForward, Values], ErrorSlopes]) -> np.ndarray | None:
-    """Change of log E [K, S] by which a fit compensates S changes: -(J^T J)^-1 J^T dr at few key
-    frames, as differences vary slowly. None if a pull is dynamic (too long), or no equilibrium."""
+    """Return the change of log E [K, S] by which a fit compensates S changes, -(J^T J)^-1 J^T dr at
+    few key frames: it varies slowly. None if a pull is dynamic or has no equilibrium."""
     if any(forward.entry.motion == "dynamic" for forward in objective.forwards):
         return None
     forwards = [forward.with_prescribed_poses(forward.frames.poses) for forward
@@ -179,9 +179,9 @@ def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndar
 
 
 def grip_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | None:
-    """Relative deviation of E [K] from the held length (``held_length_sigma_m``), which pads and
-    jaws hide, alike in all pulls. None if no gripper clamps or it is known, or as
-    :func:`compensation`."""
+    """Return the relative deviation of E [K] from the held length (``held_length_sigma_m``), which
+    soft pads and jaws hide, the same in all pulls. None if no gripper clamps or the length is
+    known, or as :func:`compensation`."""
     if not any(forward.entry.grasp.mode == "rigid"
                and calibration_of(forward.entry).held_length_sigma_m > 0
                for forward in objective.forwards):
@@ -257,9 +257,9 @@ logarithm, as E I is. Over the whole way, radii off by a fifth would seem to cha
 def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
                 points: np.ndarray, count: int, mean: SectionMean, *, seed: int = 0,
                 progress: Progress = SILENT) -> tuple[np.ndarray, np.ndarray] | None:
-    """Relative deviations of E and E I [K] from axis and radii: RMS of a fit's changes over drawn
-    shapes, times Student's quantile as they are few; even thickening leaves E I. None if too few
-    shapes, or as :func:`compensation`."""
+    """Return the relative deviations of E and E I [K] from axis and radii: RMS of what a fit would
+    have changed over drawn shapes, times Student's quantile, since they are few. Even thickening
+    leaves E I unchanged. None if too few shapes, or as :func:`compensation`."""
     if count < FEWEST:
         return None
     progress(0.0, "evaluating posterior samples of the shape")
@@ -286,8 +286,8 @@ def _towards(skeleton: Skeleton, shape: Skeleton) -> Skeleton:
 
 
 def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np.ndarray | None:
-    """Relative deviation of E [K] from twigs and leaves outside the mesh, of common relative
-    deviation ``sigma``. None if nothing hangs or no gravity, or as :func:`compensation`."""
+    """Return the relative deviation of E [K] from that of twigs and leaves outside the mesh,
+    ``sigma``. None if nothing hangs or there is no gravity, or as :func:`compensation`."""
     models = [forward.full.model for forward in objective.forwards
               if isinstance(forward.full, QuasiStaticForward)]
     # Stated masses are known; those of twigs and leaves come from their volume.

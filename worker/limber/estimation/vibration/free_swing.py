@@ -82,8 +82,7 @@ class ModalSwing:
     def moved(self, times: np.ndarray, stretch: float, damping: tuple[float, float],
               heavier: float, creep: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
         """Return markers' displacements [f, m, 3] [m] since release; ``stretch`` and ``heavier``
-        are logs of factors on modulus and density, ``creep`` the share that relaxes and its time
-        [s]."""
+        are logs of factors on modulus and density, ``creep`` a relaxing share and time [s]."""
         stiffness = np.exp(stretch) * self._stiffness
         squares, shapes = scipy.linalg.eigh(stiffness, np.exp(heavier) * self._body + self._added)
         begin, end = (np.linalg.solve(stiffness, force + heavier * change)
@@ -170,9 +169,9 @@ _GONE = 0.3
 
 @dataclass(frozen=True)
 class SwingSeen:
-    """A swing's markers [n, m, 3] [m] from rest (NaN: unseen). ``start``: "held" in the rest shape
-    until weight acts, or "loaded" until released. ``load_mass`` [kg] swings too (0: a pull, or
-    removed); ``registration`` is RMS [m] from stated positions."""
+    """A swing's markers [n, m, 3] [m] from rest (NaN: not observed). ``start`` is "held" in the
+    rest shape until weight and load act, or "loaded" until the load goes. ``load_mass`` [kg] swings
+    too (0: a pull, or removed). ``registration`` [m] is the markers' RMS from stated positions."""
 
     times: np.ndarray
     moved: np.ndarray
@@ -186,23 +185,18 @@ class SwingSeen:
 
 @dataclass(frozen=True)
 class SwingFit:
-    """Result of a swing. Intervals are 95 % intervals.
+    """Result of a swing; intervals are 95 % intervals, ``damping_interval`` [2, 2].
 
     Attributes:
-        factor: Factor on the start's Young's modulus, corrected for the mesh's stiffness;
-            factor_interval: shape [2].
+        factor: Factor on the start's Young's modulus, corrected for the mesh's stiffness.
         mesh_factor: The correction; 1 if a finer mesh was not possible.
-        release: [s] on the recording's clock; release_deviation: [s].
-        damping: Rayleigh's alpha [1/s] and beta [s]; damping_interval: shape [2, 2].
-        damping_ratio: Damping ratio of the first vibration; damping_ratio_interval: shape [2].
+        release: [s] on the recording's clock.
+        damping: Rayleigh's alpha [1/s] and beta [s]; ``damping_ratio`` is of the first vibration.
         frequency: Frequency of the first vibration about the equilibrium [Hz].
         residual: RMS of observed minus simulated [m]; over the largest displacement it is
             ``relative_residual``.
         readings: Number of independent readings, from the residual's autocorrelation.
-        forward_count: Number of simulations.
         window: First and last time used [s].
-        times, seen, simulated: For figures [s, m], shapes [f], [f, m, 3].
-        converged: Whether the last fit converged.
         creep: ``share``, its ``interval`` and ``time_s`` as for a pull; None: the record does not
             show any.
     """
@@ -291,8 +285,8 @@ _MARGIN = 0.1
 
 def fit_swing(model: BranchModel, grasp: Grasp, seen: SwingSeen, *, periods: float = 6.0,
               density_sigma: float = 0.1, progress: Progress = SILENT) -> SwingFit:
-    """Fit modulus (ratios kept) and damping to a swing, with density within its relative deviation.
-    InputError if no swing shows, WorkError if the simulation fails."""
+    """Fit modulus and damping to a swing; the moduli's ratios stay, the density has a relative
+    deviation. InputError if the recording shows no swing, WorkError if the simulation fails."""
     swing = _Swing(model, grasp, seen, density_sigma)
     released, period = first_guess(seen)
     swing.scale_to(period, released)
@@ -412,8 +406,8 @@ class _Swing:
         self._correction, self.creep_time = self._full(found.free, times) - moved, creep_time
 
     def with_creep(self, released: float, found: "_Found") -> "_Found":
-        """Return a fit with creep if likelier, by evidence of a parameter and its time (Schwarz
-        1978) for independent readings; else the same."""
+        """Return a fit with creep if it is more likely, by the evidence of a parameter and its time
+        constant (Schwarz 1978) over independent readings; else the same fit."""
         best, best_time, likeliest = found, None, LIKELIER
         for share in TIME_SHARES:
             self.creep_time = share * found.duration

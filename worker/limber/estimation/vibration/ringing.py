@@ -42,8 +42,7 @@ _LARGEST = 1e15  # largest reading, in any unit
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """Ringing of a column: its frequency [Hz], prominence, power fraction, and burst ratio.
-    """
+    """Ringing of a column: frequency [Hz], prominence, power fraction, and burst ratio."""
 
     frequency: float
     prominence: float
@@ -56,8 +55,9 @@ class _Spectrum:
 
 
 def ringing_columns(record: _Record) -> _Record:
-    """Return the columns that ring, and a sentence on others: loggers add directions, temperature,
-    counters. None clear: all that change. InputError if none does, or a reading is impossible."""
+    """Return the columns that ring, and a sentence on the others, as a logger adds directions,
+    temperatures and counters. If none rings clearly, all that change stay. InputError if none
+    changes, all are counters, or a reading is impossible."""
     if not (np.abs(record.values[np.isfinite(record.values)]) < _LARGEST).all():
         raise InputError(f"The record has a reading over {_LARGEST:g}.",
                          "No sensor gives such a number.", "Check the file and its units.")
@@ -124,8 +124,8 @@ def _spectrum(times: np.ndarray, values: np.ndarray) -> _Spectrum:
 
 
 def plucks(channels: np.ndarray, period: float) -> list[tuple[int, int]]:
-    """Return first reading and end of decay of each pluck, which starts within half a period
-    [readings]; beats of close vibrations grow slower."""
+    """Return the first reading of each pluck and the end of its decay. A pluck starts within half a
+    period [readings]; the beat of two close vibrations grows more slowly."""
     width, half = max(round(period), 8), max(round(period / 2), 4)
     if len(channels) < 4 * width:
         return [(0, len(channels))]
@@ -153,8 +153,8 @@ def _extent(channels: np.ndarray, width: int) -> np.ndarray:
 
 
 def cut_off(channels: np.ndarray, period: float) -> np.ndarray:
-    """Mask [n] of readings among equal ones at a channel's limit; a rounded vibration has equal
-    extremes too, but only as many as a converter's step explains."""
+    """Return which readings are among several equal ones at a channel's limit, bool [n]; at a
+    rounded vibration's extremes only as many are equal as are within a converter's step."""
     found = np.zeros(len(channels), bool)
     for values in channels.T:
         steps = np.abs(np.diff(np.unique(values)))
@@ -220,8 +220,8 @@ def packets_of(times: np.ndarray, number: np.ndarray) -> Packets | None:
 
 
 def _jumps(arrival: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Return packets before which readings are missing: too late [s] for the number of their last
-    reading."""
+    """Return the packets before which readings are missing, as they come too late [s] for the
+    number of their last reading."""
     steps, counts = np.diff(arrival), np.diff(last)
     late = arrival - float(np.median(steps / counts)) * last
     if len(late) < 2 * _BESIDE:
@@ -262,20 +262,9 @@ _SAME, _CHANGED = 0.05, 0.03
 
 @dataclass(frozen=True)
 class Ringing:
-    """Vibrations of a record, by frequency.
-
-    Attributes:
-        frequencies: [Hz], shape [k], ascending.
-        frequency_deviations: Standard deviations [Hz], shape [k].
-        damping: Damping ratios, shape [k].
-        damping_deviations: Shape [k].
-        shares: Fractions of the record's power, shape [k].
-        left_over: RMS of the unexplained part over that of the record.
-        start: Start of the decay that was used [s]; of several the first.
-        duration: Total duration of all decays that were used [s].
-        pluck_frequencies: The first frequency of each decay, if there are several [Hz].
-        warnings: Parts of the record that were not used.
-    """
+    """Vibrations of a record by ascending frequency [k] [Hz], with damping ratios, deviations and
+    shares of power. ``left_over`` is the unexplained RMS over the record's; ``start`` [s] of the
+    first decay used, ``duration`` [s] of all; ``warnings`` name parts that were not used."""
 
     frequencies: np.ndarray
     frequency_deviations: np.ndarray
@@ -303,9 +292,9 @@ class Record(Stream):
 
 
 def read_record(path: Path, rate_hz: float | None = None) -> Record:
-    """Read times and readings in any unit, or a C3D file's tracks. Columns with gaps or without
-    ringing go; packets count as even where that rings better; ``rate_hz`` overrides stamps.
-    InputError if unreadable, without times, readings or even steps."""
+    """Read times and readings in any unit, or a C3D file's tracks, without columns that have gaps
+    or do not ring. Packets count as even where that rings better; ``rate_hz`` overrides stamps.
+    InputError if it is unreadable, without times or readings, or its steps are not even."""
     tracks = [one for one in RECORDINGS.readers() if path.suffix.lower() in one.suffixes
               and one.holds == "markers" and one.name != "markers"]
     if tracks:
@@ -385,8 +374,8 @@ def _first_of(record: Record) -> Ringing | None:
 
 def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None, *,
              rate_deviation: float = 0.0) -> Ringing:
-    """Return a free decay's vibrations from ``start`` [s] (None: the largest motion; again plucked,
-    each decay). InputError if too short, no free vibration, or sampled too slowly."""
+    """Return a free decay's vibrations from ``start`` [s] (None: the largest motion; each decay if
+    plucked again). InputError if too short, without vibration, or sampled too slowly."""
     channels = channels / np.maximum(channels.std(axis=0), 1e-300)
     begin = 0 if start is None else int(np.searchsorted(times, start))
     if len(times) - begin < _LEAST_READINGS:
@@ -558,8 +547,8 @@ def _judged(free: np.ndarray, times: np.ndarray, channels: np.ndarray, power: fl
 
 def _first_line(frequencies: np.ndarray, shares: np.ndarray, order: list[int],
                 ) -> tuple[list[int], tuple[str, ...]]:
-    """Vibrations from the first by frequency, and what makes it doubtful: plucked branches vibrate
-    in first modes; a line far below the strongest is wind, support, or drift."""
+    """Return the vibrations from the first one on, and what makes it doubtful: plucked branches
+    vibrate in their first modes, so a line far below the strongest is wind, support or drift."""
     largest = order[int(np.argmax(shares[order]))]
     at = next(n for n, k in enumerate(order) if shares[k] >= _FIRST_SHARE * shares[largest])
     first, warnings = order[at], []

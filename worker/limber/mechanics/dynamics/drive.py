@@ -22,8 +22,8 @@ _DIFFERENCE = 2e-5
 
 
 class PosePath:
-    """Poses [frames, 6] or [frames, grasps, 6] [m, rad] of grasps over time: a cubic spline that
-    starts at rest, rotation vectors unwrapped. InputError if shapes do not fit."""
+    """Poses [frames, 6] or [frames, grasps, 6] [m, rad] over time: a cubic spline from standstill,
+    rotation vectors unwrapped. InputError if shapes do not fit or values are not finite."""
 
     def __init__(self, grasps: Sequence[Grasp], rest: np.ndarray, times: np.ndarray,
                  poses: np.ndarray):

@@ -25,7 +25,7 @@ class Modes:
 
 def lowest_modes(model: BranchModel, count: int, displacement: np.ndarray | None = None) -> Modes:
     """Return the lowest modes about an equilibrium (None: the mesh's shape), by subspace iteration
-    (Bathe). NotPositiveDefiniteError if not stable, ConvergenceError if it does not end."""
+    (Bathe). NotPositiveDefiniteError if unstable, ConvergenceError if it does not converge."""
     at = np.zeros_like(model.mesh.nodes) if displacement is None else displacement
     tangent = model.equations(()).tangent(model, at)
     vectors = np.random.default_rng(0).standard_normal((count + _SPARE, *model.mesh.nodes.shape))

@@ -87,8 +87,7 @@ def _volume_pairs(points: int) -> Callable:
     @compiled
     def volume_pairs(one, two, terms, both, block):
         """Add the blocks of stable neo-Hookean elements. With c = cof(F) g it is mu (g g') 1 +
-        (lambda + mu) c c'^T + the skew matrix of pressure F (g' x g), from the change of the
-        cofactor."""
+        (lambda + mu) c c'^T + the skew matrix of pressure F (g' x g), from the cofactor."""
         for l in range(LANES):
             n00 = n11 = n22 = n01 = n10 = n02 = n20 = n12 = n21 = 0.0
             t0 = t1 = t2 = own = 0.0

@@ -49,8 +49,8 @@ def load_effects(outdoors: LoadedOutdoors, *, strain_limit: float, deviation: fl
                  most: float | None = None, progress: Progress = SILENT,
                  ) -> tuple[Bent, dict[str, Any]]:
     """Return the equilibrium under the loads, and the stage's values, with 95 % intervals of a
-    branch that is softer or stiffer throughout (``deviation`` of log E; None: none). ``most`` also
-    asks for the factor on the loads that it bears, up to this. WorkError if no equilibrium."""
+    branch that is softer or stiffer throughout (``deviation`` of log E; None: none). ``most`` is
+    the largest factor on the loads that is tried. WorkError if there is no equilibrium."""
     gravity = outdoors.unloaded.gravity
     down = gravity / max(float(np.linalg.norm(gravity)), 1e-300)
     tip = tip_node(outdoors)

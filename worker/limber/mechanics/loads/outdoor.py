@@ -57,8 +57,9 @@ class Swaying:
 
 @dataclass(frozen=True)
 class GustResponse:
-    """Gusts on a mean load: ``factor`` on the load that bends as far as the sway's peak, deviation
-    over mean, mean to peak in deviations, crossings [Hz], deviation over the quasi-static one."""
+    """The effect of gusts on a mean load: ``factor`` times it bends the branch as far as the sway's
+    peak. ``deviation`` is over the mean, ``peak_factor`` in deviations, ``crossing`` [Hz] upwards
+    of the mean, ``dynamic`` over a quasi-static branch's deviation."""
 
     factor: float
     deviation: float
@@ -147,7 +148,7 @@ _REMAINS = 1e-3
 @dataclass(frozen=True)
 class Outdoors:
     """Loads besides the scanned weight: even wind [m/s], drag coefficient of a leafless cylinder,
-    snow per area on the ground [kg/m^2], fruit, and cuts [m], beyond which the branch goes."""
+    snow per area on the ground [kg/m^2], fruit, and cuts [m] that remove the part beyond."""
 
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
     drag: float = 1.1

@@ -198,7 +198,8 @@ _MODE_ITERATIONS = 30
 
 def settle(path: "Path", part: float) -> float | None:
     """Let the branch snap to its equilibrium at the fraction ``part`` of the path, by implicit
-    Euler steps of the potential's gradient flow. Length of the last; None if it does not rest."""
+    Euler steps of the potential's gradient flow, in which it only falls. Return the step's length;
+    None if the branch does not come to rest."""
     if path.model.material.is_linear:
         return None
     target, pins = path.constraint_at(part)
@@ -351,8 +352,7 @@ class Path:
             self.begin_rest = self.begin_rest - rigid
 
     def constraint_at(self, part: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return displacements of held nodes and pinned means at the fraction ``part`` of the path.
-        """
+        """Return displacements of held nodes and pinned means at the fraction ``part``."""
         pins = self.begin_pins + part * (self.goal.pins - self.begin_pins)
         if part >= 1.0:
             return self.goal.held, self.goal.pins

@@ -83,8 +83,7 @@ class _Search:
             "Check Young's modulus, density and gravity.")
 
     def refined(self, rest: np.ndarray, tolerance: float) -> np.ndarray:
-        """Return rest positions that the load bends into the scan, by solving for the loaded shape.
-        """
+        """Return rest positions that the load bends into the scan, solving for the loaded shape."""
         target, misses = self.scan.copy(), []
         settings = StaticSettings()
         for number in range(_MAX_ITERATIONS):

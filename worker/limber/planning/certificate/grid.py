@@ -49,8 +49,7 @@ class Grid:
         return self.origin + (numbers * self.edges) @ self.axes
 
     def along_edges(self, vectors: np.ndarray) -> np.ndarray:
-        """Return slopes [n, 3] to the position as those along a cell's edges, times their length.
-        """
+        """Return slopes [n, 3] to the position as those along a cell's edges, by their length."""
         return vectors @ self.axes.T * self.edges
 
     def spread(self, corners: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -102,8 +101,8 @@ def _axes(start: np.ndarray, goal: np.ndarray, chart: Chart) -> np.ndarray:
 
 def refined(grid: Grid, keep: np.ndarray, about_goal: np.ndarray, cell: np.ndarray,
             ratio: float | np.ndarray = FINEST) -> tuple[Grid, np.ndarray]:
-    """Cells of ``ratio`` (at most 1) times the edges over ``keep``, in the smallest box, and the
-    start's, which it stays in the centre of. A new cell that overlaps a kept one is open."""
+    """Return cells of ``ratio`` (at most 1) times the edges over ``keep`` in the smallest box, and
+    the start's, centred on the start. A new cell that overlaps a kept one is open."""
     indices, centre, ratio = np.argwhere(keep), cell + 0.5, np.full(3, ratio)
     low, high = np.minimum(indices.min(axis=0), cell), np.maximum(indices.max(axis=0), cell) + 1
     before = np.ceil((centre - low) / ratio - 0.5 - _ROUND_OFF).astype(int) + _PAD
@@ -228,9 +227,9 @@ def short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, nea
 
 def _cost_left(length: np.ndarray, depth: np.ndarray, rate: np.ndarray, edges: np.ndarray,
                ) -> np.ndarray:
-    """Cost of a length to the goal at the rate half-way, nan where unknown: one rate for all sides
-    would be the least. Inside, the length flattens out to the middle ``depth`` [m] below the
-    surface."""
+    """Return the cost of a length to the goal at the rate half-way, nan where not known. A single
+    rate for all sides would be the smallest. Inside, the length flattens out towards the goal's
+    middle, ``depth`` [m] below its surface."""
     flat = np.maximum(length, -depth)
     flat = np.where(flat < 0.0, flat + flat**2 / (2.0 * depth), flat)
     growing = sum(np.gradient(rate, edges[axis], axis=axis)

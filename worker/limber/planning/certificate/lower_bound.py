@@ -219,8 +219,9 @@ class _Search:
 
 
 def _ratios(rates: Terrain, keep: np.ndarray, ratio: float) -> np.ndarray:
-    """Ratios [3] of the next grid's edges that lower what c's bends take off as one common ratio
-    would, with the fewest cells: equal bends. None is too flat for the sub-solution's own bends."""
+    """Return the ratios [3] of the next grid's edges to this one's that lower what the bends of c
+    take off it as one common ratio would, with the fewest cells: bends are equal along each axis.
+    None is too flat for the sub-solution, which bends near start and goal."""
     bends = np.array([axis[keep].mean() for axis in rates.bends])
     ratios = ratio * np.sqrt(bends.mean() / np.maximum(bends, 1e-9 * bends.mean() + 1e-300))
     ratios = np.clip(ratios, FINEST, 1.0)

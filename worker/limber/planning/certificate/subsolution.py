@@ -225,9 +225,8 @@ def widened(cells: np.ndarray, times: int = 1) -> np.ndarray:
 
 def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cells: np.ndarray,
             edges: np.ndarray, floor: float) -> Terrain:
-    """The terrain of ``rate`` [1/m] at corners, nan if not evaluated, at least ``floor``;
-    ``slopes`` [..., 3] are its growth per edge, ``positive`` corners where the energy is not cut
-    off."""
+    """Return the terrain of ``rate`` [1/m] at corners (nan: not evaluated), at least ``floor``.
+    ``slopes`` [..., 3] are per cell edge; ``positive`` corners do not have the energy cut off."""
     bends = turns(slopes, open_cells)
     del slopes  # three numbers a corner of the whole box
     bends *= 0.25

@@ -82,9 +82,9 @@ class Chart:
                        np.ascontiguousarray(gradients, float), forward, *self.arrays)
 
     def growth(self, points: np.ndarray, reach: float) -> np.ndarray:
-        """The largest change [n] of plain coordinates per metre within ``reach`` [m]: singular
-        values are 1, R / r and R t / (r sin t). Infinite if pivot or opposite point are within
-        it."""
+        """Return the largest change [n] of plain coordinates per metre within ``reach`` [m]:
+        singular values are 1, R / r, R t / (r sin t). Infinite if pivot or opposite are in
+        reach."""
         if self.radius == 0.0:
             return np.ones(len(points))
         least, angle = self._within(points, reach)

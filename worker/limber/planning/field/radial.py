@@ -32,9 +32,9 @@ _DEGREE = {"cubic": 1, "quintic": 2, "multiquadric": 1, "gaussian": 1}
 
 @dataclass(frozen=True)
 class RadialInterpolant:
-    """A fitted field, one of ``KERNELS``, in scaled coordinates ``(x - shift) / scale``: centres
-    [m, dimension], weights of values [m, channels] and gradients [m or 0, dimension, channels],
-    polynomial [terms, channels] with ``powers`` [terms, dimension]; smoothing is the ridge."""
+    """A fitted field in scaled coordinates ``(x - shift) / scale``: centres [m, dimension], weights
+    of values [m, channels] and of gradients [m or 0, dimension, channels], and a polynomial [terms,
+    channels] with ``powers`` [terms, dimension]. ``smoothing`` is the ridge."""
 
     kernel: str
     shape: float

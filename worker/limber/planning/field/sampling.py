@@ -53,9 +53,8 @@ class SolverPool:
 
     def run(self, function: Callable, tasks: Sequence[tuple], *, progress: Progress = SILENT,
             message: str = "") -> list:
-        """Return ``[function(grasp_model, *task) for task in tasks]`` with any number of processes;
-        ``function`` may take ``progress``. WorkError if a process crashed, else a call's first
-        error."""
+        """Return ``[function(grasp_model, *task) for task in tasks]``, whatever the number of
+        processes. WorkError if a process crashed, else a call's first error."""
         if self._count == 1 or len(tasks) == 1:
             return run_tasks(function, [(self.grasp_model, *task) for task in tasks], workers=1,
                              progress=progress, message=message)
@@ -568,9 +567,9 @@ def _solve_share(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarr
 
 
 def _slack(forces: np.ndarray, usual: np.ndarray, drawn: float) -> np.ndarray:
-    """Which forces [m] are no wall: pulled taut, a branch takes many times its usual force within
-    millimetres. This spoils the field, and no gentle path goes there. So poses over twice the
-    median are left out, except up to ``drawn`` [N], with which it was drawn outward."""
+    """Return which poses' forces [m] are not of a wall. Pulled taut, a branch takes many times its
+    usual force within millimetres; this spoils the field, and no gentle path goes there. So over
+    twice the median is a wall, except up to ``drawn`` [N], the force drawn outward with."""
     middle = np.median(usual) if len(usual) else 0.0
     slack = forces <= max(_TAUT * middle, drawn * (1.0 + 1e-9))
     slack[0] = True

@@ -22,9 +22,8 @@ _OUTLINE = 24  # points per side of the grid that outlines the region
 
 @dataclass(frozen=True)
 class TrustRegion:
-    """Region of trust: hull planes [k, 4], ``n . y + c <= 0`` inside in the plain chart, and
-    positions accepted and rejected. ``low`` to ``high`` holds it, as does any box of the
-    ``outline`` [o, 3]."""
+    """Where a field is trusted: within hull planes [k, 4], ``n . y + c <= 0`` in the plain chart,
+    and nearer to accepted than rejected poses. ``low``, ``high`` and ``outline`` bound it."""
 
     planes: np.ndarray
     accepted: np.ndarray
@@ -69,9 +68,9 @@ class TrustRegion:
         return _heights(self.chart.map(points), self.planes)[0]
 
     def surely_outside(self, centres: np.ndarray, halves: np.ndarray) -> np.ndarray:
-        """Which boxes with half edges as rows [3, 3] hold no trusted point, bool [n]: above the
-        plane that is highest at their centre, to second order, or all nearer to one refused pose
-        than to any accepted one (flat boundaries: exact)."""
+        """Return which boxes with half edges as rows [3, 3] hold no trusted point, bool [n]. They
+        are above the plane that is highest at their centre, to second order, or nearer to one
+        refused pose than to any accepted one (exact, as boundaries are flat)."""
         reach = float(np.linalg.norm(halves))
         heights, slopes = self.height_and_slope(centres)
         least = heights - np.abs(slopes @ halves.T).sum(axis=1)

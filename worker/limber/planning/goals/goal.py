@@ -354,8 +354,7 @@ def with_near_side(points: np.ndarray, start: np.ndarray, goal: Goal, field: Ene
 
 
 def _entered(points: np.ndarray, start: np.ndarray, goal: Goal, field: EnergyField) -> np.ndarray:
-    """Return where the straight lines from ``start`` [3] to ``points`` [n, 3] of the goal enter it.
-    """
+    """Return where straight lines from ``start`` [3] to ``points`` [n, 3] of the goal enter it."""
     low, high = np.zeros(len(points)), np.ones(len(points))
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)

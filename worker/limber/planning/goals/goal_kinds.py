@@ -291,9 +291,9 @@ _BEGINS = 0.6  # fraction of the tip's way to the default goal at which that rea
 
 
 def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
-    """A goal far from rest, reached without force: the sample of least energy of over three
-    quarters of the largest deflection, moved a little to rest, as trust is a shell often thinner
-    than the tolerance, and the part of the goal along it counts."""
+    """Return a goal far from rest that needs no force: the sample of least energy among those over
+    three quarters of the largest deflection, moved a little towards rest. Trust is a shell often
+    thinner than the tolerance: what counts is the part of the goal along it."""
     chart = field.region.chart.plain
     samples = chart.map(field.samples.positions)
     rest = chart.map(field.rest)[0]

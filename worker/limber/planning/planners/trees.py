@@ -190,9 +190,8 @@ def chosen_engine(engine: str) -> str:
 
 @dataclass(frozen=True)
 class FoundPath:
-    """A path of evenly spaced positions [n, 3] [m]. ``tree_cost`` and ``raw`` [k, 3] are those
-    before shortcuts, ``history`` has ``{"iteration", "cost"}`` of the best so far. None: no
-    tree."""
+    """A path of even positions [n, 3] [m]. ``tree_cost`` and ``raw`` [k, 3] are before shortcuts
+    (None: no tree); ``history`` has ``{"iteration", "cost"}`` of the best so far."""
 
     points: np.ndarray
     cost: float
