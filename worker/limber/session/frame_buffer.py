@@ -192,13 +192,8 @@ class _Slot:
 
 
 class FrameWriter:
-    """Creates the file and publishes frames.
-
-    Args:
-        path: The file; overwritten.
-        faces: Triangles [f, 3] of vertex indices.
-        vertex_count, target_count: Number of vertices and of targets.
-    """
+    """Creates the file, or overwrites it, and publishes frames. ``faces`` [f, 3] are triangles of
+    vertex indices."""
 
     def __init__(self, path: Path, faces: np.ndarray, vertex_count: int, target_count: int = 0):
         self.path = Path(path)

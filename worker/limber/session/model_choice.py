@@ -53,14 +53,8 @@ def key_of(grasp: Grasp) -> tuple[str, bytes]:
 
 
 class Learning:
-    """A trainer at work on one grasp.
-
-    Args:
-        folder, settings: Those of the session.
-        grasp: Grasp to learn.
-        tell: Receives :class:`Learnt` and :class:`Checked`, from another thread.
-        say: Receives the trainer's other events.
-    """
+    """A trainer at work on one grasp. ``tell`` receives :class:`Learnt` and :class:`Checked`, from
+    another thread; ``say`` the trainer's other events."""
 
     def __init__(self, folder: Path, settings: SessionSettings, grasp: Grasp,
                  tell: Callable[[Learnt | Checked], object], say: Callable[..., None]):
@@ -152,17 +146,9 @@ _QUICK = ReducedStaticSettings(max_iterations=12, max_halvings=2, start_count=2)
 
 
 class Answering:
-    """Answers for a branch: with the reduced model of its one grasp, else with the full one.
-
-    The reduced model has not learnt loads or missing weight: with them, equilibria are computed by
-    the full model, and motion is not reliable.
-
-    Args:
-        folder, settings: Those of the session, for the trainer.
-        held: The branch.
-        tell: Passes the trainer's results to :meth:`hear`, from its thread.
-        say: Writes an event.
-    """
+    """Answers for a branch with the reduced model of its one grasp, else with the full one: also
+    under loads or without weight, which it has not learnt; motion is then not reliable. ``tell``
+    passes the trainer's results to :meth:`hear`, from its thread; ``say`` writes an event."""
 
     def __init__(self, folder: Path, settings: SessionSettings, held: HeldBranch,
                  tell: Callable[[Learnt | Checked], object], say: Callable[..., None]):
@@ -346,10 +332,8 @@ class Answering:
             self._last_step = time.monotonic() - 1 / RATE
 
     def _step_due(self, last_received: float) -> float:
-        """Return when the next step in time is due: soon after a new pose, else at the rate.
-
-        While poses stream in, a step waits briefly for the next one: it would just miss it.
-        """
+        """Return when the next step in time is due: soon after a new pose, else at the rate. While
+        poses stream in, a step waits briefly for the next one: it would just miss it."""
         streams = time.monotonic() - last_received < _STREAM_SECONDS
         part = _SOONEST if self._is_new else _LATEST if streams else 1.0
         return self._last_step + part / RATE

@@ -42,11 +42,8 @@ _WAITING_LIMIT = 1000
 
 
 class Events:
-    """JSON lines on standard output; unread lines are dropped.
-
-    Args:
-        gone: Called once when the reader has closed.
-    """
+    """JSON lines on standard output; unread lines are dropped. ``gone`` is called once when the
+    reader has closed."""
 
     def __init__(self, gone: Callable[[], None] = lambda: None):
         self._gone = gone
@@ -82,12 +79,8 @@ class Events:
 
 
 class EffectsTeller:
-    """Answers one request at a time.
-
-    Args:
-        folder, settings: Those of the session.
-        events: Receives the answers.
-    """
+    """Answers one request at a time, to ``events``. Folder and settings are those of the
+    session."""
 
     def __init__(self, folder: Path, settings: SessionSettings, events: Events):
         self._folder, self._settings, self._events = folder, settings, events
@@ -95,12 +88,8 @@ class EffectsTeller:
         self._asked: Future | None = None
 
     def ask(self, question: Effects, held: HeldBranch) -> None:
-        """Compute the answer to a request; its ``reply`` or ``error`` is sent when it is known.
-
-        Raises:
-            InputError: another request is being answered, no load acts, the weight is off, or gusts
-                are requested without a wind.
-        """
+        """Compute the answer to a request; its ``reply`` or ``error`` follows. InputError if
+        another is being answered, no load acts, the weight is off, or gusts come without a wind."""
         if self._asked is not None and not self._asked.done():
             raise InputError("The effects of loads are being computed.",
                              "One request is answered at a time.", "Wait for its reply.")
@@ -134,11 +123,7 @@ class EffectsTeller:
 
 
 def gusts_of(question: Effects) -> Gusts | None:
-    """Return the gusts of a request.
-
-    Raises:
-        InputError: its record is not one of a wind.
-    """
+    """Return the gusts of a request; InputError if its record is not one of a wind."""
     if question.gust_record is not None:
         return WindRecord.checked(np.array(question.gust_record.time_s),
                                   np.array(question.gust_record.speed_m_s), "gust_record")
@@ -148,11 +133,8 @@ def gusts_of(question: Effects) -> Gusts | None:
 
 def effects_of(folder: Path, settings: SessionSettings, young: np.ndarray, loads: Outdoors,
                gusts: Gusts | None, question: Effects, progress: Progress) -> dict[str, Any]:
-    """Return the effects of loads on a branch with these moduli at its control points [Pa].
-
-    Raises:
-        LimberError: it cannot be loaded, or has no equilibrium.
-    """
+    """Return the effects of loads on a branch with the moduli ``young`` [K] [Pa] at its control
+    points; LimberError if it cannot be loaded, or has no equilibrium."""
     held = load_held(folder, settings, progress)
     held.set_young(young)
     outdoors, peak = held.set_outdoors(loads), None

@@ -147,11 +147,8 @@ class RecordedWind(BaseModel):
 
 
 class Effects(_Command):
-    """Request the effects of wind, snow, fruit and cuts on the branch, as `limber load` does.
-
-    With ``gust``, or a ``gust_record``, the results are for the peak of the gusts; with a record,
-    only the wind's direction is used.
-    """
+    """Request the effects of wind, snow, fruit and cuts, as `limber load` does. With ``gust``, or a
+    ``gust_record``, of whose wind only the direction is used, they are for the gusts' peak."""
 
     command: Literal["effects"]
     strain_limit: float = Field(0.01, gt=0, lt=1)
@@ -195,11 +192,8 @@ class NotUnderstood(InputError):
 
 
 def parse_command(line: bytes) -> Command:
-    """Return the command of one line.
-
-    Raises:
-        NotUnderstood: it is not a command; states the reason and the known commands.
-    """
+    """Return the command of one line; NotUnderstood states why it is none, and the known
+    commands."""
     try:
         return _COMMANDS.validate_json(line, strict=True)
     except ValidationError as error:
@@ -220,10 +214,8 @@ def _id_of(line: bytes) -> int:
 
 
 class Lines:
-    """Cuts a stream of bytes into lines, in bounded memory.
-
-    ``feed`` returns the complete lines that a chunk ends, None for one that was too long.
-    """
+    """Cuts a stream of bytes into lines, in bounded memory. ``feed`` returns the complete lines
+    that a chunk ends, None for one that was too long."""
 
     def __init__(self, limit: int = LINE_LIMIT):
         self._limit = limit

@@ -40,12 +40,11 @@ class Answer:
 
     Attributes:
         displacement: Displacement of all nodes from the hanging branch [m], shape [node_count, 3].
-        grasps: The held grasps, with forces.
-        energy: Potential of strain and weight above the hanging branch [J].
-        kinetic_energy: [J]. time: Time of a motion [s].
+        energy: Potential of strain and weight above the hanging branch [J]; and ``kinetic_energy``.
+        time: Time of a motion [s].
         is_converged: An equilibrium was found, or the step was.
         is_reached: The grasps are at their requested poses.
-        is_reduced: From the reduced model. is_trusted: Within the range that the model has learnt.
+        is_trusted: Within the range that the model has learnt.
         message: Reason for a missing equilibrium.
     """
 
@@ -71,13 +70,8 @@ class Held:
 
 
 class HeldBranch:
-    """A branch, its grasps and its loads.
-
-    Args:
-        loaded: The branch as it hangs, with its targets.
-        skeleton: Its axes, for wind, snow and cuts.
-        young_deviation: Standard deviation of log E, if known.
-    """
+    """A branch as it hangs, with its targets, grasps and loads. Wind, snow and cuts need its
+    ``skeleton``; ``young_deviation`` is the standard deviation of log E, if known."""
 
     def __init__(self, loaded: LoadedBranch, skeleton: Skeleton | None = None,
                  young_deviation: float | None = None):
@@ -102,15 +96,9 @@ class HeldBranch:
 
     def grab(self, vertex: int | None, point: tuple[float, float, float] | None, radius: float,
              mode: Literal["rigid", "point"]) -> int:
-        """Hold a patch in its current position; return the number of the grasp.
-
-        Args:
-            vertex: Vertex of the surface; or ``point`` [m] on the branch as it hung at the start.
-            radius: Radius of the patch [m], on the branch as it hung; 0 takes one node.
-
-        Raises:
-            InputError: too many grasps, the branch is not there, or the base or another grasp is.
-        """
+        """Hold a patch where it is now and return the grasp's number. ``point`` [m] and
+        ``radius`` [m] (0: one node) are on the branch as it hung at the start. InputError for too
+        many grasps, or where the branch is not there, or the base or another grasp is."""
         if len(self.grasps) >= GRASP_LIMIT:
             raise InputError(f"There are already {GRASP_LIMIT} grasps.",
                              "A frame cannot hold more.", "Release one.")
@@ -127,22 +115,15 @@ class HeldBranch:
         return self._count
 
     def release(self, number: int | None) -> None:
-        """Release a grasp, or all.
-
-        Raises:
-            InputError: there is no such grasp.
-        """
+        """Release a grasp, or all; InputError if there is no such grasp."""
         if number is None:
             self.grasps.clear()
         else:
             del self.grasps[self.number(number)]
 
     def number(self, number: int | None) -> int:
-        """Return the number of an existing grasp, of the first if none is named.
-
-        Raises:
-            InputError: there is none, or not that one.
-        """
+        """Return the number of an existing grasp, the first if none is named; InputError if it is
+        not there."""
         if not self.grasps:
             raise InputError("No grasp is held.", "A move needs a grasp.", "Send a grasp first.")
         number = min(self.grasps) if number is None else number
@@ -160,22 +141,16 @@ class HeldBranch:
         self.grasps[number] = replace(held, goal=pose)
 
     def set_gravity(self, on: bool) -> None:
-        """Switch the branch's weight on or off; without it, the branch rises from where it hangs.
-
-        Raises:
-            InputError: it was loaded without weight, so there is none to switch on.
-        """
+        """Switch the branch's weight; without it, the branch rises from where it hangs. InputError
+        if it was loaded without weight."""
         if on and self.model.prestress is None:
             raise InputError("The branch has no weight.", "The session was started without it.",
                              "Start it with ", Option("gravity", True), ".")
         self.gravity_on = on
 
     def set_young(self, young: np.ndarray) -> None:
-        """Set Young's modulus at the control points [Pa]; the branch hangs as scanned.
-
-        Raises:
-            InputError: the number of values is wrong.
-        """
+        """Set Young's modulus [K] [Pa] at the control points; the branch hangs as scanned.
+        InputError if the number of values is wrong."""
         if young.shape != self.young.shape:
             raise InputError(f"{young.size} moduli.",
                              f"The branch has {len(self.young)} control points.", "")
@@ -184,11 +159,7 @@ class HeldBranch:
         self._carried = carried_strain(self.model)
 
     def set_loads(self, loads: list[Load]) -> None:
-        """Hang dead loads on the branch, replacing the earlier ones.
-
-        Raises:
-            InputError: a position is not on the branch.
-        """
+        """Replace the dead loads on the branch; InputError if a position is not on it."""
         forces = np.zeros_like(self.model.mesh.nodes)
         for load in loads:
             position = self._position_of(load.vertex, load.point)
@@ -197,13 +168,8 @@ class HeldBranch:
         self._hung = forces if loads else None
 
     def set_outdoors(self, loads: Outdoors) -> LoadedOutdoors:
-        """Apply wind, snow, fruit and cuts; they replace the earlier ones.
-
-        A cut part keeps its shape and has no weight: only the remainder counts.
-
-        Raises:
-            InputError: a position is not on the branch, or its axes are unknown.
-        """
+        """Replace wind, snow, fruit and cuts; a cut part keeps its shape, has no weight and does
+        not count. InputError if a position is not on the branch, or its axes are unknown."""
         if self._skeleton is None:
             raise InputError("The branch has no axes.", "Wind, snow and cuts need its axes.",
                              "Make it from a scan (limber reconstruct).")
@@ -215,11 +181,8 @@ class HeldBranch:
         return made
 
     def outdoors(self) -> Outdoors:
-        """Return the active wind, snow, fruit and cuts.
-
-        Raises:
-            InputError: there are none, or the branch's weight is switched off.
-        """
+        """Return the active wind, snow, fruit and cuts; InputError if there are none, or the weight
+        is off."""
         if self._outdoors is None:
             raise InputError("There is no wind, snow, fruit or cut.", "",
                              "Send `outdoors` first.")
@@ -236,9 +199,8 @@ class HeldBranch:
 
     @property
     def loads(self) -> np.ndarray | None:
-        """Forces on the nodes in addition to those that the hanging branch carries [N], None if
-        there are none, shape [node_count, 3].
-        """
+        """Forces [node_count, 3] [N] on the nodes beside those that the hanging branch carries;
+        None: none."""
         acting = [forces for forces in (self._hung, self._weather) if forces is not None]
         if not self.gravity_on and self.model.prestress is not None:
             acting.append(-self.model.mass_load[:, None] * self.model.gravity)
@@ -265,10 +227,8 @@ class HeldBranch:
         self.displacement = displacement
 
     def solve(self) -> Answer:
-        """Move towards the target poses with the full model, by a short step at most.
-
-        If there is no equilibrium, the branch keeps its last position.
-        """
+        """Move towards the target poses with the full model, by a short step at most. If there is
+        no equilibrium, the branch keeps its last position."""
         longest = max((self.goal_distance(number) for number in self.grasps), default=0.0)
         part = min(1.0, FULL_STEP * self.model.extent / max(longest, 1e-12))
         goals = {number: held.goal if part == 1.0 else pose_between(held.pose, held.goal, part)
@@ -350,11 +310,8 @@ def reduced_settings(settings: SessionSettings) -> ReducedSettings:
 
 def load_held(folder: Path, settings: SessionSettings,
               progress: Progress = SILENT) -> HeldBranch:
-    """Return the branch of a folder as it hangs, without grasps.
-
-    Raises:
-        BranchFolderError: no branch folder, or no mesh in it. InputError: it lacks the material.
-    """
+    """Return the branch of a folder as it hangs, without grasps. BranchFolderError if there is
+    none, or no mesh in it; InputError if it lacks the material."""
     branch = Branch.read(folder)
     axes = load_skeleton(branch) if branch.has("skeleton.swc") else None
     return HeldBranch(load_branch(branch, gravity=settings.gravity, progress=progress), axes,

@@ -111,10 +111,8 @@ def _listen(requests: queue.Queue[dict[str, Any] | None], progress: Progress) ->
 
 
 def _step_back() -> None:
-    """Run only when a core is idle: the session needs 60 Hz.
-
-    Before there is a model the session waits for it, so the trainer runs at a higher priority.
-    """
+    """Run only when a core is idle: the session needs 60 Hz. Before there is a model the session
+    waits for it, so the trainer runs at a higher priority."""
     if hasattr(os, "SCHED_IDLE"):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     elif hasattr(os, "nice"):

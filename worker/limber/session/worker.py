@@ -169,10 +169,7 @@ class Inbox:
 
 def read_commands(source: int, inbox: Inbox, refuse: Callable[[int, str], None]) -> None:
     """Put the commands of a file descriptor into an inbox until it ends; then close that.
-
-    Args:
-        refuse: Called for an invalid command with its id (0 if it has none) and the reason.
-    """
+    ``refuse`` gets an invalid command's id (0: it has none) and the reason."""
     lines = Lines()
     try:
         while not inbox.closed and (piece := os.read(source, _PIECE_BYTES)):
@@ -209,11 +206,8 @@ _LAST_SECONDS = 5.0
 
 
 class Session:
-    """Executes the client's commands, and answers with frames.
-
-    Raises:
-        LimberError: the branch cannot be loaded.
-    """
+    """Executes the client's commands, and answers with frames; LimberError if the branch cannot be
+    loaded."""
 
     def __init__(self, folder: Path, settings: SessionSettings):
         self.inbox = Inbox()
@@ -380,11 +374,9 @@ def _outdoors(command: protocol.Weather) -> Outdoors:
 
 
 def _steady() -> None:
-    """Remove what would occasionally delay a frame.
-
-    Kernels are loaded before the first frame needs them; a waiting thread gets the interpreter
-    within a millisecond; garbage collection examines new objects only.
-    """
+    """Remove what would occasionally delay a frame: kernels are loaded before one needs them, a
+    waiting thread gets the interpreter within a millisecond, and garbage collection examines new
+    objects only."""
     compile_kernels()
     sys.setswitchinterval(_SWITCH_SECONDS)
     gc.collect()
