@@ -62,9 +62,8 @@ def gone(folder: Path) -> WorkError:
 
 
 def require_short(folder: Path, room: int) -> None:
-    """Refuse a folder in which Windows cannot open files: their paths would be too long. ``room``
-    is the length of the longest name of a file to be written; those that are there are counted.
-    """
+    """Refuse a folder with paths too long for Windows to open: ``room`` is the longest name of a
+    file to be written; those that are there are counted."""
     if not limits_paths():
         return
     place = str(folder.absolute())

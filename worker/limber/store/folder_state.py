@@ -64,13 +64,9 @@ def begin(folder: Path, manifest: Manifest) -> None:
 
 
 def settled_manifest(folder: Path) -> Manifest:
-    """Return the manifest of a branch folder, after finishing an interrupted commit.
-
-    For callers that copy a folder without reading it.
-
-    Raises:
-        BranchFolderError: as for :func:`~limber.store.manifest.read_manifest`; or it has links.
-    """
+    """Return the manifest of a folder after finishing an interrupted commit, for callers that copy
+    it unread. BranchFolderError as for :func:`~limber.store.manifest.read_manifest`, or if it has
+    links."""
     refuse_links(folder)
     finish_pending(folder)
     return read_manifest(folder)
@@ -79,8 +75,7 @@ def settled_manifest(folder: Path) -> Manifest:
 @contextmanager
 def opening(folder: Path, *, only_reads: bool = False) -> Iterator[None]:
     """Refuse a folder that does not exist, has links, or is too deep for Windows; report a lost
-    disk.
-    """
+    disk."""
     require_short(folder, 0 if only_reads else NAME_ROOM)
     with in_words(folder):
         if not folder.is_dir():
@@ -117,10 +112,8 @@ def settle(folder: Path, *, unfinished: bool = False) -> None:
 
 
 def drop_empty(folder: Path) -> None:
-    """Remove a branch folder with a manifest but no other content; keep any other.
-
-    It is also kept if another program writes to it.
-    """
+    """Remove a branch folder with a manifest but no other content; keep any other, and one to which
+    another program writes."""
     own = (COMMIT_LOCK, RUN_LOCK, HOLDER)
     # A file that cannot be removed stays: the user must see the original failure.
     with (contextlib.suppress(OSError, BranchFolderError),

@@ -29,11 +29,8 @@ def is_pending(folder: Path) -> bool:
 
 
 def current_manifest(folder: Path) -> Manifest:
-    """Return the valid manifest: that of a pending commit, if any. Changes no files.
-
-    Raises:
-        BranchFolderError: as for :func:`~limber.store.manifest.read_manifest`.
-    """
+    """Return the valid manifest, that of a pending commit if any; change no files.
+    BranchFolderError as for :func:`~limber.store.manifest.read_manifest`."""
     pending = folder / _COMMIT
     return read_manifest(pending if (pending / MANIFEST).exists() else folder)
 
@@ -54,17 +51,9 @@ def unfinished_error(folder: Path) -> BranchFolderError:
 
 
 def commit(folder: Path, work: Path, manifest: Manifest) -> None:
-    """Commit the files in ``work``, and ``manifest``; under the commit lock.
-
-    Args:
-        folder: The branch folder, without a pending commit.
-        work: A folder in it with the new files under their names.
-        manifest: The new content of ``branch.json``.
-
-    Raises:
-        BranchFolderError: an entry that is not a file of a branch is in the way; no file was
-        committed.
-    """
+    """Commit the files in ``work``, a folder in the branch folder, under their names, and the
+    manifest; under the commit lock, without a pending commit. BranchFolderError if an entry that is
+    no branch's file is in the way: nothing was committed."""
     _require_targets(folder, (path.relative_to(work).as_posix() for path in work.rglob("*")
                               if path.is_file()))
     (work / MANIFEST).write_text(manifest.text(), encoding="utf-8")
@@ -75,11 +64,8 @@ def commit(folder: Path, work: Path, manifest: Manifest) -> None:
 
 
 def roll_forward(folder: Path) -> None:
-    """Finish a pending commit, if any; under the commit lock. Safe to repeat from any point.
-
-    Raises:
-        BranchFolderError: a file cannot be replaced, or another entry is in its place.
-    """
+    """Finish a pending commit, if any, under the commit lock; safe to repeat from any point.
+    BranchFolderError if a file cannot be replaced, or another entry is in its place."""
     pending = folder / _COMMIT
     if not pending.is_dir():
         return
@@ -121,10 +107,8 @@ def _install(folder: Path, pending: Path) -> None:
 
 
 def _require_targets(folder: Path, names: Iterable[str]) -> None:
-    """Refuse to commit files if a folder, or a pipe or file in place of a folder, is in the way.
-
-    Checked before the first of them is moved: a commit that stops halfway would never end.
-    """
+    """Refuse to commit files if a folder, or a pipe or file in place of a folder, is in the way:
+    before the first of them is moved, as a commit that stops halfway would never end."""
     for name in names:
         path = inside(folder, name)
         above = [parent for parent in path.parents if parent.is_relative_to(folder)]

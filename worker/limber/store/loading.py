@@ -59,11 +59,7 @@ class _Targets(FileContent):
 
 
 def load_mesh(branch: Branch) -> TetMesh:
-    """Return the branch's tetrahedra.
-
-    Raises:
-        BranchFolderError: there is no mesh.
-    """
+    """Return the branch's tetrahedra; BranchFolderError if there is no mesh."""
     return TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
 
 
@@ -80,13 +76,7 @@ def load_skeleton(branch: Branch) -> Skeleton:
 
 def load_found_skeleton(branch: Branch, alignment: Alignment, unit: str) -> Skeleton:
     """Return the axes as reconstruct found them, before edits, in the frame of ``alignment`` [m].
-
-    Args:
-        unit: Unit of the scan's file, in which they are kept.
-
-    Raises:
-        BranchFolderError: they were not kept.
-    """
+    They are kept in ``unit``, that of the scan's file. BranchFolderError if they were not kept."""
     found = read_skeleton(branch.require(f"{FOUND_SKELETON}.csv", "reconstruct"),
                           scale=UNIT_METRES[unit])
     return found.moved(alignment.apply(found.nodes / alignment.scale))
@@ -101,19 +91,15 @@ def load_masses(branch: Branch) -> list[dict[str, Any]]:
 
 
 def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
-    """Return the masses that hung on the branch when it was scanned, and are not in its mesh.
-
-    Twigs and leaves, as rigid bodies that move with the section they grow from; masses stated in a
-    table; and targets.
-    """
+    """Return the masses that hung on the scanned branch and are not in its mesh: twigs and leaves,
+    as rigid bodies that move with their section, masses stated in a table, and targets."""
     return hung_masses(load_masses(branch), load_targets(branch))
 
 
 def hung_masses(masses: Iterable[dict[str, Any]], targets: tuple[NamedTarget, ...],
                 ) -> tuple[PointMass, ...]:
     """Return the point masses of pruned twigs and leaves, as reconstruct lists them, and of
-    targets.
-    """
+    targets."""
     return (*(_hung(mass) for mass in masses), *target_masses(targets))
 
 
@@ -126,11 +112,8 @@ def _hung(mass: dict[str, Any]) -> PointMass:
 
 
 def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
-    """Return the named positions on the branch that `limber target` has written.
-
-    Raises:
-        InputError: the file is of a newer program.
-    """
+    """Return the named positions that `limber target` has written; InputError if the file is of a
+    newer program."""
     if not branch.has("targets.json"):
         return ()
     known = read_json_as(branch.path("targets.json"), _Targets, "a list of targets")
@@ -198,15 +181,9 @@ def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDampin
 
 
 def stiffness_deviation(branch: Branch) -> float | None:
-    """Return the relative standard deviation of the branch's bending stiffness, assumed equal all
-    along it, by the last estimate, swing or ringing; None if there is none.
-
-    A force or motion predicted on the branch's own mesh depends on E I: an error of the scanned
-    radius cancels with that of E. Swing and ringing state only the interval of E.
-
-    Raises:
-        InputError: ``estimate.json`` is damaged.
-    """
+    """Relative standard deviation of E I, equal all along, by the last estimate, swing or ringing
+    (these state only E); None if there is none. On the branch's own mesh, errors of radius and E
+    cancel. InputError if ``estimate.json`` is damaged."""
     entries = {key: branch.manifest.stages[key] for key in ("estimate", "swing", "vibration")
                if key in branch.manifest.stages}
     last = max(entries, key=lambda key: entries[key].finished, default=None)
@@ -232,20 +209,9 @@ def load_model(branch: Branch, *, gravity: bool = True, young: float | np.ndarra
                density: float | np.ndarray | None = None,
                point_masses: Iterable[PointMass] | None = None,
                **options: Unpack[ModelOptions]) -> BranchModel:
-    """Return the model of a branch folder's ``mesh.vtu``.
-
-    The mesh is taken as the unloaded shape: see :func:`load_branch`. Gravity is that of the scan,
-    which the upright rotation has rotated with the branch; masses that are not in the mesh hang on
-    it.
-
-    Args:
-        gravity: Whether the branch has weight.
-        young, poisson, density, point_masses: Replace those of the folder.
-        options: As for BranchModel.
-
-    Raises:
-        BranchFolderError: there is no mesh. InputError: it lacks material data.
-    """
+    """Return the model of ``mesh.vtu`` as the unloaded shape (see :func:`load_branch`), with the
+    scan's gravity and the masses that hang on it. Given values replace the folder's.
+    BranchFolderError if there is no mesh, InputError if it lacks material data."""
     mesh = load_mesh(branch)
 
     def known(name: str, value: float | np.ndarray | None) -> float | np.ndarray:
@@ -264,34 +230,22 @@ def load_model(branch: Branch, *, gravity: bool = True, young: float | np.ndarra
 
 
 def load_grasp_model(branch: Branch, *, gravity: bool, progress: Progress = SILENT) -> GraspModel:
-    """Return the data of a branch for planning.
-
-    See :func:`limber.planning.field.grasp_model.grasp_model_of`.
-
-    Raises:
-        BranchFolderError: a file is missing. InputError: the mesh lacks material or grasp.
-    """
+    """Return the data for planning, see :func:`limber.planning.field.grasp_model.grasp_model_of`.
+    BranchFolderError if a file is missing, InputError if the mesh lacks material or grasp."""
     return grasp_model_of(load_branch(branch, gravity=gravity, progress=progress),
                           load_skeleton(branch))
 
 
 def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
-    """Return the branch to estimate; the initial modulus is uniform.
-
-    Raises:
-        BranchFolderError: a file is missing. InputError: its moduli are not positive.
-    """
+    """Return the branch to estimate, with a uniform initial modulus. BranchFolderError if a file is
+    missing, InputError if its moduli are not positive."""
     return subject_of(load_mesh(branch), load_skeleton(branch), load_point_masses(branch),
                       branch.gravity, settings)
 
 
 def load_estimated_subject(branch: Branch, known: dict[str, Any], *, gravity: bool) -> Subject:
-    """Return the branch as used by an estimate, so that its results have the same meaning.
-
-    Args:
-        known: Content of ``estimate.json``.
-        gravity: Whether the branch's weight acts, unless the estimate had to leave it out.
-    """
+    """Return the branch as the estimate ``known``, content of ``estimate.json``, used it: its
+    results have the same meaning. Without weight if that had to leave it out."""
     return load_subject(branch, EstimateSettings(
         fractions=tuple(known["fractions"]), gravity=gravity and not known.get("is_weightless"),
         field="open" if known.get("field_form") else "inverse_distance",
@@ -304,11 +258,8 @@ def known_pulls(branch: Branch) -> list[str]:
 
 
 def pull_names(branch: Branch, settings: EstimateSettings) -> list[str]:
-    """Return the pulls to use, checked.
-
-    Raises:
-        InputError: there are none, or a requested one is missing.
-    """
+    """Return the pulls to use, checked; InputError if there are none, or a requested one is
+    missing."""
     known = known_pulls(branch)
     missing = [name for name in settings.pull if name not in known]
     if missing or not known:

@@ -29,20 +29,9 @@ _NO_LOCKS = frozenset((errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOL
 
 @contextmanager
 def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
-    """Hold the right to write to ``folder``: for a whole stage, from before its work begins.
-
-    The holder may request it again. Readers do not need it.
-
-    Args:
-        folder: The branch folder.
-        purpose: Purpose, as text for the user of another program.
-
-    Yields:
-        Whether this program did not hold it yet.
-
-    Raises:
-        BranchBusyError: another program has it locked; states which and since when.
-    """
+    """Hold the right to write to ``folder`` for a whole stage; yield whether this program did not
+    hold it yet. Readers need none. ``purpose`` is text for another program's user. BranchBusyError
+    states which program has it locked, and since when."""
     # One lock object per folder in this program, for any number of requests.
     lock = FileLock((folder / RUN_LOCK).resolve(), is_singleton=True, thread_local=False)
     try:
@@ -72,11 +61,8 @@ def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
 
 @contextmanager
 def commit_lock(folder: Path) -> Iterator[None]:
-    """Hold the right to move results into ``folder``, for a moment; other programs wait for it.
-
-    Raises:
-        BranchFolderError: it was not available within a minute, or the folder cannot be written to.
-    """
+    """Hold the right to move results into ``folder``, for a moment; others wait. BranchFolderError
+    if it was not available within a minute, or the folder cannot be written to."""
     lock = FileLock(folder / COMMIT_LOCK)
     try:
         _acquire(lock, folder, _COMMIT_WAIT_SECONDS)
@@ -94,11 +80,8 @@ def commit_lock(folder: Path) -> Iterator[None]:
 
 
 def wait_for_commit(folder: Path) -> None:
-    """Wait, a minute at most, while another program moves results into ``folder``.
-
-    For readers: the lock is requested on a read-only handle, and no file is made. Without a lock
-    file there is no such program.
-    """
+    """Wait, a minute at most, while another program moves results into ``folder``. For readers: the
+    lock is requested on a read-only handle; without a lock file there is no such program."""
     until = time.monotonic() + _COMMIT_WAIT_SECONDS
     while _is_held(folder / COMMIT_LOCK) and time.monotonic() < until:
         time.sleep(0.02)
@@ -129,9 +112,8 @@ def _is_held(path: Path) -> bool:
 
 
 def _lacks_locks(path: Path) -> bool:
-    """Whether the file system has no locks. A lock is then represented by a file, which remains
-    when its program is killed.
-    """
+    """Whether the file system has no locks: then a file is one, and remains when its program is
+    killed."""
     if sys.platform == "win32":
         return False
     import fcntl

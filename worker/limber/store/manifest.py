@@ -53,10 +53,8 @@ class StageEntry(BaseModel):
 
 
 class Manifest(BaseModel):
-    """Content of ``branch.json``.
-
-    ``uuid`` identifies the branch independent of the path and name of its folder.
-    """
+    """Content of ``branch.json``. ``uuid`` identifies the branch independent of the path and name
+    of its folder."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -84,13 +82,8 @@ class Manifest(BaseModel):
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Read the manifest of a branch folder.
-
-    Raises:
-        BranchFolderError: there is none, it is damaged or of a newer format, or it lists a file
-            outside the folder.
-        WorkError: its disk does not respond.
-    """
+    """Read a folder's manifest. BranchFolderError if there is none, it is damaged, of a newer
+    format or lists a file outside the folder; WorkError if its disk does not respond."""
     path = folder / MANIFEST
     if not path.is_file():
         raise BranchFolderError(
@@ -123,11 +116,8 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def checked_name(name: str) -> str:
-    """Return the name of a file in a branch folder, relative with ``/``.
-
-    Raises:
-        InputError: it is outside the folder, or is one of the folder's own.
-    """
+    """Return the name of a file in a branch folder, relative with ``/``; InputError if it is
+    outside the folder, or is one of the folder's own."""
     plain = relative_name(name)
     # Windows takes what follows a colon for a stream of the file before it.
     if plain.casefold().partition(":")[0] == MANIFEST or plain.startswith("."):
