@@ -123,8 +123,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             and Path(__file__).parent / "robot" not in item.path.parents]
     if lost:
         raise pytest.UsageError(f"real_time is for tests/robot alone: {', '.join(lost)}")
+    for item in items:  # tests/run.py asks for a mark of every new test that takes long
+        if LONG & {mark.name for mark in item.iter_markers()}:
+            item.user_properties.append(("long", "yes"))
 
 
+LONG = {"slow", "campaign", "real_time", "real_blender"}
+"""Marks that a test which takes long has one of."""
 _QUICK_SECONDS = 2.0
 """A test without the mark `slow` takes half a second; several times that is worth a word."""
 
@@ -134,6 +139,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     reports = terminalreporter.getreports("passed") + terminalreporter.getreports("failed")
     for report in reports:
         if report.when == "call" and report.duration > _QUICK_SECONDS and not (
-                {"slow", "real_time", "real_blender"} & set(report.keywords)):
+                LONG & set(report.keywords)):
             terminalreporter.write_line(
                 f"not marked slow, and took {report.duration:.1f} s: {report.nodeid}")

@@ -4,6 +4,7 @@ scripts/test calls it after the set-up. A part that fails hides no other part.
 """
 
 import argparse
+import json
 import os
 import re
 import shutil
@@ -26,6 +27,10 @@ NO_TESTS = 5
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 # As many tests at once as there are cores to run them: tests of the robot wait 5 s for a process.
 SIDE_BY_SIDE = ["-n", str(min(CORES, 2)), "--dist", "worksteal"]
+DURATIONS = ROOT / "tests" / "durations.json"
+"""Seconds of each test over 1 s, longest first, as the last whole run measured them."""
+LONG_SECONDS = 5.0
+"""A test that takes longer is marked `slow` or `campaign`, or was there before this rule."""
 
 
 @dataclass
@@ -37,6 +42,8 @@ class Part:
     failed: bool
     counts: Counter[str] | None = None
     skips: Counter[str] = field(default_factory=Counter)
+    seconds_of: dict[str, float] = field(default_factory=dict)
+    unmarked: set[str] = field(default_factory=set)
 
 
 def main(arguments: list[str]) -> int:
@@ -45,6 +52,8 @@ def main(arguments: list[str]) -> int:
         "Other arguments go to pytest: scripts/test tests/geometry -k skeleton"))
     parser.add_argument("--fast", action="store_true",
                         help="style, types and the quick tests of every package: for each save")
+    parser.add_argument("--campaign", action="store_true",
+                        help="the long tests that no other run has: for each night")
     parser.add_argument("--ci", action="store_true",
                         help="also bring a real Blender first and test zip and wheel last")
     asked, others = parser.parse_known_args(arguments)
@@ -52,10 +61,16 @@ def main(arguments: list[str]) -> int:
     if asked.ci:
         parts.append(provided_blender())
     parts.append(command("style", [BIN / "ruff", "check", "addon", "worker", "tests", "scripts"]))
-    if not others or asked.fast:
+    if asked.fast or not (others or asked.campaign):
         parts.append(command("types", [BIN / "mypy"]))
         parts.append(command("packages", [sys.executable, ROOT / "scripts/check_dependencies"]))
-    parts.extend(tests(asked.fast, others))
+    if asked.campaign:
+        parts.append(pytest_part("campaign", ["-m", "campaign", "--timeout", "3600", *others]))
+    else:
+        parts.extend(tests(asked.fast, others))
+    parts.extend(unmarked_parts(parts))
+    if not (asked.fast or asked.campaign or others):
+        write_durations(parts)
     if asked.ci:
         parts += [command("zip", [ROOT / "scripts" / "test_zip", "--oldest"]),
                   command("wheel", [ROOT / "scripts" / "test_wheel"])]
@@ -75,19 +90,42 @@ def tests(fast: bool, others: list[str]) -> list[Part]:
     """The tests: those chosen by pytest's own arguments, the quick ones, or all."""
     if fast:
         return [pytest_part("tests", [*SIDE_BY_SIDE, "-m",
-                                      "not slow and not real_time and not real_blender", *others])]
+                                      "not slow and not campaign and not real_time "
+                                      "and not real_blender", *others])]
     if others:
-        return [pytest_part("tests", others)]
+        return [pytest_part("tests", ["-m", "not campaign", *others])]
     # The robots' loops have real-time priority, so these follow their clocks of 2 and 8 ms beside
     # the others, which are nice. What fails all the same is tried once more, alone.
     alone = ["tests/robot", "-m", "real_time", "-o", "cache_dir=.pytest_cache/real_time"]
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as beside:
         output = Path(folder) / "output.txt"
         first = beside.submit(pytest_part, "real time", [*alone, "--durations", "5"], output)
-        rest = pytest_part("tests", ["-m", "not real_time", "--durations", "20", *SIDE_BY_SIDE])
+        rest = pytest_part("tests", ["-m", "not real_time and not campaign",
+                                     "--durations", "20", *SIDE_BY_SIDE])
         part = first.result()
         print(f"\n=== real time ===\n{output.read_text(encoding='utf-8')}", flush=True)
     return [rest, tried_again(part, alone) if part.failed else part]
+
+
+def unmarked_parts(parts: list[Part]) -> list[Part]:
+    """A failed part if new tests take long without a mark that says so."""
+    if not DURATIONS.exists():
+        return []
+    known = json.loads(DURATIONS.read_text(encoding="utf-8"))
+    long = [f"{name} ({part.seconds_of[name]:.0f} s)" for part in parts for name in
+            sorted(part.unmarked - set(known)) if part.seconds_of[name] > LONG_SECONDS]
+    for name in long:
+        print(f"scripts/test: takes over {LONG_SECONDS:.0f} s without the mark slow or campaign: "
+              f"{name}", flush=True)
+    return [Part("durations", 0.0, True)] if long else []
+
+
+def write_durations(parts: list[Part]) -> None:
+    """Keep how long the tests of a whole run took, to half a second."""
+    rounded = {name: round(2 * seconds) / 2 for part in parts
+               for name, seconds in part.seconds_of.items() if seconds > 1.0}
+    ordered = dict(sorted(rounded.items(), key=lambda one: (-one[1], one[0])))
+    DURATIONS.write_text(json.dumps(ordered, indent=0) + "\n", encoding="utf-8")
 
 
 def tried_again(part: Part, arguments: list[str]) -> Part:
@@ -112,13 +150,16 @@ def pytest_part(name: str, arguments: list[str], output: Path | None = None) -> 
         report = Path(folder) / "report.xml"
         code = _pytest(arguments, report, output)
         counts, skips = _counted(report)
-    return Part(name, time.monotonic() - began, code not in (0, NO_TESTS), counts, skips)
+        seconds_of, unmarked = _timed(report)
+    return Part(name, time.monotonic() - began, code not in (0, NO_TESTS), counts, skips,
+                seconds_of, unmarked)
 
 
 def _pytest(arguments: list[str], report: Path, output: Path | None) -> int:
     polite = ["nice"] if SIDE_BY_SIDE[0] in arguments and shutil.which("nice") else []
     with output.open("w") if output else nullcontext() as file:
-        return subprocess.run([*polite, *PYTEST, *arguments, "--junit-xml", str(report)], cwd=ROOT,
+        return subprocess.run([*polite, *PYTEST, *arguments, "--junit-xml", str(report),
+                               "-o", "junit_duration_report=call"], cwd=ROOT,
                               stdout=file, stderr=file, check=False).returncode
 
 
@@ -138,6 +179,17 @@ def _counted(report: Path) -> tuple[Counter[str], Counter[str]]:
         else:
             counts["passed"] += 1
     return counts, skips
+
+
+def _timed(report: Path) -> tuple[dict[str, float], set[str]]:
+    """Return the seconds of each test of a JUnit report, and which have no mark of a long one."""
+    seconds, unmarked = {}, set()
+    for case in ElementTree.parse(report).iter("testcase") if report.exists() else ():
+        name = f"{case.get('classname')}::{case.get('name')}"
+        seconds[name] = float(case.get("time") or 0.0)
+        if all(one.get("name") != "long" for one in case.iter("property")):
+            unmarked.add(name)
+    return seconds, unmarked
 
 
 def provided_blender() -> Part:

@@ -1,5 +1,7 @@
 """The suite's own runner: no part hides another, and the table says what happened."""
 
+import json
+
 import pytest
 from tests import run
 
@@ -11,13 +13,14 @@ FAILURE = '<testcase classname="a" name="fails"><failure message="no">no</failur
 
 
 @pytest.fixture
-def pytest_runs(monkeypatch):
+def pytest_runs(monkeypatch, tmp_path):
     """Calls of pytest that write what a list says of their part: True fails, False passes."""
     outcomes, calls = {"real_time": [False], "not real_time": [False]}, []
 
     def called(arguments, report, output):
         calls.append(arguments)
-        part = arguments[arguments.index("-m") + 1] if "-m" in arguments else "not real_time"
+        part = arguments[arguments.index("-m") + 1].removesuffix(" and not campaign")
+        part = part if part in outcomes else "not real_time"
         failed = outcomes[part].pop(0)
         report.write_text(REPORT.format(FAILURE if failed else ""))
         if output is not None:
@@ -25,6 +28,7 @@ def pytest_runs(monkeypatch):
         return int(failed)
 
     monkeypatch.setattr(run, "_pytest", called)
+    monkeypatch.setattr(run, "DURATIONS", tmp_path / "durations.json")
     monkeypatch.setattr(run, "command", lambda name, words: run.Part(name, 0.1, False))
     return outcomes, calls
 
@@ -65,4 +69,21 @@ def test_a_failed_style_check_fails_the_run(pytest_runs, monkeypatch, capsys):
 def test_arguments_go_to_pytest(pytest_runs):
     _, calls = pytest_runs
     assert run.main(["tests/geometry", "-k", "skeleton"]) == 0
-    assert calls == [["tests/geometry", "-k", "skeleton"]]
+    assert calls == [["-m", "not campaign", "tests/geometry", "-k", "skeleton"]]
+
+
+def test_durations_are_kept_and_a_new_long_test_wants_a_mark(pytest_runs, monkeypatch, capsys):
+    """A whole run writes them; what was there before, or is marked, may take its time."""
+    case = '<testcase classname="a" name="{}" time="{}">{}</testcase>'
+    mark = '<properties><property name="long" value="yes"/></properties>'
+    monkeypatch.setattr("tests.test_run.REPORT", "<testsuites>{}" + case.format("b", 7.1, mark)
+                        + case.format("c", 9.3, "") + case.format("d", 0.4, "") + "</testsuites>")
+    assert run.main([]) == 0, "there are no durations to compare with yet"
+    kept = run.DURATIONS.read_text()
+    assert list(json.loads(kept).items()) == [("a::c", 9.5), ("a::b", 7.0)]
+    pytest_runs[0].update({"real_time": [False], "not real_time": [False]})
+    assert run.main([]) == 0
+    run.DURATIONS.write_text("{}")
+    pytest_runs[0].update({"real_time": [False], "not real_time": [False]})
+    assert run.main([]) == 1
+    assert "without the mark slow or campaign: a::c (9 s)" in capsys.readouterr().out

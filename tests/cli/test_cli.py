@@ -134,13 +134,6 @@ def test_every_listed_command_exists():
         assert command.help
 
 
-@pytest.mark.parametrize("arguments", [
-    ["nosuch"], ["record"], ["reconstruct"], ["reconstruct", "--nosuch"]])
-def test_wrong_usage_is_exit_code_2(arguments):
-    """Unknown commands and options, and missing arguments, end with 2."""
-    assert main.call(arguments) == 2
-
-
 def test_an_unknown_command_or_option_is_answered_with_those_like_it(capfd):
     """One that is like none points at the list."""
     for arguments, told in ((["recnstruct"], "Did you mean reconstruct?"),

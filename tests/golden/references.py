@@ -99,7 +99,8 @@ def error_reference() -> dict[str, dict]:
             code, out, said = _run(command, "--json")
             told = json.loads(out[-1]) if out and out[-1].startswith("{") else {}
             found[command] = _without_places({"code": code} | {
-                name: told[name] for name in ("status", "error", "fix", "choices", "place")
+                name: shortened(told[name])
+                for name in ("status", "error", "fix", "remedies", "place")
                 if told.get(name)} | ({} if told else {"said": said}))
     return found
 

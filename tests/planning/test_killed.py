@@ -18,7 +18,6 @@ from limber.core.files.atomic import is_owned_name
 from limber.store import Branch
 
 ROOT = Path(__file__).parents[2]
-KINDS = [pytest.param(kind, id=kind.name) for kind in (signal.SIGKILL, signal.SIGTERM)]
 pytestmark = [pytest.mark.skipif(os.name == "nt", reason="POSIX signals"),
               pytest.mark.timeout(400)]
 
@@ -76,7 +75,8 @@ def assert_clean(folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [
+    signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.campaign)])
 def test_a_killed_energy_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
     """Earlier results stand; the next run sweeps what was left, and finds what it always finds."""
     before = (folder / "energy.npz").read_bytes()
@@ -103,7 +103,8 @@ def assert_same(now: np.ndarray, then: np.ndarray, name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [
+    signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.campaign)])
 def test_a_killed_plan_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
     """While both paths are solved on the full model."""
     ask = (folder, "--start-seed", "3", "--iterations", "100", "--name",
@@ -116,7 +117,7 @@ def test_a_killed_plan_leaves_no_process_and_a_folder_to_go_on_with(folder, kind
     assert len(Branch.open(folder).names("plans")) > len(before)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_killed_bench_leaves_no_process():
     killed_at_work([sys.executable, "-m", "benchmarks.table", "estimation", "--quick"],
                    signal.SIGKILL)

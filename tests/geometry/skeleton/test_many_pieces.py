@@ -75,7 +75,7 @@ def _sticks(count, seed=5):
         [np.r_[first, first + 1], np.r_[first + 1, first + 2]], axis=1)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_strewn_sticks_take_no_more_rounds_than_a_crown(priced_bridges) -> None:
     """A bridge for each of 300 short sticks, and few trials without one."""
     nodes, edges = _sticks(300)
