@@ -92,11 +92,14 @@ def test_options_are_told_by_their_titles(addon, stage, named, wanted):
 
 def test_settings_without_a_value_are_shown(bpy, registered, whole_texts):
     """Each once, in the text's order: not those with a value, switches, or what no panel keeps."""
+    layout, steps = Layout(), part("panels.steps")
     stage = part("stages").stages()["reconstruct"]
-    found = part("plain_words").settings_in(
-        "Crop it (--crop-low, --crop-high), join (--plants joined), give --root or --crop-low; "
-        "--no-force, --output, --such-a-thing.", stage)
-    assert [field.name for field in found] == ["crop_low", "crop_high", "root"]
+    error = InputError("Two plants.", "", *map(Option, (
+        "crop_low", "crop_high", "root", "crop_low", "force", "output", "such_a_thing")),
+        Option("plants", "joined"))
+    steps.draw_error(layout, bpy.context, stage, error.as_json())
+    assert [name for name in layout.names("prop") if name in stage.fields] == [
+        "crop_low", "crop_high", "root"]
 
 
 def test_a_step_that_an_error_names_is_a_button(bpy, registered, whole_texts):

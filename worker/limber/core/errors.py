@@ -80,7 +80,10 @@ class Text(str):
     @property
     def named(self) -> tuple[Option | Command, ...]:
         """The options and commands in it, each once."""
-        found = {str(part): part for part in self.parts if not isinstance(part, str)}
+        found: dict[str, Option | Command] = {}
+        for part in self.parts:
+            if not isinstance(part, str):
+                found.setdefault(str(part), part)
         return tuple(found.values())
 
     def shown(self, show: Callable[[Option | Command], str]) -> str:
@@ -133,8 +136,8 @@ class LimberError(Exception):
         return self
 
     def at(self, position: Iterable[float]) -> Self:
-        """Set the position; returns the error itself."""
-        self.place = tuple(float(value) for value in position)
+        """Set the position, also for an error with the same ``seen``; returns the error itself."""
+        self.place = self.seen.at(position).place
         return self
 
 

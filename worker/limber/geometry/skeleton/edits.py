@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial import cKDTree
 
 from limber.core.alignment import Alignment
-from limber.core.errors import Command, InputError
+from limber.core.errors import Command, InputError, Text
 from limber.core.files.reading import read_json
 from limber.core.json_values import validated
 from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, Skeleton
@@ -152,7 +152,8 @@ def edited(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str] | None 
         try:
             skeleton = doing[edit.do](skeleton, edit)
         except InputError as error:
-            refusal = InputError(f"Edit {number} ({edit.do}): {error.seen}", error.why, error.fix)
+            refusal = InputError(Text(f"Edit {number} ({edit.do}): ", error.seen), error.why,
+                                 error.fix)
             if misfits is None:
                 raise refusal from error
             misfits.append(str(refusal))

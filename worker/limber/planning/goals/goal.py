@@ -394,7 +394,8 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
                        f"m{unit_hint(missed, field)}.", "The branch was sampled with its grasp "
                        f"from {position_text(field.region.low)} to "
                        f"{position_text(field.region.high)} m.", goal.advice, ", or sample farther "
-                       "(", Command("energy", Option("deflection")), ").").at(nearest)
+                       "(", Command("energy", Option("deflection")), ").").at(
+                           goal.centre(field))
 
 
 def unit_hint(off: float, field: EnergyField) -> str:

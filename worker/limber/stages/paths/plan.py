@@ -291,7 +291,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
             )
         except NoPathError as error:
             limited = default_limit(limits, settings, strength)
-            raise type(error)(error.seen, error.why, f"{error.fix} {limited}".strip()) from error
+            raise type(error)(error.seen, error.why, error.fix,
+                              *([" ", limited] if limited else [])) from error
         if limited := default_limit(limits, settings, strength):
             progress.warn(limited)
         if found.summary["stopped"]:
