@@ -99,12 +99,8 @@ def error_reference() -> dict[str, dict]:
             code, out, said = _run(command, "--json")
             told = json.loads(out[-1]) if out and out[-1].startswith("{") else {}
             found[command] = _without_places({"code": code} | {
-<<<<<<< HEAD
                 name: shortened(told[name])
                 for name in ("status", "error", "fix", "remedies", "place")
-=======
-                name: told[name] for name in ("status", "error", "fix", "remedies", "place")
->>>>>>> 8722e0e0 (Keep the place of an error that is raised again, and its references)
                 if told.get(name)} | ({} if told else {"said": said}))
     return found
 

@@ -257,12 +257,8 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
         raise InputError(
             f"{branch.folder} has no mesh of this skeleton.",
             "The last reconstruct failed. The scan is needed again.",
-<<<<<<< HEAD
             "Run ", Command("reconstruct", "CLOUD", "-o", "NAME.branch", Option("edits"), "FILE"),
             ".")
-=======
-            "Run ", Command("reconstruct", "CLOUD -o NAME.branch", Option("edits"), "FILE"), ".")
->>>>>>> 8722e0e0 (Keep the place of an error that is raised again, and its references)
     settings = _settings(made)
     alignment = branch.manifest.alignment
     digests = {name: value for name, value in made.reads.items() if name != "edits"}
