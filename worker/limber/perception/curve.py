@@ -59,9 +59,8 @@ class RestCurve:
 
 @dataclass(frozen=True)
 class BentCurve:
-    """A state of a :class:`RestCurve`: rotation of each segment against rest [n - 1, 3, 3], and the
-    sum of rotation steps at each knot [knots, 3] [rad], a measure of the bend and no rotation
-    vector."""
+    """A state of a :class:`RestCurve`: each segment's rotation against rest [n - 1, 3, 3], and the
+    sum of rotation steps at each knot [knots, 3] [rad], which is no rotation vector."""
 
     rest: RestCurve
     turns: np.ndarray

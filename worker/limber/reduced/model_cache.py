@@ -62,7 +62,7 @@ def write_model(model: ReducedModel, path: Path,
 
 
 def read_model(path: Path) -> ReducedModel:
-    """Read a model that :func:`write_model` wrote; InputError if it is not one, or of another
+    """Read a model that :func:`write_model` wrote; InputError if it is none, or of another
     format."""
     arrays = {name: values for name, values in read_arrays(path, "a reduced model").items()
               if not name.startswith("snapshot_")}
@@ -138,9 +138,8 @@ def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
 
 
 def as_control_points(model: BranchModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights [tet_count, K] and moduli [K] that give the model's Young's modulus, at the
-    mesh's control points. If they cannot, it becomes one region of which only the level can
-    change."""
+    """Return weights [tet_count, K] and moduli [K] [Pa] that give the model's Young's modulus. If
+    the mesh's control points cannot, it becomes one region of which only the level can change."""
     from limber.mechanics.materials.materials import young_weights
 
     marks = model.mesh.point_data.get("control_point")
@@ -210,8 +209,8 @@ class ReducedCache:
         return self.folder / f"{key}.npz"
 
     def load(self, key: str) -> tuple[ReducedModel, Snapshots] | None:
-        """Return a model and its full solutions; None if there is none. A damaged file is removed,
-        and said."""
+        """Return a model and its full solutions; None without one. Damaged files go, with a
+        warning."""
         path = self.path(key)
         if not path.is_file():
             return None
@@ -279,8 +278,7 @@ class ReducedCache:
 
 @dataclass(frozen=True)
 class LearntModel:
-    """A reduced model and the full solutions that it was trained on; ``was_known``: from the
-    cache."""
+    """A reduced model and the full solutions that trained it; ``was_known``: from the cache."""
 
     reduced: ReducedModel
     snapshots: Snapshots

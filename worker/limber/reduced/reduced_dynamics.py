@@ -70,8 +70,7 @@ class ReducedStepper:
 
     def move(self, pose: np.ndarray, step: float) -> bool:
         """Step to a pose [m, rad] reached in ``step`` [s]; return whether it converged. The grasp
-        moves straight there without acceleration: the noise of live poses must not shake the
-        branch."""
+        moves straight, without acceleration: noise of live poses must not shake the branch."""
         return self._move(check_pose(pose), step, _LIVE_HALVINGS)
 
     def _move(self, pose: np.ndarray, step: float, halvings: int) -> bool:

@@ -102,9 +102,8 @@ class ReducedState:
 
 @dataclass(frozen=True)
 class ReducedSensitivities:
-    """Derivatives to log Young's modulus at the K control points: coordinates [size, K], reaction
-    [3, K] [N], [Nm] about the pose's position, and strain energy with that of a carried weight
-    [K] [J]."""
+    """Derivatives to log Young's modulus at K control points: coordinates [size, K], reaction
+    [3, K] [N], [Nm] about the pose's position, strain energy [K] [J] with a carried weight's."""
 
     coordinates: np.ndarray
     reaction_force: np.ndarray
@@ -325,9 +324,8 @@ class ReducedModel:
 
     def followed(self, start: np.ndarray, pose: np.ndarray,
                  settings: ReducedStaticSettings = _STATIC) -> ReducedState:
-        """Return the equilibrium that a pinned grasp comes to from coordinates ``start`` [size].
-        Unlike :meth:`solve_static` it seeks no other state; if even short steps jump, it has not
-        converged."""
+        """Return the equilibrium that a pinned grasp comes to from coordinates ``start`` [size]. It
+        seeks no other state; where even short steps jump, it has not converged."""
         began, pose = time.perf_counter(), check_pose(pose)
         at_pose = np.concatenate([self.grasp.centre + start[:self.basis.lift_count], pose[3:]])
         found = self._follow(at_pose, start, pose, self.load, settings, settings.iteration_limit,

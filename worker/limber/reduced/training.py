@@ -245,8 +245,7 @@ class Trainer:
 
     def differentiate(self, poses: np.ndarray, young: np.ndarray,
                       displacements: np.ndarray) -> Snapshots:
-        """Return full solutions with converged ``displacements`` [s, node_count, 3] [m] and their
-        tangents."""
+        """Return converged ``displacements`` [s, node_count, 3] [m] with their tangents."""
         rows = []
         for pose, modulus, displacement in zip(poses, young, displacements, strict=True):
             model = self.model.with_young(self.weights @ modulus)
@@ -312,9 +311,8 @@ class Trainer:
 
     def _swings(self, state: np.ndarray, modes: np.ndarray, pose: np.ndarray, young: np.ndarray,
                 rng: np.random.Generator) -> list[np.ndarray]:
-        """Return states swung out from one along its vibrations, as far as motion does. A vibration
-        as it is would stretch; bent by its own inertia load (omega^2 M times the mode) the branch
-        keeps its length."""
+        """Return states swung out from one along its vibrations, as far as motion does: bent by
+        their inertia load (omega^2 M times the mode), which keeps the length of what turns far."""
         model = self.model.with_young(self.weights @ young)
         mass, found = model.mass_matrix, []
         rate = np.array([(mode * model.tangent_times(state, mode)).sum()

@@ -192,8 +192,7 @@ class _Slot:
 
 
 class FrameWriter:
-    """Creates the file, or overwrites it, and publishes frames. ``faces`` [f, 3] are triangles of
-    vertex indices."""
+    """Makes the file anew and publishes frames; ``faces`` [f, 3] are vertex indices."""
 
     def __init__(self, path: Path, faces: np.ndarray, vertex_count: int, target_count: int = 0):
         self.path = Path(path)

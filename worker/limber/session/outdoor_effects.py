@@ -42,8 +42,7 @@ _WAITING_LIMIT = 1000
 
 
 class Events:
-    """JSON lines on standard output; unread lines are dropped. ``gone`` is called once when the
-    reader has closed."""
+    """JSON lines on standard output, dropped if unread. ``gone``: called once the reader closed."""
 
     def __init__(self, gone: Callable[[], None] = lambda: None):
         self._gone = gone
@@ -79,8 +78,7 @@ class Events:
 
 
 class EffectsTeller:
-    """Answers one request at a time, to ``events``. Folder and settings are those of the
-    session."""
+    """Answers one request at a time, to ``events``."""
 
     def __init__(self, folder: Path, settings: SessionSettings, events: Events):
         self._folder, self._settings, self._events = folder, settings, events

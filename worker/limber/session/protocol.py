@@ -192,8 +192,7 @@ class NotUnderstood(InputError):
 
 
 def parse_command(line: bytes) -> Command:
-    """Return the command of one line; NotUnderstood states why it is none, and the known
-    commands."""
+    """Return the command of a line; NotUnderstood says why it is none, and names the known ones."""
     try:
         return _COMMANDS.validate_json(line, strict=True)
     except ValidationError as error:

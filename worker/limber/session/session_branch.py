@@ -122,8 +122,7 @@ class HeldBranch:
             del self.grasps[self.number(number)]
 
     def number(self, number: int | None) -> int:
-        """Return the number of an existing grasp, the first if none is named; InputError if it is
-        not there."""
+        """Return the number of a grasp, the first if none is named; InputError if there is none."""
         if not self.grasps:
             raise InputError("No grasp is held.", "A move needs a grasp.", "Send a grasp first.")
         number = min(self.grasps) if number is None else number
@@ -181,8 +180,8 @@ class HeldBranch:
         return made
 
     def outdoors(self) -> Outdoors:
-        """Return the active wind, snow, fruit and cuts; InputError if there are none, or the weight
-        is off."""
+        """Return the active wind, snow, fruit and cuts; InputError without any, or without
+        weight."""
         if self._outdoors is None:
             raise InputError("There is no wind, snow, fruit or cut.", "",
                              "Send `outdoors` first.")
@@ -199,8 +198,7 @@ class HeldBranch:
 
     @property
     def loads(self) -> np.ndarray | None:
-        """Forces [node_count, 3] [N] on the nodes beside those that the hanging branch carries;
-        None: none."""
+        """Forces [node_count, 3] [N] beside those that the hanging branch carries; None: none."""
         acting = [forces for forces in (self._hung, self._weather) if forces is not None]
         if not self.gravity_on and self.model.prestress is not None:
             acting.append(-self.model.mass_load[:, None] * self.model.gravity)

@@ -206,7 +206,7 @@ _LAST_SECONDS = 5.0
 
 
 class Session:
-    """Executes the client's commands, and answers with frames; LimberError if the branch cannot be
+    """Executes the client's commands, answers with frames; LimberError if the branch cannot be
     loaded."""
 
     def __init__(self, folder: Path, settings: SessionSettings):

@@ -64,9 +64,8 @@ def begin(folder: Path, manifest: Manifest) -> None:
 
 
 def settled_manifest(folder: Path) -> Manifest:
-    """Return the manifest of a folder after finishing an interrupted commit, for callers that copy
-    it unread. BranchFolderError as for :func:`~limber.store.manifest.read_manifest`, or if it has
-    links."""
+    """Return a folder's manifest after finishing an interrupted commit, for callers that only copy
+    it. BranchFolderError as for :func:`~limber.store.manifest.read_manifest`, or for links."""
     refuse_links(folder)
     finish_pending(folder)
     return read_manifest(folder)
@@ -74,7 +73,7 @@ def settled_manifest(folder: Path) -> Manifest:
 
 @contextmanager
 def opening(folder: Path, *, only_reads: bool = False) -> Iterator[None]:
-    """Refuse a folder that does not exist, has links, or is too deep for Windows; report a lost
+    """Refuse a folder that is missing, has links, or is too deep for Windows; report a lost
     disk."""
     require_short(folder, 0 if only_reads else NAME_ROOM)
     with in_words(folder):
@@ -112,8 +111,7 @@ def settle(folder: Path, *, unfinished: bool = False) -> None:
 
 
 def drop_empty(folder: Path) -> None:
-    """Remove a branch folder with a manifest but no other content; keep any other, and one to which
-    another program writes."""
+    """Remove a folder with nothing but a manifest, unless another program writes to it."""
     own = (COMMIT_LOCK, RUN_LOCK, HOLDER)
     # A file that cannot be removed stays: the user must see the original failure.
     with (contextlib.suppress(OSError, BranchFolderError),

@@ -98,7 +98,7 @@ def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
 
 def hung_masses(masses: Iterable[dict[str, Any]], targets: tuple[NamedTarget, ...],
                 ) -> tuple[PointMass, ...]:
-    """Return the point masses of pruned twigs and leaves, as reconstruct lists them, and of
+    """Return the point masses of pruned twigs and leaves, as reconstruct lists them, and
     targets."""
     return (*(_hung(mass) for mass in masses), *target_masses(targets))
 
@@ -112,8 +112,8 @@ def _hung(mass: dict[str, Any]) -> PointMass:
 
 
 def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
-    """Return the named positions that `limber target` has written; InputError if the file is of a
-    newer program."""
+    """Return the positions that `limber target` has named; InputError for a newer program's
+    file."""
     if not branch.has("targets.json"):
         return ()
     known = read_json_as(branch.path("targets.json"), _Targets, "a list of targets")
@@ -258,7 +258,7 @@ def known_pulls(branch: Branch) -> list[str]:
 
 
 def pull_names(branch: Branch, settings: EstimateSettings) -> list[str]:
-    """Return the pulls to use, checked; InputError if there are none, or a requested one is
+    """Return the pulls to use, checked; InputError without any, or if a requested one is
     missing."""
     known = known_pulls(branch)
     missing = [name for name in settings.pull if name not in known]

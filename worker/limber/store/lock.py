@@ -112,8 +112,7 @@ def _is_held(path: Path) -> bool:
 
 
 def _lacks_locks(path: Path) -> bool:
-    """Whether the file system has no locks: then a file is one, and remains when its program is
-    killed."""
+    """Whether the file system has no locks: files stand for them, and outlive a killed program."""
     if sys.platform == "win32":
         return False
     import fcntl

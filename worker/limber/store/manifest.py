@@ -53,8 +53,7 @@ class StageEntry(BaseModel):
 
 
 class Manifest(BaseModel):
-    """Content of ``branch.json``. ``uuid`` identifies the branch independent of the path and name
-    of its folder."""
+    """Content of ``branch.json``; ``uuid`` names the branch wherever its folder is."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -59,9 +59,8 @@ class _Shown:
 
 def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool = False,
              one_sided: bool = False, view: View | None = None) -> Skeleton:
-    """Return the skeleton with the likeliest axes and radii, intervals, states and probabilities.
-    ``noise`` is the points' standard deviation [m]; with ``rays`` of one sensor it widens no
-    branch."""
+    """Return the skeleton with the likeliest axes and radii, intervals, states, probabilities.
+    Points scatter by ``noise`` [m]; that of one sensor's ``rays`` widens no branch."""
     shown = _Shown.of(skeleton, points, noise)
     spacing, count = shown.spacing, shown.count
     # A quarter of a circle is off together; the four average.
@@ -107,9 +106,8 @@ def evidence(skeleton: Skeleton, points: np.ndarray, noise: float,
 
 
 def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
-    """Drop side runs with a probability below ``least``, and what they carry. Lists each with
-    ``length`` [m], its fork ``from`` and tip ``at`` [m], median ``radius`` [m] and
-    ``probability``."""
+    """Drop side runs with a probability below ``least``, and what they carry. Lists each:
+    ``length``, fork ``from``, tip ``at``, median ``radius``, all [m], and ``probability``."""
     runs = skeleton.runs()
     probability = np.ones(len(runs))
     for run, members in enumerate(runs[1:], start=1):

@@ -52,8 +52,8 @@ _STILL_THICK = 0.6  # fraction of points not yet on a line down to which the wei
 
 class ContractionStatus(StrEnum):
     """How a contraction ended. contracted: nearly all points lie on lines; stalled: points no
-    longer moved; iteration_limit: all solves were used; given: the skeleton was, nothing was
-    contracted."""
+    longer moved; iteration_limit: all solves were used; given: there was none, the skeleton was
+    given."""
 
     contracted = "contracted"
     stalled = "stalled"
@@ -184,8 +184,8 @@ def _finite(points: np.ndarray) -> np.ndarray:
 
 def tangent_laplacian(points: np.ndarray, neighbours: int) -> sparse.csc_matrix:
     """Return a cotangent Laplacian of Delaunay triangles of each point's ``neighbours`` in its
-    tangent plane (Belkin, Sun, Wang 2009, as in Cao et al.). Up to three points see each triangle,
-    hence the third."""
+    tangent plane (Belkin, Sun, Wang: Constructing Laplace operator from point clouds in R^d, 2009;
+    as in Cao et al.). Each triangle is seen from up to three points, hence the third."""
     count = min(neighbours + 1, len(points))
     _, near = cKDTree(points).query(points, k=count)
     offset = points[near] - points[near].mean(axis=1, keepdims=True)
@@ -238,9 +238,9 @@ _SPARSE_QUANTILE = 0.1
 
 
 def is_sparse(points: np.ndarray, contracted: np.ndarray) -> bool:
-    """Whether a tenth of the points moved to an axis by less than their spacing: contraction cannot
-    separate their branches. The ratio is over 0.75 in scans of single branches, under 0.57 in trees
-    and sparse scans."""
+    """Whether part of the scan shows branches too sparsely for contraction to separate them: points
+    moved to an axis by less than their spacing. For that tenth of the points the ratio is over 0.75
+    in scans of single branches, under 0.57 in trees and sparse scans."""
     drawn = np.linalg.norm(points - contracted, axis=1)
     _, near = cKDTree(contracted).query(contracted, k=min(16, len(points)))
     thickness = np.median(drawn[near], axis=1)

@@ -171,8 +171,8 @@ def _spanning_forest(nodes: np.ndarray, edges: np.ndarray, length: np.ndarray,
 
 
 def keep_largest(graph: CurveGraph, joined: Joined, gap: float) -> np.ndarray:
-    """Take the bridges of the largest piece, discard the others, and return whether each node was
-    kept."""
+    """Take the bridges of the largest piece, discard the others, return the mask [n] of kept
+    nodes."""
     weight = np.bincount(joined.label, joined.support)
     main = joined.label == int(np.argmax(weight))
     graph.nodes, graph.thickness, graph.support = joined.nodes, joined.thickness, joined.support

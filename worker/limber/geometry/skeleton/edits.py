@@ -117,8 +117,7 @@ Edit = Annotated[AddBranch | MoveNode | DeleteBranch | MergeBranch | Bridge | Sp
 
 
 def read_edits(path: Path) -> list[Edit]:
-    """Read a file of edits; InputError if it cannot be read, is not JSON, or has an invalid edit,
-    which is named."""
+    """Read a file of edits; InputError if it is not JSON, or names the edit that is invalid."""
     try:
         return validated(list[Edit], read_json(path, "a JSON file of edits"))
     except ValidationError as error:
@@ -141,9 +140,9 @@ def edits_text(edits: Sequence[Edit]) -> str:
 
 def edited(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str] | None = None,
            ) -> Skeleton:
-    """Apply edits with positions [m] in the skeleton's frame, in order. InputError if a position is
-    on no axis or the result is no tree; with ``misfits``, which receives the message, such an edit
-    is skipped."""
+    """Apply edits with positions [m] in the skeleton's frame. InputError if a position is on no
+    axis or the result is no tree; ``misfits`` receives its message instead, and the edit is
+    skipped."""
     doing: dict[str, Callable[[Skeleton, Any], Skeleton]] = {
         "add": _added, "move": _moved, "delete": _deleted, "merge": _merged,
         "bridge": _bridged, "split": _split, "root": _rooted, "radius": _with_radius,

@@ -254,8 +254,7 @@ def edge_matrix(count: int, edges: np.ndarray, weight: np.ndarray | None = None,
 def specks(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
            ) -> np.ndarray:
     """A number [n] for each node: its own, but one per piece too short for a direction. Contraction
-    makes a line in a random direction of a few points; a piece joined to its middle finds no
-    end."""
+    makes random lines of a few points; a piece joined to the middle of one finds no end."""
     label = labels(len(nodes), edges)
     low, high = np.full((label.max() + 1, 3), np.inf), np.full((label.max() + 1, 3), -np.inf)
     np.minimum.at(low, label, nodes)
@@ -329,9 +328,8 @@ def _rival(state: Joined, able: Hypotheses, end: int, onto: int) -> Rival | None
 
 def bridge_evidence(price: float, length: float, thickness: float, rival_price: float | None,
                     ) -> np.ndarray:
-    """Evidence [3] for a bridge with ``price`` (cost over length): ln of ``rival_price`` [m] (None:
-    no rival) over its own cost, ln of ``price``, and ln(1 + length / thickness of the thinner
-    end)."""
+    """Evidence [3] for a bridge: ln of ``rival_price`` [m] (None: no rival) over its own, ln of
+    ``price`` (cost over length), and ln(1 + length / thickness of the thinner end)."""
     ratio = _MOST if rival_price is None else rival_price / max(price * length, 1e-300)
     return np.array([np.log(np.clip(ratio, 1 / _MOST, _MOST)), np.log(max(price, 1e-12)),
                      np.log1p(length / max(thickness, 1e-12))])
@@ -590,9 +588,8 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
 
 def _joined(first: Joined, rules: Rules, refused: frozenset[tuple[int, int]] = frozenset(),
             dearest: float = np.inf, alone: bool = True) -> Joined:
-    """Make bridges from the given state, none between ``refused`` pieces, until they cost
-    ``dearest`` [m]. While ``alone``, pieces without a direction are joined only to ends that point
-    straight at them."""
+    """Make bridges from a state, none between ``refused`` pieces, until they cost ``dearest`` [m].
+    While ``alone``, pieces without a direction join only ends that point straight at them."""
     state = first.copy(first.rounds)
     while True:
         weight = np.bincount(state.label, state.support)

@@ -119,9 +119,8 @@ _LINE = 2.0  # length of a twig's start in carrier radii over which its directio
 
 
 def attached(skeleton: Skeleton) -> Skeleton:
-    """Attach each side run where its own direction meets the carrier's axis. The contraction draws
-    a fork towards the twig: its nodes inside the carrier are dropped and its line is extended
-    back."""
+    """Attach side runs where their own direction meets the carrier's axis, as contraction draws
+    forks outwards: nodes inside the carrier are dropped, and the line is extended back."""
     parent, keep = skeleton.parent.copy(), np.ones(skeleton.node_count, bool)
     runs = skeleton.runs()
     for run in range(1, len(runs)):
@@ -367,8 +366,7 @@ def resampled(skeleton: Skeleton, spacing: float = 1.0, least: np.ndarray | floa
 
 @dataclass(frozen=True)
 class PointSpacing:
-    """How far apart a scan's points are: each one's mean ``distance`` [m] from its nearest
-    neighbours."""
+    """How far apart points are: the mean ``distance`` [m] of each from its nearest neighbours."""
 
     tree: cKDTree
     distance: np.ndarray

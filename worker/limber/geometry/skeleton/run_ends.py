@@ -130,9 +130,8 @@ def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
 
 
 def unpinched(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
-    """Return the skeleton with no first radius below the median of its run farther out. From a
-    strip along a hidden stem, contraction makes a run too thin for the fit to move it to the
-    axis."""
+    """Return the skeleton with no first radius below the median of its run farther out. Of a strip
+    along a hidden stem, contraction makes a run too thin for the fit to move it."""
     count, radius = point_counts(skeleton, points), skeleton.radius.copy()
     for own in skeleton.own_runs():
         for k, node in enumerate(own):

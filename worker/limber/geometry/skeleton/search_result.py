@@ -143,8 +143,8 @@ _Place = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class FoundSkeleton:
-    """A skeleton in the prepared cloud's frame, from the part of the cloud without the
-    ``leaves``."""
+    """A skeleton in the frame of the prepared cloud, from which the ``leaves`` were removed
+    first."""
 
     result: SkeletonResult
     leaves: list[Leaf]

@@ -77,8 +77,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
 
 @dataclass(frozen=True)
 class _Search:
-    """A cloud [m, 3] [m] in its own frame, and the search for its skeleton. ``diagonal`` is the
-    cloud's size [m]."""
+    """A cloud in its own frame, ``diagonal`` [m] in size, and the search for its skeleton."""
 
     points: np.ndarray
     settings: SkeletonSettings

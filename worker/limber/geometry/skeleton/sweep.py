@@ -28,9 +28,9 @@ def tangents(points: np.ndarray) -> np.ndarray:
 
 def frames(points: np.ndarray, tangent: np.ndarray, normal: np.ndarray | None = None,
            ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation-minimising frames by double reflection (Wang et al., ACM TOG 27, 2008): normals and
-    binormals [n, 3] along points [n, 3] with unit tangents. The first ``normal`` [3] is made
-    orthogonal to the tangent; None: any."""
+    """Rotation-minimising frames: normals and binormals [n, 3] along points [n, 3] with unit
+    tangents, by double reflection (Wang, Jüttler, Zheng, Liu: Computation of Rotation Minimizing
+    Frames, 2008). The first ``normal`` [3] is made orthogonal to the tangent; None: any."""
     normals = np.empty_like(points)
     first = any_normal(tangent[0]) if normal is None else normal - tangent[0] * (
         normal @ tangent[0])
@@ -72,9 +72,8 @@ def bending_factor(sides: int) -> float:
 
 def rings(centres: np.ndarray, radius: np.ndarray, normals: np.ndarray, binormals: np.ndarray,
           sides: int, factor: float | None = None) -> np.ndarray:
-    """Polygons [n, sides, 3] around ``centres``, for circles of ``radius`` [n] [m], their first
-    corners along ``normals``. ``factor`` is the circumradius in radii; None: that of the circle's
-    area."""
+    """Polygons [n, sides, 3] for circles of ``radius`` [n] [m] around ``centres``, first corners
+    along ``normals``. ``factor`` is the circumradius in radii; None: that of equal area."""
     factor = polygon_factor(sides) if factor is None else factor
     angle = 2 * np.pi * np.arange(sides) / sides
     around = (np.cos(angle)[None, :, None] * normals[:, None]

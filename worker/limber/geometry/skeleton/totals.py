@@ -100,9 +100,8 @@ def totals(skeleton: Skeleton, doubts: SearchDoubts = _NOTHING_OPEN) -> dict[str
 
 def _of_tree(skeleton: Skeleton, own: np.ndarray, variance: np.ndarray, odds: float = 0.0,
              ) -> tuple[float, float]:
-    """Mean and variance of a sum of runs' ``own`` contributions [runs], with their ``variance``. A
-    run exists only if its carrier does, or its fork is elsewhere. ``odds`` is added to the
-    logarithm of all odds."""
+    """Mean and variance of a sum of runs' ``own`` values [runs], of given ``variance``. A run needs
+    its carrier, or a fork elsewhere. ``odds`` is added to the logarithm of all odds."""
     chance = _moved(np.minimum(probability_given_carrier(skeleton) / PLACED, 1.0), odds)
     mean, spread = own.astype(float), variance.astype(float)
     # A run carried by another one has a higher number.

@@ -150,9 +150,8 @@ _TRUE = (1.007, 1.016, 1.031, 1.052, 1.110, 1.155, 1.225, 1.333)
 
 
 def robust_sigma(residual: np.ndarray, radius: np.ndarray) -> float:
-    """Noise [m] of points on the thicker half, as thin twigs' radii absorb part of it. Points
-    farther than a radius off may belong to something else: the result is corrected for those left
-    out."""
+    """Noise [m] of points on the thicker half, as thin twigs' radii absorb part of it. Points over
+    a radius off may be something else's: the result is corrected for those left out."""
     near = np.abs(residual) < radius
     if near.sum() < 10:
         near = np.ones(len(residual), bool)
@@ -343,9 +342,8 @@ _HELD = 2  # trusted rounds in which the limit keeps that of most sensors
 
 @dataclass(frozen=True)
 class AxisFit:
-    """A fitted skeleton. ``segment`` is the node whose cylinder (to its parent) each point belongs
-    to, ``residual`` its distance from that [m], positive outside, ``noise`` their robust standard
-    deviation [m]."""
+    """A fitted skeleton; each point's ``segment``, the node whose cylinder (to its parent) it is
+    on, and ``residual`` from that [m], positive outside, of robust deviation ``noise`` [m]."""
 
     skeleton: Skeleton
     segment: np.ndarray

@@ -82,9 +82,8 @@ def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high:
 @compiled_exactly
 def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
                    density: np.ndarray) -> np.ndarray:
-    """Mean (cos, sin) [points, 2] of positions on a circle, by their likelihood for each point:
-    ``density``, in the middles of even intervals, times exp(sharpness (cos(place - angle) - 1)), a
-    von Mises distribution."""
+    """Mean (cos, sin) [points, 2] of positions on a circle with a ``density`` in the middles of
+    even intervals, times exp(sharpness (cos(place - angle) - 1)) for each point (von Mises)."""
     step_count = len(density)
     angle = 2 * np.pi * (np.arange(step_count) + 0.5) / step_count
     across, up, log = np.cos(angle), np.sin(angle), np.log(density)

@@ -81,8 +81,7 @@ def sight_field(skeleton: Skeleton, points: np.ndarray, view: View | None = None
 
 def by_projected_widths(skeleton: Skeleton, points: np.ndarray, view: View | None = None,
                         ) -> tuple[Skeleton, SightField]:
-    """Return the skeleton, fitted by distances, with axes and radii by the width of its points, and
-    the sight."""
+    """Return the skeleton with axes and radii by the width of its points, and the sight."""
     field, start = sight_field(skeleton, points, view), skeleton
     for _ in range(_ROUNDS):
         skeleton = _near(start, _moved(skeleton, points, field))

@@ -199,9 +199,8 @@ def weighted_target_distances(radius: np.ndarray, noise: float,
 
 def held_across(out: np.ndarray, axis: np.ndarray, positions: np.ndarray, stout: np.ndarray,
                 ) -> np.ndarray:
-    """How firmly points hold the axis across their own direction, as vectors [m, 3]: only where
-    noise hides their position on the circle, or the seen side ends. ``stout`` is (radius /
-    noise)^2."""
+    """How firmly points hold the axis across their direction, as vectors [m, 3]: where noise hides
+    their position on the circle, or the seen side ends. ``stout``: (radius / noise)^2."""
     # Without these terms, steps went twice as far as they should and back again: one-sided radii
     # came out right or a sixth too thin by turns.
     known = np.clip(1 - stout * (1 - np.einsum("mj,mj->m", positions, positions)), 0.0, 1.0)
@@ -212,9 +211,8 @@ def held_across(out: np.ndarray, axis: np.ndarray, positions: np.ndarray, stout:
 
 def mean_positions(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: np.ndarray,
                    seen: SeenSides) -> np.ndarray:
-    """Mean direction [m, 3] from the axis to each point's true position, shorter than 1 where that
-    is uncertain. ``sharpness`` is radius times distance over noise^2, ``stout`` (radius /
-    noise)^2."""
+    """Mean direction [m, 3] from the axis to points' true positions, below 1 where uncertain.
+    ``sharpness`` is radius times distance / noise^2, ``stout`` is (radius / noise)^2."""
     mean = out * np.where(sharpness > 1, 1 - 0.5 / np.maximum(sharpness, 1.0), 0.5)[:, None]
     if seen.along_sight:
         # Scatter along the sight does not widen a silhouette: its effect on the radius is bounded.

@@ -154,9 +154,9 @@ def _half_sphere() -> np.ndarray:
 
 def fit_seen_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight: np.ndarray,
                   mean: np.ndarray, first: SeenSides, limit_free: bool = True) -> SeenSides:
-    """Estimate sight and limit of one seen side from the points' angles, by Fisher scoring, one
-    step a call for the limit, none without ``limit_free``. ``sharpness`` is radius times distance
-    over noise^2."""
+    """Estimate sight and limit of one seen side from the points' angles by Fisher scoring; the
+    limit takes a step a call, if ``limit_free``. ``sharpness`` is radius times distance /
+    noise^2."""
     # The mean normal is off where a scan has holes or branches lean (by 23 degrees at most in
     # generated ones), and the last grazing angle depends on the sensor. For a point at a given
     # distance, the angle is that of its true position, blurred by a von Mises distribution: the
@@ -238,8 +238,7 @@ def sides_of(axis: np.ndarray, view: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def evenly_seen(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
                 weight: np.ndarray, across: np.ndarray, noise: float) -> np.ndarray:
-    """Mask [n] of the nodes with enough points around them that show all of the side that was
-    seen."""
+    """Mask [n] of the nodes with enough points around them that show all of the seen side."""
     # Weights by the sides that were seen make a cylinder as thin as a strip is wide, where the rest
     # is hidden or points are few. Started from the truth, twigs with under 7 points a radius of
     # length shrank to 0.8 of theirs, and hidden stems to a third. There the nearest positions are
