@@ -100,8 +100,8 @@ class Tied:
 
 def tied(mesh: TetMesh, added: Iterable[PointMass], gradients: np.ndarray, weights: np.ndarray,
          volume_weights: np.ndarray) -> list[Tied]:
-    """Tie masses to a mesh by shape functions' gradients [1/m] [tet_count, q, 3, a], quadrature
-    weights [m^3] and integrals [m^3] [tet_count, a]. InputError if a mass is below 0 or not
+    """Tie masses by a mesh's shape functions' gradients [1/m] [tet_count, q, 3, a], quadrature
+    weights [m^3] and integrals [m^3] [tet_count, a]. InputError if a mass is negative or not
     finite."""
     found = []
     for one in added:

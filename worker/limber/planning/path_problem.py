@@ -150,9 +150,9 @@ def start_of(field: EnergyField, goal: Goal, settings: PlanSettings) -> np.ndarr
 
 
 def random_start(field: EnergyField, goal: Goal, settings: PlanSettings, seed: int) -> np.ndarray:
-    """Draw a start, as the paper's "randomized initial configurations", whose way it does not
-    state: uniform, at least half the largest deflection from rest and the goal's middle, and a
-    quarter from its border. NoPathError if none was found."""
+    """Draw a start evenly from the allowed region, at least half the largest deflection from rest
+    and the goal's middle, and a quarter from its border. The paper does not say how it drew its
+    "randomized initial configurations". NoPathError if none was found."""
     generator = np.random.default_rng([seed, 7])
     points = field.region.draw(4000, generator)
     half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())

@@ -71,8 +71,8 @@ def set_all_keys(objective: Objective, count: int) -> None:
 
 
 def prescribed_start(objective: Objective, values: Values) -> tuple[Values, bool]:
-    """Fit pulls with an observed path by force alone first; return if that explains them. Far from
-    the solution no force explains path and points; near it they are fitted together."""
+    """Fit pulls with an observed path by force alone first, and say whether it explains them. Far
+    from the solution no force explains path and points; near it both are fitted together."""
     observed = [forward for forward in objective.forwards if is_path_observed(forward)]
     if not observed:
         return values, True

@@ -26,18 +26,9 @@ OUTLIER_SHARE = 0.15
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Uncertainty of the free vector and of the moduli.
-
-    Attributes:
-        covariance: Covariance of the free vector, shape [p, p].
-        young_interval: 95 % intervals at the control points [Pa], shape [K, 2].
-        variance_factor: Mean squared residual over the expected one; 1 if the noise is as stated.
-        correlation: Correlation of the free vector, shape [p, p].
-        repetition: Number of successive frames with the same error: 1 if their errors are
-            independent.
-        recording_spread: Standard deviation of log E between recordings, common to all moduli.
-        quantile: Number of deviations in the half width of a 95 % interval (Student's t).
-    """
+    """Uncertainty of the free vector [p, p] and 95 % of the moduli [K, 2] [Pa]. ``variance_factor``
+    is squared residual over expected (1: as stated), ``repetition`` the frames in a row that err
+    alike, ``quantile`` the half width of 95 % in deviations (Student's t)."""
 
     covariance: np.ndarray
     young_interval: np.ndarray

@@ -292,9 +292,9 @@ class Tangent:
 
 
 class Equations:
-    """Stiffness equations for one set of constraints, shared by a mesh's models. Clamped nodes are
-    eliminated; a pinned mean has three multipliers, on a stiffness plus the outer product of its
-    weights. This changes no solution, and is positive definite wherever the problem is."""
+    """Stiffness equations for one set of constraints, shared by a mesh's models. Fixed and clamped
+    nodes are eliminated; a pinned mean has three multipliers, on a stiffness plus its weights'
+    outer product. This changes no solution, and is positive definite wherever the problem is."""
 
     def __init__(self, tets: np.ndarray, gradients: np.ndarray, weights: np.ndarray,
                  fixed: np.ndarray, grasps: Sequence[Grasp]):

@@ -169,8 +169,8 @@ class Limits:
 
     @classmethod
     def of(cls, settings: PlanSettings, stiffer: float = 1.0) -> "Limits":
-        """Return the settings' limits; ``stiffer``, the modulus over its estimate, is left room in
-        stress. InputError if the workspace is empty or strain limited twice."""
+        """Return the settings' limits; by ``stiffer``, a possible modulus over its estimate, the
+        stress may be larger. InputError if the workspace is empty or strain limited twice."""
         strain = settings.max_strain or np.inf
         if settings.wood is not None and settings.max_damage is None:
             if settings.max_strain is not None:

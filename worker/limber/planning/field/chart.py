@@ -82,9 +82,8 @@ class Chart:
                        np.ascontiguousarray(gradients, float), forward, *self.arrays)
 
     def growth(self, points: np.ndarray, reach: float) -> np.ndarray:
-        """Return the largest change [n] of plain coordinates per metre within ``reach`` [m]:
-        singular values are 1, R / r, R t / (r sin t). Infinite if pivot or opposite are in
-        reach."""
+        """Return the largest change [n] of plain coordinates per metre within ``reach`` [m],
+        infinite if pivot or opposite are within: singular values are 1, R / r, R t / (r sin t)."""
         if self.radius == 0.0:
             return np.ones(len(points))
         least, angle = self._within(points, reach)

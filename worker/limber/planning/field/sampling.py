@@ -53,8 +53,8 @@ class SolverPool:
 
     def run(self, function: Callable, tasks: Sequence[tuple], *, progress: Progress = SILENT,
             message: str = "") -> list:
-        """Return ``[function(grasp_model, *task) for task in tasks]``, whatever the number of
-        processes. WorkError if a process crashed, else a call's first error."""
+        """Return ``[function(grasp_model, *task) for task in tasks]`` by any number of processes;
+        it may take ``progress``. WorkError if a process crashed, else the first error of a call."""
         if self._count == 1 or len(tasks) == 1:
             return run_tasks(function, [(self.grasp_model, *task) for task in tasks], workers=1,
                              progress=progress, message=message)

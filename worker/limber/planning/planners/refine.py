@@ -75,9 +75,8 @@ def slide_end(path: np.ndarray, goals: np.ndarray, limits: FieldArrays, weights:
 
 def polish(path: np.ndarray, energy_field: EnergyField, limits: FieldArrays,
            weights: EdgeWeights) -> np.ndarray:
-    """Move a path [n, 3] with fixed ends to the nearest optimum, by L-BFGS with the field's
-    gradient, which has no trust or limits: the farthest tenth that is allowed and cheaper is
-    taken."""
+    """Move a path [n, 3] with fixed ends to the nearest optimum, by L-BFGS with the gradient of the
+    field alone: of the way there, the farthest tenth that is allowed and cheaper is taken."""
     spacing = max(weights.step, np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
                   / _POLISH_POINTS)
     corners = resample(path, spacing)
