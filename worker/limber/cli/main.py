@@ -264,8 +264,8 @@ def _output_lost(error: OSError) -> int:
     return 3
 
 
-def _execute(name: str, function: Callable[..., dict[str, Any]], *, as_json: bool, verbose: bool,
-             progress_style: str, **options: Any) -> None:
+def _execute(name: str, function: Callable[..., dict[str, Any]], /, *, as_json: bool,
+             verbose: bool, progress_style: str, **options: Any) -> None:
     """Run a command's function, print its outcome and exit with its code."""
     started = time.perf_counter()
     style = "json" if as_json else "verbose" if verbose else "short"
