@@ -3,17 +3,32 @@
 import json
 import os
 import shlex
+import shutil
 import signal
+import string
 import subprocess
 import sys
 import time
+import zipfile
+from pathlib import Path
+from types import SimpleNamespace
 
 import click
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.cli import main
+from limber.cli.main import call
+from limber.cli.terminal import (
+    UNITS,
+    closing_lines,
+    command_to_type,
+    found_lines,
+    result_lines,
+    table_lines,
+)
 from limber.core.errors import Cancelled, ConvergenceError, InputError, SafetyStop
+from limber.core.files import caches
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.command_line import command_line, settings_options
 from limber.stages.registry import stage_description, stage_summaries
@@ -270,3 +285,142 @@ def test_help_names_default_and_range_as_typed():
     for text in ("[default: 150; at least 30; at most 5000]", "[default: --upright]",
                  "[default: 0.5 0.002]", "[default: 0.2,0.8]"):
         assert text in told
+
+
+# What a person reads on a terminal.
+
+
+def test_result_has_few_digits_and_nothing_empty():
+    """Numbers to five digits, lists on a line, what is nested indented, empty entries left out."""
+    result = {"young_pa": [95342689.1366041, 1e8], "converged": True, "picture": None, "ties": [],
+              "count": 2280, "quality": {"ratio": 0.99583506, "bad": None},
+              "bridges": [{"from": [0.1234567, 0.0], "length": 0.0374492}]}
+    assert list(result_lines(result)) == [
+        "young_pa: [9.5343e+07, 1e+08]", "converged: yes", "count: 2280", "quality:",
+        "  ratio: 0.99584", "bridges:", "  from [0.12346, 0], length 0.037449"]
+    assert list(result_lines({"costs": list(range(30))}))[-1] == "  and 18 more (--json shows all)"
+
+
+def test_table_is_aligned():
+    """Every row is as wide as the header."""
+    lines = list(table_lines([["point", "E [MPa]"], ["1", "95.34"]]))
+    assert lines == ["point  E [MPa]", "    1    95.34"]
+
+
+def test_lines_of_what_was_found_have_units_and_need_their_values():
+    """A line whose value is not there is left out; a vector is told by its length."""
+    values = {"length_m": 0.0042, "young_pa": [2.5e9, None], "moved_m": [3.0, 0.0, 4.0],
+              "share": 0.123, "why": None, "one": 1, "two": 2000, "best": {"force_n": 1.25}}
+    lines = ["{length_m:m} long", "{young_pa[0]:Pa}", "{young_pa[1]:Pa}", "{moved_m:|m} away",
+             "{share:share} of it", "{one:#branch/branches}, {two:#branch/branches}", "{why}",
+             "{nothing}", "{best[force_n]:N}",
+             lambda result: f"{len(result)} values", lambda result: None,
+             lambda result: result["of an older program"]]
+    assert list(found_lines(lines, values)) == [
+        "4.2 mm long", "2.5 GPa", "5 m away", "12.3 % of it",
+        "1 branch, 2,000 branches", "1.25 N", "8 values"]
+
+
+def test_the_end_says_what_where_and_what_next():
+    """A command that is proposed can be typed as it stands."""
+    values = {"branch_folder": Path("my trees/a.branch"), "name": None}
+    then = command_to_type("limber estimate {branch_folder}", values)
+    assert then == "limber estimate 'my trees/a.branch'"
+    assert command_to_type("limber plan {branch_folder} --name {name}", values) == ""
+    assert command_to_type("{name:if}limber verify {branch_folder}", values) == ""
+    assert command_to_type("{branch_folder:if}limber doctor", values) == "limber doctor"
+    assert closing_lines(["Done."], "a.branch", then) == [
+        "Done.", "in    a.branch", f"next  {then}"]
+    assert closing_lines(["Done."]) == ["Done."]
+
+
+@pytest.mark.parametrize("name", list(stage_summaries()))
+def test_every_stage_says_what_it_found_and_proposes_commands_that_exist(name):
+    """Its lines are written in known units; the command after it is one of ours."""
+    stage = stage_description(name)
+    assert stage.found
+    for line in (line for line in stage.found if isinstance(line, str)):
+        for _text, field, spec, _conversion in string.Formatter().parse(line):
+            if field is not None and spec:
+                assert spec.lstrip("|") in UNITS or spec[0] in ".#", (line, spec)
+    if stage.then:
+        program, command, *_rest = stage.then.rpartition(":if}")[2].split()
+        assert program == "limber" and command in stage_summaries()
+
+
+# `limber cache` and `limber bug-report`.
+
+EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """A cache of three files of 1,000 bytes, the first used longest ago."""
+    monkeypatch.setattr(caches, "cache_folder", lambda: tmp_path / "cache")
+    (tmp_path / "cache" / "tetrahedra").mkdir(parents=True)
+    for age, name in enumerate(("new", "middle", "old")):
+        path = tmp_path / "cache" / "tetrahedra" / f"{name}.npz"
+        path.write_bytes(bytes(1000))
+        os.utime(path, (1e9 - 100 * age,) * 2)
+    return tmp_path / "cache" / "tetrahedra"
+
+
+def _result(capsys):
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def test_a_cache_keeps_what_was_used_last(kept, capsys):
+    """Shown, trimmed to a size, cleared; a size that is none is refused."""
+    assert call(["cache", "--json"]) == 0
+    assert _result(capsys)["caches"] == {"tetrahedra": {"file_count": 3, "byte_count": 3000}}
+    assert call(["cache", "--limit", "0.002 MB", "--json"]) == 0
+    assert _result(capsys)["freed_bytes"] == 1000
+    assert sorted(path.stem for path in kept.iterdir()) == ["middle", "new"]
+    assert call(["cache", "--limit", "much"]) == 2
+    assert call(["cache", "--clear"]) == 0 and not list(kept.iterdir())
+
+
+def test_a_bug_report_holds_the_manifest_and_no_data_unasked(tmp_path, capsys):
+    """A damaged folder is told as such; with --data its files go along."""
+    folder = shutil.copytree(EXAMPLE, tmp_path / "a.branch")
+    (folder / "mesh.vtu").write_text("cut short")
+    out = tmp_path / "bug.zip"
+    assert call(["bug-report", str(folder), "-o", str(out), "--note", "it broke", "--json"]) == 0
+    assert _result(capsys)["damaged_count"] == 1
+    with zipfile.ZipFile(out) as archive:
+        assert archive.namelist() == ["report.json", "branch/branch.json"]
+        told = json.loads(archive.read("report.json"))
+    assert told["note"] == "it broke" and told["damages"][0]["name"] == "mesh.vtu"
+    assert told["doctor"]["python"] and told["files"]["cloud.ply"]["bytes"] > 0
+    (folder / "branch.json").write_text("{")
+    assert call(["bug-report", str(folder), "-o", str(out), "--data", "--json"]) == 0
+    assert not _result(capsys)["opens"]
+    with zipfile.ZipFile(out) as archive:
+        assert "branch/cloud.ply" in archive.namelist()
+
+
+def test_a_bug_report_of_a_scan(tmp_path, capsys):
+    """One that no branch came of: its size and checksum, with --data the file."""
+    scan, out = tmp_path / "scan.ply", tmp_path / "bug.zip"
+    scan.write_bytes(b"ply, more or less")
+    for words, names in (((), ["report.json"]), (("--data",), ["report.json", "scan.ply"])):
+        assert call(["bug-report", str(scan), "-o", str(out), *words, "--json"]) == 0
+        with zipfile.ZipFile(out) as archive:
+            assert archive.namelist() == names
+            assert json.loads(archive.read("report.json"))["files"]["scan.ply"]["bytes"] == 17
+    assert call(["bug-report", str(tmp_path / "none"), "-o", str(out)]) == 2
+    capsys.readouterr()
+
+
+def test_doctor_names_what_is_wrong_with_a_cache(tmp_path, monkeypatch, capsys):
+    """Empty files, and a disk without room."""
+    (tmp_path / "numba").mkdir()
+    (tmp_path / "numba" / "a.nbi").write_bytes(b"")
+    (tmp_path / "numba" / "b.nbi").write_bytes(bytes(2_000_000))
+    monkeypatch.setattr(caches, "cache_folder", lambda: tmp_path)
+    assert call(["doctor", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["caches"]["numba"]
+    assert told.startswith("2 files, 2 MB; 1 of them empty")
+    monkeypatch.setattr("shutil.disk_usage", lambda _place: SimpleNamespace(free=5e6))
+    assert call(["doctor", "--json"]) == 0
+    assert "its disk has 5 MB left" in json.loads(capsys.readouterr().out)["caches"]["numba"]

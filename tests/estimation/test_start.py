@@ -13,8 +13,12 @@ from limber.estimation.fitting.initial_modulus import scaled_start
 from limber.estimation.fitting.objective import Evaluation, EvaluationLog, Objective
 from limber.estimation.fitting.optimise import LONGEST_STEP, gauss_newton
 from limber.estimation.forward.gripper_path import force_for_travel
-from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
+from limber.estimation.parameters import YOUNG_BOUNDS_PA, ParameterSpace, Values
+from limber.estimation.settings import FitSpec
 from limber.mechanics.grasp import Grasp
+from limber.mechanics.statics.solve import solve_static
+from limber.store import Branch
+from limber.store.loading import load_subject
 
 
 @pytest.fixture(scope="module")
@@ -121,3 +125,54 @@ def test_a_modulus_changes_at_most_threefold_a_step(small_bench, small_pull, mon
     for number, free in enumerate(tried[1:], 1):
         assert min(np.abs(free - earlier).max()
                    for earlier in tried[:number]) <= LONGEST_STEP + 1e-9
+
+
+# The free vector.
+
+VALUES = Values(np.array([1e7, 2e7, 3e7, 4e7]), 0.33, 800.0, (0.5, 0.002))
+
+
+def test_pack_and_unpack_undo_each_other():
+    """All kinds of parameters come back; what is not free keeps its value."""
+    space = ParameterSpace.separate(VALUES, ("poisson", "density", "alpha", "beta"))
+    again = space.unpack(space.pack(VALUES))
+    assert np.allclose(again.young, VALUES.young)
+    assert (again.poisson, again.density) == pytest.approx((0.33, 800.0))
+    assert again.damping == pytest.approx((0.5, 0.002))
+    fixed = ParameterSpace.separate(VALUES).unpack(np.log([1e6, 1e6, 1e6, 1e6]))
+    assert fixed.poisson == 0.33 and fixed.damping == (0.5, 0.002)
+
+
+def test_ties_share_one_modulus():
+    """Members of a group get one value, the geometric mean at the start; names say so."""
+    space = ParameterSpace(VALUES, (0, 1, 1, 2))
+    assert space.groups == (0, 1, 1, 2) and space.size == 3
+    assert space.names == ["E1", "E2=E3", "E4"]
+    young = space.unpack(space.pack(VALUES)).young
+    assert young[1] == young[2] == pytest.approx(np.sqrt(2e7 * 3e7))
+
+
+def test_bounds_are_named():
+    """A modulus at its bound is named."""
+    space = ParameterSpace.separate(VALUES)
+    free = space.pack(VALUES)
+    assert space.on_bound(free) == []
+    free[2] = space.bounds()[1][2]
+    assert space.on_bound(free) == ["E3"]
+
+
+# What a fit starts from.
+
+
+def test_left_out_twigs_weigh_on_the_branch_that_is_fitted(branch_folder):
+    """Twigs that the mesh leaves out hang on the model of a pull that gravity bends."""
+    branch = Branch.open(branch_folder)
+    bare = load_subject(branch, FitSpec()).model
+    with branch.stage("mesh") as stage:
+        stage.path("point_masses.json").write_text(json.dumps(
+            [{"mass_kg": 0.02, "centre_m": [0.1, 0, 0.2], "attached_m": [0, 0, 0.2]}]))
+    loaded = load_subject(branch, FitSpec()).model
+    stiff = {"young": 1e12, "gravity": (0.0, 0.0, -9.80665)}
+    base = [solve_static(model.with_parameters(**stiff)).require().base_force[2]
+            for model in (bare, loaded)]
+    assert base[1] - base[0] == pytest.approx(0.02 * 9.80665, rel=1e-6)

@@ -1,15 +1,21 @@
 """What goes wrong in recordings, each through the command that a user runs."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from limber.cli.main import call
+from limber.core.alignment import Alignment
+from limber.core.constants import FORCE_UNITS_N
+from limber.core.errors import InputError
 from limber.geometry.cloud.camera import D455, write_camera
 from limber.perception.observe import write_depth
-from limber.recordings.recording import read_pull, write_pull
+from limber.recordings.import_request import likely_slip, require_no_slip
+from limber.recordings.recording import Observations, read_pull, write_pull
+from limber.recordings.sensor_checks import clean, force_unit_suspicion, unswapped, work_done
 from limber.recordings.time_series import Stream, read_stream, write_stream
 
 
@@ -273,3 +279,147 @@ def test_a_recording_of_the_gripper_alone_is_no_estimate(branch_folder, capsys):
     pull_with(branch_folder, "alone", change)
     line = estimated(branch_folder, capsys, "--pull", "alone", code=2)
     assert "alone has nothing that was seen of the branch" in line["error"]
+
+
+# Hand-made tables with a slip: it is named when they are imported.
+
+
+@pytest.mark.parametrize(("change", "told"), [
+    (lambda p: {"times": 1e3 * p.times}, "gripper span.*milliseconds.*t_ms"),
+    (lambda p: {"times": 1e3 * p.times, "observations": None}, "longer than an hour.*t_ms"),
+    (lambda p: {"observations": Observations(1e3 * p.observations.times,
+                                             p.observations.positions)}, "markers span.*t_ms"),
+    (lambda p: {"poses": np.degrees(p.poses + [0, 0, 0, 0, 0, 0.3])}, "degrees.*rx_deg"),
+    (lambda p: {"poses": p.poses * [1e3, 1e3, 1e3, 1, 1, 1]}, "m/s.*millimetres.*x_mm"),
+    (lambda p: {"wrenches": np.zeros_like(p.wrenches)}, "zero in all.*remove the columns")])
+def test_what_no_robot_does_is_refused(plain_pull, change, told):
+    """Physical limits: 5 m/s, a turn, an hour; two tables of one pull last about as long."""
+    assert require_no_slip(plain_pull) == plain_pull
+    if "hour" in told:
+        plain_pull = replace(plain_pull, times=3.0 * plain_pull.times)
+    with pytest.raises(InputError, match=told):
+        require_no_slip(replace(plain_pull, **change(plain_pull)))
+
+
+def test_a_pull_without_force_is_named(plain_pull):
+    found = require_no_slip(replace(plain_pull, wrenches=np.full_like(plain_pull.wrenches, np.nan)))
+    assert "has no force" in found.warnings[-1]
+
+
+@pytest.mark.parametrize(("change", "told"), [
+    (lambda p: 1e3 * p, "millimetres"), (lambda p: p[:, [2, 1, 0]], "likely z, y, x"),
+    (lambda p: p[:, [1, 2, 0]], "likely y, z, x"), (lambda p: p - [0.5, 0, 0.2], "of the scan"),
+    (lambda p: p + 3.0, "")])
+def test_the_slip_that_puts_points_on_the_branch(change, told):
+    """Millimetres, exchanged titles, the scan's frame; none where none fits."""
+    nodes = np.linspace([0.0, 0.1, 0.0], [0.05, 0.1, 0.8], 200)
+    points = nodes[[50, 120, 190]]
+    found = likely_slip(change(points), nodes, Alignment(origin=(-0.5, 0.0, -0.2)), 0.02)
+    assert (told in found) if told else not found
+
+
+# Faults of sensors and markers are found, repaired and told.
+
+
+def with_force(pull, wrenches):
+    return replace(pull, wrenches=wrenches)
+
+
+def test_a_good_pull_is_left_alone(plain_pull):
+    """No fault, no word, no change."""
+    cleaned = clean(plain_pull)
+    assert not cleaned.warnings
+    assert np.array_equal(cleaned.wrenches, plain_pull.wrenches)
+    assert np.array_equal(cleaned.observations.positions, plain_pull.observations.positions)
+
+
+def test_work_equals_the_energy_of_the_spring(plain_pull):
+    """50 N/m pulled out by 0.1 m stores 0.25 J."""
+    assert work_done(plain_pull)[-1] == pytest.approx(0.25, rel=0.01)
+
+
+def test_wrong_sign_is_turned(plain_pull):
+    """A sensor that reports the branch's force on the gripper: negative work gives it away."""
+    cleaned = clean(with_force(plain_pull, -plain_pull.wrenches))
+    assert np.allclose(cleaned.wrenches, plain_pull.wrenches)
+    assert any("sign was reversed" in w for w in cleaned.warnings)
+
+
+def test_sign_is_only_questioned_under_gravity(plain_pull):
+    """A heavy branch that is lowered does work on the gripper: then the sign stays."""
+    entry = plain_pull.entry.model_copy(update={"gravity_m_s2": (0.0, 0.0, -9.81)})
+    pull = replace(plain_pull, entry=entry, wrenches=-plain_pull.wrenches)
+    cleaned = clean(pull)
+    assert np.array_equal(cleaned.wrenches, pull.wrenches)
+    assert any("weight" in w for w in cleaned.warnings)
+
+
+def test_untared_sensor(plain_pull):
+    """The reading at rest is subtracted."""
+    bias = np.r_[0.4, -0.3, 0.2, 0.01, 0.0, 0.0]
+    cleaned = clean(with_force(plain_pull, plain_pull.wrenches + bias))
+    assert np.abs(np.mean(cleaned.wrenches - plain_pull.wrenches, axis=0)).max() < 0.02
+    assert any("not tared" in w for w in cleaned.warnings)
+
+
+def test_saturation_and_spikes_are_left_out(plain_pull):
+    """Readings at the limit and single jumps become "not measured"; the rest stays."""
+    wrenches = plain_pull.wrenches.copy()
+    wrenches[:, 0] = np.minimum(wrenches[:, 0], 3.0)
+    wrenches[60, 2] += 5.0
+    cleaned = clean(with_force(plain_pull, wrenches))
+    lost = ~np.isfinite(cleaned.wrenches[:, 0])
+    assert lost[60] and lost[wrenches[:, 0] == 3.0].all()
+    assert lost.sum() == 1 + np.sum(wrenches[:, 0] == 3.0)
+    text = " ".join(cleaned.warnings)
+    assert "saturated" in text and "spike" in text
+
+
+def test_known_range_of_the_sensor(plain_pull):
+    """Readings at the range that pull.toml states count as saturated without a flat top."""
+    sensor = plain_pull.entry.sensor.model_copy(update={"force_range_n": 4.0})
+    pull = replace(plain_pull, entry=plain_pull.entry.model_copy(update={"sensor": sensor}))
+    cleaned = clean(pull)
+    beyond = np.abs(plain_pull.wrenches[:, 0]) >= 4.0
+    assert beyond.any() and np.array_equal(~np.isfinite(cleaned.wrenches[:, 0]), beyond)
+
+
+def test_swapped_markers_get_their_names_back(plain_pull):
+    """Two markers that exchange names for a while: positions come out as if they had not."""
+    positions = plain_pull.observations.positions.copy()
+    positions[20:35] = positions[20:35, ::-1]
+    fixed, frames = unswapped(Observations(plain_pull.observations.times, positions))
+    assert np.allclose(fixed.positions, plain_pull.observations.positions)
+    assert frames == [20, 35]
+    told = clean(replace(plain_pull, observations=Observations(
+        plain_pull.observations.times, positions))).warnings
+    assert any("swapped" in w for w in told)
+
+
+def test_a_lost_marker_is_not_a_swap(plain_pull):
+    """A marker that vanishes for some frames keeps its name, and so do the others."""
+    positions = plain_pull.observations.positions.copy()
+    positions[10:20, 0] = np.nan
+    fixed, frames = unswapped(Observations(plain_pull.observations.times, positions))
+    assert not frames and np.allclose(fixed.positions, positions, equal_nan=True)
+
+
+def test_gap_is_told(plain_pull):
+    """A second without robot data is named."""
+    keep = (plain_pull.times < 1.0) | (plain_pull.times > 2.0)
+    pull = replace(plain_pull, times=plain_pull.times[keep], poses=plain_pull.poses[keep],
+                   wrenches=plain_pull.wrenches[keep])
+    assert any("gap" in w and "1.0" in w for w in clean(pull).warnings)
+
+
+@pytest.mark.parametrize(("unit", "young"), [
+    ("gf", 1e9), ("mN", 1e9), ("kgf", 1e5), ("lbf", 5e4), ("kN", 1e6)])
+def test_an_impossible_modulus_names_the_unit(unit, young):
+    """Forces in another unit than newtons scale the modulus; where that shows, the unit is named.
+    """
+    assert unit in force_unit_suspicion(young / FORCE_UNITS_N[unit])
+
+
+def test_plausible_moduli_raise_no_suspicion():
+    """Silicone, a green twig and dry oak are all possible."""
+    assert all(force_unit_suspicion(young) is None for young in (2.5e5, 3e8, 1.2e10))

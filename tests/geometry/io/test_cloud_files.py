@@ -1,13 +1,18 @@
 """Readers: every format gives the same points, and bad files are named."""
 
+import struct
+
 import numpy as np
 import pytest
+import trimesh
 
 from benchmarks.foreign_files import CLOUD as POINTS
 from benchmarks.foreign_files import CLOUDS, write_ascii_ply
 from limber.core.errors import InputError
-from limber.geometry.io.clouds import read_cloud, read_points
+from limber.geometry.io import isolated_readers
+from limber.geometry.io.clouds import las_columns, read_cloud, read_points
 from limber.geometry.io.depth_images import read_depth
+from limber.geometry.io.isolated_readers import read_apart
 
 
 @pytest.mark.parametrize("name", CLOUDS)
@@ -162,3 +167,124 @@ def test_depth_image_with_mask(tmp_path):
     cloud = read_depth(tmp_path / "depth.png", tmp_path / "camera.toml", tmp_path / "mask.png")
     assert len(cloud) == 100
     np.testing.assert_allclose(cloud.points[:, 2], 0.5)
+
+
+# Headers that speak of more points than the file holds are refused before memory is taken.
+
+PLY = "ply\nformat {form} 1.0\nelement vertex {count}\nproperty float x\nproperty float y\n" \
+      "property float z\nend_header\n"
+PCD = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {count}\nHEIGHT 1\n" \
+      "POINTS {count}\nDATA {form}\n"
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_ply(tmp_path, form):
+    """As text and binary: billions are refused, as many as there are are read."""
+    path = tmp_path / "a.ply"
+    body = b"1 2 3\n4 5 6" if form == "ascii" else np.arange(
+        6, dtype=">f4" if "big" in form else "<f4").tobytes()
+    path.write_bytes(PLY.format(form=form, count=2).encode() + body)
+    assert len(read_points(path)) == 2
+    path.write_bytes(PLY.format(form=form, count=4_000_000_000).encode() + body)
+    with pytest.raises(InputError, match="announces"):
+        read_points(path)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
+def test_pcd(tmp_path, form):
+    """Likewise, and compressed points whose sizes are mangled."""
+    path = tmp_path / "a.pcd"
+    body = b"1 2 3\n" if form == "ascii" else struct.pack("<II", 12, 4_000_000_000) + bytes(12)
+    path.write_bytes(PCD.format(form=form, count=300_000_000).encode() + body)
+    with pytest.raises(InputError, match="announces"):
+        read_points(path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las(tmp_path, suffix):
+    """Read as written; with a mangled count refused by the header alone."""
+    import laspy
+
+    content = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    content.x, content.y, content.z = np.arange(30.0).reshape(3, 10)
+    path = tmp_path / f"a{suffix}"
+    content.write(str(path))
+    np.testing.assert_allclose(read_points(path).points[:, 0], np.arange(10.0), atol=0.01)
+    raw = bytearray(path.read_bytes())
+    struct.pack_into("<I", raw, 107, 2_000_000_000)
+    path.write_bytes(raw)
+    with pytest.raises(InputError, match="announces"):
+        read_points(path)
+
+
+@pytest.mark.slow
+def test_a_reader_apart_tells_what_went_wrong(tmp_path):
+    """An error of a package in the other process arrives as one of ours."""
+    path = tmp_path / "a.laz"
+    path.write_bytes(b"LASF" + bytes(400))
+    with pytest.raises(InputError, match=r"a\.laz cannot be read"):
+        read_apart(las_columns, path)
+
+
+def test_vertices_of_two_numbers(tmp_path):
+    """They are no places."""
+    path = tmp_path / "a.obj"
+    path.write_text("v 1 2\nv 2 3\nv 3 4\nf 1 2 3\n")
+    with pytest.raises(InputError):
+        read_points(path)
+
+
+def test_the_largest_number_means_no_reading(tmp_path):
+    """Drivers write it where a pixel saw nothing: those points are left out and counted."""
+    path = tmp_path / "a.xyz"
+    path.write_text("1 2 3\n4 5 6\n3.4e38 3.4e38 3.4e38\n")
+    cloud = read_points(path)
+    assert len(cloud) == 2 and cloud.not_finite == 1
+
+
+# Meshes that are brought as clouds: their vertices are read, or the mesh is named.
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".off"])
+@pytest.mark.parametrize("mesh", [trimesh.creation.cylinder(0.01, 0.4, sections=32),
+                                  trimesh.creation.box((0.1, 0.1, 0.4))])
+def test_a_mesh_of_large_faces_is_no_cloud(tmp_path, suffix, mesh):
+    """A Blender cylinder has its surface where no vertex is."""
+    mesh.export(tmp_path / f"a{suffix}")
+    with pytest.raises(InputError, match=r"mesh of .* faces.*limber mesh"):
+        read_points(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl"])
+def test_a_fine_mesh_is_read_and_named(tmp_path, suffix):
+    """A scanner's program writes triangles between its points."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    ball.export(tmp_path / f"a{suffix}")
+    cloud = read_points(tmp_path / f"a{suffix}")
+    assert "is a mesh of 1280 faces" in cloud.notes[0]
+    np.testing.assert_allclose(np.ptp(cloud.points, axis=0), 0.2, rtol=1e-3)
+
+
+# Readers in a process of their own: what stops them is their own work, and is named.
+
+
+@pytest.fixture
+def packed(tmp_path):
+    """A good LAZ file."""
+    import laspy
+
+    content = laspy.create(point_format=3)
+    content.header.scales = [1e-4] * 3
+    content.x, content.y, content.z = np.random.default_rng(0).uniform(0, 1, (3, 50))
+    content.write(tmp_path / "a.laz")
+    return tmp_path / "a.laz"
+
+
+def test_too_much_work_is_named_as_that(packed, monkeypatch):
+    """A reader that computes for ever is stopped; its file is not called damaged."""
+    monkeypatch.setattr(isolated_readers, "_LEAST_SECONDS", 0.0)
+    monkeypatch.setattr(isolated_readers, "_SECONDS_PER_MB", 0.0)
+    with pytest.raises(InputError, match="s of processor time") as caught:
+        read_points(packed)
+    assert "damaged" not in str(caught.value)

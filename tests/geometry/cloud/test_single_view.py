@@ -1,19 +1,27 @@
 """Clouds of one depth camera: recognised as such, and rid of their flying pixels."""
 
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scan_scores import score
+from limber.core.errors import InputError
 from limber.geometry.cloud import preparation
-from limber.geometry.cloud.camera import D455, Camera, depth_to_cloud
+from limber.geometry.cloud.camera import (
+    D455,
+    Camera,
+    depth_to_cloud,
+    project,
+    read_camera,
+    write_camera,
+)
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
-from limber.geometry.cloud.single_view import Sight, find_sight, flying_pixels
+from limber.geometry.cloud.single_view import Sight, find_sight, flying_pixels, scan_line_view
 from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.io.clouds import read_points
 from limber.geometry.skeleton.skeletonise import skeletonise
+from limber.geometry.tets.tree_sweep import straight_beam
 from limber.perception.simulated_camera import render_depth, with_noise
 
 AHEAD = np.array([1.0, 0.0, 0.1])
@@ -134,3 +142,127 @@ def test_flying_pixels_grow_no_twigs(seed: int, monkeypatch: pytest.MonkeyPatch)
         if angle < 90.0:
             assert scored["forks_found"] == scored["forks"]
     assert false[0] == 0 < false[1]
+
+
+# The camera of a depth image, told by its file's order wherever the cloud was moved to.
+
+
+def image() -> np.ndarray:
+    """Points [m] of a wavy surface with a hole, as a camera at the origin sees it along z."""
+    row, column = np.mgrid[:D455.height, :D455.width]
+    depth = 1.0 + 0.1 * np.sin(column / 40) * np.cos(row / 30)
+    depth = np.where((np.abs(row - 400) < 70) & (np.abs(column - 700) < 60), depth, 0.0)
+    depth[360:380, 680:720] = 0.0
+    depth = np.round(depth, 3)  # as sensors have it: whole millimetres
+    return depth_to_cloud(D455, depth).points
+
+
+@pytest.mark.parametrize("columns_first", [False, True])
+def test_the_camera_is_found_where_the_cloud_was_moved(columns_first: bool) -> None:
+    """Place within 1 mm and direction within 0.1 degrees, row by row or column by column."""
+    points = image()
+    if columns_first:
+        points = points[np.lexsort([np.round(points[:, 1] / points[:, 2], 6),
+                                    np.round(points[:, 0] / points[:, 2], 6)])]
+    turn, shift = Rotation.from_rotvec([0.3, 1.2, -0.5]).as_matrix(), np.array([3.0, -2.0, 7.0])
+    eye, forward = scan_line_view(points @ turn.T + shift)
+    assert eye == pytest.approx(shift, abs=1e-3)
+    assert forward @ (turn @ [0, 0, 1]) > np.cos(np.deg2rad(0.1))
+
+
+def test_scans_in_another_order_tell_no_camera() -> None:
+    """A shuffled image, a cloud sorted along a grid and points by chance show none."""
+    rng = np.random.default_rng(1)
+    points = image()
+    assert scan_line_view(rng.permutation(points)) is None
+    assert scan_line_view(rng.uniform(0, 1, (3000, 3))) is None
+    grid = np.round(rng.uniform(0, 1, (3000, 3)), 2)
+    assert scan_line_view(grid[np.lexsort(grid.T)]) is None
+
+
+def test_a_moved_image_loses_its_flying_pixels_too() -> None:
+    """What flies is dropped from the shifted cloud as from the cloud in the camera's frame."""
+    points = image()
+    flying = np.random.default_rng(2).random(len(points)) < 0.03
+    points = points * np.where(flying, 1.1, 1.0)[:, None]
+    at_camera = prepare(Cloud(points), 1.0, PreparationSettings())
+    moved = prepare(Cloud(1000 * points + [4000.0, -900.0, 2500.0]), 1e-3, PreparationSettings())
+    assert at_camera.counts["flying"] > 0.9 * flying.sum()
+    assert moved.counts["flying"] == at_camera.counts["flying"]
+    assert moved.view.eye + moved.origin == pytest.approx([4.0, -0.9, 2.5], abs=2e-3)
+
+
+# Pixels to points and back.
+
+
+def test_back_projection_undoes_projection():
+    """Every pixel's point projects onto that pixel again, whatever the camera's pose."""
+    camera = D455.looking(eye=np.array([0.4, -0.9, 0.7]), target=np.array([0.0, 0.1, 0.3]))
+    depth = np.zeros((camera.height, camera.width))
+    rows, columns = np.array([5, 300, 700]), np.array([9, 640, 1200])
+    depth[rows, columns] = [0.8, 1.1, 1.9]
+    cloud = depth_to_cloud(camera, depth)
+    pixels, z = project(camera, cloud.points)
+    assert np.allclose(pixels, np.column_stack([columns, rows]), atol=1e-9)
+    assert np.allclose(z, depth[rows, columns])
+
+
+def test_target_is_in_the_middle_and_up_is_up():
+    """The camera looks at its target, with z of the branch upwards in the image."""
+    camera = D455.looking(eye=np.array([0.0, -1.0, 0.3]), target=np.array([0.0, 0.0, 0.3]))
+    pixels, depth = project(camera, np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 0.4], [0.1, 0.0, 0.3]]))
+    assert np.allclose(pixels[0], (camera.cx, camera.cy)) and np.allclose(depth, 1.0)
+    assert pixels[1, 1] < pixels[0, 1] and pixels[2, 0] > pixels[0, 0]
+
+
+def test_rendered_beam_lies_on_its_surface():
+    """Points of a noiseless depth image of a beam are a radius from its axis."""
+    mesh = straight_beam(0.4, 0.02, sides=24, quadratic=False)
+    camera = D455.looking(eye=np.array([0.1, -0.8, 0.2]), target=np.array([0.0, 0.0, 0.2]))
+    cloud = depth_to_cloud(camera, render_depth(camera, mesh.nodes, mesh.surface_faces()))
+    side = np.abs(cloud.points[:, 2] - 0.2) < 0.15
+    distance = np.hypot(*cloud.points[side, :2].T)
+    assert len(distance) > 2000
+    assert abs(np.median(distance) - 0.02) < 3e-4 and distance.max() < 0.0205
+    # One side only: the camera sees no point of the far half.
+    assert np.max(cloud.points @ [0.0, 1.0, 0.0]) < 0.01
+
+
+def test_noise_has_the_stated_size_and_share():
+    """Depth noise of a plane follows disparity_sigma z^2 / (f b), readings go missing."""
+    depth = np.full((720, 1280), 1.5)
+    noisy = with_noise(D455, depth, np.random.default_rng(0), flying_share=0.0)
+    seen = noisy > 0
+    assert abs(np.mean(~seen) - 0.02) < 0.002
+    assert np.std(noisy[seen]) == pytest.approx(D455.depth_sigma(1.5), rel=0.02)
+
+
+def test_images_of_another_size_are_refused():
+    """Intrinsics of another image would silently misplace every point."""
+    with pytest.raises(InputError, match="640x480"):
+        depth_to_cloud(D455, np.zeros((480, 640)))
+
+
+def test_camera_file_round_trip_and_named_error(tmp_path):
+    """camera.toml keeps every number; a wrong entry is named."""
+    camera = D455.looking(eye=np.array([0.4, -0.9, 0.7]), target=np.zeros(3))
+    write_camera(tmp_path / "camera.toml", camera)
+    assert read_camera(tmp_path / "camera.toml") == camera
+    (tmp_path / "bad.toml").write_text("width = 10\nheight = 10\nfx = -3\nfy = 1\ncx = 0\ncy = 0\n")
+    with pytest.raises(InputError, match="fx"):
+        read_camera(tmp_path / "bad.toml")
+    with pytest.raises(InputError, match="intrinsics"):
+        read_camera(tmp_path / "none.toml")
+    assert Camera(width=4, height=3, fx=1, fy=1, cx=0, cy=0).depth_scale == 1000
+
+
+def test_numbers_that_no_camera_has_are_refused(tmp_path):
+    """With them a pixel would lie at no finite place; true is none at all."""
+    for line in ("fy = 1e-300", "cx = 1e10", "depth_scale = 1e-12", "width = true",
+                 "fx = true", "height = 10000000", "pose = [0, 0, 0, 0, 0, 90]"):
+        text = {"width": "32", "height": "24", "fx": "40.0", "fy": "40.0", "cx": "15.5",
+                "cy": "11.5"} | dict([line.split(" = ", 1)])
+        path = tmp_path / "camera.toml"
+        path.write_text("".join(f"{name} = {value}\n" for name, value in text.items()))
+        with pytest.raises(InputError, match=line.split()[0]):
+            read_camera(path)
