@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.estimation.test_nuisances import TRUTH, subject_of
+from tests.estimation.test_nuisances import TRUTH as TOLD
+from tests.estimation.test_nuisances import subject_of
 from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force, without_cell
 
 from benchmarks.paper_branches import FRACTIONS, measured
@@ -177,7 +178,7 @@ def followed(bench, small, pull, young=None, **settings):
 def test_intervals_hold_whatever_was_advised(small_bench, small, off, advised):
     """Another start, a prescribed path, a free frame."""
     interval = followed(small_bench, small, off, **advised)
-    assert interval is None or np.all((interval[:, 0] < TRUTH) & (TRUTH < interval[:, 1]))
+    assert interval is None or np.all((interval[:, 0] < TOLD) & (TOLD < interval[:, 1]))
 
 
 @pytest.mark.slow
@@ -196,4 +197,4 @@ def test_their_true_places_narrow_the_interval(small_bench, small, small_pull, o
     """As --nominal states them: no worse, and the truth is still inside."""
     entry = off.entry.model_copy(update={"rest_points_m": small_pull.entry.rest_points_m})
     interval = followed(small_bench, small, replace(off, entry=entry))
-    assert np.all((interval[:, 0] < TRUTH) & (TRUTH < interval[:, 1]))
+    assert np.all((interval[:, 0] < TOLD) & (TOLD < interval[:, 1]))
