@@ -98,7 +98,8 @@ def test_the_notebook(tmp_path):
     done = subprocess.run([sys.executable, "-W", "ignore", script], cwd=tmp_path, check=False,
                           capture_output=True, text=True, timeout=250)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("Estimate(E [MPa] ") and "% above the best" in done.stdout
+    assert done.stdout.startswith("Estimate(Young's modulus ") and ") MPa, " in done.stdout
+    assert "% above the best" in done.stdout
     for number in range(len(others) + 1):
         assert (tmp_path / f"{number}.png").read_bytes().startswith(b"\x89PNG")
     true = json.loads((tmp_path / "scan" / "truth.json").read_text())["young_pa"]

@@ -64,7 +64,7 @@ PRINTS = ("reconstruct", "mesh-cylinders", "target", "load", "estimate", "predic
 """Stages whose last lines for people are kept as well: they find all done the second time."""
 
 OF_THE_RUN = {"seconds", "plan_seconds", "check_seconds", "peak_memory_mb", "uuid",
-              "cloud_sha256",
+              "cloud_sha256", "blender",
               # These follow the last digits, which differ by processor: two postures tie.
               "history", "forward_count", "joint_limit_margin_rad", "start_joints_rad"}
 CLOCK = re.compile(r"done in [\d.]+ s|\d{4}-\d\d-\d\d[T \d:]*")

@@ -72,8 +72,8 @@ class Constraint(Protocol):
         """Describe where states break it most; None if they keep it."""
         values = self.values(grasps, nodes)
         worst = int(values.argmax())
-        return str(Broken(self.name.replace("_", " "), float(values[worst]), self.limit,
-                          grasps[worst])) if values[worst] > self.limit else None
+        return Broken(self.name.replace("_", " "), float(values[worst]), self.limit,
+                      grasps[worst]).text if values[worst] > self.limit else None
 
 
 _SCALE = 0.1  # [m] in which closeness falls to a third
