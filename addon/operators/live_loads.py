@@ -31,7 +31,7 @@ class LiveLoads:
         self._scene, self._surface = scene, surface
         self._group = properties.group_of(scene, stages()["load"])
         self._before = {name: getattr(self._group, name) for name in PLACES}
-        self._sent = {**_NOTHING, "drag": self._group.drag}
+        self._sent = {**_NOTHING}
         self._weighs = True
         self._asked: int | None = None
         self._reply: dict[str, Any] = {}
@@ -104,7 +104,7 @@ class LiveLoads:
     def _wanted(self) -> dict[str, Any]:
         group, fields = self._group, stages()["load"].fields
         return {"wind_m_s": list(group.wind) if group.use_wind else [0.0] * 3,
-                "drag": group.drag, "snow_kg_m2": group.snow,
+                "snow_kg_m2": group.snow,
                 "fruit": [{"point": row[:3], "mass_kg": row[3]}
                           for row in rows_of(fields["fruit"], group.fruit) if row[3] > 0],
                 "cuts": rows_of(fields["cut"], group.cut)}
