@@ -457,6 +457,7 @@ class VirtualRealSense:
     def __init__(self, address: str, pose: np.ndarray):
         self._eye = VirtualCamera(address)
         self._camera = D455.model_copy(update={"pose": tuple(map(float, pose))})
+        self.longest = 0.0
 
     def config(self):
         return SimpleNamespace(enable_stream=lambda kind: None)
@@ -476,6 +477,7 @@ class VirtualRealSense:
     def wait_for_frames(self, milliseconds):
         stamp = 1e3 * time.time()
         steps = np.round(1e4 * self._eye.depth(self._camera)).astype(np.uint16)
+        self.longest = max(self.longest, time.time() - 1e-3 * stamp)
         return SimpleNamespace(get_depth_frame=lambda: SimpleNamespace(
             get_data=lambda: steps, get_timestamp=lambda: stamp,
             get_frame_timestamp_domain=lambda: "global"))
@@ -494,7 +496,8 @@ def test_a_realsense_records_what_the_tracker_follows(branch_folder, tmp_path, r
     cell = cell_at(branch_folder, robot.address).model_copy(update={
         "camera": CameraEntry(pose=placed.pose, mount="branch")})
     path = cell_file(cell, tmp_path)
-    monkeypatch.setitem(sys.modules, "pyrealsense2", VirtualRealSense(robot.address, placed.pose))
+    camera = VirtualRealSense(robot.address, placed.pose)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", camera)
     result = record(branch_folder, path, "seen", sideways_pull(branch_folder, distance=0.03),
                     RecordOptions(confirm="seen", realsense=True))
     assert result["ended"] == "reached" and result["depth_images"] > 5
@@ -506,7 +509,10 @@ def test_a_realsense_records_what_the_tracker_follows(branch_folder, tmp_path, r
     # At the grasp the branch is where the gripper is; below, it follows on the same side.
     start = np.array(pull.entry.grasp.point_m)
     held = np.array([np.interp(seen.times, pull.times, pull.poses[:, k]) for k in range(3)]).T
-    assert np.nanmax(np.linalg.norm(seen.positions[:, 1] - held, axis=1)) < 4e-3
+    off = np.linalg.norm(seen.positions[:, 1] - held, axis=1)
+    # On a machine that stands still, an image is as much later than its stamp.
+    speed = np.linalg.norm(np.gradient(held, seen.times, axis=0), axis=1).max()
+    assert np.nanmedian(off) < 2e-3 and np.nanmax(off) < 4e-3 + speed * camera.longest
     gone = (seen.positions[:, 0] - skeleton.point_at(0.5)) @ out
     way = (held - start) @ out
     assert way.max() > 0.025
