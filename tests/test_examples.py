@@ -65,7 +65,7 @@ def test_the_core_in_ten_lines(tmp_path):
     """Further out it holds more energy and pulls harder."""
     folder = shutil.copytree(EXAMPLE, tmp_path / "a.branch")
     told = re.findall(r"(\d+) mm: (\S+) J, \[(.+)\] N", run(sys.executable, SCRIPTS / "bend.py",
-                                                           folder))
+                                                            folder))
     energies = [float(energy) for _, energy, _ in told]
     forces = [float(np.linalg.norm([float(part) for part in force.split()]))
               for _, _, force in told]

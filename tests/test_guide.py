@@ -55,7 +55,7 @@ def test_every_option_of_help_is_explained(written_pages):
 
     page = written_pages["reference/commands.md"]
     sections = dict(section.split("\n", 1) for section in re.split(r"^##+ limber ", page,
-                                                                  flags=re.MULTILINE)[1:])
+                                                                   flags=re.MULTILINE)[1:])
 
     def check(command: click.Command, words: str) -> int:
         if isinstance(command, click.Group):

@@ -126,7 +126,7 @@ def test_virtual_pull(folder, expected):
     truth = TrueBranch(subject.mesh, subject.skeleton, subject.control_points,
                        (0.2, 0.4, 0.6, 0.8), subject.start.young, branch.gravity)
     settings = PullSpec(frames=4, position_noise=0.0, force_noise=0.0, reach=0.2,
-                                   poisson=0.35, density=900.0, phase=0.3)
+                        poisson=0.35, density=900.0, phase=0.3)
     pull, moved = simulate_pull(truth, "virtual", settings)
     assert not pull.entry.weightless and pull.entry.gravity_m_s2 is None
     loaded = load_branch(branch, gravity=True, progress=REFUSING)

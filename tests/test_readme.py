@@ -92,7 +92,7 @@ def test_the_readmes_times_and_sizes_are_as_measured():
     spent = re.search(r"; (\d+) s", measured["limber demo: by the clock; processor time"])[1]
     size = measured["all packages, installed"].removesuffix(" GB")
     assert _said(r"demo takes (\d+) seconds of processor time") == pytest.approx(float(spent),
-                                                                               rel=0.25)
+                                                                                 rel=0.25)
     assert _said(r"and (\d\.\d) GB of disk") == pytest.approx(float(size), rel=0.25)
     memory = measured["limber demo: largest memory of a process"].removesuffix(" MB")
     assert _said(r"and (\d\.\d) GB of memory") == pytest.approx(float(memory) / 1000, rel=0.25)

@@ -96,7 +96,7 @@ def test_settings_without_a_value_are_shown(bpy, registered, whole_texts):
     stage = part("stages").stages()["reconstruct"]
     error = InputError("Two plants.", "", *map(Option, (
         "crop_low", "crop_high", "root", "crop_low", "force", "output", "such_a_thing")),
-        Option("plants", "joined"))
+                       Option("plants", "joined"))
     steps.draw_error(layout, bpy.context, stage, error.as_json())
     assert [name for name in layout.names("prop") if name in stage.fields] == [
         "crop_low", "crop_high", "root"]

@@ -159,7 +159,7 @@ def off(small, small_pull):
 def followed(bench, small, pull, young=None, **settings):
     """The result of an estimate from a start, as its interval; None: refused."""
     chosen = FitSpec(hold_out=False, mesh_check=False, poisson=0.36, key_frames=6,
-                              young=young, **settings)
+                     young=young, **settings)
     subject = subject_of(bench, small)
     if young is not None:
         subject = replace(subject, start=replace(subject.start, young=np.full(4, young)))

@@ -85,7 +85,7 @@ def test_a_calibration_gives_what_was_promised(today, small_bench, noisy, action
 def test_a_recorded_torque_gives_what_was_promised(small, small_bench, pose_sigma):
     """A clamping gripper whose torque was not recorded leaves the outer moduli undetermined."""
     settings = PullSpec(young=small.young, poisson=0.36, frames=10, mode="rigid",
-                                   grasp_fraction=0.85, phase=0.5, torque_noise=0.0)
+                        grasp_fraction=0.85, phase=0.5, torque_noise=0.0)
     pull = simulate_pull(small.truth(), "pull-1", settings)[0]
     calibration = CELL.model_copy(update={
         "held_length_sigma_m": 0.0, "pose_sigma_m": pose_sigma, "pose_sigma_rad": 0.0})
@@ -128,7 +128,7 @@ def test_the_best_come_first_and_the_idle_do_not_come(today, small_bench, noisy)
 # As many control points as the pulls support.
 
 QUICK = FitSpec(key_frames=6, hold_out=False, mesh_check=False, gravity=False,
-                         poisson=0.35)
+                poisson=0.35)
 
 
 class _OnTheFitsMesh(PaperBranch):

@@ -469,7 +469,7 @@ def test_points_aside_of_the_scanned_axis_move_no_modulus(small_bench, small):
     sides = np.random.default_rng(4).standard_normal((4, 3))
     sides *= 3e-3 / np.linalg.norm(sides, axis=1, keepdims=True)
     settings = PullSpec(young=small.young, poisson=small.poisson, frames=16, reach=0.4,
-                                   position_noise=0.0, force_noise=0.0, phase=0.3)
+                        position_noise=0.0, force_noise=0.0, phase=0.3)
     pull = measured(simulate_pull(replace(truth, control_points=truth.control_points + sides),
                                   "pull-1", settings)[0], 3, points=5e-4, force=0.01)
     calibration = CalibrationEntry(force_bias_sigma_n=0.02, force_drift_sigma_n=0.02)

@@ -16,7 +16,7 @@ LENGTH, RADIUS, YOUNG, DENSITY = 0.5, 2e-3, 1e9, 900.0
 BENDING = YOUNG * np.pi / 4 * RADIUS**4
 GRAVITY = np.array([0.0, 0.0, -9.81])
 EXACT = PullSpec(position_noise=0.0, force_noise=0.0, torque_noise=0.0, frames=4,
-                            duration=6.0, phase=0.5, poisson=0.36)
+                 duration=6.0, phase=0.5, poisson=0.36)
 
 
 def straight(twigs=()):

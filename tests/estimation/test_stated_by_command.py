@@ -42,7 +42,7 @@ class LayeredBranch(TrueBranch):
 def recorded(folder, truth, first=0, offset=0.0):
     """Write a pull of the truth as tables of a robot and of markers; returns the pull."""
     settings = PullSpec(model="rod", frames=40, seed=5, phase=0.7, poisson=0.36,
-                                   position_noise=3e-4, force_noise=5e-3)
+                        position_noise=3e-4, force_noise=5e-3)
     pull = simulate_pull(truth, "pull-2", settings)[0]
     wrenches = pull.wrenches + np.r_[offset + np.zeros(3), np.zeros(3)]
     seen = pull.observations

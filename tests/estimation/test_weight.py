@@ -48,7 +48,7 @@ def pull(scanned):
     truth = TrueBranch(prestress.mesh, prestress.skeleton, prestress.control_points,
                        (0.2, 0.4, 0.6, 0.8), TRUTH, GRAVITY)
     settings = PullSpec(frames=6, reach=0.15, position_noise=0.0, force_noise=0.0,
-                                   poisson=0.36, density=900.0, phase=0.4)
+                        poisson=0.36, density=900.0, phase=0.4)
     made = simulate_pull(truth, "pull", settings)[0]
     assert not made.entry.weightless
     return made

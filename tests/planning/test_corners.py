@@ -42,7 +42,7 @@ def bowing_field():
     return fit_field(GraspSamples(
         np.hstack([points, np.zeros_like(points)]), energy, chart.pull_back(points, slope),
         1.5 * points, np.ones(len(points)), np.empty((0, 6)), np.full(len(points), 0.01)),
-        np.zeros(3), RADIUS)
+                     np.zeros(3), RADIUS)
 
 
 def problem_on(field, share):

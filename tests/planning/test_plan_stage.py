@@ -58,7 +58,7 @@ def test_deformation_aware_path_is_gentler_on_the_full_model(planned_branch):
 def test_reported_energies_are_the_full_models(planned_branch):
     """Energy, force and pose of a path's point are those that the branch model gives there."""
     small_model = load_grasp_model(Branch.open(planned_branch), gravity=True,
-        progress=Progress(on_warning=pytest.fail))
+                                   progress=Progress(on_warning=pytest.fail))
     plan = read_plan(planned_branch)["plan"]
     poses = np.array(plan["poses"])
     middle = len(poses) // 2
@@ -144,7 +144,7 @@ def test_same_seed_same_plan(copied):
     """Run again by force, the planner's path is the same to the bit."""
     before = read_plan(copied)
     plan_paths(copied, PlanSettings(iterations=800, start_seed=3), name="there",
-                       workers=1, force=True)
+               workers=1, force=True)
     after = read_plan(copied)
     for key in ("baseline", "plan"):
         assert np.array_equal(before[key]["field_energies_j"], after[key]["field_energies_j"])
@@ -280,7 +280,7 @@ def test_plan_that_breaks_a_limit_on_the_full_model_is_refused(copied, monkeypat
     with pytest.raises(NoPathError, match=r"force \[N\] .* exceeds .* at \(.*\) m") as refused:
         plan_paths(copied, PlanSettings(max_force=cap, start=tuple(
             plan["plan"]["poses"][0][:3]), goal=tuple(plan["plan"]["poses"][-1][:3])),
-            name="refused", workers=1)
+                   name="refused", workers=1)
     assert refused.value.exit_code == 3
     assert not (copied / "plans/refused.json").exists()
 

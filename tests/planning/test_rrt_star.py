@@ -32,7 +32,7 @@ ENGINES = ["own", pytest.param("ompl", marks=pytest.mark.skipif(
 def make_problem(field, *, deformation, distance=0.3, goal=GOAL, **limits):
     limited = field.limited(**limits)
     cost = CostWeights.between(field, START, goal.centre(field),
-                                  deformation=deformation, distance=distance)
+                               deformation=deformation, distance=distance)
     return PathProblem(field, limited, cost.weights, START, goal,
                        goals=goal_points(goal, field, limited))
 

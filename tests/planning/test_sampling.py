@@ -212,7 +212,7 @@ def test_weight_leaves_the_scan_as_the_rest_state(planned_branch, small_mesh):
     """With gravity the branch hangs at rest in the shape that was scanned, strained by its weight.
     """
     model = load_grasp_model(Branch.open(planned_branch), gravity=True,
-        progress=Progress(on_warning=pytest.fail))
+                             progress=Progress(on_warning=pytest.fail))
     assert not model.rest.displacement.any() and model.energy(model.rest) == 0.0
     assert model.peak_strain(model.rest.displacement) > 1e-4, "the weight must matter here"
     assert np.allclose(model.rest_position, Grasp.from_mesh(small_mesh).centre, atol=1e-9)

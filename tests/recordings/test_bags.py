@@ -342,7 +342,7 @@ def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, ba
 
 @pytest.mark.slow
 def test_a_broken_description_in_a_bag_costs_only_itself(mcap, tmp_path, bare_folder, plain_pull,
-                                                          monkeypatch):
+                                                         monkeypatch):
     from limber.core.progress import Progress
     from limber.recordings import bag_pull
 

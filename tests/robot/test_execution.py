@@ -374,7 +374,7 @@ def test_an_armed_run_feels_what_was_predicted_and_ends_where_it_should(planned_
 
 
 def test_a_sensor_that_the_nudge_finds_wrong_stops_before_the_path(planned_folder, armed, robot,
-                                                                  monkeypatch):
+                                                                   monkeypatch):
     """The prediction is turned round instead of the sensor: the approach and a nudge, no more."""
     predicted, motions = PullModel.predicted, []
 

@@ -198,7 +198,7 @@ def test_an_arm_that_was_moved_after_its_stop_does_not_go_back(e_series):
         link.stop()
         link.wait("stopped", seconds=5)
         e_series.ask("stand", joints=list(np.add(e_series.state["joints"],
-                                                     [0.2, 0, 0, 0, 0, 0])))
+                                                 [0.2, 0, 0, 0, 0, 0])))
         time.sleep(0.1)
         with pytest.raises(SafetyStop, match=r"mm and .* degrees away from its path"):
             link.retreat()

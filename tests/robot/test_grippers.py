@@ -87,7 +87,7 @@ def test_a_gripper_that_closes_on_nothing_begins_no_pull(served, own_address):
 @pytest.mark.parametrize("register, value, told", [
     ("STA", 0, "not activated.*opens and closes it"), ("FLT", 10, "fault 10")])
 def test_one_that_is_not_ready_is_refused_and_not_activated(served, own_address, register, value,
-                                                           told):
+                                                            told):
     served.robotiq.values[register] = value
     with pytest.raises(WorkError, match=told):
         RobotiqGripper(own_address)

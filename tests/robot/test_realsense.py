@@ -112,7 +112,7 @@ def run(arguments: list[str], capfd) -> tuple[int, dict]:
 
 
 def test_the_command_writes_a_cloud_and_names_what_is_missing(library, tmp_path, capfd,
-                                                             monkeypatch):
+                                                              monkeypatch):
     path, out = tmp_path / "cell.toml", tmp_path / "scan.ply"
     write_cell(path, CELL)
     code, told = run(["--realsense", str(path), "-o", str(out)], capfd)

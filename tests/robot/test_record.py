@@ -155,7 +155,7 @@ def after_a_way(robot, way: float, action: str, **values):
 
 
 def test_a_sensor_that_a_nudge_finds_wrong_stops_before_the_pull(branch_folder, tmp_path, robot,
-                                                                monkeypatch):
+                                                                 monkeypatch):
     """The prediction is turned round instead of the sensor: nothing is recorded, the name is free.
     """
     predicted, motions = PullModel.predicted, []
@@ -197,7 +197,7 @@ def test_what_goes_wrong_during_a_pull_is_noticed_within_ten_millimetres(
 
 
 def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folder, tmp_path,
-                                                                   robot, capfd):
+                                                                    robot, capfd):
     """Along its axis a branch is stiff: 30 N within a millimetre or two, and more on the way."""
     skeleton = load_skeleton(Branch.open(branch_folder))
     axis = skeleton.point_at(0.92) - skeleton.point_at(0.87)

@@ -135,7 +135,7 @@ def test_targets_are_set_replaced_and_removed(folder, capsys):
     assert [(t.name, t.position, t.mass) for t in targets] == [
         ("flower", (0.0, 0.0, 0.25), 0.02), ("leaf", (0.0, 0.0, 0.1), 0.0)]
     loaded = load_branch(Branch.open(folder), gravity=True,
-        progress=Progress(on_warning=pytest.fail))
+                         progress=Progress(on_warning=pytest.fail))
     assert [m.mass for m in loaded.model.point_masses] == [0.02]
     result = set_target(folder, "flower", TargetSettings(remove=True))
     assert result["targets"] == ["leaf"]

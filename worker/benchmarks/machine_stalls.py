@@ -77,7 +77,7 @@ class Witness:
         host takes its time away like this.
         """
         return max(self._longest_of([one for one in seen if one[0] > since - _TOGETHER_SECONDS],
-                                     since) for seen in map(tuple, self._seen))
+                                    since) for seen in map(tuple, self._seen))
 
     def lost(self, since: float, until: float) -> float:
         """Return the largest total stall of a processor between two moments [s]."""

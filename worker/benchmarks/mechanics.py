@@ -49,13 +49,13 @@ _SPEED = (
           "under 3.2 times (assembly + factorisation + solve)"),
     Asked("converged implicit steps, 1,000 quadratic tetrahedra", "40 steps a second"))
 _LINEAR = Asked("linear tetrahedra, one-Newton step, 7,500 tetrahedra",
-               "12 ms where the prototype took 11.6")
+                "12 ms where the prototype took 11.6")
 _GRASPS = Asked("300 random grasps to 40 % of the length, full model, one process",
-               "105 s; no false equilibrium")
+                "105 s; no false equilibrium")
 _MEMORY = Asked("memory at 50,000 quadratic tetrahedra", "4 GB, and it solves")
 _FELUPE = Asked("peer: felupe, same mesh, material and load (alpha 2)", "-")
 _SKFEM = Asked("peer: scikit-fem, same mesh, linear elasticity (no large deflection as shipped)",
-              "-")
+               "-")
 
 
 # --- exact solutions ---------------------------------------------------------------------------

@@ -222,7 +222,7 @@ def simulate_reduced(model: ReducedModel, *, poses: np.ndarray, times: np.ndarra
     if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0).all():
         raise InputError("Times do not ascend.", "Each frame needs a later time.", "Sort them.")
     path = scipy.interpolate.CubicSpline(times, unwrapped(poses[:, None])[:, 0], axis=0,
-                       bc_type=((1, np.zeros(6)), (2, np.zeros(6))))
+                                         bc_type=((1, np.zeros(6)), (2, np.zeros(6))))
     begin = start or model.solve_static(poses[0], nodal_forces=nodal_forces)
     stepper = ReducedStepper(model, begin, nodal_forces=nodal_forces, settings=settings)
     stepper.state.time = float(times[0])

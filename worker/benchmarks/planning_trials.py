@@ -642,7 +642,7 @@ def _sure_plan(start: Start, unknown: YoungUncertainty, settings: PlanSettings,
         try:
             return plan_motion(free.field, start.model, settings.model_copy(update={
                 "max_force": cap, "confidence": CONFIDENCE, "goal": end}), uncertainty=unknown,
-                workers=1), cap, tight
+                               workers=1), cap, tight
         except NoPathError:
             if tight == _TIGHT[-1]:
                 raise

@@ -376,7 +376,7 @@ def closed_loops(setting: Setting, voided: Voided, address: str) -> list[Row]:
     """
     trials = setting.trials("loops", setting.seeds(10, 1), partial(
         _loop, address=address, out=setting.out, progress=setting.progress, voided=voided),
-        "cli", "planning", "estimation", *_PACKAGES, catch=LimberError)
+                            "cli", "planning", "estimation", *_PACKAGES, catch=LimberError)
     ended, count = sound(trials), len(trials)
     failed = [each.failure for each in trials if each.failure]
     if not ended:

@@ -54,9 +54,9 @@ _THREE_PULLS = _asked("three pulls, gripper calibrated to 0.2 mm and 0.2 degrees
 
 _START = Asked("truths of 0.3 MPa to 10 GPa that fall 1 to 30 fold, at 1 to 4 control points, "
                   "half of them with a fork: fits that end at them (loss within 1 %)",
-                  "198 of 200")
+               "198 of 200")
 _ADVICE = Asked("interval expected after an action over that got by following it",
-                   "within 20 %")
+                "within 20 %")
 _PAPER = Asked("the paper's branches, noisy: worst error; simulations and seconds, its method / "
                   "ours", "6 %; 20 times fewer")
 _SETTINGS = FitSpec(hold_out=False, mesh_check=False)
@@ -212,7 +212,7 @@ def _followed(action: str, pulls: list[Pull], truth: Truth, cell: CellErrors,
     known = cell.calibration.model_copy(update=_BETTER.get(action, {}))
     shifts = known.point_sigma_m * rng.standard_normal(len(FRACTIONS))
     exact = drawn_branches.exact_pull(truth, len(pulls) if action == ANOTHER_PULL else 0, choice,
-                                    FIRST_TURN, shifts=shifts)
+                                      FIRST_TURN, shifts=shifts)
     if action == ANOTHER_PULL:
         return [*pulls, recorded(exact, cell, rng)]
     return [recorded(exact, CellErrors.drawn(known, rng), rng)]

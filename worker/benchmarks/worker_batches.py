@@ -195,7 +195,7 @@ def killed(setting: Setting) -> list[Row]:
         wanted = digests(folder / "undisturbed")
         kills = setting.trials("kills", setting.seeds(30, 3), partial(
             _kill, folder=folder, whole=whole, wanted=wanted),
-            "store", "batch", "core", "stages", "geometry")
+                               "store", "batch", "core", "stages", "geometry")
     redone, stored = (Counter(key for kill in kills for key in kill[name])
                       for name in ("redone", "found"))
     again = ", ".join(f"{key} {count} times" for key, count in redone.items()) or "nothing"

@@ -395,7 +395,7 @@ def _inputs(template: Path, folder: Path) -> None:
     times = np.arange(0, 4, 0.02)
     np.savetxt(folder / "ring.csv", np.column_stack(
         [times, np.exp(-0.5 * times) * np.cos(30 * times)]), "%.5f", ",",
-        header="time_s,a_m_s2", comments="")
+               header="time_s,a_m_s2", comments="")
     (folder / "jobs.toml").write_text('[[job]]\nscans = ["none*.xyz"]\n')
     (folder / "cell.toml").write_text('[robot]\nmodel = "none"\n')
 

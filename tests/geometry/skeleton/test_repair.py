@@ -164,7 +164,7 @@ def _branch(stem: np.ndarray = ALONG, twig: np.ndarray | None = None, at: int = 
 
 
 def _shell(low: float = 0.0, high: float = 0.4, wide: float = np.pi, radius: float = RADIUS,
-          noise: float = NOISE) -> np.ndarray:
+           noise: float = NOISE) -> np.ndarray:
     """Points around the stem, or on its side that faces x."""
     rng = np.random.default_rng(0)
     angle, z = rng.uniform(-wide, wide, 2000), rng.uniform(low, high, 2000)

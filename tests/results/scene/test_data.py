@@ -440,7 +440,7 @@ def test_the_stage_shows_the_folders_targets(tmp_path, mesh):
         {"name": "flower", "position_m": [0.0, 0.0, 0.4], "mass_kg": 0.01}]}
     _branch(tmp_path / "a.branch", mesh.with_data(
         cell_data={"young": np.full(mesh.tet_count, 1e8)}),
-        target={"targets.json": json.dumps(targets)})
+            target={"targets.json": json.dumps(targets)})
     scene(SceneInputs(branch_folder=tmp_path / "a.branch", data=tmp_path / "data.npz"),
           SceneSettings())
     with np.load(tmp_path / "data.npz", allow_pickle=False) as content:

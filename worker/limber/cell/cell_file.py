@@ -616,7 +616,7 @@ def not_stated(cell: Cell) -> list[str]:
 
 
 def _template_lines(kind: type[BaseModel], stated: dict[str, Any], examples: dict[str, Any],
-           is_example: bool) -> Iterator[str]:
+                    is_example: bool) -> Iterator[str]:
     """The keys of a section; those that are not stated are examples, commented out."""
     for name, entry in kind.model_fields.items():
         value, mark = stated.get(name), ""

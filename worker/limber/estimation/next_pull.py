@@ -132,7 +132,7 @@ class Cell:
             "position_sigma_m": part * sensor.position_sigma_m,
             "force_sigma_n": part * sensor.force_sigma_n,
             "torque_sigma_nm": None if torque is None else part * torque}),
-            known.model_copy(update={"pose_noise_m": part * known.pose_noise_m}), count)
+                    known.model_copy(update={"pose_noise_m": part * known.pose_noise_m}), count)
 
 
 @dataclass(frozen=True)

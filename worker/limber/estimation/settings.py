@@ -165,7 +165,7 @@ class VirtualPullSettings(Settings):
     groups: ClassVar[Groups] = {
         "material": ("young", "poisson", "density", "gravity", "own_weight", "shape"),
         "motion": ("model", "motion", "drive", "weight", "frames", "duration", "grasp_fraction",
-            "mode", "reach", "phase"),
+                   "mode", "reach", "phase"),
         "noise": ("position_noise", "force_noise", "camera", "seed"),
         "errors of the cell": ("cell_errors",),
     }

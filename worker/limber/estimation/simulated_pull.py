@@ -347,7 +347,7 @@ def _entry(truth: TrueBranch, settings: PullSpec, is_weightless: bool) -> PullEn
 
 
 def write_depth_frames(folder: Path, truth: TrueBranch, pull: Pull, displacements: list[np.ndarray],
-                        settings: PullSpec) -> None:
+                       settings: PullSpec) -> None:
     """Write simulated D455 depth images of a pull: ``depth/`` and ``camera.toml``."""
     camera = viewing(truth.mesh.nodes, displacements)
     write_camera(folder / "camera.toml", camera)

@@ -179,7 +179,7 @@ def carried(model: "BranchModel") -> Prestress:
 
     own_load, added_load = (mass[:, None] * model.gravity for mass in (own, added))
     return Prestress(carrying(own_load), carrying(added_load) if added_load.any() else None,
-                   len(model.point_masses))
+                     len(model.point_masses))
 
 
 def _carried(model: "BranchModel", load: np.ndarray, moved: np.ndarray) -> CarriedWeight:

@@ -24,9 +24,9 @@ class SimulateSettings(Settings):
         "output": ("name", "vtu"),
         "motion": ("kind", "move", "turn", "grasp_force", "duration", "hold"),
         "grasp and loads": ("grasp_point", "grasp_mode", "hold_at", "load_at",
-            "mass_at"),
+                            "mass_at"),
         "material": ("young", "material", "gravity", "rest_shape", "damping_mass",
-            "damping_stiffness"),
+                     "damping_stiffness"),
         "solver": ("step", "scheme", "newmark_beta", "newmark_gamma"),
     }
     common = ("name", "move", "grasp_force", "young")

@@ -64,7 +64,7 @@ class SolvedPoses:
     def loads(self) -> dict[str, np.ndarray]:
         """Loads by their names except closeness to obstacles, shape [n] each."""
         return dict(zip(LOADS[:-1], (self.strains, self.stresses, self.axial_forces,
-                                np.linalg.norm(self.torques, axis=1)), strict=True))
+                                     np.linalg.norm(self.torques, axis=1)), strict=True))
 
     def take(self, index: np.ndarray) -> "SolvedPoses":
         """Return the states of ``index``, in its order."""

@@ -85,7 +85,7 @@ class CostToGo:
                 _numbered(name, len(grids)) for name in _OF_GRID]
             require_shapes(path, arrays, {"axes": (3, 3)} | dict(zip(
                 names, ((3,), (3,), *3 * [("x", "y", "z")]), strict=True)), _WHAT,
-                flags=(has_cost, known))
+                           flags=(has_cost, known))
             grids.append(BoundGrid(arrays[origin], arrays[edges], np.where(
                 arrays[has_cost], arrays[costs], np.nan), arrays[known].astype(bool)))
         return cls(arrays["axes"], tuple(grids))

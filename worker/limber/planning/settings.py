@@ -51,10 +51,10 @@ class PlanSettings(Settings):
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the grasp, in the branch's frame [m]. Without any goal, a distant pose "
         "is chosen and stated."),
-        json_schema_extra=POSITION)
+                                                    json_schema_extra=POSITION)
     tip_goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the branch's tip, or of --target, in the branch's frame [m]."),
-        json_schema_extra=POSITION)
+                                                        json_schema_extra=POSITION)
     target: str | None = Field(None, description=(
         "Named target (`limber target`) for --tip-goal, --target-box, --in-view and "
         "--second-arm. Default: the tip."))
@@ -72,7 +72,7 @@ class PlanSettings(Settings):
     goal_tolerance: float = Field(0.01, gt=0, le=1, description="Radius of the goal region [m].")
     start: tuple[float, float, float] | None = Field(None, description=(
         "Start position of the grasp [m]. Default: the rest pose."),
-        json_schema_extra=POSITION)
+                                                     json_schema_extra=POSITION)
     start_seed: int | None = Field(None, ge=0, description=(
         "Seed of a random deformed start configuration, as in the paper's trials."))
     deformation_weight: float = Field(1.0, gt=0, description=(
@@ -107,7 +107,7 @@ class PlanSettings(Settings):
         "the estimate's intervals."))
     workspace: tuple[float, float, float, float, float, float] | None = Field(None, description=(
         "Box that the grasp must stay in: lower corner, upper corner, in the branch's frame [m]."),
-        json_schema_extra=BOX)
+                                                                              json_schema_extra=BOX)
     clearance: float | None = Field(None, ge=0, le=0.5, description=(
         "Least distance of branch, gripper and arm from the cell's obstacles [m]. Default: twice "
         "the uncertainty of the robot's base in the cell file, but no more than the branch has at "

@@ -22,11 +22,11 @@ class ImportSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("kind", "robot", "unit", "force_unit", "rate_hz", "nominal", "marker_frame",
-            "coordinates", "time_offset", "recorded", "yolo_weights", "yolo_prompt"),
+                  "coordinates", "time_offset", "recorded", "yolo_weights", "yolo_prompt"),
         "bags and robot logs": ("cell", "frame_pose", "wrench_topic", "pose_topic",
-            "points_topic", "bag_clock"),
+                                "points_topic", "bag_clock"),
         "grasp and loads": ("grasp_point", "grasp_distance", "grasp_radius", "grasp_mode",
-            "direction", "weight", "load", "own_weight"),
+                            "direction", "weight", "load", "own_weight"),
         "simulation": ("drive", "motion", "swing_start"),
         "noise": ("position_sigma", "force_sigma", "torque_sigma", "pull_toml"),
     }

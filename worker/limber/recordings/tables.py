@@ -190,7 +190,7 @@ def _titled(rows: list[list[str]], at: int) -> list[str] | None:
     labels = _filled(named, columns)
     kinds = _filled(next((row for row in rows[:at] if _is_kind(row)), []), columns)
     types = _filled(next((row for row in rows[:at] if "type" in (_letters(row[0]),
-                                                               _letters(row[1]))), []), columns)
+                                                                 _letters(row[1]))), []), columns)
     present = {kind.lower() for kind in types.values()}
     chosen = next((kind for kind in _TYPES if kind in present), None)
     units = rows[at + 1] if at + 1 < len(rows) else []

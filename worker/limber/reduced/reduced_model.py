@@ -461,7 +461,7 @@ class ReducedModel:
             if move is None and gain <= settings.tolerance * max(energy, 1e-12):
                 novelty = float((np.abs(q[self._known]) / self._largest[self._known]).max())
                 return FoundState(q, stable, novelty, iteration + 1,
-                              self.energy(q) - float(load @ q), steady)
+                                  self.energy(q) - float(load @ q), steady)
             move = None
         return FoundState(q, False, np.inf, most, np.inf)
 

@@ -180,7 +180,7 @@ def _registered(touched: np.ndarray, on_branch: np.ndarray) -> tuple[np.ndarray,
 
 
 def _inaccurate(residuals: np.ndarray, touched: np.ndarray, on_branch: np.ndarray,
-         names: Sequence[str], largest_residual: float) -> InputError:
+                names: Sequence[str], largest_residual: float) -> InputError:
     """Return why points [n, 3] do not fit: the change that would make them fit."""
     off = ", ".join(f"{name} {1000 * value:.1f}"
                     for name, value in zip(names, residuals, strict=True))

@@ -198,7 +198,7 @@ class InteractiveSession:
         """Return the ``count``-th event of a kind, waiting for it; None if it does not come."""
         return self._child.wait(lambda: next(itertools.islice(
             (line for line in self.events if line.get("event") == event), count - 1, None), None),
-            seconds)
+                                seconds)
 
     def close(self) -> None:
         """End the session; safe to call again."""

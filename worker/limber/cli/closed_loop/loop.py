@@ -229,7 +229,7 @@ class ClosedLoop:
             if not found["plan"]["worth"]:
                 return replace(planned, reason=found["plan"]["why"])
             self._pulled(robot, number, *grasp_of(load_skeleton(branch),
-                                                   found["best"]["grasp_fraction"]), "--suggested")
+                                                  found["best"]["grasp_fraction"]), "--suggested")
             planned = replace(self._planned(planned.goal), pull_count=number)
         return replace(planned, reason=f"{_MOST_PULLS} pulls were made")
 

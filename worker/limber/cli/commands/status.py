@@ -24,7 +24,7 @@ def command(run: Run, job_file: Path) -> dict[str, Any]:
     count = counts(jobs, records)
     run.close(f"Of {len(jobs.branches)} branches " + ", ".join(
         f"{number} {state}" for state, number in count.items() if number) + ".",
-        then=f"limber batch {shlex.quote(str(job_file))}" if count["waiting"] else "")
+              then=f"limber batch {shlex.quote(str(job_file))}" if count["waiting"] else "")
     return {"branch_count": len(jobs.branches), **count,
             "running_now": [f"{branch.name} {task.label}" for branch in jobs.branches
                             for task in branch.tasks

@@ -34,10 +34,10 @@ _HEIGHTS = ("height", "elevation", "altitude", "z", "h", "hohe", "hoehe", "alt",
 ROLES = {
     "position": (*(tuple(form.format(axis) for axis in "xyz") for form in _FORMS),
                  *(tuple(f"{word}{k}" for k in range(3)) for word in ("points", "point",
-                                                                     "position", "pos", "xyz")),
+                                                                      "position", "pos", "xyz")),
                  *((*plane, height) for plane in _PLANES for height in _HEIGHTS)),
     "normal": (*(tuple(form.format(axis) for axis in "xyz") for form in ("n{}", "normal{}",
-                                                                        "{}normal", "norm{}")),
+                                                                         "{}normal", "norm{}")),
                *(tuple(f"{word}{k}" for k in range(3)) for word in ("normals", "normal"))),
     "color": (*(tuple(form.format(name) for name in ("red", "green", "blue"))
                 for form in ("{}", "color{}", "colour{}", "diffuse{}")),

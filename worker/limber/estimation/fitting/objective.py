@@ -489,7 +489,7 @@ class Objective:
         jacobian = None if jacobian is None else np.vstack([jacobian, rows])
         loss = sum(float(np.sum((pull.positions - forward.frames.positions)[
             seen_in(forward.frames)]**2)) for pull, forward in zip(pulls, self.forwards,
-                                                                strict=True))
+                                                                   strict=True))
         return Evaluation(free, residual, jacobian, loss, tuple(pulls), unknown_count, errors)
 
     def raw_slopes(self, evaluation: Evaluation) -> list[RawSlopes]:

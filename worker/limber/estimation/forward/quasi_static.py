@@ -261,7 +261,7 @@ class QuasiStaticForward(Forward):
         self._drives = [drive + step for drive, step in zip(self._drives, steps, strict=True)]
         self._hints = [state.displacement + np.tensordot(step, moved, axes=1)
                        for state, step, moved in zip(self.states(), steps, self._compliances,
-                                                      strict=True)]
+                                                     strict=True)]
         self._values, self.response = None, None
 
     def under_readings(self, simulated: Simulated) -> Simulated:

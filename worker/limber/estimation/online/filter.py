@@ -466,7 +466,7 @@ class OnlineEstimator:
         weight = 1.0 / np.maximum(np.abs(off) / (4.0 * typical), 1.0)
         scaled = jacobian.T * weight
         return Kept(frame, state, self.log_young.copy(), scaled @ jacobian, scaled @ off,
-                     float(np.sqrt(np.mean(off**2))) if len(off) else 0.0)
+                    float(np.sqrt(np.mean(off**2))) if len(off) else 0.0)
 
     def _relinearise(self, settings: ReducedStaticSettings) -> None:
         self._turn = (self._turn + 1) % (len(self._information.kept) - 1)

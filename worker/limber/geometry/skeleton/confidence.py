@@ -290,7 +290,7 @@ def _part(
 ) -> DoubtfulPart:
     length = float(skeleton.steps[nodes].sum()) if len(nodes) > 1 else 0.0
     return DoubtfulPart(kind, run, skeleton.nodes[nodes[len(nodes) // 2]], length,
-                 float(np.median(skeleton.radius[nodes])), value)
+                        float(np.median(skeleton.radius[nodes])), value)
 
 
 def _stretches(nodes: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:

@@ -352,7 +352,7 @@ _GROUND = 0.2  # fraction of the scan's height below which a base stands on the 
 
 
 def are_plants(nodes: np.ndarray, thickness: np.ndarray, label: np.ndarray,
-                bridge: tuple[int, int], up: np.ndarray) -> bool:
+               bridge: tuple[int, int], up: np.ndarray) -> bool:
     """Whether two pieces are each on the ground, and neither base is on the other's end."""
     height = nodes @ up
     ground = height.min() + _GROUND * np.ptp(height)

@@ -62,7 +62,7 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
 
 
 def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
-                 residual: np.ndarray) -> None:
+                residual: np.ndarray) -> None:
     """Refuse a cloud with axes but without round sections (a ball). Leaves give a warning only."""
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     round_share = float(np.mean(np.abs(residual) < 0.4 * skeleton.radius[segment]))

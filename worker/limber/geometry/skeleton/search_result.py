@@ -190,7 +190,7 @@ class FoundSkeleton:
             [piece.found() for piece in stored.split_off], stored.loops, stored.pruned,
             _position_array(stored.second_base), [end.found() for end in stored.root_ends],
             stored.leafy, [twig.found() for twig in stored.unlikely]),
-            _leaves(path, arrays, stored))
+                   _leaves(path, arrays, stored))
 
 
 class _Part(BaseModel):

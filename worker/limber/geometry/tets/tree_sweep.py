@@ -235,7 +235,7 @@ def joints(axis: RunAxis, start: np.ndarray, lean: np.ndarray, patch: Patch, cor
         order = patch.loop[::-1] if backwards[k] else patch.loop
         numbers = np.concatenate([order, -1 - np.arange(sides + 1)])
         found.append(Joint(float(start[k]), tangent[k], turn[k],
-                             numbers[block[k]], float(quality[k])))
+                           numbers[block[k]], float(quality[k])))
     return found
 
 

@@ -170,7 +170,7 @@ class NewmarkStepper(Stepper):
                 and self._tangent_step == dt and self._tangent_error <= _KEPT_TANGENT_ERROR)
 
     def _make_tangent(self, new: MotionState, increment: np.ndarray | None,
-                   viscous: Viscous | None, dt: float) -> bool:
+                      viscous: Viscous | None, dt: float) -> bool:
         settings, damping = self.settings, self.model.damping
         rate, inertia = settings.gamma / (settings.beta * dt), 1 / (settings.beta * dt**2)
         # Its memory is reused by the new one.

@@ -102,7 +102,7 @@ class MotionTangents:
                     values[grasp.nodes] -= grasp.weights @ values[grasp.nodes]
             imposed = model.mass_times(alpha * motion[0] + motion[1] - free)
             self._states[number] = MotionState(new.time, change, *motion, strain, past.strain,
-                                                dt)
+                                               dt)
             self._out.append(history + force(change) + imposed)
 
     def frame(self, state: MotionState) -> tuple[np.ndarray, np.ndarray]:

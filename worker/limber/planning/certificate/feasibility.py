@@ -193,7 +193,7 @@ def _judged(problem: GentleProblem, most_cells: int, is_exact: bool = False) -> 
             # Along the shell: the chord of a curved cell may be well off it.
             return Verdict(cells.edges, path=chart.curved(resample(flat, _FINE)))
         uncertainty = np.maximum(uncertainty[open_cells][~free].sum(axis=0),
-                           (bends / tolerance)[open_cells][ends].sum(axis=0))
+                                 (bends / tolerance)[open_cells][ends].sum(axis=0))
         parts = np.where(uncertainty >= _DOUBTED * uncertainty.max(), 2, 1)
         if connected.sum() * parts.prod() > most_cells:
             return Verdict(cells.edges)

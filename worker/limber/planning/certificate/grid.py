@@ -76,7 +76,7 @@ def first_grid(problem: GentleProblem) -> tuple[Grid, np.ndarray]:
     after = np.ceil(high / spacing - 0.5).astype(int) + _PAD + 1
     open_cells = np.pad(np.ones(tuple(before + after - 2 * _PAD), bool), _PAD)
     return Grid(start - ((before + 0.5) * spacing) @ axes, axes, np.full(3, spacing), open_cells,
-                 np.ones_like(open_cells)), before
+                np.ones_like(open_cells)), before
 
 
 def _axes(start: np.ndarray, goal: np.ndarray, chart: Chart) -> np.ndarray:
@@ -205,8 +205,8 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     # A cell of the next grid queries up to 4 of its edges away, 7 times half its diagonal; its
     # centre is within ``half`` of this one's.
     return AboutGoal(whole(known), whole(np.nan_to_num(cost)),
-                      whole(inside), slack, bool(touching.any()),
-                      whole(filled <= growth * 8.0 * half))
+                     whole(inside), slack, bool(touching.any()),
+                     whole(filled <= growth * 8.0 * half))
 
 
 def short_enough(problem: GentleProblem, grid: Grid, open_cells: np.ndarray, near: np.ndarray,

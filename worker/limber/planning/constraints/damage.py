@@ -205,7 +205,7 @@ class DamageAlong:
         rows = np.column_stack([self.nodes, self.strains, *known.values()])
         stream.write(table_text((*_COLUMNS, *known), (
             (*row[:3], parent, *row[3:]) for row, parent in zip(rows, self.parents, strict=True)),
-            digits=6))
+                                digits=6))
 
     @classmethod
     def read(cls, path: Path) -> "DamageAlong":

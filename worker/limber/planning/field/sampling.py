@@ -131,8 +131,8 @@ def sample_between(
         count = max(2, -(-len(chosen) // _SHARE_PAIRS))
         shares = [chosen[k::count] for k in range(count)]
         found = solvers.run(_ask, [(share,) for share in shares if share],
-                         progress=progress.part(number / _ROUNDS, (number + 1) / _ROUNDS),
-                         message="between neighbouring poses")
+                            progress=progress.part(number / _ROUNDS, (number + 1) / _ROUNDS),
+                            message="between neighbouring poses")
         known += [one for added, _ in found for one in added]
         bistable = np.concatenate([bistable, *(middles for _, middles in found)])
     return known[begun:], bistable
@@ -277,7 +277,7 @@ class LowEnergySurface:
 
 
 def walk_energy_surface(solvers: SolverPool, count: int, *, deflection: float, seed: int = 0,
-                progress: Progress = SILENT) -> tuple[LowEnergySurface, list[Solved]]:
+                        progress: Progress = SILENT) -> tuple[LowEnergySurface, list[Solved]]:
     """Return the shell, and states on it and a little beyond: per direction one under a force
     across, one also drawn outward. ``deflection`` is over arc length, ``seed`` turns the
     directions. A branch that is no cantilever gets the sphere about its base."""
@@ -293,7 +293,7 @@ def walk_energy_surface(solvers: SolverPool, count: int, *, deflection: float, s
     # In turn: the farther from rest, the longer it takes.
     shares = max(2, -(-len(across) // _SHARE_DIRECTIONS))
     found = solvers.run(_walk, [(across[k::shares], force) for k in range(shares)],
-                     progress=progress, message="finding the low-energy surface")
+                        progress=progress, message="finding the low-energy surface")
     pairs = [found[k % shares][k // shares] for k in range(len(across))]
     slack = [pair[0] for pair in pairs[1:] if pair[0] is not None]
     positions = np.array([grasp_model.rest_position, *(state.pose[:3] for state in slack)])
@@ -491,7 +491,7 @@ def solve_branch(solvers: SolverPool, targets: np.ndarray, known: Sequence[Solve
     shares = np.array_split(np.argsort(targets[:, 0], kind="stable"), share_count)
     begin = [taken(solvers.grasp_model, solvers.grasp_model.rest), *known]
     found = solvers.run(_solve_share, [(targets[share], share, begin) for share in shares],
-                     progress=progress, message="solving grasp poses")
+                        progress=progress, message="solving grasp poses")
     solved = sorted((one for share in found for one in share), key=lambda s: s.target)
     return ([*begin, *(one for one in solved if not one.trouble)],
             [one for one in solved if one.trouble])

@@ -140,7 +140,7 @@ def _add_share_of_strength(data: SceneData, strength: float | None) -> None:
     source_text = (f"{100 * STRENGTH_OVER_YOUNG:g} % of E, assumed" if strength is None
                    else f"{strength / 1e6:.3g} MPa")
     add_frame_scalar(data, "stress_over_strength", stress / strength_of(young, strength),
-                      f"stress over strength ({source_text})", "", "inferno", is_from_zero=True)
+                     f"stress over strength ({source_text})", "", "inferno", is_from_zero=True)
 
 
 def add_frame_scalar(data: SceneData, name: str, values: np.ndarray, title: str, unit: str,

@@ -338,7 +338,7 @@ class RetreatPath:
                              "its path.", "Something has moved it.",
                              "Free the branch by hand.")
         if difference := different_joints(sample.joints, self._joints[nearest],
-                                         self._names):
+                                          self._names):
             raise SafetyStop("The arm is not in the configuration in which it arrived: "
                              f"{'; '.join(difference)}.",
                              "Something has moved it.", "Free the branch by hand.")

@@ -66,7 +66,7 @@ class Simulation(Result):
     frame_count: int = shown("frames", ",")
     energy: float = shown("final energy", ".4g J")
     grasp_force: Vector = shown("final force", ".4g N", of=np.linalg.norm,
-                          meaning="final force of the gripper on the branch [N], shape [3]")
+                                meaning="final force of the gripper on the branch [N], shape [3]")
     tip_displacement: Vector = shown("final displacement of the tip", ".1f mm", of=np.linalg.norm)
     peak_strain: float = shown("largest strain", ".4g")
     min_det_f: float = shown("smallest det F", ".3f", meaning="smallest det F, a volume ratio")

@@ -48,7 +48,7 @@ class CompareSettings(Settings):
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the grasp, in the branch's frame [m]. Default: the branch's tip within "
         "reach of a second arm, as in the paper."),
-        json_schema_extra=POSITION)
+                                                    json_schema_extra=POSITION)
     seed: int = Field(0, ge=0, description="Seed of the starts and the planners.")
     max_detour: float | None = Field(8.1, ge=0, le=1000, description=(
         "Largest extra length of the gentle path over that of RRT* [%]. Default: the paper's "

@@ -454,7 +454,7 @@ def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: PlanPath
                       for path in (found.baseline, found.plan))
     stage.path(f"plans/{name}.json").write_text(plan_text(
         found.summary, baseline, plan, motion, limits_of_motion(motion, limits), pace),
-        encoding="utf-8")
+                                                encoding="utf-8")
     stage.path(f"plans/{name}.csv").write_text(path_table(plan), encoding="utf-8")
     stage.path(f"plans/{name}-baseline.csv").write_text(path_table(baseline), encoding="utf-8")
     stage.path(f"plans/{name}-motion.csv").write_text(motion_table(motion), encoding="utf-8")
@@ -468,7 +468,7 @@ def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: PlanPath
     stage.path(f"frames/{name}.json").write_text(json.dumps(plain({
         "frame_count": len(frames), "rate": _FRAME_RATE, "vertex_count": len(vertices),
         "energies_j": plan.energies, "forces_n": plan.force_sizes, "path": name})) + "\n",
-        encoding="utf-8")
+                                                 encoding="utf-8")
     # Values for colouring the surface in the scene, at the vertices and in the order of the frames.
     model, mesh = grasp_model.model, grasp_model.mesh
     states = [strain_state(model, u) for u in displacements]

@@ -58,4 +58,4 @@ def estimated_uncertainty(branch: Branch, grasp_model: GraspModel) -> YoungUncer
     weights = young_weights(grasp_model.mesh, points) * np.array(
         found.get("young_mesh_pa") or found["young_pa"], float)
     return YoungUncertainty(weights / weights.sum(axis=1, keepdims=True),
-                      np.log(interval[:, 1] / interval[:, 0]) / _INTERVAL, correlation)
+                            np.log(interval[:, 1] / interval[:, 0]) / _INTERVAL, correlation)

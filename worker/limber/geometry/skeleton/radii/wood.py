@@ -109,7 +109,7 @@ def _pipes(parent: np.ndarray, radius: np.ndarray, forks: np.ndarray,
     pipes = sparse.coo_matrix((
         np.concatenate([part, np.full(len(forks), -1.0)]),
         (np.concatenate([own, row[forks]]), np.concatenate([child, forks]))),
-        (len(forks), count)).tocsr()
+                              (len(forks), count)).tocsr()
     miss = pipe - log[forks]
     if len(forks):
         miss -= np.clip(np.median(miss), -_PIPE_SIGMA, _PIPE_SIGMA)
