@@ -30,13 +30,8 @@ _ROUND = np.linspace(0.0, np.pi, 13)
 
 def cell_picture(cell: Cell, joints: np.ndarray, obstacles: Sequence[Obstacle],
                  skeleton: Skeleton | None) -> Figure:
-    """Return the drawing.
-
-    Args:
-        joints: Angles of the arm [rad], shape [n].
-        obstacles: Those of the cell, branch frame.
-        skeleton: Axes of the branch; None: only its frame is drawn.
-    """
+    """Return the drawing of a cell with the arm at ``joints`` [rad], the cell's obstacles, branch
+    frame, and the branch's axes; without skeleton only the branch's frame is drawn."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(15.0, 6.0), layout="constrained")
@@ -125,11 +120,8 @@ def _branch(axes: Axes, seen: list[int], skeleton: Skeleton) -> None:
 
 
 def camera_edges(cell: Cell, flange: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return both ends of the edges of what the camera sees, up to a metre away [m], branch frame.
-
-    Args:
-        flange: Its frame in the branch's frame, for a camera on it, shape [4, 4].
-    """
+    """Return both ends of the edges of what the camera sees, up to a metre away [m], branch frame;
+    ``flange``: its frame there, for a camera on it, shape [4, 4]."""
     camera = cell.camera
     assert camera is not None
     frame = matrices(np.array(camera.pose))

@@ -25,8 +25,7 @@ PATH_NAMES = {"baseline": "shortest", "plan": "gentle"}
 
 def simulated_pull(branch: Branch) -> dict[str, Any] | None:
     """Return the result of a branch's first simulated pull; None if all pulls were measured.
-    ``young_assumed`` is set if the branch was not generated and its modulus is unknown.
-    """
+    ``young_assumed`` is set if the branch was not generated and its modulus is unknown."""
     stages = branch.manifest.stages
     found = [stages[key].result for key in (f"pull:{name}" for name in branch.names("pulls"))
              if key in stages and stages[key].result.get("young_true_pa") is not None]
@@ -43,12 +42,8 @@ def modulus_origin(branch: Branch) -> str:
 
 
 def modulus_sentence(estimate: Mapping[str, Any], assumed: str = "") -> str:
-    """Return the moduli from base to tip with their intervals.
-
-    Args:
-        estimate: ``young_pa`` [K] and ``young_interval_pa`` [K][2] [Pa], with None where open.
-        assumed: What the reader must know first; empty for a real pull.
-    """
+    """Return the moduli from base to tip with their intervals [Pa], None where open; ``assumed``:
+    what the reader must know first, empty for a real pull."""
     intervals = estimate.get("young_interval_pa") or [None] * len(estimate["young_pa"])
     values = [_with_interval(young, interval) for young, interval in zip(
         estimate["young_pa"], intervals, strict=True)]
@@ -63,11 +58,7 @@ def modulus_sentence(estimate: Mapping[str, Any], assumed: str = "") -> str:
 
 
 def path_sentence(plan: Mapping[str, Any]) -> str:
-    """Return length, energy and force of the gentle path, and its savings.
-
-    Args:
-        plan: Summary of a plan.
-    """
+    """Return length, energy and force of the gentle path, and its savings, by a plan's summary."""
     gentle = plan["plan"]
     parts = [f"is {1e3 * gentle['length_m']:.3g} mm long"]
     if gentle.get("peak_energy_j") is not None:
@@ -86,8 +77,7 @@ def path_sentence(plan: Mapping[str, Any]) -> str:
 
 def certificate_sentence(plan: Mapping[str, Any]) -> str:
     """Return how far a plan's cost can be above the optimum, or within an allowed length its
-    energy, and what is proven of it.
-    """
+    energy, and what is proven of it."""
     certificate, detour = plan.get("certificate") or {}, plan.get("detour")
     quantity = "energy along the path" if detour else "cost"
     gaps = [(certificate.get("gap_percent"), "on the energy field (proven)"),
@@ -102,15 +92,9 @@ def certificate_sentence(plan: Mapping[str, Any]) -> str:
 
 
 def remarks_on(plan: Mapping[str, Any]) -> dict[str, str]:
-    """Return the limits of arm or wood that a plan's paths exceed, by measure.
-
-    Args:
-        plan: Summary of a plan; ``robot`` names its arm, ``strength`` has the strain at which half
-            of such branches break, and its source.
-
-    Returns:
-        Sentences by ``peak_force_n`` and ``peak_strain``; empty if no limit is exceeded.
-    """
+    """Return the limits of arm (``robot``) or wood (``strength``: the strain at which half of such
+    branches break, and its source) that a plan's paths exceed, as sentences by ``peak_force_n`` and
+    ``peak_strain``."""
     found = {}
     for key, over in (("peak_force_n", _over_arm), ("peak_strain", _over_wood)):
         remarks: dict[str, list[str]] = {}
@@ -130,12 +114,8 @@ def beyond_sentence(plan: Mapping[str, Any]) -> str:
 
 
 def force_remark(force: float, model: str | None = None) -> str:
-    """State which arm cannot apply a force [N]; empty if all can.
-
-    Args:
-        force: Largest force on the gripper.
-        model: Name or file of the arm; None for the strongest known one that cannot.
-    """
+    """State which arm, by name or file, cannot apply a force [N]; None: the strongest known one
+    that cannot. Empty if all can."""
     try:
         arms = [arm_named(model)] if model else list(ARMS.values())
     except InputError:
@@ -150,13 +130,9 @@ def force_remark(force: float, model: str | None = None) -> str:
 
 
 def strain_remark(strain: float, strength: Mapping[str, Any]) -> str:
-    """State that a strain breaks half of such branches; empty if it does not.
-
-    Args:
-        strain: Largest principal strain.
-        strength: ``median_strain`` and its ``source``
-            (:meth:`limber.planning.constraints.damage.Strength.describe`).
-    """
+    """State that a largest principal strain breaks half of such branches, else "", by
+    ``median_strain`` and ``source`` of
+    :meth:`limber.planning.constraints.damage.Strength.describe`."""
     if strain <= strength["median_strain"]:
         return ""
     return (f"over the {100 * strength['median_strain']:.2g} % at which half of such branches "
@@ -164,13 +140,9 @@ def strain_remark(strain: float, strength: Mapping[str, Any]) -> str:
 
 
 def peaks_line(peaks: Mapping[str, Any], model: str | None = None) -> str:
-    """Return the largest strain and force of a motion, each with the limit that it exceeds.
-
-    Args:
-        peaks: ``peak_strain``, and ``peak_force_n`` [N], 0 if no gripper holds the branch; the
-            branch's ``young_median_pa``, by which a strength is assumed or not.
-        model: Name or file of the arm that applies the force, if known.
-    """
+    """Return ``peak_strain`` and ``peak_force_n`` [N] (0: no gripper) of a motion, each with the
+    limit that it exceeds; ``model``: the arm; ``young_median_pa`` says whether a strength is
+    assumed."""
     strain, force = peaks["peak_strain"], peaks.get("peak_force_n")
     of_wood = assumed_strain(peaks.get("young_median_pa") or 0.0) is not None
     parts = [("Largest strain", f"{100 * strain:.2g} %",
@@ -182,11 +154,8 @@ def peaks_line(peaks: Mapping[str, Any], model: str | None = None) -> str:
 
 
 def failure_sentence(strain_over_limit: float) -> str:
-    """State that loads strain the wood beyond its failure strain; empty if they do not.
-
-    Args:
-        strain_over_limit: Largest strain over that strain.
-    """
+    """State that loads strain the wood beyond its failure strain, of which they reach this
+    multiple; empty if they do not."""
     return "There the wood fails." if strain_over_limit > 1.0 else ""
 
 

@@ -24,13 +24,8 @@ def surface_nodes(mesh: TetMesh) -> np.ndarray:
 
 
 def write_pc2(path: Path, positions: np.ndarray, start: float = 0.0, rate: float = 1.0) -> None:
-    """Write positions over time as a PC2 point cache (Blender's Mesh Cache modifier).
-
-    Args:
-        positions: Vertices [m], shape [frames, n, 3].
-        start: Number of the first frame.
-        rate: Frames per sample.
-    """
+    """Write positions [m], shape [frames, n, 3], as a PC2 point cache (Blender's Mesh Cache
+    modifier), from frame ``start`` on, ``rate`` frames per sample."""
     positions = np.asarray(positions, np.float32)
     shaped = positions.ndim == 3 and positions.shape[2] == 3 and len(positions) > 0
     if not shaped or not np.isfinite(positions).all():
@@ -43,11 +38,8 @@ def write_pc2(path: Path, positions: np.ndarray, start: float = 0.0, rate: float
 
 
 def read_pc2(path: Path) -> tuple[np.ndarray, float, float]:
-    """Return positions [frames, n, 3], start and rate of a PC2 file.
-
-    Raises:
-        InputError: it is no PC2 file, or it is truncated.
-    """
+    """Return positions [frames, n, 3], start and rate of a PC2 file; InputError if it is none, or
+    truncated."""
     data = Path(path).read_bytes()
     whole = len(data) >= _PC2_HEADER.size
     header = data[:_PC2_HEADER.size] if whole else bytes(_PC2_HEADER.size)
@@ -91,27 +83,17 @@ class FramesFile(FileContent):
 
 
 def read_frames_file(path: Path) -> FramesFile:
-    """Read the description of a motion's frames.
-
-    Raises:
-        InputError: it cannot be read, or its lists differ in length.
-    """
+    """Read the description of a motion's frames; InputError if it cannot be read, or its lists
+    differ in length."""
     return read_json_as(path, FramesFile, "a description of a motion's frames")
 
 
 def surface_fields(mesh: TetMesh, states: Sequence[StrainState]) -> dict[str, np.ndarray]:
-    """Return the values for colouring a surface in each frame, for ``frames/NAME.npz``.
-
-    Volume-weighted averages over the tetrahedra at a vertex; for det F their minimum.
-
-    Args:
-        states: One per frame, from :func:`limber.mechanics.strain.strain_state`.
-
-    Returns:
-        ``strain_energy_density_j_m3``, ``principal_strain`` (the largest),
-        ``principal_stress_pa`` (the largest) and ``det_f``, each [frames, vertices], single
-        precision, vertices as in PC2 files.
-    """
+    """Return the values for colouring a surface in each frame, for ``frames/NAME.npz``, from
+    :func:`limber.mechanics.strain.strain_state`: ``strain_energy_density_j_m3``, the largest
+    ``principal_strain`` and ``principal_stress_pa``, volume-weighted over the tetrahedra at a
+    vertex, and the least ``det_f``, each [frames, vertices] in single precision, vertices as in PC2
+    files."""
     nodes = surface_nodes(mesh)
     average = node_average(mesh)[nodes]
     least = [_least_at_nodes(mesh, state.det_f)[nodes] for state in states]
@@ -141,15 +123,9 @@ def _least_at_nodes(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
 
 def write_pvd_series(folder: Path, name: str, model: BranchModel, times: np.ndarray,
                      displacement: np.ndarray) -> list[Path]:
-    """Write ``name.pvd`` and one VTU per frame, with strain, stress and energy density.
-
-    Args:
-        folder: Where to write; it must exist.
-        displacement: [m], shape [frames, node_count, 3].
-
-    Returns:
-        The files written, the PVD last; open that one in ParaView.
-    """
+    """Write ``name.pvd`` and one VTU per frame, with strain, stress and energy density, of
+    displacements [m], [frames, node_count, 3], into an existing folder; return the files, the PVD,
+    which ParaView opens, last."""
     folder, paths = Path(folder), []
     for number, moved in enumerate(displacement):
         state = strain_state(model, moved)

@@ -32,14 +32,9 @@ _LEAST_OUT_OF_PLANE = 0.005  # m, of the third
 
 @dataclass(frozen=True)
 class BaseFit:
-    """The base's pose and how well the touched points agree.
-
-    Attributes:
-        pose: Pose of the robot's base in the branch's frame [m, rad], shape [6].
-        residuals: Distance of each point after the fit [m], shape [n].
-        position_sigma: Standard error of the base's position at the points [m].
-        rotation_sigma: Standard error of its rotation about its worst axis [rad].
-    """
+    """Pose of the robot's base in the branch's frame [m, rad], shape [6], distances of the points
+    after the fit [m], shape [n], and standard errors of the base's position at the points [m] and
+    of its rotation about its worst axis [rad]."""
 
     pose: np.ndarray
     residuals: np.ndarray
@@ -53,28 +48,17 @@ class BaseFit:
 
 
 def least_depth(largest_residual: float) -> float:
-    """Return how far out of plane points must spread [m] to reveal a mirrored fit.
-
-    A mirrored fit has residuals of twice that spread, which must exceed the allowed residual.
-    """
+    """Return how far out of plane points must spread [m] to reveal a mirrored fit: its residuals
+    are twice that, and must exceed the allowed residual."""
     return max(_LEAST_OUT_OF_PLANE, 0.5 * largest_residual)
 
 
 def require_frame(points: np.ndarray, names: Sequence[str], which: str,
                   largest_residual: float = 0.01) -> None:
-    """Refuse points that do not determine the frame, or its handedness.
-
-    Three points, or any number in a plane, fit a mirrored frame without a residual.
-
-    Args:
-        points: Positions [m], shape [n, 3].
-        names: Names of the points.
-        which: Description for the message: ``on the branch`` or ``as they were touched``.
-        largest_residual: Largest residual that :func:`fit_base` allows [m].
-
-    Raises:
-        InputError: too few, no numbers, too close to each other, in a line or in a plane.
-    """
+    """Refuse points [m], shape [n, 3], that do not determine the frame or its handedness: three, or
+    any number in a plane, fit a mirrored one without a residual. ``which`` is ``on the branch`` or
+    ``as they were touched``. InputError if too few, no numbers, too close, in a line or in a
+    plane."""
     if len(points) < _FEWEST_POINTS:
         raise InputError(f"{len(points)} points {which}.", "Four or more points that are not "
                          "coplanar are needed, because fewer also fit a mirrored "
@@ -114,15 +98,10 @@ def touched_point(cell: Cell, sample: Sample) -> np.ndarray:
 
 
 def gripper_pose(cell: Cell, sample: Sample) -> np.ndarray:
-    """Return the pose of the gripper's middle by the controller's own pose, base frame [m, rad, 6].
-
-    The controller knows the arm's true dimensions. Its pose is that of the tool set there, and
-    newer controllers report that tool. With others the nominal dimensions show which tool it is,
-    the cell's ``tool.grasp_pose`` or none. They are not used for the position.
-
-    Raises:
-        InputError: another tool is set.
-    """
+    """Return the pose of the gripper's middle by the controller's own pose, base frame [m, rad, 6],
+    as it knows the arm's true dimensions. Newer ones report the tool set there; else the nominal
+    dimensions, not used for the position, show whether it is ``tool.grasp_pose`` or none.
+    InputError if another is set."""
     grasp = np.array(cell.tool.grasp_pose)
     if sample.tool is not None:
         return _carried(sample.pose, sample.tool, grasp)
@@ -143,18 +122,10 @@ def _carried(pose: np.ndarray, tool: np.ndarray, grasp: np.ndarray) -> np.ndarra
 
 def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: float = 0.01,
              names: Sequence[str] | None = None) -> BaseFit:
-    """Fit the rigid transform from the robot's base to the branch's frame (Kabsch 1976).
-
-    Args:
-        touched: Points touched by the robot's tip, base frame [m], shape [n, 3].
-        on_branch: The same points in the branch's frame [m], shape [n, 3].
-        largest_residual: A point farther away than this [m] was mixed up or touched wrongly.
-        names: Names of the points, for messages; by default their numbers from 1 on.
-
-    Raises:
-        InputError: fewer than four points, points in a plane or too close to each other, mirrored
-            points, or an outlier.
-    """
+    """Fit the rigid transform from the robot's base to the branch's frame (Kabsch 1976), from
+    points [m], shape [n, 3], touched by the tip and on the branch. InputError for fewer than four,
+    in a plane, too close, mirrored, or one farther off than ``largest_residual`` [m], which was
+    mixed up."""
     touched, on_branch = np.asarray(touched, float), np.asarray(on_branch, float)
     if touched.shape != on_branch.shape or touched.ndim != 2 or touched.shape[1] != 3:
         raise InputError(f"{len(touched)} points were touched, but {len(on_branch)} are given on "
@@ -235,15 +206,9 @@ _STEP = 1e-6
 
 @dataclass(frozen=True)
 class CameraFit:
-    """The camera, the board, and how well the views agree.
-
-    Attributes:
-        camera: Pose of the camera, in the base's frame if it is fixed, else in the gripper's [m,
-            rad], shape [6].
-        board: Its pose in the other of the two, shape [6]; of a marker the turn is zero.
-        residuals: Distance of each view's board from where it should be seen [m], shape [n].
-        covariance: Covariance of the fitted parameters, shape [k, k].
-    """
+    """Pose of the camera, in the base's frame if it is fixed, else in the gripper's [m, rad], shape
+    [6]; the board's in the other of the two (of a marker without turn), each view's residual [m],
+    shape [n], and the covariance of the fitted parameters [k, k]."""
 
     camera: np.ndarray
     board: np.ndarray
@@ -257,12 +222,8 @@ class CameraFit:
 
     def deviations(self, frame: Callable[[np.ndarray, np.ndarray], np.ndarray],
                    point: np.ndarray) -> tuple[float, float]:
-        """Return standard errors of a frame composed of both: of its image of ``point`` [m, 3], and
-        of its rotation about the worst axis [rad].
-
-        Args:
-            frame: Computes it, shape [4, 4], from the frames of camera and board.
-        """
+        """Return standard errors of a frame [4, 4] that ``frame`` composes of camera and board: of
+        its image of ``point`` [m, 3], and of its rotation about the worst axis [rad]."""
         known = np.r_[self.camera, self.board][:len(self.covariance)]
         middle = frame(*_frames(known))
         slopes = np.zeros((6, len(known)))
@@ -279,18 +240,10 @@ class CameraFit:
 
 def fit_camera(robot: np.ndarray, seen: np.ndarray, camera_on: CameraOn, *,
                largest_residual: float = 0.01) -> CameraFit:
-    """Fit the frames of camera and board.
-
-    Args:
-        robot: Poses of the gripper's middle in the base's frame [m, rad], shape [n, 6].
-        seen: The board's poses in the camera's frame, shape [n, 6]; or positions of a marker, [n,
-        3].
-        camera_on: What carries the camera.
-        largest_residual: A view with a larger residual than this [m] was mixed up.
-
-    Raises:
-        InputError: too few views, the arm rotated about one axis only, or an outlier.
-    """
+    """Fit the frames of camera and board to the gripper's poses in the base's frame [m, rad], shape
+    [n, 6], and the board's in the camera's, [n, 6], or a marker's positions, [n, 3]. InputError for
+    too few views, a rotation about one axis only, or a view off by more than ``largest_residual``
+    [m]."""
     robot, seen = np.asarray(robot, float), np.asarray(seen, float)
     if not (np.isfinite(robot).all() and np.isfinite(seen).all()):
         raise InputError("A view contains a number that is not finite.", "", "Omit it.")
@@ -346,11 +299,8 @@ def _require_depth(positions: np.ndarray, largest_residual: float) -> None:
 
 
 def _started(turn: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the squared error of the best frames with this camera rotation [3, 3], and them.
-
-    With that rotation given the positions are a linear problem: R x_i + x = R_i y + t_i for the
-    observations x_i.
-    """
+    """Return the squared error of the best frames with this camera rotation [3, 3], and them: the
+    positions are then a linear problem, R x_i + x = R_i y + t_i for the observations x_i."""
     count = len(moves)
     left = np.hstack([np.tile(-np.eye(3), (count, 1)), moves[:, :3, :3].reshape(-1, 3)])
     right = (seen[:, :3] @ turn.T - moves[:, :3, 3]).ravel()
@@ -387,17 +337,10 @@ def base_from_camera(fit: CameraFit, scan: np.ndarray, camera_on: CameraOn,
                      scan_pose: np.ndarray | None, near: np.ndarray,
                      ) -> tuple[np.ndarray, float, float]:
     """Return the robot's base in the branch's frame [m, rad, 6], and its standard errors of
-    position [m] and rotation [rad] at the branch.
-
-    Args:
-        scan: Transform from the scan's coordinates [m] to the branch's, shape [4, 4]. The scan's
-            coordinates are those of the fixed camera; or of the carried one while the gripper was
-            at ``scan_pose`` [6]; without that, of the fixed board.
-        near: Position of the branch, branch frame [m], shape [3].
-
-    Raises:
-        InputError: the scan is in the frame of a marker, which has no rotation.
-    """
+    position [m] and rotation [rad] at the branch (``near`` [m], shape [3]). ``scan`` [4, 4]
+    transforms the scan's coordinates [m]: those of the fixed camera, of the carried one at
+    ``scan_pose`` [6], or of the fixed board. InputError if they are a marker's, which has no
+    rotation."""
     if camera_on == "gripper" and scan_pose is None and len(fit.covariance) < 12:
         raise InputError("The scan is in the board's frame, but only the position of a marker was "
                          "seen.", "A position has no axes.", "Also give the board's rotations "
@@ -425,15 +368,8 @@ _LARGEST_PX = 3.0
 
 @dataclass(frozen=True)
 class Board:
-    """A printed board or tag.
-
-    Attributes:
-        kind: Kind of print.
-        squares: Number of squares of the ChArUco board along x and y.
-        square_m: Edge length of its squares, or of the tag [m].
-        marker_m: Edge length of its markers [m].
-        dictionary: Marker dictionary by its OpenCV name.
-    """
+    """A printed ChArUco board or tag: number of its squares along x and y, edge lengths of squares
+    (or the tag) and markers [m], and the OpenCV name of its marker dictionary."""
 
     kind: Literal["charuco", "apriltag"]
     squares: tuple[int, int]
@@ -444,14 +380,8 @@ class Board:
 
 @dataclass(frozen=True)
 class View:
-    """A board in one picture.
-
-    Attributes:
-        name: Name of the picture.
-        corners: Corners on the board [m], its frame, shape [k, 3].
-        pixels: Their positions in the picture, shape [k, 2].
-        pose: Pose of the board in the camera's frame from this picture alone [m, rad], shape [6].
-    """
+    """A board in one picture: its corners [m] in its own frame, [k, 3], their pixels [k, 2], and
+    its pose in the camera's frame by this picture alone [m, rad], shape [6]."""
 
     name: str
     corners: np.ndarray
@@ -460,12 +390,8 @@ class View:
 
 
 def find_board(path: Path, board: Board, camera: CameraEntry) -> View | None:
-    """Return the board in a picture; None if too little of it is seen.
-
-    Raises:
-        InputError: the picture cannot be read, or has another size than the camera's.
-        MissingDependencyError: OpenCV is not installed.
-    """
+    """Return the board in a picture; None if too little of it is seen. InputError if the picture
+    cannot be read, or is not of the camera's size; MissingDependencyError without OpenCV."""
     require_extra("camera", ("cv2",), "Finding a board in pictures")
     import cv2
 
@@ -519,19 +445,9 @@ def _matrix(camera: CameraEntry) -> np.ndarray:
 
 def fit_pictures(robot: np.ndarray, views: list[View], camera: CameraEntry, camera_on: CameraOn,
                  largest_residual: float = 0.01) -> tuple[CameraFit, np.ndarray]:
-    """Fit the frames of camera and board to all corners of all pictures.
-
-    Args:
-        robot: Poses of the gripper's middle [m, rad], shape [n, 6].
-        views: One per pose.
-        camera_on: What carries the camera.
-
-    Returns:
-        The fit, and each picture's residual (root mean square of its corners' distances) [px].
-
-    Raises:
-        InputError: as :func:`.fit_camera`; or a picture does not fit, which is named.
-    """
+    """Fit the frames of camera and board to all corners of all pictures, by the gripper's poses [m,
+    rad], shape [n, 6]; return the fit and each picture's residual (root mean square) [px].
+    InputError as :func:`.fit_camera`, or naming a picture that does not fit."""
     first = fit_camera(robot, np.array([view.pose for view in views]), camera_on,
                        largest_residual=largest_residual)
     moves = matrices(robot) if camera_on == "stand" else inverted(matrices(robot))

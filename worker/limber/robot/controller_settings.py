@@ -23,13 +23,8 @@ _SAME_KG, _SAME_CENTRE_M = 0.005, 0.001
 
 @dataclass(frozen=True)
 class Difference:
-    """One difference between a controller and the cell file.
-
-    Attributes:
-        what: Its name.
-        seen, required: Value in the controller, and in the cell file.
-        is_set: Whether a motion sets it automatically, and restores it.
-    """
+    """A value of the controller that differs from the cell file's; ``is_set``: a motion sets it,
+    and restores it."""
 
     what: str
     seen: str
@@ -43,11 +38,9 @@ class Difference:
 
 def tool_in_controller(cell: Cell, sample: Sample,
                        calibration: FactoryCalibration | None = None) -> np.ndarray:
-    """Return the tool [m, rad, 6] that is set in the controller, in the flange's frame.
-
-    Newer controllers report it. Otherwise it is computed from joints and pose: with the dimensions
-    that the controller reports of its arm, or with nominal ones, to some millimetres.
-    """
+    """Return the tool [m, rad, 6] set in the controller, in the flange's frame: as newer ones
+    report it, else from joints and pose, with the arm's reported dimensions or with nominal ones,
+    to some millimetres."""
     if sample.tool is not None:
         return sample.tool
     flange = (cell.arm.forward(sample.joints) if calibration is None
@@ -65,11 +58,8 @@ def is_tool(cell: Cell, sample: Sample, tool: np.ndarray,
 
 
 def require_tool(cell: Cell, sample: Sample) -> None:
-    """Refuse a motion with another tool in the controller than the cell's.
-
-    Raises:
-        SafetyStop: states both.
-    """
+    """Refuse a motion with another tool in the controller than the cell's: a SafetyStop that states
+    both."""
     grasp = np.array(cell.tool.grasp_pose)
     if not is_tool(cell, sample, grasp):
         raise SafetyStop("The tool centre point in the controller is "
@@ -82,11 +72,8 @@ def require_tool(cell: Cell, sample: Sample) -> None:
 
 def differences(cell: Cell, sample: Sample, calibration: FactoryCalibration | None = None,
                 ) -> list[Difference]:
-    """Return the differences between controller and cell; values not reported are omitted.
-
-    Args:
-        calibration: Dimensions that the controller reports of its arm.
-    """
+    """Return the differences between controller and cell, without values not reported;
+    ``calibration``: the dimensions that the controller reports of its arm."""
     found, grasp = [], np.array(cell.tool.grasp_pose)
     if not is_tool(cell, sample, grasp, calibration):
         exact = sample.tool is not None or calibration is not None
@@ -109,12 +96,9 @@ def differences(cell: Cell, sample: Sample, calibration: FactoryCalibration | No
 
 
 class SteadySettings:
-    """Notices that tool centre point or payload were changed in the controller.
-
-    Another tool moves the pose that the controller reports, but no joint. Targets and recorded
-    poses are of that point: after a change they mean another place. Another payload looks like a
-    force on the branch.
-    """
+    """Notices that tool centre point or payload were changed in the controller: targets and
+    recorded poses are of that point and then mean another place, though no joint moves; another
+    payload looks like a force on the branch."""
 
     def __init__(self, arm: Arm):
         self._arm = arm

@@ -39,14 +39,8 @@ _OLDEST_SECONDS = 0.5  # of a frame; more is another clock
 
 
 class RealSense:
-    """The first camera that is connected; a context manager.
-
-    Attributes:
-        camera: Its intrinsics, as it reports them.
-
-    Raises:
-        MissingDependencyError: pyrealsense2 is not installed. WorkError: no camera answers.
-    """
+    """The first camera that is connected, with the intrinsics that it reports; a context manager.
+    MissingDependencyError without pyrealsense2; WorkError if no camera answers."""
 
     def __init__(self) -> None:
         library = _library()
@@ -78,22 +72,16 @@ class RealSense:
         self._pipeline.stop()
 
     def depth(self) -> np.ndarray:
-        """Return a depth image [m], shape [height, width]; NaN without a reading.
-
-        Raises:
-            WorkError: it sends no frames.
-        """
+        """Return a depth image [m], shape [height, width], NaN without a reading; WorkError if it
+        sends no frames."""
         frames = np.array([self._frame() for _ in range(_FRAMES)])
         is_seen = (frames > 0).sum(axis=0) > _FRAMES // 2
         median = np.ma.median(np.ma.masked_equal(frames, 0), axis=0).filled(0)
         return np.where(is_seen, self._scale * median, np.nan)
 
     def frame(self) -> tuple[np.ndarray, float]:
-        """Return the next image [m], NaN without a reading, and when it was taken [s, monotonic].
-
-        Raises:
-            WorkError: it sends no frames.
-        """
+        """Return the next image [m], NaN without a reading, and when it was taken [s, monotonic];
+        WorkError if it sends no frames."""
         frame = self._next()
         age = 0.0
         if frame.get_frame_timestamp_domain() in self._host_clocks:
@@ -114,23 +102,15 @@ class RealSense:
 
 
 def seen_points(cell: Cell, camera: RealSense, flange: np.ndarray | None) -> np.ndarray:
-    """Return the points that a camera sees within its range [m], branch frame, shape [n, 3].
-
-    Args:
-        cell: Its [camera] states pose and mount.
-        flange: The flange's frame in the robot's base, for a camera on it, shape [4, 4].
-    """
+    """Return the points that a camera sees within its range [m], branch frame, shape [n, 3];
+    ``flange``: its frame in the robot's base, for a camera on it, shape [4, 4]."""
     return placed_image(cell, camera, flange)[2]
 
 
 def placed_image(cell: Cell, camera: RealSense, flange: np.ndarray | None,
                  ) -> tuple[Camera, np.ndarray, np.ndarray]:
-    """Return the camera at its pose in the branch's frame; a depth image [m], shape [height,
-    width], NaN outside the range; and its points by rows [m], branch frame, shape [n, 3].
-
-    Args:
-        cell, flange: As :func:`seen_points` takes them.
-    """
+    """Return the camera at its pose in the branch's frame, a depth image [m], shape [height,
+    width], NaN outside the range, and its points by rows [m], branch frame, shape [n, 3]."""
     entry = cell.camera
     assert entry is not None
     frame = matrices(np.array(entry.pose))
@@ -178,23 +158,16 @@ _PIXELS = 1  # around the target's own, for errors of the camera's pose
 
 @dataclass(frozen=True)
 class LiveView:
-    """One image of what is neither the branch nor out of range.
-
-    Attributes:
-        camera: Intrinsics as the device reports them; its pose in the branch's frame.
-        depth: [m], NaN where nothing of that kind was seen, shape [height, width].
-    """
+    """An image [m], shape [height, width], of what is neither the branch nor out of range (NaN),
+    with the camera's intrinsics and pose in the branch's frame."""
 
     camera: Camera
     depth: np.ndarray
 
     @classmethod
     def taken(cls, cell: Cell, device: RealSense, branch: np.ndarray) -> "LiveView":
-        """Take an image with the camera at the cell's [camera], which is fixed.
-
-        Args:
-            branch: Its nodes at rest, branch frame [m], shape [n, 3].
-        """
+        """Take an image with the camera at the cell's [camera], which is fixed; ``branch``: its
+        nodes at rest, branch frame [m], shape [n, 3]."""
         camera, depth, points = placed_image(cell, device, None)
         away, _ = KDTree(branch).query(points, distance_upper_bound=_BRANCH_M)
         other = np.full(depth.shape, np.nan)
@@ -218,10 +191,7 @@ class LiveView:
 
 def look(cell: Cell, branch: np.ndarray, progress: Progress) -> LiveView | None:
     """Return what the connected camera sees now; None, with a warning, where none answers.
-
-    Args:
-        branch: As :meth:`LiveView.taken` takes it.
-    """
+    ``branch`` as of :meth:`LiveView.taken`."""
     device: Any
     try:
         with RealSense() as device:
@@ -250,23 +220,10 @@ _ENOUGH_POINTS = 50
 
 
 class DepthRecorder:
-    """Writes depth images into a folder in a thread of its own, from :meth:`start` on.
-
-    Args:
-        cell: Its [camera] stands still.
-        camera: Open.
-        folder: Gets ``camera.toml`` and ``depth/SECONDS.png``.
-        skeleton: The branch at rest.
-        joints: Returns the arm's angles now [rad], or None.
-
-    Attributes:
-        count: Images written.
-        empty_count: Images that did not show the branch, and were not written.
-        error: Why it ended early, or None.
-
-    Raises:
-        InputError: the camera is not fixed beside the branch.
-    """
+    """Writes ``camera.toml`` and ``depth/SECONDS.png`` into a folder in a thread of its own, from
+    :meth:`start` on; images that do not show the branch are only counted. ``joints`` returns the
+    arm's angles now [rad], or None; ``error`` is why it ended early. InputError if the camera is
+    not fixed beside the branch."""
 
     def __init__(self, cell: Cell, camera: RealSense, folder: Path, skeleton: Skeleton,
                  joints: Callable[[], np.ndarray | None]):
@@ -330,11 +287,8 @@ def axis_points(skeleton: Skeleton) -> np.ndarray:
 
 
 def fixed_camera(cell: Cell, camera: RealSense) -> Camera:
-    """Return the camera at its pose in the branch's frame.
-
-    Raises:
-        InputError: the cell has no camera, or one on the flange.
-    """
+    """Return the camera at its pose in the branch's frame; InputError if the cell has none, or one
+    on the flange."""
     if cell.camera is None or cell.camera.mount != "branch":
         raise InputError("The cell file has no [camera] with mount = \"branch\".", "During a pull "
                          "the camera has to stand still beside the branch.", "Calibrate a fixed "
@@ -345,13 +299,9 @@ def fixed_camera(cell: Cell, camera: RealSense) -> Camera:
 
 def branch_pixels(cell: Cell, camera: Camera, depth: np.ndarray, axis: cKDTree,
                   joints: np.ndarray | None) -> np.ndarray:
-    """Return the pixels that may show the branch, shape [height, width] of bool.
-
-    Args:
-        depth: [m], shape [height, width]; NaN or 0 without a reading.
-        axis: Points on the branch's axis at rest, branch frame.
-        joints: The arm's angles [rad]; None: it is not left out.
-    """
+    """Return the pixels of a depth image [m], NaN or 0 without a reading, that may show the branch,
+    bool [height, width]: near ``axis`` at rest, branch frame, and not the arm at ``joints``
+    [rad]."""
     assert cell.camera is not None
     near, far = cell.camera.range_m
     kept = np.isfinite(depth) & (depth >= near) & (depth <= far)

@@ -25,14 +25,9 @@ _CONNECTED_SECONDS = 5.0
 
 
 def require_confirmation(name: str, typed: str | None, cell: Cell, progress: Progress) -> None:
-    """Let the robot move only after a person has typed ``name``; asked for at a terminal.
-
-    Settings of the controller that differ from the cell are shown before that.
-
-    Raises:
-        InputError: nothing was typed, or another text.
-        LimberError: the robot does not answer, or cannot be moved now.
-    """
+    """Let the robot move only after a person has typed ``name``, asked for at a terminal and after
+    the settings of the controller that differ from the cell. InputError if nothing or another text
+    was typed; LimberError if the robot does not answer, or cannot be moved."""
     asks = typed is None and sys.stdin.isatty()
     if asks or typed == name:
         show_before_motion(cell, progress.warn)
@@ -46,14 +41,10 @@ def require_confirmation(name: str, typed: str | None, cell: Cell, progress: Pro
 
 def retreat_if_chosen(cell: Cell, link: RobotLink, choice: AfterStop, progress: Progress,
                       ) -> dict[str, Any]:
-    """After a stop the arm holds, unless ``choice`` or the person at the terminal is retreat.
-
-    If a retreat does not bring the force below the soft limit, the gripper opens.
-
-    Returns:
-        ``choice``; ``retreated``, whether the arm retreated; ``gripper_opened``; ``force_n``, the
-        remaining force on the branch (None: not known); and ``outcome``, all of it in words.
-    """
+    """After a stop the arm holds, unless ``choice`` or the person at the terminal is retreat; if
+    that leaves the force above the soft limit, the gripper opens. Returns ``choice``,
+    ``retreated``, ``gripper_opened``, ``force_n`` left on the branch (None: not known), and
+    ``outcome`` in words."""
     if choice == "ask" and sys.stdin.isatty():
         typed = input("The robot has stopped. Type retreat to return along the same path; "
                       "anything else holds: ")
@@ -147,11 +138,8 @@ def _left(force: float | None) -> str:
 
 
 def grip(cell: Cell, link: RobotLink, *, close: bool, progress: Progress) -> None:
-    """Close or open the gripper; without a wire, the person at the terminal does it.
-
-    Raises:
-        SafetyStop: it closed on nothing, as far as it tells.
-    """
+    """Close or open the gripper; without a wire, the person at the terminal does it. SafetyStop if
+    it closed on nothing, as far as it tells."""
     if is_driven(cell):
         link.gripper(close)
         time.sleep(cell.tool.grip_seconds)

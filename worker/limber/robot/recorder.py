@@ -28,20 +28,12 @@ class Lines(Protocol):
 
 
 class PullRecorder:
-    """Writes samples as poses of the grasped piece of branch, and the wrench on it.
-
-    The piece is at its rest pose, not rotated, when the gripper closes; from then on it moves with
-    the gripper as one body.
-
-    Attributes:
-        count: Samples written.
-        peak_force: [N].
-        last: The last sample taken, shape [37] as in :data:`limber.robot.driver.link.COLUMNS`.
-    """
+    """Writes samples as poses of the grasped piece and the wrench on it: at rest, not rotated, when
+    the gripper closes, it then moves with it as one body. ``count`` are written, ``peak_force`` is
+    in [N], ``last`` as in :data:`limber.robot.driver.link.COLUMNS`, shape [37]."""
 
     def __init__(self, lines: Lines, point: np.ndarray, compliance: float = 0.0):
-        """Begin a recording of the piece at ``point`` [3], which trails by ``compliance`` [m/N].
-        """
+        """Begin a recording of the piece at ``point`` [3], which trails by ``compliance`` [m/N]."""
         self._lines, self._point = lines, np.asarray(point, float)
         self._compliance = compliance
         self._offset: np.ndarray | None = None
@@ -79,11 +71,8 @@ class PullRecorder:
 
 
 def known_noise(cell: Cell, position_sigma: float | None = None) -> SensorEntry:
-    """Noise of the force sensor's single readings from the cell, and noise from the points at rest.
-
-    Args:
-        position_sigma: Noise of a tracked point [m]; None: as is usual.
-    """
+    """Noise of the force sensor's single readings by the cell, and of a tracked point at rest [m];
+    None: as is usual."""
     noise = {} if position_sigma is None else {"position_sigma_m": position_sigma}
     return SensorEntry(
         **noise,
@@ -93,12 +82,9 @@ def known_noise(cell: Cell, position_sigma: float | None = None) -> SensorEntry:
 
 def known_errors(cell: Cell, seconds: float, *, tare_sigma: Sequence[float] | None = None,
                  ) -> CalibrationEntry:
-    """Errors of a recording of ``seconds`` [s] that the cell leaves open.
-
-    Args:
-        tare_sigma: Standard error of the tare before it [N, N m], shape [6]; without one the zero
-            is as uncertain as after a tare at some earlier time.
-    """
+    """Errors of a recording of ``seconds`` [s] that the cell leaves open; ``tare_sigma``: standard
+    error of the tare before it [N, N m], shape [6], without which the zero is as uncertain as after
+    a tare at some earlier time."""
     usual = CalibrationEntry()
     minutes = seconds / 60.0
     drift = cell.sensor.drift_n_per_minute
@@ -117,18 +103,10 @@ def known_errors(cell: Cell, seconds: float, *, tare_sigma: Sequence[float] | No
 
 
 class MarkerStream:
-    """Tracked points from another program: JSON lines ``{"t_s", "points_m"}`` over TCP.
-
-    Times are on the robot's clock. With ``"frame": "base"`` the points are in the robot's base
-    frame, else in the branch's. A point that is not seen is null. A frame with another number of
-    points than the first is omitted, since it does not state which is which.
-
-    Args:
-        base: The robot's base in the branch's frame [m, rad], shape [6].
-
-    Raises:
-        WorkError: the stream does not answer.
-    """
+    """Tracked points of another program: JSON lines ``{"t_s", "points_m"}`` over TCP, on the
+    robot's clock, in the branch's frame or with ``"frame": "base"`` the robot's, whose pose is
+    ``base`` [m, rad]. An unseen point is null; a frame of another number than the first is omitted,
+    as it does not say which is which. WorkError if the stream does not answer."""
 
     def __init__(self, address: str, port: int, base: np.ndarray, timeout: float = 3.0):
         self._base = matrices(np.asarray(base, float))
@@ -143,11 +121,8 @@ class MarkerStream:
         self.rejected_count = 0
 
     def read(self, timeout: float = 0.0) -> list[tuple[float, np.ndarray]]:
-        """Return the frames that have arrived: time [s], points [n, 3] in the branch's frame.
-
-        Raises:
-            WorkError: the tracker has closed its connection.
-        """
+        """Return the frames that have arrived: time [s], points [n, 3] in the branch's frame;
+        WorkError if the tracker has closed its connection."""
         while select.select([self._socket], [], [], timeout)[0]:
             chunk = self._socket.recv(65536)
             if not chunk:
@@ -170,15 +145,9 @@ class MarkerStream:
         return frames
 
     def at_rest(self) -> tuple[np.ndarray, float | None]:
-        """Return the resting positions of the points so far, and the noise of one of them.
-
-        Returns:
-            Mean positions [m], shape [n, 3], and the standard deviation of a coordinate of one
-            frame [m], or None if too few frames arrived.
-
-        Raises:
-            WorkError: no points arrive, one of them is never seen, or their number changes.
-        """
+        """Return the mean resting positions so far [m], shape [n, 3], and the standard deviation of
+        one coordinate of a frame [m], None for too few. WorkError if no points arrive, one is never
+        seen, or their number changes."""
         frames = self.read(1.0)
         if not frames:
             raise WorkError("The tracker sends no points.", "", "Check that it sees the branch.")
@@ -239,12 +208,8 @@ _TURNED_M = 1e-3  # back from the farthest point: the outward motion is over
 
 
 def off_axis(cell: Cell, gripper: np.ndarray, distance: float) -> str | None:
-    """Return a warning if the gripper is farther from the branch's axis than is explained.
-
-    Args:
-        gripper: Its middle, branch frame [m], shape [3].
-        distance: From the branch's axis [m].
-    """
+    """Return a warning if the gripper's middle, branch frame [m], shape [3], is farther from the
+    branch's axis than is explained."""
     base = cell.base
     lever = float(np.linalg.norm(gripper - base.pose[:3]))
     explained = _BASE_DEVIATIONS * float(np.hypot(base.position_sigma_m,
@@ -258,11 +223,8 @@ def off_axis(cell: Cell, gripper: np.ndarray, distance: float) -> str | None:
 
 
 def nudge_direction(pull: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
-    """Return the unit vector [3] of the softest nudge whose force is across that of a pull [3].
-
-    Args:
-        stiffness: Of the held branch [N/m], shape [3, 3].
-    """
+    """Return the unit vector [3] of the softest nudge whose force is across that of a pull [3];
+    ``stiffness`` of the held branch [N/m], shape [3, 3]."""
     force = stiffness @ pull
     # Rows that span what is across the pull's force.
     across = np.linalg.svd(force[None])[2][1:]
@@ -273,15 +235,9 @@ def nudge_direction(pull: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
 
 
 def certain_directions(stiffness: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """Return the projection [3, 3] onto directions in which a pull's force can be predicted.
-
-    A branch is so stiff along itself that a model turned by a few degrees predicts another force
-    along it; only the rest tells what the sensor does.
-
-    Args:
-        stiffness: Of the held branch [N/m], shape [3, 3].
-        way: Of the gripper, shape [3].
-    """
+    """Return the projection [3, 3] onto directions in which a pull's force can be predicted, by the
+    branch's stiffness [N/m] and the way [3]: along itself it is so stiff that a model turned by a
+    few degrees predicts another force."""
     force = stiffness @ way
     # The force of the model turned about each axis.
     changes = [np.cross(axis, force) - stiffness @ np.cross(axis, way) for axis in np.eye(3)]
@@ -292,15 +248,9 @@ def certain_directions(stiffness: np.ndarray, way: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PredictedPull:
-    """Forces along the first outward motion of a pull, by the branch's model.
-
-    Attributes:
-        travels: Travel of the gripper [m], ascending from 0, shape [n].
-        forces: Forces of the gripper on the branch [N], branch frame, shape [n, 3].
-        factor: Factor by which a force may be larger or smaller, if the moduli are known; else
-        None.
-        certain: As :func:`certain_directions`, shape [3, 3]; the force's direction is judged there.
-    """
+    """Forces of the gripper on the branch [N], [n, 3], along its first outward travels [m],
+    ascending from 0; ``factor``: by which a force may differ, if the moduli are known; ``certain``:
+    as of :func:`certain_directions`, where the direction is judged."""
 
     travels: np.ndarray
     forces: np.ndarray
@@ -314,14 +264,8 @@ class PredictedPull:
 
 
 class _Growth:
-    """The growth of a force along the predicted one, now and before.
-
-    Readings are summed over bins of travel, so that a long pull takes no longer to judge.
-
-    Args:
-        noise: Standard deviation of a single reading [N].
-        end: Travel up to which there is a prediction [m].
-    """
+    """The growth of a force along the predicted one, now and before, over bins of travel up to
+    ``end`` [m], so that a long pull takes no longer to judge; ``noise`` of a single reading [N]."""
 
     def __init__(self, noise: float, end: float):
         self._noise = noise
@@ -331,9 +275,8 @@ class _Growth:
         self._is_over = False
 
     def take(self, travels: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> None:
-        """Take ``predicted`` forces [N] at travels [m], and the forces [N] measured along them,
-        shape [n] each.
-        """
+        """Take ``predicted`` forces [N] at travels [m], and those measured along them, shape [n]
+        each."""
         farthest = np.maximum.accumulate(np.r_[self._farthest, travels])[1:]
         back = np.flatnonzero(travels < farthest - _TURNED_M)
         out = len(travels) if not len(back) else int(back[0])
@@ -348,9 +291,8 @@ class _Growth:
         np.add.at(self._sums, bins[known], rows[:out][known])
 
     def slip(self) -> tuple[float, float] | None:
-        """Return how much of the predicted growth the force has now, over that before, and the
-        travel [m] over which; None if it grows on, or if noise explains it.
-        """
+        """Return how much of the predicted growth the force has now over that before, and the
+        travel [m] over which; None if it grows on, or noise explains it."""
         end = min(int(self._farthest / _BIN_M), len(self._sums))
         if self._is_over or not self._sums[0, 0]:
             return None
@@ -368,9 +310,8 @@ class _Growth:
         return None
 
     def whole(self) -> tuple[float, float] | None:
-        """Return the growth per predicted newton since the start, and its standard deviation; None
-        over too short a travel.
-        """
+        """Return the growth per predicted newton since the start, and its deviation; None over too
+        short a travel."""
         # Slack of a millimetre counts little over such a travel.
         if self._farthest < 3 * _FROM_M or not self._sums[0, 0]:
             return None
@@ -396,11 +337,8 @@ class _Growth:
 
 
 class _Direction:
-    """The direction in which a force grows, against the predicted one.
-
-    Args:
-        noise: Standard deviation of a single reading [N].
-    """
+    """The direction in which a force grows, against the predicted one; ``noise`` of a reading
+    [N]."""
 
     def __init__(self, noise: float):
         self._noise = noise
@@ -445,16 +383,8 @@ class _Direction:
 
 
 class PullPlausibility:
-    """Checks the samples of a pull as they arrive.
-
-    Args:
-        cell: States the sensor's noise and drift.
-        predicted: Expected forces.
-
-    Attributes:
-        predicted: As given.
-        reason: Why the sensor cannot be right, once that is certain.
-    """
+    """Checks the samples of a pull against expected forces as they arrive, by the cell's noise and
+    drift; ``reason``: why the sensor cannot be right, once that is certain."""
 
     def __init__(self, cell: Cell, predicted: PredictedPull):
         self._noise = _NOISES * cell.sensor.force_sigma_n / np.sqrt(_SMOOTHED)
@@ -485,9 +415,8 @@ class PullPlausibility:
         return self.reason
 
     def left_at_end(self, samples: np.ndarray) -> str | None:
-        """Return in words a force that remains with the gripper back at its start and is not
-        explained by noise, drift and the branch; ``samples`` [n, 37] are the last ones.
-        """
+        """Return in words a force that remains in the last samples [n, 37], back at the start, and
+        is not explained by noise, drift and the branch."""
         left = float(np.linalg.norm(samples[:, _COLUMNS].mean(axis=0)))
         drift = self._drift * (float(samples[-1, 0]) - self._began)
         allowed = self._noise + drift + _BACK_SHARE * self._peak

@@ -39,13 +39,8 @@ _LOOPBACK = "127."
 
 @dataclass(frozen=True)
 class Weighing:
-    """A sensor's readings of a tilted gripper.
-
-    Attributes:
-        mass: Mass that explains the changes [kg], by the sensor.
-        sigma: Its standard error [kg].
-        faults: Errors of the sensor or the stated mass, in words.
-    """
+    """A sensor's readings of a tilted gripper: the mass that explains the changes [kg], its
+    standard error, and errors of the sensor or the stated mass, in words."""
 
     mass: float
     sigma: float
@@ -59,11 +54,9 @@ def weighed_as(cell: Cell) -> dict[str, Any]:
 
 
 def unweighed(cell: Cell) -> str | None:
-    """Return why the last weighing does not confirm sensor and stated mass; None if it does.
-
-    A sensor that feels no weight needs none, nor does a bare flange that was never weighed or is
-    the virtual robot's, whose gripper is another at each start.
-    """
+    """Return why the last weighing does not confirm sensor and stated mass; None if it does, or
+    none is needed: without felt weight, of a bare flange never weighed, or of the virtual robot,
+    whose gripper is another at each start."""
     stated, last = cell.tool.mass_kg or 0.0, _last_weighing(cell)
     is_bare = not stated and (last is None or cell.robot.address.startswith(_LOOPBACK))
     if is_bare or cell.sensor.kind in _FEEL_NO_WEIGHT:
@@ -82,11 +75,8 @@ def unweighed(cell: Cell) -> str | None:
 
 
 def require_weighed(cell: Cell) -> None:
-    """Refuse a motion with the branch whose sensor and gripper no weighing confirms.
-
-    Raises:
-        InputError: states what the last weighing found, with both masses.
-    """
+    """Refuse a motion with the branch whose sensor and gripper no weighing confirms: InputError
+    with what the last one found, and both masses."""
     if reason := unweighed(cell):
         raise InputError(f"{reason}.", "The guard would feel another force than the branch's, and "
                          "the branch's moduli would be wrong.",
@@ -107,10 +97,8 @@ def _last_weighing(cell: Cell) -> dict[str, Any] | None:
 
 
 def tilted_joints(joints: np.ndarray, mass: float) -> np.ndarray:
-    """Return joint angles [6, n] from ``joints`` [n] and back, tilted by the two middle wrists.
-
-    So small that the weight of ``mass`` [kg] changes by no more than the guard allows.
-    """
+    """Return joint angles [6, n] from ``joints`` [n] and back, tilted by the two middle wrists so
+    little that the weight of ``mass`` [kg] changes by no more than the guard allows."""
     tilt = min(_MOST_TILT, float(np.arcsin(min(1.0, _CHANGE_N / max(GRAVITY * mass, 1e-9)))))
     offs = np.zeros((6, len(joints)))
     offs[[1, 2], 3] = tilt, -tilt
@@ -119,11 +107,8 @@ def tilted_joints(joints: np.ndarray, mass: float) -> np.ndarray:
 
 
 def require_tilts(downs: np.ndarray, stated: float) -> np.ndarray:
-    """Return the axes [3, 3] along which directions of gravity [n, 3] differ, most first.
-
-    Raises:
-        InputError: too few directions, about one axis only, or no mass [kg] is stated.
-    """
+    """Return the axes [3, 3] along which directions of gravity [n, 3] differ, most first;
+    InputError for too few, about one axis only, or if no mass [kg] is stated."""
     if not stated > 0.0:
         raise InputError("The cell file states no tool.mass_kg above 0.", "Without a weight there "
                          "is nothing to compare the sensor with.", "State the gripper's mass.")
@@ -136,20 +121,10 @@ def require_tilts(downs: np.ndarray, stated: float) -> np.ndarray:
 
 
 def weigh(downs: np.ndarray, forces: np.ndarray, times: np.ndarray, stated: float) -> Weighing:
-    """Compare readings at some tilts with the weight of the stated mass.
-
-    Bias and a linear drift in time are fitted with them.
-
-    Args:
-        downs: Direction of gravity in the flange's axes at each tilt, shape [n, 3].
-        forces: Mean readings there, of the surroundings on the tool, flange axes [N], shape
-            [n, 3], not corrected for any payload.
-        times: Times [s], shape [n].
-        stated: Mass in the cell file [kg].
-
-    Raises:
-        InputError: too few tilts, or about one axis only; or no mass is stated.
-    """
+    """Compare mean readings [N], [n, 3], of the surroundings on the tool, flange axes, not
+    corrected for a payload, at some directions of gravity there [n, 3] and times [s], with the
+    weight of the stated mass [kg]; bias and a linear drift are fitted too. InputError for too few
+    tilts, about one axis only, or without a stated mass."""
     axes = require_tilts(downs, stated)
     away = downs - downs[0]
     # Along gravity itself bias and weight are nearly indistinguishable: only the two tilts separate
@@ -199,16 +174,9 @@ _STILL = 1e-6  # N: a working sensor's noise never repeats so closely
 
 @dataclass(frozen=True)
 class Observed:
-    """A robot at rest.
-
-    Attributes:
-        facts: Description of the controller, as in :class:`.ArmControl`.
-        samples: In order.
-        readings: Reading of the force sensor with each, flange axes, not tared [N, N m], shape [n,
-        6].
-        differences: Differences between the controller and the cell.
-        calibration: Dimensions of the arm that its controller reports; None if it does not.
-    """
+    """A robot at rest: the controller's facts as in :class:`.ArmControl`, samples in order, each
+    with the sensor's reading, flange axes, not tared [N, N m], [n, 6], differences from the cell,
+    and the arm's dimensions, if its controller reports them."""
 
     facts: dict[str, Any]
     samples: list[Sample]
@@ -222,11 +190,8 @@ class Observed:
         return self.samples[-1].program_runs
 
     def nominal_off(self, cell: Cell) -> float | None:
-        """Return the deviation of the controller's pose from the arm's nominal dimensions [m].
-
-        Most of it is the arm's own calibration, which the controller knows. None if the tool of its
-        pose is not known.
-        """
+        """Return how far the controller's pose is from the nominal dimensions' [m], mostly by the
+        arm's own calibration, which it knows; None if the tool of its pose is not known."""
         sample = self.samples[-1]
         if sample.tool is None and any(each.what == "tool centre point"
                                        for each in self.differences):
@@ -235,12 +200,9 @@ class Observed:
         return self._off(cell.arm.forward(sample.joints), tool)
 
     def calibrated_off(self, cell: Cell) -> float | None:
-        """Return the deviation of the controller's pose from that of the reported dimensions [m].
-
-        More than rounding is a tool that is not the one assumed: an arm that has been repaired or
-        calibrated again, or a tool centre point that an older controller does not report. None
-        without reported dimensions.
-        """
+        """Return how far the controller's pose is from the reported dimensions' [m], if any: more
+        than rounding is another tool than assumed, of an arm repaired or calibrated again, or one
+        that an older controller does not report."""
         if self.calibration is None:
             return None
         sample = self.samples[-1]
@@ -277,11 +239,8 @@ class Observed:
 
 
 def observe(cell: Cell, seconds: float) -> Observed:
-    """Read a robot and its force sensor for ``seconds`` [s].
-
-    Raises:
-        LimberError: the robot or its sensor does not answer, or cannot be moved now.
-    """
+    """Read a robot and its force sensor for ``seconds`` [s]; LimberError if either does not answer,
+    or the arm cannot be moved now."""
     control = control_of(cell)
     try:
         sensor = open_sensor(cell)
@@ -303,11 +262,8 @@ def observe(cell: Cell, seconds: float) -> Observed:
 
 
 def show_before_motion(cell: Cell, warn: Callable[[str], None]) -> None:
-    """Report differences from the cell before anything is written or moves.
-
-    Raises:
-        LimberError: as :func:`observe`. SafetyStop: a program runs, or the sensor is implausible.
-    """
+    """Report differences from the cell before anything is written or moves. LimberError as
+    :func:`observe`; SafetyStop if a program runs, or the sensor is implausible."""
     seen = observe(cell, _BEFORE_MOTION_SECONDS)
     if seen.program_runs:
         raise SafetyStop("A program is running on the controller.",

@@ -28,15 +28,8 @@ from limber.mechanics.model import BranchModel
 
 
 def require_elastic(law: MaterialLaw, program: str, *, at_any_strain: bool = False) -> None:
-    """Refuse a law that is not described by Young's modulus and Poisson's ratio alone.
-
-    Args:
-        program: The program that receives these two numbers.
-        at_any_strain: Whether the program also computes large strains with them.
-
-    Raises:
-        InputError: it is another law.
-    """
+    """Refuse a law that Young's modulus and Poisson's ratio alone do not describe to ``program``,
+    or only at small strains if it computes with them ``at_any_strain``: an InputError."""
     if law.is_hookean or (not at_any_strain and is_hookean_at_rest(law)):
         return
     raise InputError(f"{program} does not support the material {law.name!r}.",
@@ -48,27 +41,17 @@ def require_elastic(law: MaterialLaw, program: str, *, at_any_strain: bool = Fal
 _SAMPLES_A_SEGMENT = 12
 _SPLITS = 1
 """Each tetrahedron is split into eight several times, each with the four points of Gauss' rule.
-Second moments are exact except for the assignment of points to links.
-"""
+Second moments are exact except for the assignment of points to links."""
 _GAUSS = (0.58541019662496852, 0.1381966011250105)
 
 
 @dataclass(frozen=True)
 class RodTree:
-    """Rigid links. Link 0 is fixed; link k hangs on ``parent[k]`` by a spring at ``joint[k]``.
-
-    Attributes:
-        parent: Shape [n]; -1 for link 0.
-        joint: Positions of the springs [m], shape [n, 3]; that of link 0 is the root.
-        axes: Principal bending axes and the tangent, as rows, shape [n, 3, 3].
-        stiffness: About these axes [N m/rad], shape [n, 3].
-        mass: [kg], shape [n].
-        centre: Centre of mass [m], shape [n, 3].
-        inertia: About the centre, along the branch's axes [kg m^2], shape [n, 3, 3].
-        end: End of each link [m], shape [n, 3].
-        radius: Radius of a round section of the same area [m], shape [n].
-        gravity: [m/s^2], shape [3]; zero if the branch has no weight.
-    """
+    """Rigid links: link 0 is fixed, link k hangs on ``parent[k]`` by a spring at ``joint[k]`` [m],
+    [n, 3], with stiffness [N m/rad] about ``axes``, the principal bending axes and the tangent as
+    rows, [n, 3, 3]. Mass [kg], centre and end [m], [n, 3]; inertia about the centre along the
+    branch's axes [kg m^2]; radius of a round section of the same area [m]; gravity [m/s^2], zero if
+    the branch has no weight."""
 
     parent: np.ndarray
     joint: np.ndarray
@@ -87,11 +70,8 @@ class RodTree:
 
     @property
     def carried(self) -> np.ndarray:
-        """Angles about its axes at which each spring is unstressed [rad], shape [n, 3].
-
-        With these angles the springs carry the weight beyond them, and the branch rests in the
-        shape in which it was scanned.
-        """
+        """Angles about its axes at which each spring is unstressed [rad], shape [n, 3]: they carry
+        the weight beyond them, and the branch rests as it was scanned."""
         pull = self.mass[:, None] * self.gravity
         force, moment = pull.copy(), np.cross(self.centre, pull)
         for link in range(self.count - 1, 0, -1):
@@ -111,11 +91,8 @@ class RodTree:
 
 
 def matched(tree: RodTree, model: BranchModel, tip: int) -> tuple[RodTree, float]:
-    """Return the links with all springs scaled so that node ``tip`` is as compliant as in the mesh.
-
-    What links leave out (mainly the stiffening effect of forks) is a few percent. One common factor
-    corrects for it and is returned as well.
-    """
+    """Return the links, springs scaled by one factor so that node ``tip`` is as compliant as in the
+    mesh, and the factor: links leave out a few percent, mainly the stiffening of forks."""
     position = model.mesh.nodes[tip]
     compliance = np.zeros((3, 3))
     link = tree.link_at(position)
@@ -152,16 +129,9 @@ class _Segment:
 
 
 def rod_tree(model: BranchModel, skeleton: Skeleton, spacing: float) -> RodTree:
-    """Return the links of a branch.
-
-    Args:
-        model: Mesh, material, weight and attached masses.
-        skeleton: Its axes, in the mesh's frame.
-        spacing: Length of a link [m]; forks cut links, too.
-
-    Raises:
-        InputError: a link would contain no part of the mesh, or no springs exist for its material.
-    """
+    """Return the links of a branch model (mesh, material, weight, attached masses) along the
+    skeleton in the mesh's frame, ``spacing`` long [m] and cut at forks. InputError if one would
+    contain no part of the mesh, or no springs exist for its material."""
     require_elastic(model.material, "A rod's spring")
     points, volume, tet = _sampled(model.mesh)
     wood = cKDTree(points)
@@ -274,10 +244,8 @@ def _pieces(skeleton: Skeleton, children: np.ndarray) -> list[list[int]]:
 
 
 def _sampled(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points that represent equal parts of each tetrahedron, with their volumes and tetrahedra.
-
-    Their second-order sums equal those of the tetrahedra (Keast's four-point rule).
-    """
+    """Points that represent equal parts of each tetrahedron, with their volumes and tetrahedra:
+    their second-order sums equal those of the tetrahedra (Keast's four-point rule)."""
     corners = np.eye(4)[None]
     for _ in range(_SPLITS):
         corners = _split(corners)
@@ -365,17 +333,9 @@ _TIMESTEP = 1e-3
 
 def mjcf_text(tree: RodTree, damping: RayleighDamping, name: str,
               sites: Mapping[str, tuple[float, float, float]]) -> str:
-    """Return an MJCF model that is at rest in its scanned shape.
-
-    Each link except the fixed one has three hinges (two for bending, one for torsion). Of Rayleigh
-    damping, MJCF supports the stiffness-proportional part but not the mass-proportional part.
-
-    Args:
-        tree: From :func:`limber.results.exports.rigid_links.rod_tree`.
-        damping: Identified or assumed damping.
-        name: Name of the model.
-        sites: Positions on the branch [m] to follow, by name.
-    """
+    """Return an MJCF model of the links, at rest in its scanned shape: three hinges each but the
+    fixed one, two for bending, one for torsion. Of Rayleigh damping MJCF supports the
+    stiffness-proportional part alone. ``sites``: positions on the branch [m] to follow, by name."""
     root = ElementTree.Element("mujoco", model=name)
     root.append(ElementTree.Comment(
         f" Limber: m, kg, s. Damping: {damping.stiffness:.6g} s times the stiffness. The part of "
@@ -441,18 +401,10 @@ _WIDEST = 1.5
 
 
 def urdf_text(tree: RodTree, damping: RayleighDamping, name: str) -> str:
-    """Return a URDF model of a branch; link ``link0`` is held by ``world``.
-
-    URDF has no springs. Stiffness and the unstressed angle of each spring are written in
-    ``<gazebo>`` (springStiffness, springReference) and again in ``<limber>``, for the user's own
-    programs. A joint rotates about one axis, so there are two links without size between
-    neighbours.
-
-    Args:
-        tree: From :func:`limber.results.exports.rigid_links.rod_tree`.
-        damping: Only its stiffness-proportional part is used.
-        name: Name of the model.
-    """
+    """Return a URDF model of the links; ``link0`` is held by ``world``. URDF has no springs:
+    stiffness and unstressed angle are written in ``<gazebo>`` (springStiffness, springReference)
+    and in ``<limber>``, for the user's programs, of damping the stiffness-proportional part. A
+    joint rotates about one axis, so there are two links without size between neighbours."""
     root = ElementTree.Element("robot", name=name)
     ElementTree.SubElement(root, "link", name="world")
     slack = tree.carried

@@ -24,21 +24,11 @@ _ELEMENTS = {"linear": "C3D4", "quadratic": "C3D10"}
 
 def inp_text(model: BranchModel, name: str, tip: int, load: np.ndarray | None = None,
              mode_count: int = 3) -> str:
-    """Return an input file: mesh, materials, the held base, a static step and a frequency step.
-
-    The shape is that of the hanging branch, which already carries its weight. The steps therefore
-    have no weight, and its geometric stiffness is left out. Attached masses are left out too.
-
-    Args:
-        model: Has quadratic tetrahedra. Their node order is that of Abaqus.
-        name: Name of the model.
-        tip: The loaded node, named TIP.
-        load: Load on the tip node [N], shape [3]; None: no static step.
-        mode_count: Number of frequencies; 0: no frequency step.
-
-    Raises:
-        InputError: *ELASTIC does not support the model's material, or Abaqus its element.
-    """
+    """Return an input file: mesh of quadratic tetrahedra, whose node order is Abaqus', materials,
+    held base, a static step with ``load`` [N], shape [3], on the node TIP, and a frequency step,
+    each if asked for. The hanging shape already carries its weight, so the steps have none, nor its
+    geometric stiffness, nor attached masses. InputError if *ELASTIC does not support the material,
+    or Abaqus the element."""
     require_elastic(model.material, "Abaqus' *ELASTIC", at_any_strain=True)
     mesh = model.mesh
     kind = _ELEMENTS.get(mesh.element.name)
@@ -104,13 +94,9 @@ _FRICTION = 0.5
 
 @dataclass(frozen=True)
 class Deformable:
-    """A branch as simulators of deformable bodies represent it: linear tetrahedra of one material.
-
-    Attributes:
-        model: Linear tetrahedra without weight and with one modulus throughout [Pa].
-        moduli: Moduli of the branch itself, shape [tet_count] [Pa].
-        young: Modulus of the model, with which its tip is as compliant as that of the branch.
-    """
+    """A branch as simulators of deformable bodies represent it: linear tetrahedra without weight,
+    with one modulus ``young`` [Pa] by which its tip is as compliant as the branch's, whose own are
+    ``moduli``, shape [tet_count] [Pa]."""
 
     model: BranchModel
     moduli: np.ndarray
@@ -118,21 +104,10 @@ class Deformable:
 
 
 def as_deformable(model: BranchModel, tip: int) -> Deformable:
-    """Return a branch with linear tetrahedra and the modulus that makes its tip as compliant.
-
-    Each quadratic tetrahedron becomes eight linear ones on the same nodes; fewer linear ones are
-    far too stiff in bending. PhysX takes one material per body. The one modulus accounts for this
-    and for the remaining excess stiffness. Where the moduli vary along the branch, the bent shape
-    differs from that of the branch.
-
-    Args:
-        model: Model of the hanging branch. Its shape includes the effect of weight, so none acts on
-        it here.
-        tip: Node at which the two are compared.
-
-    Raises:
-        InputError: PhysX does not support the material.
-    """
+    """Return a hanging branch with eight linear tetrahedra for each quadratic one, on the same
+    nodes (fewer are far too stiff in bending), and the one modulus, as PhysX takes one material per
+    body, that makes node ``tip`` as compliant. Where moduli vary along the branch, the bent shape
+    differs. InputError if PhysX does not support the material."""
     require_elastic(model.material, "PhysX")
     bare = model.without_point_masses().with_parameters(gravity=(0.0, 0.0, 0.0))
     parts = _PARTS if bare.mesh.is_quadratic else np.array([[0, 1, 2, 3]])
@@ -148,12 +123,10 @@ def as_deformable(model: BranchModel, tip: int) -> Deformable:
 
 
 def write_usd(branch: Deformable, damping: RayleighDamping, name: str, path: Path) -> None:
-    """Write a USD file, text or binary depending on its suffix: metres, kilograms, z up.
-
-    ``/Branch`` is the body, ``/Branch/simulation`` its tetrahedra, ``/Branch/base`` fixes the
-    vertices of the base, ``/Branch/wood`` is its material. Values without an attribute in the
-    schema are written as ``limber:...``: the moduli of the tetrahedra and Rayleigh damping.
-    """
+    """Write a USD file, text or binary by its suffix, in metres and kilograms, z up: ``/Branch`` is
+    the body, ``/Branch/simulation`` its tetrahedra, ``/Branch/base`` fixes the base,
+    ``/Branch/wood`` is its material; moduli and Rayleigh damping, for which the schema has no
+    attribute, are ``limber:...``."""
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
     mesh = branch.model.mesh

@@ -28,10 +28,8 @@ _NUMBER_INCHES = 0.6  # width of a number below an axis
 
 
 def two_views(points: np.ndarray) -> tuple["Figure", list[tuple["Axes", int, int]]]:
-    """Return a figure of the front and the side of ``points`` [n, 3].
-
-    Each view has its axes, the horizontal coordinate and the depth coordinate; z points up.
-    """
+    """Return a figure of the front and the side of ``points`` [n, 3], each with its axes,
+    horizontal or depth coordinate; z points up."""
     import matplotlib.pyplot as plt
     from matplotlib.ticker import MaxNLocator
 

@@ -15,8 +15,7 @@ _LEAST = 1e-4  # probabilities below look alike
 
 def damage_along_branch(damage: DamageAlong) -> "Figure":
     """Draw the branch's axes from the front and the side, coloured by the probability of damage, or
-    by the largest strain if the strength is not known. The worst place is marked.
-    """
+    by the largest strain if the strength is not known. The worst place is marked."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import LogNorm, Normalize
 

@@ -20,11 +20,7 @@ AXIS_DOTS = {"x": "o", "y": "s", "z": "^"}
 
 
 def report_figures(estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
-    """Yield each figure (matplotlib) of ``estimate.json`` with its caption.
-
-    Args:
-        estimate: Content of a branch's ``estimate.json``.
-    """
+    """Yield each figure (matplotlib) of the content of ``estimate.json``, with its caption."""
     yield (young_along_branch(estimate), _interval_caption(estimate))
     yield (what_the_pulls_tell(estimate),
            "How well the pulls determine each parameter: standard deviation (of a modulus E: of "

@@ -19,11 +19,8 @@ _NAMES = [*(f"{kind}_f{axis}_n" for kind in ("smooth", "expected") for axis in "
 
 
 def force_along_path(path: Path) -> "Figure":
-    """Draw the measured force (smoothed), and the predicted one with its 95 % interval.
-
-    Raises:
-        InputError: the log is damaged, or has no moment with a predicted force.
-    """
+    """Draw the measured force (smoothed), and the predicted one with its 95 % interval; InputError
+    if the log is damaged, or predicts no force."""
     from matplotlib.figure import Figure
 
     log = read_stream(path)

@@ -14,15 +14,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
-    """Draw the branch as scanned (grey) and under the loads, coloured by its largest strain.
-
-    Args:
-        mesh: The branch's mesh.
-        frames: Path of ``frames/load-NAME.pc2``, with its ``.npz`` beside it.
-
-    Raises:
-        InputError: the frames are damaged or belong to another mesh.
-    """
+    """Draw the branch as scanned (grey) and under the loads of ``frames/load-NAME.pc2``, coloured
+    by its largest strain in the ``.npz`` beside it; InputError if they are damaged or belong to
+    another mesh."""
     import matplotlib.pyplot as plt
 
     nodes, corners = np.unique(mesh.surface_faces(), return_inverse=True)
@@ -48,11 +42,8 @@ def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
 
 
 def strain_along_path(along: np.ndarray) -> "Figure":
-    """Draw the largest strain of each piece of the main path.
-
-    Args:
-        along: Ends of the pieces from the root [m] and the largest principal strain, [n, 3].
-    """
+    """Draw the largest strain of each piece of the main path: its ends from the root [m] and the
+    largest principal strain, [n, 3]."""
     from matplotlib.figure import Figure
 
     from_m, to_m, strain = along.T

@@ -36,16 +36,9 @@ def draw_page(branch: Branch,
               results: Sequence[Callable[[Branch], Section | None]], *,
               calipers: Sequence[Caliper] = (), progress: Progress = SILENT,
               ) -> tuple[str, list[Section]]:
-    """Return the page for the stages that have been run, as HTML, and its sections.
-
-    Args:
-        results: Builders of the sections of the stages' results.
-        calipers: Caliper diameters to compare with the scan's.
-
-    Raises:
-        InputError: a diameter's position is beyond the branch.
-        MissingDependencyError: the packages of the extra ``report`` are not installed.
-    """
+    """Return the page for the stages that have been run, as HTML, and its sections, by builders of
+    each and caliper diameters to compare with the scan's. InputError for a diameter beyond the
+    branch; MissingDependencyError without the extra ``report``."""
     require_extra("report", ("matplotlib", "jinja2"), "The report")
     page = [_found(branch), *_held_back(branch), _summary(branch)]
     builders: list[Callable[[Branch], Section | None]] = [

@@ -127,8 +127,7 @@ def paths_over_slice(field: EnergyField, plan: PlanFile,
 
 def paths_over_bound(field: EnergyField, bound: CostToGo, plan: PlanFile) -> "Figure | None":
     """Draw both paths over the least cost of any path to the goal, in their common plane; None if
-    the bound is zero there.
-    """
+    the bound is zero there."""
     view = _View.of(field, plan)
     cost = bound.at(view.points)
     cost[~field.region.contains(view.points)] = np.nan

@@ -11,13 +11,9 @@ from limber.results.findings import ASSUMED, remarks_on
 
 def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
                  ) -> list[list[str]]:
-    """Return estimated Young's modulus per control point, with truth and error if known.
-
-    Args:
-        estimate: ``young_pa`` [K] and ``young_interval_pa`` [K][2] [Pa].
-        pull: Result of ``limber virtual-pull`` (``young_true_pa`` [K], and ``young_assumed`` if
-            these are of a scan without a real pull), or None.
-    """
+    """Return estimated Young's modulus [Pa] per control point, with truth and error if the pull, of
+    ``limber virtual-pull``, has ``young_true_pa``; ``young_assumed``: of a scan without a real
+    pull."""
     truth = true_moduli(estimate, pull or {})
     header = ["control point", "E [MPa]", "95 % interval [MPa]"]
     titles = ["assumed E [MPa]", "difference"] if is_assumed(pull) else ["true E [MPa]", "error"]
@@ -32,13 +28,9 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
 
 
 def true_moduli(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> list[float]:
-    """Return the true moduli of a simulated pull at an estimate's control points [Pa], [K].
-
-    The true field has inverse-distance weights, as the paper's. Empty if it is not known there.
-
-    Args:
-        estimate, pull: As for :func:`modulus_rows`; ``fractions`` are the control points of each.
-    """
+    """Return the true moduli of a simulated pull at an estimate's control points [Pa], [K], by
+    inverse-distance weights as the paper's between its own ``fractions``; empty if not known
+    there."""
     truth, count = list(pull.get("young_true_pa") or []), len(estimate["young_pa"])
     known, asked = pull.get("fractions"), estimate.get("fractions")
     if not (truth and known and asked):
@@ -78,8 +70,7 @@ def is_assumed(pull: Mapping[str, Any] | None) -> bool:
 
 def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
     """Return shortest against gentle path, with peaks and changes in percent. A last column states
-    which limits of arm or wood are exceeded, if any.
-    """
+    which limits of arm or wood are exceeded, if any."""
     rows = [["measure", "shortest", "gentle", "change"]]
     remarks, notes = remarks_on(plan), []
     for label, key, unit in [
@@ -133,12 +124,9 @@ def _below(plan: Mapping[str, Any]) -> list[list[str]]:
 
 
 def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
-    """Return the sources of each modulus's uncertainty, as standard deviations in percent.
-
-    Args:
-        estimate: ``young_deviation`` with ``sensor``, ``geometry``, ``mesh`` and ``total``, each
-            [K] of log E or None if not examined; ``fractions`` [K].
-    """
+    """Return the sources of each modulus's uncertainty (``young_deviation``: ``sensor``,
+    ``geometry``, ``mesh``, ``total``, [K] of log E, None if not examined), as standard deviations
+    in percent."""
     parts = estimate.get("young_deviation") or {}
     known = {"sensor": "from sensors", "geometry": "from the scan's shape", "mesh": "from the mesh",
              **({"path": "from the gripper's path"} if parts.get("path") else {}),
@@ -158,12 +146,8 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
 
 
 def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
-    """Return the causes of the moduli's uncertainty, largest first, and how to reduce each.
-
-    Args:
-        estimate: ``causes``, each with ``cause``, ``share``, ``deviation`` and ``advice``
-            (:func:`limber.estimation.uncertainty.covariance.largest`).
-    """
+    """Return the causes of the moduli's uncertainty, largest first, and how to reduce each
+    (:func:`limber.estimation.uncertainty.covariance.largest`)."""
     return table_of(
         estimate.get("causes") or [], ("cause", "cause"),
         ("fraction of the variance", "share", ".0f %"),
@@ -173,12 +157,8 @@ def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
 
 
 def action_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
-    """Return what to do next, best first, and the interval of E to expect after each.
-
-    Args:
-        estimate: ``next_actions``, as of
-            :meth:`limber.estimation.uncertainty.next_actions.Prospects.best`.
-    """
+    """Return what to do next, best first, and the interval of E to expect after each
+    (:meth:`limber.estimation.uncertainty.next_actions.Prospects.best`)."""
     return table_of(
         estimate.get("next_actions") or [], ("action", "action"), ("how", "how"),
         ("intervals shrink by", lambda each: 1 - each["width_share"], ".0f %"),
@@ -187,12 +167,8 @@ def action_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
 
 
 def pull_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
-    """Return each pull's modulus over the joint one, and the change per day if there is one.
-
-    Args:
-        estimate: ``pull_moduli`` and ``drift``
-            (:mod:`limber.estimation.uncertainty.drift`).
-    """
+    """Return each pull's modulus over the joint one, and the change per day if there is one
+    (:mod:`limber.estimation.uncertainty.drift`)."""
     rows = table_of(
         estimate.get("pull_moduli") or [], ("pull", "pull"),
         ("recorded", lambda each: each["recorded"] or "-"), ("E over the joint E", "factor", ".3g"),
@@ -205,12 +181,7 @@ def pull_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
 
 
 def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
-    """Return how well a fit without a pull predicts that pull.
-
-    Args:
-        estimate: ``held_out``, pull's name to ``rms_m``, ``rms_force_n``, ``relative_distance``,
-            ``relative_force`` (each None if not measured) and ``in_fit``.
-    """
+    """Return how well a fit without a pull predicts that pull; numbers not measured are None."""
     scores = estimate.get("held_out") or {}
     return table_of(
         [{"pull": name, **score} for name, score in scores.items()], ("pull", "pull"),
@@ -265,13 +236,8 @@ def edit_rows(effects: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the uncertain parts of a skeleton.
-
-    Args:
-        doubtful: Uncertain parts, each with ``kind``, ``branch``, ``at`` [3], ``length_m``,
-            ``radius_m`` and ``value``: those of
-            :class:`limber.geometry.skeleton.confidence.Doubt`.
-    """
+    """Return the uncertain parts of a skeleton, as of
+    :class:`limber.geometry.skeleton.confidence.Doubt`."""
     value_formats = {"unlikely branch": "probability {:.2f}",
                      "attachment": "probability {:.2f}", "root": "probability {:.2f}",
                      "unresolved radius": "sigma {:.0%} of the radius",
@@ -295,11 +261,8 @@ def doubtful_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def alternative_rows(graphs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the most likely skeletons, the one in use first.
-
-    Args:
-        graphs: Each with ``probability``, ``length_m`` and ``edits``, as of `limber skeleton`.
-    """
+    """Return the most likely skeletons, with probability, length [m] and edits, the one in use
+    first."""
     used = max(graphs[0]["probability"], 1e-300)
 
     def differs(graph: Mapping[str, Any]) -> str:

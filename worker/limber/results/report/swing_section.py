@@ -11,12 +11,8 @@ if TYPE_CHECKING:
 
 
 def along_path(seen: np.ndarray, simulated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the displacement [m] along its path of the marker with the largest swing: observed
-    (NaN if not observed) and simulated, shape [n] each.
-
-    Args:
-        seen, simulated: Displacements of all markers [m], shape [n, markers, 3].
-    """
+    """Return the displacement [m] along its path of the marker with the largest swing, observed
+    (NaN if not) and simulated, shape [n] each, from those of all markers, [n, markers, 3]."""
     most = int(np.argmax(np.ptp(simulated, axis=0).max(axis=1)))
     direction = np.linalg.svd(simulated[:, most] - simulated[:, most].mean(axis=0))[2][0]
     return seen[:, most] @ direction, simulated[:, most] @ direction

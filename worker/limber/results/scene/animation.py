@@ -39,13 +39,9 @@ _FRAME_VALUES = {"energies_j": "frame_energy", "kinetic_energies_j": "frame_kine
 
 def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | None,
                strength: float | None = None) -> None:
-    """Add the frames of ``motion``; by default those of the plan, else the newest.
-
-    ``strength`` [Pa] is the breaking stress of the wood; assumed if not given.
-
-    Raises:
-        BranchFolderError: the frames do not exist or belong to another mesh.
-    """
+    """Add the frames of ``motion``, by default the plan's, else the newest; ``strength``: breaking
+    stress of the wood [Pa], else assumed. BranchFolderError if they do not exist or belong to
+    another mesh."""
     names = [name.removesuffix(".pc2") for name in branch.names("frames") if name.endswith(".pc2")]
     data.info["motions"] = names
     if motion is not None and motion not in names:
@@ -169,11 +165,9 @@ def _add_carried(data: SceneData, positions: np.ndarray, is_plan: bool) -> None:
 
 
 def carried(points: np.ndarray, vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Return the motion of ``points`` inside the branch with the surface, [frames, k, 3].
-
-    Inverse-distance weights of a high power: the ring of vertices around a point dominates, or both
-    rings if the point is between two.
-    """
+    """Return the motion of ``points`` inside the branch with the surface, [frames, k, 3], by
+    inverse-distance weights of a high power: the ring of vertices around a point dominates, or both
+    rings between two."""
     distance = np.linalg.norm(points[:, None] - vertices, axis=2)
     weights = np.maximum(distance, 1e-9) ** -4
     weights /= weights.sum(axis=1, keepdims=True)
@@ -197,17 +191,12 @@ RESIDUAL = "measured to simulated"
 
 
 def add_observation(data: SceneData, branch: Branch) -> None:
-    """Add the measurements of the pull whose motion is shown, else of the newest pull.
-
-    ``observation`` [t, m, 3] m (the last observed position where ``observation_visible`` [t, m] is
-    false), ``observation_times`` [t] s; ``observation_grasp`` [g, 3] m of the gripper, and
-    ``observation_grasp_times`` [g] s, on the same clock. ``info["pulls"]`` names all recordings.
-
-    If the frames are those of this pull (``limber simulate --pull`` replays it under its name),
-    ``observation_motion`` [frames, m, 3] is the position of each point in each frame,
-    ``observation_seen`` [frames, m] whether it was observed then. Scalar ``residual`` is its
-    distance to the simulation.
-    """
+    """Add the measurements of the shown motion's pull, else the newest's: ``observation`` [t, m, 3]
+    m (the last one where ``observation_visible`` [t, m] is false) at ``observation_times`` [t] s,
+    the gripper's ``observation_grasp`` [g, 3] m likewise on the same clock; ``info["pulls"]`` names
+    all. If `limber simulate --pull` replays it, ``observation_motion`` [frames, m, 3] and
+    ``observation_seen`` [frames, m] are in each frame, and scalar ``residual`` is the distance to
+    the simulation."""
     pulls = [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]
     data.info["pulls"] = pulls
     frames = data.info.get("frames") or {}
@@ -264,19 +253,16 @@ def _add_frames(data: SceneData, branch: Branch, pull: Pull, count: int) -> None
 
 
 def _rest_points(data: SceneData, entry: PullEntry, count: int) -> np.ndarray | None:
-    """Return the rest positions of the observed points [m], shape [count, 3]; None if unknown.
-    """
+    """Return the rest positions of the observed points [m], shape [count, 3]; None if unknown."""
     rest = entry.rest_points_m
     found = np.array(rest, float) if rest is not None else data.arrays.get("control_points")
     return found if found is not None and found.shape == (count, 3) else None
 
 
 def _in_frames(data: SceneData, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions of points at ``times`` [s], [frames, m, 3], and whether seen, [frames, m].
-
-    Positions are interpolated linearly between two observations of a point. A point counts as not
-    seen where the nearest observation lacks it, and before the first and after the last.
-    """
+    """Return positions at ``times`` [s], [frames, m, 3], linear between observations, and whether
+    seen, [frames, m]: not where the nearest observation lacks the point, nor before the first and
+    after the last."""
     found, visible, at = (data.arrays[f"observation{part}"] for part in ("", "_visible", "_times"))
     nearest = np.abs(times[:, None] - at).argmin(axis=1)
     step = np.diff(at).max(initial=0.0)
@@ -317,18 +303,9 @@ def _held_on(positions: np.ndarray, visible: np.ndarray) -> np.ndarray:
 
 
 def add_fit(data: SceneData, branch: Branch, name: str | None) -> None:
-    """Add Young's modulus along the branch as a graph, and the fit of the simulation to a pull.
-
-    Args:
-        data: Gets ``rods:fit`` (lines along simulated points, balls at measured ones, coloured by
-            the distance between them), scalar ``residual`` and graphs.
-        branch: The branch whose ``estimate.json`` is read, if present.
-        name: The pull whose measurement is shown; the first of the estimate if it is not one of
-        them.
-
-    Raises:
-        InputError: ``estimate.json`` is damaged.
-    """
+    """Add Young's modulus along the branch as a graph, and the fit to pull ``name``, else the
+    estimate's first: ``rods:fit`` (lines along simulated points, balls at measured ones, coloured
+    by the distance), scalar ``residual`` and graphs. InputError if ``estimate.json`` is damaged."""
     if not branch.has("estimate.json"):
         return
     estimate = read_estimate(branch.path("estimate.json"))
@@ -388,10 +365,7 @@ _ROTATION = ("rx_rad", "ry_rad", "rz_rad")
 
 def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
     """Add the paths of ``plan``, by default the newest, and its goal; return its name.
-
-    Raises:
-        BranchFolderError: the plan does not exist or is damaged.
-    """
+    BranchFolderError if it does not exist or is damaged."""
     plans = [key.split(":", 1)[1] for key in branch.manifest.stages if key.startswith("plan:")]
     data.info["plans"] = plans
     if plan is None:

@@ -28,10 +28,7 @@ LIBRARIES = ("libegl1", "libgl1", "libice6", "libsm6", "libx11-6", "libxext6", "
 
 def make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
     """Run the script with ``arguments``; return its output and the Blender used.
-
-    Raises:
-        MissingDependencyError: there is no bpy package and no Blender, or bpy does not load.
-    """
+    MissingDependencyError without bpy package and Blender, or if bpy does not load."""
     from limber.core.processes.child import run_json_process
 
     progress(0.0, "starting Blender")
@@ -60,12 +57,8 @@ def _why_bpy_does_not_load() -> str | None:
 
 
 def blender_command() -> list[str]:
-    """Return the command that runs the add-on's script in a process with bpy.
-
-    Raises:
-        MissingDependencyError: neither the bpy package nor Blender is installed, or the script is
-        missing.
-    """
+    """Return the command that runs the add-on's script in a process with bpy;
+    MissingDependencyError without bpy package and Blender, or without the script."""
     script = str(scene_script())
     named = os.environ.get("LIMBER_SCENE_BLENDER")
     blender = named or os.environ.get("LIMBER_BLENDER") or shutil.which("blender")
@@ -83,8 +76,7 @@ def blender_command() -> list[str]:
 
 def _is_older_than_bpy(blender: str | None) -> bool:
     """Whether a Blender shows our scenes but may be unable to open files of the bpy package. That
-    Blender then writes them.
-    """
+    Blender then writes them."""
     if not blender:
         return False
     try:
@@ -101,11 +93,8 @@ def _is_older_than_bpy(blender: str | None) -> bool:
 
 
 def scene_script() -> Path:
-    """Return the path of ``make_scene.py``: the wheel's own copy, or the checkout's.
-
-    Raises:
-        MissingDependencyError: it is in neither.
-    """
+    """Return the path of ``make_scene.py``, the wheel's own copy or the checkout's;
+    MissingDependencyError if there is none."""
     here = Path(__file__).parent
     candidates = [here / "addon" / "make_scene.py", here.parents[3] / "addon" / "make_scene.py"]
     for path in candidates:

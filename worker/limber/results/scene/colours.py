@@ -24,12 +24,8 @@ _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, 
 
 
 def colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> dict[str, Any]:
-    """Return a scale that spans ``values``: title, unit, low, high, log, ticks, stops, colours; and
-    ``is_one``: all values are mid-scale.
-
-    Args:
-        colours: ``viridis`` or ``inferno``.
-    """
+    """Return a scale that spans ``values``, in ``viridis`` or ``inferno``: title, unit, low, high,
+    log, ticks, stops, colours; and ``is_one``: all are mid-scale."""
     low, high = float(values.min()), float(values.max())
     is_one = high - low <= 1e-6 * abs(high)
     if is_one:
@@ -116,10 +112,8 @@ class SceneData:
     info: dict[str, Any] = field(default_factory=dict)
 
     def write(self, path: Path) -> None:
-        """Write one .npz file that ``numpy.load(path, allow_pickle=False)`` reads.
-
-        A path without the suffix is given it.
-        """
+        """Write one .npz file that ``numpy.load(path, allow_pickle=False)`` reads; the suffix is
+        added."""
         text = json.dumps(plain(self.info), allow_nan=False)
         path = path if path.suffix == ".npz" else path.with_name(f"{path.name}.npz")
         # Not directly into the file: an archive that cannot be written raises again when it is
@@ -137,20 +131,9 @@ _SIDES = 6
 def add_rods(data: SceneData, name: str, title: str, points: np.ndarray, lines: np.ndarray,
              radius: float | np.ndarray, values: np.ndarray, scale: dict[str, Any], *,
              ball_from: int | None = None, ball_radius: float = 0.0) -> None:
-    """Add lines between points as rods, coloured by a value.
-
-    Args:
-        data: Gets ``rods:NAME`` and ``rod_faces:NAME``, ``rod_color:NAME``; and
-            ``info["rods"][NAME]``.
-        name: Name of the rods in the file.
-        title: Title that the user reads.
-        points: Positions [m], shape [n, 3].
-        lines: Indices of the two points that each line joins, shape [l, 2].
-        radius: Radius of the rods [m], or one per point.
-        values: At each point, shape [n].
-        scale: Colour scale of the values.
-        ball_from: Points from this one on are balls of ``ball_radius`` [m].
-    """
+    """Add lines [l, 2] between points [m], [n, 3], as rods of a radius [m], one for all or per
+    point, coloured by ``values`` [n]: ``rods:NAME``, ``rod_faces:NAME``, ``rod_color:NAME`` and
+    ``info["rods"][NAME]``. Points from ``ball_from`` on are balls of ``ball_radius`` [m]."""
     parts = [(*rods(points, np.asarray(lines, int).reshape(-1, 2), radius), 0)]
     if ball_from is not None:
         parts.append((*balls(points[ball_from:], ball_radius), ball_from))
@@ -185,10 +168,8 @@ def balls(points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np
 
 def rods(points: np.ndarray, lines: np.ndarray, radius: float | np.ndarray,
          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices [v, 3] m, triangles [f, 3] and the point of each vertex [v] of open tubes.
-
-    Lines without length get no rod.
-    """
+    """Return vertices [v, 3] m, triangles [f, 3] and the point of each vertex [v] of open tubes;
+    lines without length get none."""
     points = np.asarray(points, float)
     size = np.broadcast_to(np.asarray(radius, float), len(points))
     vector = points[lines[:, 1]] - points[lines[:, 0]]

@@ -88,18 +88,10 @@ __all__ = ["FORMAT", "SceneData", "scene_data"]
 
 def scene_data(branch: Branch, plan: str | None = None, motion: str | None = None,
                targets: Sequence[NamedTarget] = (), strength: float | None = None) -> SceneData:
-    """Collect what can be shown of ``branch``.
-
-    Args:
-        plan: Which plan's paths to show; by default the newest.
-        motion: Which frames; by default those of the plan, else the newest.
-        targets: Named positions on the branch.
-        strength: Breaking stress of the wood [Pa]; assumed if not given.
-
-    Raises:
-        BranchFolderError: there is no mesh, no such plan or no such frames, or the frames belong to
-        another mesh.
-    """
+    """Collect what can be shown of ``branch``: a plan's paths, by default the newest's, a motion's
+    frames, by default the plan's, else the newest, named ``targets``; ``strength``: breaking stress
+    of the wood [Pa], else assumed. BranchFolderError without mesh, plan or frames, or if these
+    belong to another mesh."""
     mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
     faces = mesh.surface_faces()
     used, compact = np.unique(faces, return_inverse=True)

@@ -21,8 +21,7 @@ MEASURED, SIMULATED, TRUE = (0.25, 0.85, 0.95), (0.95, 0.95, 0.95), (1.0, 0.62, 
 """Colours as in the report (:data:`limber.core.constants.DATA_COLOURS`), for a dark background."""
 FIRST, SECOND = (0.93, 0.36, 0.42), (0.45, 0.62, 1.0)
 """Colours of the planned path and of its baseline: as for the paths themselves
-(:data:`limber.core.constants.PATH_COLOURS`), lighter for the graph's dark background.
-"""
+(:data:`limber.core.constants.PATH_COLOURS`), lighter for the graph's dark background."""
 _MOST_POINTS = 400
 _LOG_FROM = 5.0
 """Growth factor of a positive quantity above which its axis is logarithmic."""
@@ -127,11 +126,8 @@ def _decades(low: float, high: float) -> list[float]:
 
 
 def young_graph(estimate: dict[str, Any]) -> dict[str, Any]:
-    """Return Young's modulus along the branch with its interval, and the truth if known.
-
-    Args:
-        estimate: Content of ``estimate.json``.
-    """
+    """Return Young's modulus along the branch with its interval, and the truth if known, of the
+    content of ``estimate.json``."""
     fractions = np.array(estimate["fractions"], float)
     young = np.array(estimate["young_pa"], float)
     interval = np.array(estimate["young_interval_pa"], float)
@@ -157,11 +153,8 @@ def young_graph(estimate: dict[str, Any]) -> dict[str, Any]:
 
 
 def energy_graph(paths: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> dict[str, Any]:
-    """Return the energy along paths.
-
-    Args:
-        paths: For ``plan`` and ``baseline``: title, points [p, 3] m and energies [p] J.
-    """
+    """Return the energy along paths ``plan`` and ``baseline``: title, points [p, 3] m and energies
+    [p] J."""
     along = {key: arc_lengths(points) for key, (_, points, _) in paths.items()}
     graph = Graph("Energy along the paths",
                   Axis.over("along the path", "m", list(along.values())),
@@ -175,15 +168,9 @@ def energy_graph(paths: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> dict[s
 def force_graph(name: str, times: np.ndarray, measured: np.ndarray,
                 simulated: np.ndarray | None = None, cursor: np.ndarray | None = None,
                 ) -> dict[str, Any] | None:
-    """Return the force of a pull over time; None if it was not measured.
-
-    Args:
-        name: Name of the pull.
-        times: [s], shape [n].
-        measured: Force of the gripper [N], shape [n, 3]; NaN where it was not measured.
-        simulated: Force by the estimate, likewise.
-        cursor: Time of each frame of the shown motion [s], on the same clock.
-    """
+    """Return a pull's force [N], [n, 3], over times [s], measured (NaN where not) and simulated,
+    with the time of each shown frame on the same clock [s] as cursor; None if it was not
+    measured."""
     known = {"measured": measured, "simulated": simulated}
     forces = {label: np.linalg.norm(np.asarray(values, float).reshape(-1, 3), axis=1)
               for label, values in known.items() if values is not None}

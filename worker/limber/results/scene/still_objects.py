@@ -150,11 +150,9 @@ def alignment(branch: Branch) -> np.ndarray:
 
 
 def map_offset(matrix: np.ndarray) -> list[float]:
-    """Return the branch's origin in the scan's coordinates and unit, shape [3].
-
-    Double precision: the add-on stores it on the object, since map coordinates lose their digits in
-    the single precision of a viewport.
-    """
+    """Return the branch's origin in the scan's coordinates and unit, shape [3], in double
+    precision: the add-on stores it on the object, as a viewport's single precision loses map
+    coordinates."""
     return np.linalg.solve(matrix[:3, :3], -matrix[:3, 3]).tolist()
 
 
@@ -191,11 +189,8 @@ def _gripper_points(data: SceneData) -> np.ndarray:
 
 
 def _view_direction(points: np.ndarray, behind: np.ndarray) -> np.ndarray:
-    """Return a unit vector that looks across the main direction of ``points`` [n, 2], downwards.
-
-    Args:
-        behind: Direction of what should be behind them [2]; zeros if nothing should.
-    """
+    """Return a unit vector that looks across the main direction of ``points`` [n, 2], downwards,
+    with the direction ``behind`` [2] behind them; zeros if nothing should be."""
     across = principal_axes(points)[0] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
     # The same side is always chosen, so that a picture can be reproduced.
     side = behind @ across if np.any(behind) else across[1]
@@ -228,11 +223,9 @@ _Part = tuple[np.ndarray, np.ndarray]
 
 
 def add_cell(data: SceneData, cell: Cell, obstacles: Sequence[Obstacle]) -> None:
-    """Add what a cell file states, each as ``solid:KEY`` and ``solid_faces:KEY``.
-
-    ``info["cell"]`` has title, colour and opacity of each. The arm, with what it carries, is left
-    out where the scene shows its dry run; else the picture shows all of it.
-    """
+    """Add what a cell file states as ``solid:KEY`` and ``solid_faces:KEY``, with title, colour and
+    opacity in ``info["cell"]``; the arm, with what it carries, only where the scene does not show
+    its dry run."""
     data.info["cell"] = {}
     base = matrices(np.array(cell.base.pose))
     home = np.array(cell.arm.home, float)
@@ -325,11 +318,8 @@ _POSE = ("x_m", "y_m", "z_m")
 
 
 def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
-    """Add the arm in each frame of the plan's motion, if `limber execute` has checked it.
-
-    Raises:
-        InputError: the dry run's table is damaged.
-    """
+    """Add the arm in each frame of the plan's motion, if `limber execute` has checked it;
+    InputError if the dry run's table is damaged."""
     entry = branch.manifest.stages.get(f"execute-preview:{plan}")
     name = f"executions/{plan}-preview.csv"
     grasps = data.arrays.get("grasp_motion")
@@ -363,12 +353,8 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
 
 
 def _rows(positions: np.ndarray, grasps: np.ndarray) -> np.ndarray | None:
-    """Return the row of the dry run nearest to each frame, in ascending order; or None.
-
-    Args:
-        positions: Positions of the grasp in the dry run [m], shape [rows, 3].
-        grasps: Positions of the grasp in the frames [m], shape [frames, 3].
-    """
+    """Return the row of the dry run nearest to each frame, in ascending order, or None, by the
+    grasp's positions [m], [rows, 3] and [frames, 3]."""
     first, rows = 0, []
     for grasp in grasps:
         distances = np.linalg.norm(positions[first:] - grasp, axis=1)
@@ -388,8 +374,7 @@ follows the shell that the branch yields along."""
 
 def add_reach(data: SceneData, branch: Branch) -> None:
     """Add the hemisphere about the base that bounds the grasp's positions, and the energy there if
-    it was sampled.
-    """
+    it was sampled."""
     if branch.has("energy.npz"):
         _add_energy_grid(data, branch)
     elif "grasp" in data.arrays and "skeleton" in data.arrays:

@@ -52,15 +52,8 @@ Orders = queue.SimpleQueue[dict[str, Any] | None]
 
 
 class Driver:
-    """One robot, its sensor and its guard.
-
-    Args:
-        cell: Robot, tool, sensor and limits.
-        words: Channel for the driver's messages.
-
-    Raises:
-        LimberError: the robot does not answer, or is not in a state to be moved.
-    """
+    """One robot of a cell, its sensor and its guard; ``words`` is the channel for its messages.
+    LimberError if the robot does not answer, or is not in a state to be moved."""
 
     def __init__(self, cell: Cell, words: Words):
         self.cell, self.tell = cell, words.tell
@@ -119,8 +112,7 @@ class Driver:
             self._senses.feel(self._last)
 
     def _bears_silence(self, last: Sample) -> bool:
-        """Judge the silence since ``last``; returns whether the robot may still be connected.
-        """
+        """Judge the silence since ``last``; returns whether the robot may still be connected."""
         age = time.monotonic() - last.arrived
         if not self._hold_ups.has_just_woken:
             self._under_way.judge(self.guard.silence(age), at_once=True)

@@ -43,14 +43,9 @@ def calibration_of(cell: Cell) -> FactoryCalibration | None:
 
 
 def stop_from_outside(cell: Cell, seconds: float) -> bool:
-    """Stop an arm whose driver has ended, by its controller's dashboard.
-
-    Args:
-        seconds: Longest wait for the connection [s].
-
-    Returns:
-        Whether the stop was sent; a controller of another kind has no such channel.
-    """
+    """Stop an arm whose driver has ended by its controller's dashboard, connecting for at most
+    ``seconds`` [s]; returns whether the stop was sent, as other controllers have no such
+    channel."""
     if _CONTROLS.get(cell.arm.controller) not in (UrControl, _virtual):
         return False
     try:
@@ -65,13 +60,9 @@ def stop_from_outside(cell: Cell, seconds: float) -> bool:
 
 
 def control_of(cell: Cell) -> ArmControl:
-    """Open the controller of a cell's arm; nothing moves yet.
-
-    Raises:
-        InputError: no driver is registered for this kind of controller, or the number of joints
-            is not that of the columns of samples.
-        LimberError: the controller does not answer, or the arm cannot be moved in its state.
-    """
+    """Open the controller of a cell's arm; nothing moves yet. InputError if no driver is registered
+    for its kind, or the joints do not fit the columns of samples; LimberError if it does not
+    answer, or its arm cannot be moved."""
     opened = _CONTROLS.get(cell.arm.controller)
     if opened is None:
         raise InputError(f"No driver is registered for controller {cell.arm.controller!r} of the "

@@ -33,15 +33,9 @@ _GRACE_SECONDS = 0.015
 
 
 class HoldUps:
-    """Detects a delay of the loop, and gives it time to read the messages from that time.
-
-    Messages that arrived wait in the connections, and are read and judged. Their absence does not
-    prove silence yet: the loop listens once more, and not a second time without a sample.
-
-    Args:
-        quiet: Time for which the loop listens at once [s].
-        tell: Reports events.
-    """
+    """Detects a delay of the loop and gives it time to read the messages from then: their absence
+    proves no silence yet. It listens once more, for ``quiet`` [s] at once, and not again without a
+    sample."""
 
     def __init__(self, quiet: float, tell: Callable[..., None]):
         self._quiet, self._tell = quiet, tell
@@ -52,12 +46,8 @@ class HoldUps:
         self._listened = time.monotonic()
 
     def note(self, last_arrived: float | None, *, moving: bool) -> None:
-        """The loop has listened once more.
-
-        Args:
-            last_arrived: When the last sample came, on the monotonic clock [s].
-            moving: Whether a trajectory is followed.
-        """
+        """The loop has listened once more; ``last_arrived``: when the last sample came [s,
+        monotonic], ``moving``: whether a trajectory is followed."""
         before, self._listened = self._listened, time.monotonic()
         overslept = self._listened - before - self._quiet
         if overslept < _HELD_UP_SECONDS:
@@ -80,13 +70,8 @@ _LONG_STEP_SECONDS = 0.004
 
 @dataclass
 class Following:
-    """A trajectory being followed.
-
-    Attributes:
-        trajectory: Its trajectory.
-        time: Time of the target along it [s].
-        rate: Rate of its time, 0 to 1.
-    """
+    """A trajectory being followed: the time of the target along it [s], and the rate of that time,
+    0 to 1."""
 
     trajectory: Trajectory
     time: float = 0.0
@@ -94,16 +79,8 @@ class Following:
 
 
 class UnderWay:
-    """The trajectory that the arm follows now, if any, and whether it was stopped.
-
-    Args:
-        control: Moves the arm.
-        guard: Decides.
-        tell: Reports events.
-
-    Attributes:
-        following: None if no trajectory is followed.
-    """
+    """The trajectory that the arm follows now, if any, and whether it was stopped; ``control``
+    moves the arm, ``guard`` decides, ``tell`` reports."""
 
     def __init__(self, control: ArmControl, guard: Guard, tell: Callable[..., None]):
         self._control, self._guard, self._tell = control, guard, tell
@@ -125,11 +102,8 @@ class UnderWay:
 
     def judge(self, decision: Decision, sample: Sample | None = None, *,
               at_once: bool = False) -> None:
-        """Act on a decision.
-
-        Args:
-            at_once: Stop by the second channel as well, since no step of the controller is near.
-        """
+        """Act on a decision; ``at_once``: stop by the second channel too, since no step of the
+        controller is near."""
         if decision.verdict == Verdict.STOP and self._stopped_at is None:
             if self.following is not None:
                 # The control program takes a command with the controller's next step, 8 ms of a
@@ -225,14 +199,8 @@ _MESSAGE = re.compile(r"\(([^()]*)\)")
 
 @dataclass(frozen=True)
 class Reading:
-    """One reading.
-
-    Attributes:
-        wrench: Wrench of the surroundings on the tool, flange axes, about the flange [N, N m],
-        shape [6].
-        age: [s].
-        raw: Numbers as the sensor sent them, shape [6].
-    """
+    """Wrench of the surroundings on the tool, flange axes, about the flange [N, N m], shape [6];
+    its age [s], and the numbers as the sensor sent them."""
 
     wrench: np.ndarray
     age: float
@@ -240,20 +208,14 @@ class Reading:
 
 
 class ForceTorqueSensor(Protocol):
-    """A source of readings.
-
-    Attributes:
-        connections: Its own connections, over which readings arrive between the robot's samples.
-    """
+    """A source of readings; over its own ``connections`` they arrive between the robot's
+    samples."""
 
     connections: tuple[socket.socket, ...]
 
     def read(self, sample: Sample) -> Reading:
-        """Return the newest reading at the time of a sample of the robot.
-
-        Raises:
-            ConnectionError: the connection to the sensor was lost.
-        """
+        """Return the newest reading at the time of a sample of the robot; ConnectionError if the
+        connection was lost."""
         ...
 
     def close(self) -> None:
@@ -280,11 +242,8 @@ class ControllerSensor:
 
 
 class Ft300Sensor:
-    """A Robotiq FT300 by the text stream of its URCap: about 100 readings a second.
-
-    Raises:
-        WorkError: the port does not answer.
-    """
+    """A Robotiq FT300 by the text stream of its URCap: about 100 readings a second. WorkError if
+    the port does not answer."""
 
     def __init__(self, cell: Cell, timeout: float = 2.0):
         self._frame = frame_of(np.array(cell.sensor.pose))
@@ -326,11 +285,8 @@ class Ft300Sensor:
 
 
 class Ft300UsbSensor:
-    """A Robotiq FT300 by Modbus over its USB converter: about 70 readings a second.
-
-    Raises:
-        LimberError: as :class:`.Ft300Line`.
-    """
+    """A Robotiq FT300 by Modbus over its USB converter: about 70 readings a second. LimberError as
+    :class:`.Ft300Line`."""
 
     connections: tuple[socket.socket, ...] = ()
 
@@ -354,10 +310,8 @@ class Ft300UsbSensor:
 
 
 class ReplayedSensor:
-    """Readings from a CSV file: ``t_s`` and six columns, in the sensor's frame.
-
-    Time starts at the first sample.
-    """
+    """Readings from a CSV file from the first sample on: ``t_s`` and six columns, in the sensor's
+    frame."""
 
     connections: tuple[socket.socket, ...] = ()
 
@@ -386,11 +340,8 @@ class ReplayedSensor:
 
 
 def require_sensor(cell: Cell) -> None:
-    """Refuse a cell without a force sensor that the guard can rely on.
-
-    Raises:
-        InputError: the cell names no sensor, or names a CB3's own estimate, which is no sensor.
-    """
+    """Refuse a cell without a force sensor that the guard can rely on: InputError if it names none,
+    or a CB3's own estimate."""
     if cell.sensor.kind == "none":
         raise InputError("The cell file names no force sensor.",
                          "The guard does not move a branch that it cannot feel.",
@@ -403,12 +354,8 @@ def require_sensor(cell: Cell) -> None:
 
 
 def open_sensor(cell: Cell) -> ForceTorqueSensor:
-    """Return the cell's sensor.
-
-    Raises:
-        InputError: as :func:`require_sensor`, or the cell names a replay for a real robot.
-        WorkError: it does not answer.
-    """
+    """Return the cell's sensor. InputError as :func:`require_sensor`, or if the cell names a replay
+    for a real robot; WorkError if it does not answer."""
     require_sensor(cell)
     if cell.sensor.kind == "replay":
         if not cell.robot.address.startswith("127."):
@@ -427,14 +374,10 @@ def open_sensor(cell: Cell) -> ForceTorqueSensor:
 
 @dataclass
 class WrenchChain:
-    """Tare, weight, range and filter: from readings to the wrench of the gripper on the branch.
-
-    Attributes:
-        cell: Gripper's mass, ranges, frames.
-        bias, bias_sigma: Bias from the tare, flange frame, and its standard error, shape [6].
-        at_rest: Forces during the tare [N], shape [n, 3].
-        count: Readings that the slower output averages; its delay is half of them.
-    """
+    """Tare, weight, range and filter, from readings to the wrench of the gripper on the branch.
+    ``bias`` and its standard error are of the tare, flange frame, shape [6]; ``at_rest`` are forces
+    during it [N], shape [n, 3]; the slower output averages ``count`` readings, and lags half of
+    them."""
 
     cell: Cell
     count: int = 5
@@ -459,11 +402,8 @@ class WrenchChain:
         self._taring = []
 
     def end_tare(self, least: int = 20) -> np.ndarray:
-        """Take the mean of the collected readings as bias; returns its standard error [6].
-
-        Raises:
-            WorkError: too few readings, or the gripper was touched: their spread exceeds the noise.
-        """
+        """Take the mean of the collected readings as bias; return its standard error [6]. WorkError
+        if too few, or the gripper was touched: their spread exceeds the noise."""
         readings, self._taring = np.array(self._taring or []), None
         if len(readings) < least:
             raise WorkError(f"Only {len(readings)} readings arrived for the "
@@ -481,11 +421,9 @@ class WrenchChain:
         return self.bias_sigma
 
     def wrench(self, sample: Sample, reading: Reading) -> tuple[np.ndarray, np.ndarray]:
-        """Return the wrench of the gripper on the branch, at once and smoothed, shape [6] each.
-
-        Branch frame, about the grasp's centre. Readings at the end of the sensor's range are
-        infinite: the true wrench is larger by an unknown amount.
-        """
+        """Return the wrench of the gripper on the branch, at once and smoothed, shape [6] each,
+        branch frame, about the grasp's centre; readings at the end of the range are infinite, as
+        the true ones are larger."""
         flange = frame_of(sample.pose) @ self._from_tool
         raw = reading.wrench - self._weight(flange)
         if self._taring is not None:
@@ -497,8 +435,7 @@ class WrenchChain:
         return now, np.asarray(sum(self._recent) / len(self._recent))
 
     def between(self, sample: Sample, reading: Reading) -> np.ndarray:
-        """Return the wrench of a reading that arrived after ``sample``, shape [6], not averaged.
-        """
+        """Return the wrench of a reading that arrived after ``sample``, shape [6], not averaged."""
         flange = frame_of(sample.pose) @ self._from_tool
         return self._on_branch(reading.wrench - self._weight(flange), reading, flange)
 
@@ -539,12 +476,8 @@ _UPPER = np.triu_indices(3)
 
 
 class Senses:
-    """The force sensor, its tare, and the expected wrench of the branch.
-
-    Attributes:
-        smooth: Latest smoothed wrench, branch frame [N, N m], shape [6].
-        retreat_path: The arm's path so far.
-    """
+    """The force sensor, its tare, and the branch's expected wrench; ``smooth``: latest smoothed
+    wrench, branch frame [N, N m], shape [6]; ``retreat_path``: the arm's path so far."""
 
     def __init__(self, cell: Cell, control: ArmControl, sensor: ForceTorqueSensor, guard: Guard,
                  under_way: UnderWay, hold_ups: HoldUps, tell: Callable[..., None]):
@@ -657,11 +590,7 @@ class Senses:
         return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), covariance
 
     def begin_tare(self, sample: Sample, seconds: float) -> None:
-        """Tare the force over the next ``seconds`` [s].
-
-        Raises:
-            SafetyStop: the robot moves.
-        """
+        """Tare the force over the next ``seconds`` [s]; SafetyStop if the robot moves."""
         if self._under_way.following is not None:
             raise SafetyStop("The sensor cannot be tared while the robot "
                              "moves.", "", "Wait until the robot is at "

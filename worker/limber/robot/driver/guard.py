@@ -29,8 +29,7 @@ _MOSTLY = 0.8  # cosine of the angle to the predicted force that a difference op
 _MOSTLY_AT_ONCE = 0.5  # the same for a sudden change: a sliding piece pulls sideways
 NOISES = 7.0
 """Standard deviations of the filtered force that noise explains: in three directions, one in a
-million motions of a minute exceeds it.
-"""
+million motions of a minute exceeds it."""
 LOST_SHARE = 0.4
 """Fraction of its force that a held branch loses when it slips or breaks."""
 FAULTS = {"an empty gripper, a branch that slipped or a broken one": 1.0,
@@ -45,14 +44,8 @@ _FELL = "the predicted force dropped suddenly: the branch slipped, broke or came
 
 def difference_name(off: np.ndarray, expected: np.ndarray, before: np.ndarray, least: float,
                     ) -> str:
-    """Return the most probable name of a difference to the expected force.
-
-    Args:
-        off: The difference [N], shape [3].
-        expected: The expected force [N], shape [3].
-        before: The usual difference so far [N], shape [3].
-        least: Expected force [N] up to which a difference has no direction.
-    """
+    """Return the most probable name of a difference ``off`` [N] to the expected force, by the usual
+    one so far, shape [3] each; at an expected force up to ``least`` [N] it has no direction."""
     expected_size, missing = length(expected), -float(off @ expected)
     if expected_size <= least:
         return _UNLIKE
@@ -65,11 +58,8 @@ def difference_name(off: np.ndarray, expected: np.ndarray, before: np.ndarray, l
 
 def allowed_difference(off: np.ndarray, covariance: np.ndarray, least: float, most: float,
                        ) -> float:
-    """Return the largest allowed difference in the direction of ``off`` [3], which is not 0.
-
-    The bound is an ellipsoid: ``least``, widened by standard deviations of the prediction up to
-    ``most``.
-    """
+    """Return the largest allowed difference in the direction of ``off`` [3], not 0: an ellipsoid,
+    ``least`` widened by standard deviations of the prediction up to ``most``."""
     squares, axes = np.linalg.eigh(covariance)
     radii = least**2 + np.minimum(DEVIATIONS**2 * np.maximum(squares, 0.0), most**2)
     along = axes.T @ (off / length(off))
@@ -78,13 +68,8 @@ def allowed_difference(off: np.ndarray, covariance: np.ndarray, least: float, mo
 
 @dataclass(frozen=True)
 class ForceErrors:
-    """Errors of a measured force that no branch causes.
-
-    Attributes:
-        noise: Standard deviation of the filtered force at rest, per axis [N].
-        drift: Of the sensor [N/s].
-        inertia: Force that accelerates the gripper [N].
-    """
+    """Errors of a measured force that no branch causes: noise of the filtered force at rest per
+    axis [N], the sensor's drift [N/s], and the force that accelerates the gripper [N]."""
 
     noise: float
     drift: float
@@ -93,8 +78,7 @@ class ForceErrors:
     @classmethod
     def of_cell(cls, cell: "Cell", kept: float) -> "ForceErrors":
         """Return the errors that a cell states, of a force whose filter keeps a fraction ``kept``
-        of its value each step.
-        """
+        of its value each step."""
         return cls(white_noise(cell.sensor.force_sigma_n, kept),
                    cell.sensor.drift_n_per_minute / 60.0,
                    (cell.tool.mass_kg or 0.0) * cell.limits.acceleration_m_s2)
@@ -120,10 +104,8 @@ def white_noise(sigma: float, kept: float) -> float:
 
 
 def noise_at_rest(forces: np.ndarray, kept: float) -> float:
-    """Return the filtered force's standard deviation, from forces at rest [N], shape [n, 3].
-
-    The filter averages readings that are repeated, or smoothed by the sensor, less than white ones.
-    """
+    """Return the filtered force's standard deviation, from forces at rest [N], shape [n, 3]:
+    repeated or smoothed readings are averaged less than white ones."""
     off = forces - forces.mean(axis=0)
     filtered, rows = np.zeros(3), np.empty_like(off)
     for number, row in enumerate(off):
@@ -134,29 +116,17 @@ def noise_at_rest(forces: np.ndarray, kept: float) -> float:
 
 def allowed_change(off: np.ndarray, covariance: np.ndarray, largest: float, within: float,
                    most: float) -> float:
-    """Return the largest allowed change of a difference since the branch was held.
-
-    Args:
-        off: The change [N], shape [3].
-        largest: Largest predicted force so far [N].
-        within: Force that the sensor's errors explain [N].
-    """
+    """Return the largest allowed change ``off`` [N], shape [3], of a difference since the branch
+    was held; ``largest``: predicted force so far [N], ``within``: what the sensor's errors explain
+    [N]."""
     return allowed_difference(off, covariance, float(np.hypot(LOST_SHARE * largest, within)), most)
 
 
 def not_seen(times: np.ndarray, forces: np.ndarray, covariance: np.ndarray, errors: ForceErrors,
              most: float) -> dict[str, float]:
-    """Return the :data:`FAULTS` that the guard cannot see along a path.
-
-    Args:
-        times: Since the branch was held [s], shape [n].
-        forces: Predicted [N], shape [n, 3].
-        covariance: Theirs, shape [n, 3, 3].
-        most: As :func:`allowed_difference` takes it.
-
-    Returns:
-        For each such fault the peak force [N] from which it could be seen.
-    """
+    """Return for each of the :data:`FAULTS` that the guard cannot see along a path the peak force
+    [N] from which it could: by times since the branch was held [s], shape [n], and predicted forces
+    [N], shape [n, 3], with covariance; ``most`` as of :func:`allowed_difference`."""
     sizes = np.linalg.norm(forces, axis=1)
     largest, within = np.maximum.accumulate(sizes), errors.within(times)
     rows = np.flatnonzero(sizes > 0.0)
@@ -255,13 +225,9 @@ class GuardSettings:
 
 @dataclass
 class Relief:
-    """Progress of a retreat in reducing the values that exceeded their limits.
-
-    Attributes:
-        force, torque: Least values since it began [N], [N m].
-        excess: Least excess over each limit of the arm's position.
-        marked_force, marked_clock, marked_grasp: Start of the next measurement of a fall.
-    """
+    """Progress of a retreat in reducing the values that exceeded their limits: least force [N],
+    torque [N m] and excess over each limit of position so far; ``marked_...`` start the next
+    measurement of a fall."""
 
     force: float
     torque: float
@@ -304,12 +270,8 @@ _RISES = "the {} rises during the return"
 
 
 class Guard:
-    """Watches one robot.
-
-    Attributes:
-        state: What it currently allows.
-        reason: Reason of its last stop or pause.
-    """
+    """Watches one robot: ``state`` is what it currently allows, ``reason`` that of its last stop or
+    pause."""
 
     def __init__(self, arm: Arm, settings: GuardSettings, rate: float):
         self._arm, self._step = arm, 1.0 / rate
@@ -336,39 +298,23 @@ class Guard:
         return self._errors.noise
 
     def tared(self, forces: np.ndarray | None = None) -> None:
-        """The force sensor has been tared: from now on its limits apply.
-
-        Args:
-            forces: Readings at rest, which tell its noise [N], shape [n, 3].
-        """
+        """The force sensor has been tared: from now on its limits apply. ``forces``: readings at
+        rest, which tell its noise [N], shape [n, 3]."""
         self._is_tared = True
         self._held = None
         self._errors = self._settings.errors.measured(
             None if forces is None else noise_at_rest(forces, self._kept))
 
     def hold(self, off: np.ndarray | None, clock: float = 0.0) -> None:
-        """The gripper holds the resting branch; from here on its force follows the prediction.
-
-        What the fingers press aside when they close, and the sensor's drift so far, stay as they
-        are and tell nothing about the branch.
-
-        Args:
-            off: Measured force minus the predicted one there [N], shape [3]; None: it holds
-                nothing.
-            clock: Of the controller [s].
-        """
+        """The gripper holds the resting branch: from here on its force follows the prediction.
+        ``off``, measured minus predicted [N], shape [3], is what the fingers press aside and the
+        drift so far, and tells nothing of the branch; None: it holds nothing. ``clock``: the
+        controller's [s]."""
         self._held, self._held_clock = off, clock
 
     def begin(self, *, by_joints: bool = False) -> None:
-        """Allow a motion.
-
-        Args:
-            by_joints: The motion is in joint space: singularities are no limit.
-
-        Raises:
-            SafetyStop: after a stop that was not acknowledged, while one is paused, or before the
-                force sensor was tared.
-        """
+        """Allow a motion; of one ``by_joints`` singularities are no limit. SafetyStop after a stop
+        that was not acknowledged, while one is paused, or before a tare."""
         if self.state != State.IDLE:
             raise SafetyStop(f"The robot is {self.state.value}: {self.reason}.",
                              "No motion begins before a person has checked.",
@@ -380,18 +326,10 @@ class Guard:
         self._memory = GuardMemory(by_joints=by_joints)
 
     def begin_retreat(self, wrench: np.ndarray) -> None:
-        """Allow a motion back along the path that was followed: a person has chosen it.
-
-        It is needed when a value exceeds its limit. So each limit exceeded at its start is replaced
-        by the least value since then, plus the allowed difference between measured and predicted
-        force. The motion stops if a force rises, or does not fall.
-
-        Args:
-            wrench: Wrench of the gripper on the branch, smoothed [N, N m], shape [6].
-
-        Raises:
-            SafetyStop: the robot moves, or the force is not known.
-        """
+        """Allow a motion back along the followed path, which a person has chosen since a value
+        exceeds its limit: each such limit becomes the least value since then plus the allowed
+        difference to the prediction. It stops if a force rises, or does not fall. ``wrench`` is
+        smoothed, [N, N m], shape [6]. SafetyStop if the robot moves, or the force is not known."""
         if self.state == State.MOVING:
             raise SafetyStop("The robot is moving.", "", "Stop it before the return.")
         if not np.isfinite(wrench).all():
@@ -436,19 +374,11 @@ class Guard:
     def look(self, sample: Sample, *, wrench: np.ndarray, raw: np.ndarray,
              expected: np.ndarray | None = None, uncertainty: np.ndarray | None = None,
              grasp: np.ndarray | None = None, sent: np.ndarray | None = None) -> Decision:
-        """Judge a sample.
-
-        Args:
-            wrench: Wrench of the gripper on the branch by the sensor in use, tared, branch frame
-                [N, N m], shape [6].
-            raw: The reading as received and rotated to the flange's axes, shape [2, 6]. A frozen
-                sensor repeats one of them to the last digit, however the robot rotates.
-            expected: The same wrench as predicted by the model, or None.
-            uncertainty: Covariance of that prediction, shape [6, 6]: it widens the allowed
-                difference by two standard deviations, at most by the soft force limit.
-            grasp: Position of the grasp, branch frame [m], shape [3].
-            sent: Target of the tool at this time, base frame [m], shape [3], or None.
-        """
+        """Judge a sample. ``wrench``: of the gripper on the branch, tared, branch frame [N, N m],
+        shape [6]; ``raw``: as received and rotated to the flange's axes, [2, 6], as a frozen sensor
+        repeats one of them to the last digit; ``expected``: as predicted, with covariance [6, 6]
+        that widens the allowed difference by two deviations, up to the soft limit; ``grasp``:
+        branch frame [m], ``sent``: target, base frame [m]."""
         last, self._memory.grasp = self._memory.grasp, grasp
         self._memory.travel = None if last is None or grasp is None else grasp - last
         for check in (self._check_clock(sample), self.modes(sample),
@@ -470,11 +400,8 @@ class Guard:
         return GO
 
     def permit(self, current: np.ndarray, target: np.ndarray, seconds: float) -> np.ndarray:
-        """Return a target [6] that keeps the speed limits, on the path from ``current`` to it.
-
-        Raises:
-            SafetyStop: no motion is allowed now, or the target is no pose.
-        """
+        """Return a target [6] that keeps the speed limits, on the path from ``current`` to it;
+        SafetyStop if no motion is allowed now, or it is no pose."""
         if self.state != State.MOVING:
             raise SafetyStop(f"The robot is {self.state.value}.", self.reason, "")
         if target.shape != (6,) or not np.isfinite(target).all():
@@ -596,8 +523,7 @@ class Guard:
 
     def _is_over(self, name: str, excess: float, slack: float) -> bool:
         """Whether a limit of the arm's position is exceeded by ``excess``; a retreat allows this
-        while the excess does not grow by more than ``slack``.
-        """
+        while the excess does not grow by more than ``slack``."""
         relief = self._memory.relief
         if excess <= 0 or relief is None:
             return excess > 0
@@ -672,11 +598,9 @@ class Guard:
         return GO
 
     def _check_drop(self, filtered: np.ndarray) -> Decision:
-        """Judge a force [6] without a prediction, as while E is being measured.
-
-        A sudden loss still indicates a slip, but not while the branch is released and pulls in the
-        gripper's direction of motion.
-        """
+        """Judge a force [6] without a prediction, as while E is measured: a sudden loss still
+        indicates a slip, but not while the branch is released and pulls in the gripper's direction
+        of motion."""
         memory, force = self._memory, length(filtered[:3])
         if memory.travel is not None and float(memory.travel @ filtered[:3]) < 0:
             memory.peak = force

@@ -39,22 +39,13 @@ COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
            "expected_xx_n2", "expected_xy_n2", "expected_xz_n2",
            "expected_yy_n2", "expected_yz_n2", "expected_zz_n2")
 """Columns of a row of samples: grasp pose and wrench on the branch, in the branch's frame; the last
-six are the covariance of the expected force.
-"""
+six are the covariance of the expected force."""
 
 
 class RobotLink:
-    """A robot in a driver process; a context manager.
-
-    Args:
-        cell: The robot's cell.
-        on_samples: Called with each batch of samples, shape [n, 37] as in :data:`COLUMNS`, from its
-            own thread.
-        python: Interpreter that has ur-rtde; by default this one.
-
-    Raises:
-        LimberError: no robot answers, or it cannot be moved now; the reason is the driver's.
-    """
+    """A robot in a driver process; a context manager. ``on_samples`` is called with each batch,
+    shape [n, 37] as in :data:`COLUMNS`, from its own thread; ``python``: an interpreter that has
+    ur-rtde. LimberError with the driver's reason if no robot answers, or it cannot be moved now."""
 
     def __init__(self, cell: Cell, on_samples: Callable[[np.ndarray], None] | None = None,
                  python: str | None = None):
@@ -94,11 +85,8 @@ class RobotLink:
         self.close()
 
     def wait_for_samples(self, seconds: float = 5.0) -> np.ndarray:
-        """Return the latest of the next samples, shape [37] as in :data:`COLUMNS`.
-
-        Raises:
-            WorkError: no samples arrive.
-        """
+        """Return the latest of the next samples, shape [37] as in :data:`COLUMNS`; WorkError if
+        none arrives."""
         self._sampled.clear()
         if not self._sampled.wait(seconds):
             raise WorkError(f"The robot's driver sent no samples within {seconds:.0f} s.",
@@ -111,11 +99,7 @@ class RobotLink:
         return self.wait("tared", seconds=seconds + 5.0)
 
     def start(self, trajectory: Trajectory) -> None:
-        """Begin to follow a trajectory.
-
-        Raises:
-            SafetyStop: the guard or the driver refuses.
-        """
+        """Begin to follow a trajectory; SafetyStop if the guard or the driver refuses."""
         expected = trajectory.expected
         self._order(order="follow", times=trajectory.times.tolist(),
                     poses=trajectory.poses.tolist(),
@@ -128,26 +112,16 @@ class RobotLink:
         self.wait("started", seconds=5.0)
 
     def follow(self, trajectory: Trajectory) -> dict[str, Any]:
-        """Follow a trajectory to its end; returns the event that ended it.
-
-        That is ``reached``, ``stopped`` or ``paused``, with its reason.
-
-        Raises:
-            SafetyStop: it was refused. WorkError: the driver has ended.
-        """
+        """Follow a trajectory to its end; return the event that ended it: ``reached``, ``stopped``
+        or ``paused``, with its reason. SafetyStop if it was refused; WorkError if the driver has
+        ended."""
         self.start(trajectory)
         return self.wait("reached", "stopped", "paused", seconds=10 * trajectory.duration + 30.0)
 
     def retreat(self) -> dict[str, Any]:
-        """Retreat along its path, slower; a person has asked for it.
-
-        Returns:
-            The event that ended it: ``reached``, or ``stopped`` with its reason, for example
-            because the force does not fall on the path.
-
-        Raises:
-            SafetyStop: there is no path back, or the arm left it. WorkError: the driver has ended.
-        """
+        """Retreat along its path, slower, as a person asked; return ``reached``, or ``stopped``
+        with its reason, for example that the force does not fall. SafetyStop if there is no path
+        back, or the arm left it; WorkError if the driver has ended."""
         # Until the arm is at rest, and the smoothed force is that of its position.
         time.sleep(_STANDS_SECONDS)
         self._order(order="retreat")
@@ -175,11 +149,8 @@ class RobotLink:
         self._order(order="stop")
 
     def wait(self, *kinds: str, seconds: float) -> dict[str, Any]:
-        """Return the next event of one of ``kinds``.
-
-        Raises:
-            LimberError: the driver refused or failed, or its process ended.
-        """
+        """Return the next event of one of ``kinds``; LimberError if the driver refused or failed,
+        or ended."""
         event = self._child.wait(lambda: self._taken(kinds), seconds)
         if event is not None:
             return event
@@ -285,13 +256,9 @@ _FORCE, _SMOOTH, _EXPECTED = (slice(COLUMNS.index(name), COLUMNS.index(name) + 3
 
 
 class LiveForce:
-    """Writes the gripper's force; a context manager, which removes the file at its end.
-
-    Args:
-        folder: The branch folder.
-        title: Title of the motion, for a person.
-        limit: Force at which the guard pauses [N].
-    """
+    """Writes the gripper's force into the branch folder and removes the file at its end; a context
+    manager. ``title`` names the motion for a person, ``limit`` is the force at which the guard
+    pauses [N]."""
 
     def __init__(self, folder: Path, title: str, limit: float):
         self._path = Path(folder) / FILE

@@ -22,12 +22,10 @@ _ALL_PRESENT = 1  # MCL_CURRENT: not future memory, which could then be refused
 
 
 def claim_real_time(priority: int = 20) -> bool:
-    """Ask for round-robin real-time scheduling; returns whether it was granted.
-
-    Linux grants it to root and to users with a real-time limit. Without it other programs can delay
-    the loop by tens of milliseconds, which causes a stop. It is not requested if this process may
-    use only one processor: the loop would take it from the program that gives orders.
-    """
+    """Ask for round-robin real-time scheduling; return whether it was granted: to root, and to
+    users with a real-time limit. Without it other programs delay the loop by tens of milliseconds,
+    which causes a stop. With one processor it is not requested: the loop would take it from the
+    program that gives orders."""
     if not hasattr(os, "sched_setscheduler") or not may_use_two_processors():
         return False
     try:
@@ -45,31 +43,20 @@ def may_use_two_processors() -> bool:
 
 
 def spare_what_is_loaded() -> bool:
-    """Exclude the present objects from every later garbage collection, and keep them in memory.
-
-    A full collection visits everything that the libraries loaded: 20 to 70 ms in a loop that must
-    not pause for 50. After this it visits only newer objects, which are few. The system may also
-    evict code pages unused for a minute, such as those of a motion while the arm is at rest.
-    Their first use would then wait for the disk.
-
-    Returns:
-        Whether the pages stay; Linux grants it to root and to users who may lock that much memory.
-    """
+    """Exclude the present objects from later garbage collections: a full one takes 20 to 70 ms in a
+    loop that must not pause for 50. Keep their pages in memory, as those unused for a minute, such
+    as a motion's while the arm rests, would wait for the disk; returns whether they stay (root, and
+    users who may lock that much)."""
     gc.collect()
     gc.freeze()
     return sys.platform == "linux" and ctypes.CDLL(None).mlockall(_ALL_PRESENT) == 0
 
 
 def keep_awake() -> bool:
-    """Keep the computer's processors from sleeping while they idle, until this process ends.
-
-    A sleeping processor wakes late: by a fraction of a millisecond, and that of a virtual machine
-    when its host returns it. That took 5 to 50 ms and delayed a loop with a cycle of 2 ms several
-    times a second. This is Linux's own interface for it (``Documentation/power/pm_qos_interface``).
-
-    Returns:
-        Whether it was granted: to root, and to users who may write to the device.
-    """
+    """Keep the processors from sleeping while they idle, until this process ends
+    (``Documentation/power/pm_qos_interface``); return whether that was granted. One wakes late, a
+    virtual machine's when its host returns it: 5 to 50 ms delayed a loop of 2 ms several times a
+    second."""
     try:
         # Left open on purpose: the request holds as long as the file is open.
         device = os.open(_WAKING, os.O_WRONLY)
@@ -132,14 +119,9 @@ class RenewedDeadline:
 
 
 class Words:
-    """The events of the driver, written by a separate thread.
-
-    If the parent is slow to read, the pipe fills within a third of a second. A loop that waited for
-    it would starve the controller's watchdog.
-
-    Args:
-        out: Destination of events, one JSON object a line.
-    """
+    """The driver's events, one JSON object a line, written by a separate thread: a slow parent
+    fills the pipe in a third of a second, and a loop that waited would starve the controller's
+    watchdog."""
 
     def __init__(self, out: TextIO):
         self._out = out

@@ -36,16 +36,10 @@ _MOST_TRIED = 24  # variants of the path checked against obstacles
 
 @dataclass(frozen=True)
 class RobotMotion:
-    """A robot's motion that takes a branch along a path.
-
-    Poses are of the gripper's middle in the robot's base frame.
-
-    Attributes:
-        approach: Motion from a start before the branch to the grasp.
-        path: Motion with the branch held.
-        joints: Joint angles of approach and path together, one continuous branch.
-        rotation: Rotation of the gripper at the grasp, branch frame, as a rotation vector [rad].
-    """
+    """A robot's motion that takes a branch along a path, as poses of the gripper's middle in the
+    base's frame: approach from a start before the branch, path with the branch held, joint angles
+    of both on one continuous branch, and the gripper's rotation at the grasp, branch frame
+    [rad]."""
 
     approach: Trajectory
     path: Trajectory
@@ -78,23 +72,11 @@ class _PathSegment:
 def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
                  speed: float, rotation: np.ndarray | None = None,
                  blocked: Blocked | None = None) -> RobotMotion:
-    """Turn a path of the grasped piece of branch into motion of the robot.
-
-    Of all directions of approach across the branch and all branches of the inverse kinematics, the
-    unblocked one that stays farthest from singularities is chosen.
-
-    Args:
-        predicted: Poses of the grasped piece from its rest pose on, and their predicted wrenches.
-        axis: Direction of the branch at the grasp, branch frame, shape [3].
-        speed: Speed of the gripper [m/s].
-        rotation: Rotation of the gripper at the grasp, branch frame [rad], shape [3], if it is
-        given.
-
-    Raises:
-        InputError: the speed exceeds the cell's limit.
-        NoPathError: no branch of the inverse kinematics follows the motion, or all are blocked;
-            states where and why.
-    """
+    """Turn a path of the grasped piece, its predicted poses from rest on and wrenches, into motion:
+    of all approaches across the branch's ``axis`` [3] and branches of the inverse kinematics, the
+    unblocked one farthest from singularities, at ``speed`` [m/s], with the gripper's ``rotation``
+    [rad] if given. InputError if the speed exceeds the cell's limit; NoPathError, where and why, if
+    no branch follows it, or all are blocked."""
     if speed > cell.limits.speed_m_s:
         raise InputError(f"{speed:g} m/s exceeds the cell's {cell.limits.speed_m_s:g} m/s.", "The "
                          "guard would slow the motion down, and the predicted forces would not "
@@ -121,10 +103,8 @@ def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
 
 
 def across(axis: np.ndarray) -> list[np.ndarray]:
-    """Return rotations [rad] of a gripper that approaches across a branch along ``axis`` [3].
-
-    The gripper's z is its direction of approach; its y is along the branch.
-    """
+    """Return rotations [rad] of a gripper that approaches across a branch along ``axis`` [3]: its z
+    is the direction of approach, its y along the branch."""
     y = np.asarray(axis, float) / np.linalg.norm(axis)
     side = np.cross(y, [0.0, 0.0, 1.0])
     if np.linalg.norm(side) < 0.1:
@@ -181,16 +161,10 @@ def _timed(cell: Cell, predicted: Predicted, segment: _PathSegment, speed: float
 
 @dataclass(frozen=True)
 class Followed:
-    """Accuracy of a robot in following a path, from its samples.
-
-    Attributes:
-        peak_force: Greatest force on the branch [N].
-        path_error: Greatest distance of the grasp from the path [m].
-        force_error: 95th percentile of the difference between the smoothed and the expected force,
-            as a fraction of the peak force; NaN without expected forces.
-        force_within: Fraction of the samples whose force differs from the expected one by less than
-            5 % of the peak, or is within the 95 % interval of the two together; NaN likewise.
-    """
+    """Accuracy of a robot in following a path: greatest force on the branch [N], greatest distance
+    from the path [m], 95th percentile of the smoothed force's difference to the expected one over
+    the peak, and the share of samples within 5 % of the peak or the 95 % interval of the two
+    together; NaN without expected forces."""
 
     peak_force: float
     path_error: float
@@ -199,14 +173,9 @@ class Followed:
 
 
 def followed(samples: np.ndarray, path: np.ndarray, force_sigma: float = 0.0) -> Followed:
-    """Compare a robot's motion with the planned and expected one.
-
-    Args:
-        samples: As in :data:`limber.robot.driver.link.COLUMNS`.
-        path: [m], branch frame, shape [n, 3].
-        force_sigma: Standard deviation of the smoothed force: noise, tare and drift of the sensor
-        [N].
-    """
+    """Compare samples, as in :data:`limber.robot.driver.link.COLUMNS`, with the planned path [m],
+    branch frame, shape [n, 3]; ``force_sigma``: the smoothed force's, of noise, tare and drift
+    [N]."""
     force = samples[:, 13:16]
     # Distance from segments, not from points.
     start, vectors = path[:-1], np.diff(path, axis=0)
@@ -252,13 +221,8 @@ _AXES = _AXES / np.linalg.norm(_AXES, axis=1)[:, None]
 
 @dataclass(frozen=True)
 class TurnCost:
-    """Wrenches of a clamped branch about its natural rotations along a path.
-
-    Attributes:
-        along: Length of the path up to each state [m], shape [k].
-        wrenches: Without an offset [N, N m], shape [k, 6].
-        slopes: Their derivative to the offset, shape [k, 6, 3].
-    """
+    """Wrenches [N, N m], shape [k, 6], of a clamped branch at its natural rotations along a path of
+    length [m], shape [k], and their derivative to an offset, [k, 6, 3]."""
 
     along: np.ndarray
     wrenches: np.ndarray
@@ -285,13 +249,9 @@ class TurnCost:
 
 @dataclass(frozen=True)
 class Turned:
-    """A robot's motion with the gripper turned beyond the branch's natural rotation.
-
-    Attributes:
-        motion: The motion.
-        offsets: Offset at each pose of the path [rad], branch frame, shape [n, 3].
-        energies, torques: What they cost, by the second-order function [J, N m], shape [n].
-    """
+    """A motion with the gripper turned beyond the branch's natural rotation: offsets at each pose
+    [rad], branch frame, shape [n, 3], and what they cost by the second-order function [J, N m],
+    shape [n]."""
 
     motion: RobotMotion
     offsets: np.ndarray
@@ -306,18 +266,9 @@ def turned(poses: np.ndarray, offsets: np.ndarray) -> np.ndarray:
 
 def turned_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, cost: TurnCost, slack: float,
                   most: tuple[float, float], **asked: Any) -> Turned:
-    """Return the motion whose offset from the natural rotations costs least energy.
-
-    Args:
-        predicted: At the natural rotations.
-        cost: At the same poses.
-        slack: Largest offset [rad].
-        most: Largest force [N] and torque [N m] of the gripper on the branch.
-        asked: As :func:`.robot_motion` takes it.
-
-    Raises:
-        NoPathError: as :func:`.robot_motion` without an offset, if none within the slack helps.
-    """
+    """Return the motion whose offset of at most ``slack`` [rad] from the natural rotations costs
+    least energy; ``most``: largest force [N] and torque [N m] on the branch, ``asked`` as of
+    :func:`.robot_motion`. NoPathError, as without an offset, if none helps."""
     grips, refusal = _farthest(cell, predicted, axis, asked)
 
     def tried(grip: np.ndarray, offsets: np.ndarray) -> RobotMotion | None:
@@ -356,11 +307,8 @@ def turned_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, cost: Turn
 def _farthest(cell: Cell, predicted: Predicted, axis: np.ndarray, asked: dict[str, Any],
               ) -> tuple[list[tuple[np.ndarray, float]], NoPathError]:
     """Return the gripper's rotations with which the arm follows the natural path farthest, each
-    with the share of the path where it ends; and the error of the farthest.
-
-    Raises:
-        NoPathError: with none the arm even comes to the branch.
-    """
+    with the share where it ends, and that error; NoPathError if with none it even comes to the
+    branch."""
     given = asked.get("rotation")
     ends: list[tuple[np.ndarray, float, NoPathError]] = []
     for grip in across(axis) if given is None else [np.asarray(given, float)]:
@@ -403,13 +351,9 @@ HELD = ("path", "hold", "return")
 
 @dataclass(frozen=True)
 class Leg:
-    """One part of the motion.
-
-    Attributes:
-        name: ``approach``, ``grasp``, ``path``, ``hold``, ``return``, ``release`` or ``leaving``.
-        duration: [s].
-        trajectory: The gripper's motion; None: it stands still, and opens, closes or holds.
-    """
+    """One part of the motion: ``approach``, ``grasp``, ``path``, ``hold``, ``return``, ``release``
+    or ``leaving``; without trajectory the gripper stands still for ``duration`` [s], and opens,
+    closes or holds."""
 
     name: str
     duration: float

@@ -29,14 +29,8 @@ _OUT_OF_REACH = "out of the arm's reach"
 
 @dataclass(frozen=True)
 class JointPath:
-    """Joint angles along a path.
-
-    Attributes:
-        branch: Number of the arm's configuration.
-        joints: Angles [rad], continuous, shape [n, joints].
-        singularity: Least distance from a singularity along the path, dimensionless.
-        limit_margin: Least distance of a joint from its limit [rad].
-    """
+    """Continuous joint angles along a path [rad], shape [n, joints], of one configuration of the
+    arm, with the least distance from a singularity (dimensionless) and from a joint limit [rad]."""
 
     branch: int
     joints: np.ndarray
@@ -61,20 +55,10 @@ class Refusal:
 def follow(arm: Arm, frames: np.ndarray, *, singularity_margin: float = 0.05,
            joint_margin: float = 0.05, joint_limits: np.ndarray | None = None,
            ) -> tuple[list[JointPath], list[Refusal]]:
-    """Return the joint paths along which the flange passes ``frames``, the best first.
-
-    Best is the one farthest from singularities. Full turns are chosen so that the joints stay
-    farthest from their limits.
-
-    Args:
-        frames: Frames of the flange in the base's, in order and close together, shape [n, 4, 4].
-        singularity_margin: Least allowed :meth:`.Arm.singularity_distance`.
-        joint_margin: Least allowed distance from a joint limit [rad].
-        joint_limits: Least and greatest angles [rad], shape [joints, 2]; else the arm's own.
-
-    Returns:
-        The paths, and for every other branch the reason of its rejection.
-    """
+    """Return the joint paths along which the flange passes ``frames`` [n, 4, 4], base frame, close
+    together: the one farthest from singularities first, full turns as far as possible from the
+    limits; and why every other branch was rejected. Margins are of
+    :meth:`.Arm.singularity_distance` and the limits [rad], [joints, 2], else the arm's."""
     frames = np.asarray(frames, float)
     if frames.ndim != 3 or frames.shape[1:] != (4, 4) or not np.isfinite(frames).all():
         raise InputError(f"The frames have shape {frames.shape} or are not finite.",
@@ -93,17 +77,9 @@ def follow(arm: Arm, frames: np.ndarray, *, singularity_margin: float = 0.05,
 
 def joint_path(arm: Arm, frames: np.ndarray, *, start: np.ndarray | None = None,
                joint_limits: np.ndarray | None = None, **margins: float) -> JointPath:
-    """Return the joint path along ``frames`` [n, 4, 4].
-
-    Args:
-        start: Joint angles [rad] where the robot is, shape [joints]: the branch nearest to them is
-            taken, so that a path begins without a turn of the arm. Absent: the branch farthest
-            from singularities.
-        margins, joint_limits: As :func:`follow` takes them.
-
-    Raises:
-        NoPathError: no configuration follows the whole path; states where and why.
-    """
+    """Return the joint path along ``frames`` [n, 4, 4] nearest to the angles ``start`` [rad], so
+    that it begins without a turn of the arm, or farthest from singularities; margins as of
+    :func:`follow`. NoPathError, where and why, if no configuration follows it all."""
     paths, refusals = follow(arm, frames, joint_limits=joint_limits, **margins)
     if not paths:
         raise no_branch(refusals, np.asarray(frames))
@@ -213,17 +189,9 @@ class _Tree:
 
 def joint_space_path(start: np.ndarray, goal: np.ndarray, limits: np.ndarray, free: Free, *,
                      seed: int = 0) -> np.ndarray:
-    """Return joint angles from ``start`` [n] to ``goal`` [n] on a free path, shape [k, n].
-
-    Neighbours are at most :data:`STEP_RAD` apart.
-
-    Args:
-        limits: Least and greatest angles [rad], shape [n, 2].
-        free: Returns which joint angles are free.
-
-    Raises:
-        NoPathError: start or goal is not free, or no path was found.
-    """
+    """Return joint angles [rad] on a free path from ``start`` to ``goal`` within limits [n, 2],
+    shape [k, n], neighbours at most :data:`STEP_RAD` apart. NoPathError if start or goal is not
+    free, or no path was found."""
     for name, angles in (("start", start), ("goal", goal)):
         if not free(angles[None])[0]:
             raise NoPathError(f"The arm's {name} is in collision, or closer than allowed.",
@@ -308,14 +276,9 @@ def is_at(joints: np.ndarray, goal: np.ndarray) -> bool:
 
 def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurroundings,
               ) -> Trajectory:
-    """Return the motion from joint angles ``start`` [n] to ``goal`` [n], the gripper empty.
-
-    It keeps clear of cell, branch and the arm itself, and is slow near the branch.
-
-    Raises:
-        NoPathError: there is no such path, start or goal collide, or the gripper would leave the
-        workspace.
-    """
+    """Return the motion of the empty gripper between joint angles [n], clear of cell, branch and
+    the arm itself, slow near the branch. NoPathError without such a path, or if start or goal
+    collide, or the gripper would leave the workspace."""
     _require_limits(cell, goal)
     if is_at(start, goal):
         raise NoPathError("The arm is there already.", "", "")
@@ -333,15 +296,9 @@ def to_joints(cell: Cell, start: np.ndarray, goal: np.ndarray, around: ArmSurrou
 
 
 def away_from_branch(cell: Cell, joints: np.ndarray, pose: np.ndarray) -> Trajectory:
-    """Return the straight retreat of an open gripper from the branch, opposite to its approach.
-
-    Args:
-        joints: Current joint angles [rad], shape [n].
-        pose: Pose of the gripper's middle from the controller, base frame [m, rad], shape [6].
-
-    Raises:
-        NoPathError: the arm cannot reach so far.
-    """
+    """Return the straight retreat of an open gripper from the branch, opposite to its approach, by
+    joint angles [rad] and the controller's pose of its middle, base frame [m, rad]. NoPathError if
+    the arm cannot reach so far."""
     here = matrices(pose)
     back = here.copy()
     back[:3, 3] -= cell.approach.distance_m * here[:3, :3] @ np.array(cell.approach.direction)

@@ -37,18 +37,9 @@ JOINT_RAD = 0.05
 
 def require_start(pose: np.ndarray, joints: np.ndarray, start: np.ndarray,
                   start_joints: np.ndarray | None, names: Sequence[str]) -> None:
-    """Refuse a motion that starts away from the arm's pose, or in another configuration.
-
-    Args:
-        pose: Measured, base frame [m, rad], shape [6].
-        joints: Measured [rad], shape [n].
-        start: Pose with which the motion begins, shape [6].
-        start_joints: Joint angles for which it was checked [rad], shape [n]; None: it was not.
-        names: Names of the joints.
-
-    Raises:
-        SafetyStop: states the differences, with both values.
-    """
+    """Refuse a motion that starts away from the arm's measured pose [m, rad], shape [6], base
+    frame, or in another configuration than ``start_joints`` [rad], for which it was checked (None:
+    it was not); the SafetyStop states both values."""
     away = length(start[:3] - pose[:3])
     if away > POSITION_M:
         raise SafetyStop(f"The path starts {1000 * away:.1f} mm away from the robot.",
@@ -102,17 +93,10 @@ _FORMAT = 1
 
 @dataclass(frozen=True)
 class FollowedPath:
-    """A path read from disk.
-
-    Attributes:
-        poses: Poses of the tool's centre, base frame [m, rad], in order, shape [n, 6].
-        joints: [rad], shape [n, joints].
-        speeds: Greatest speeds on it [m/s], [rad/s], shape [2].
-        bias: Bias of the force sensor by its last tare, flange frame [N, N m], shape [6]; None if
-            it is not known with the cell's payload (`limber robot weigh` tares with another).
-        gripper_closed: Whether the gripper was last closed; None: it was not moved.
-        at: Start time of the path, seconds since 1970.
-    """
+    """A path read from disk: poses of the tool's centre, base frame [m, rad], [n, 6]; joints [rad];
+    greatest speeds [m/s], [rad/s]; the last tare's bias, flange frame [N, N m], None if not with
+    the cell's payload (`limber robot weigh` tares with another); whether the gripper was last
+    closed; its start, seconds since 1970."""
 
     poses: np.ndarray
     joints: np.ndarray
@@ -134,10 +118,8 @@ def log_path() -> Path:
 
 
 def read_followed_path(cell: Cell) -> FollowedPath | None:
-    """Return the path that the cell's robot followed last; None if none is known.
-
-    A line that is half written is ignored; a path of another arm or tool does not count.
-    """
+    """Return the path that the cell's robot followed last, None if unknown; half-written lines are
+    ignored, as is a path of another arm or tool."""
     try:
         with open(followed_path_file(cell), encoding="utf-8") as stream:
             lines = list(json_objects(stream))
@@ -165,14 +147,8 @@ def read_followed_path(cell: Cell) -> FollowedPath | None:
 
 
 def followed_path(cell: Cell, otherwise: str) -> FollowedPath:
-    """Return the path that the cell's robot followed last.
-
-    Args:
-        otherwise: What to do instead, for the message.
-
-    Raises:
-        InputError: none is known.
-    """
+    """Return the path that the cell's robot followed last; the InputError, if none is known, says
+    what to do ``otherwise``."""
     followed = read_followed_path(cell)
     if followed is None:
         raise InputError(f"No path that the robot at {cell.robot.address} followed with this arm "
@@ -257,13 +233,8 @@ _LEAST_SPEEDS = np.array([1e-3, 1e-2])  # m/s, rad/s
 
 
 class RetreatPath:
-    """Positions of an arm since the gripper closed, or since the motion began.
-
-    Args:
-        names: Names of the arm's joints.
-        followed: The path of an earlier program, to begin with.
-        kept: Called with each position that is kept, and with the data at the start of a path.
-    """
+    """Positions of an arm since the gripper closed, or since the motion began, after an earlier
+    program's; ``kept`` is called with each, and with the data at the start of a path."""
 
     def __init__(self, names: Sequence[str], followed: FollowedPath | None = None,
                  kept: FollowedPathFile | None = None) -> None:
@@ -275,13 +246,8 @@ class RetreatPath:
         self._rest: np.ndarray | None = None
 
     def begin(self, sample: Sample, trajectory: Trajectory, *, goes_on: bool = False) -> None:
-        """A trajectory is followed from ``sample`` on.
-
-        Legs on which the same branch is held, from the same rest pose, are one path.
-
-        Args:
-            goes_on: So is this leg with the path of an earlier program.
-        """
+        """A trajectory is followed from ``sample`` on. Legs on which one branch is held, from one
+        rest pose, are one path; ``goes_on``: so is this with that of an earlier program."""
         rest = None if trajectory.expected is None else trajectory.expected.rest_pose
         goes_on = goes_on and bool(self._poses)
         if not goes_on and (
@@ -309,17 +275,10 @@ class RetreatPath:
             self._kept.add(pose=self._poses[-1], joints=self._joints[-1])
 
     def from_here(self, sample: Sample, acceleration: float) -> Trajectory:
-        """Return the path from ``sample`` back to its start, at half the speed of the first pass.
-
-        The part between the first and the last time that the arm was here is omitted: a pull that
-        was stopped on its own return is not pulled out again.
-
-        Args:
-            acceleration: [m/s^2].
-
-        Raises:
-            SafetyStop: there is no path back, the arm left it, or is in another configuration.
-        """
+        """Return the path from ``sample`` back to its start at half the first speed, braking with
+        ``acceleration`` [m/s^2], without what lies between two visits: a pull stopped on its return
+        is not pulled out again. SafetyStop without a path back, off it, or in another
+        configuration."""
         if not self._poses:
             raise SafetyStop("There is no path to return along.", "The robot has not followed any "
                                                                   "path yet.",

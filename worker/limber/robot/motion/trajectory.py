@@ -32,14 +32,9 @@ def reaction_seconds(cell: Cell) -> float:
 
 
 def contact_speed(cell: Cell) -> float:
-    """Return the greatest speed [m/s] at which a contact stays below the hard limit plus a tenth.
-
-    The arm brakes from the soft limit on. The path v t + v^2 / 2a times the stiffness of the
-    contact (``limits.contact_n_per_m``) may add no more than the difference between the two.
-
-    Raises:
-        InputError: not even a millimetre a second is slow enough.
-    """
+    """Return the greatest speed v [m/s] at which a contact of ``limits.contact_n_per_m`` stays
+    below the hard limit plus a tenth: braking from the soft limit takes v t + v^2 / 2a. InputError
+    if not even a millimetre a second is slow enough."""
     limits = cell.limits
     distance = (OVER_HARD * limits.hard_force_n - limits.soft_force_n) / limits.contact_n_per_m
     lost = _BRAKING_M_S2 * reaction_seconds(cell)
@@ -57,14 +52,8 @@ def contact_speed(cell: Cell) -> float:
 
 
 def speed_within(cell: Cell, speed: float, warn: Callable[[str], None] | None = None) -> float:
-    """Return ``speed`` [m/s], or less where a contact requires it.
-
-    Args:
-        warn: Is told of a speed that is reduced.
-
-    Raises:
-        InputError: as :func:`contact_speed`.
-    """
+    """Return ``speed`` [m/s], or less, which ``warn`` is told, where a contact requires it;
+    InputError as :func:`contact_speed`."""
     most = contact_speed(cell)
     if speed > most and warn is not None:
         limits = cell.limits
@@ -86,15 +75,9 @@ def speed_within(cell: Cell, speed: float, warn: Callable[[str], None] | None = 
 
 @dataclass(frozen=True)
 class ExpectedWrench:
-    """Expected wrenches along a path of the gripper, branch frame.
-
-    Attributes:
-        wrenches: Wrenches of the gripper on the branch, about its middle [N, N m], shape [n, 6].
-        slopes: Their derivative to the gripper's position [m] and rotation [rad], shape [n, 6, 6].
-        covariance: Covariance of the wrenches, shape [n, 6, 6].
-        rest_pose: Pose of the gripper when it closes on the resting branch, the robot's base frame
-            [m, rad], shape [6].
-    """
+    """Wrenches expected of the gripper on the branch along a path, about its middle, branch frame
+    [N, N m], [n, 6]; their derivative to position [m] and rotation [rad], [n, 6, 6], and
+    covariance; ``rest_pose``: where it closes on the resting branch, base frame [m, rad]."""
 
     wrenches: np.ndarray
     slopes: np.ndarray
@@ -122,16 +105,9 @@ class ExpectedWrench:
 
 @dataclass(frozen=True)
 class Predicted:
-    """A clamped grasp along a path, as predicted by the model.
-
-    Attributes:
-        poses: Poses of the grasped piece from its rest pose on, branch frame [m, rad], shape [n,
-        6].
-        wrenches: Wrenches of a rigid gripper [N, N m], shape [n, 6].
-        stiffness: Their derivative to the pose, shape [n, 6, 6].
-        young_covariance: Covariance of the forces from the uncertainty of Young's modulus, [n, 3,
-        3].
-    """
+    """A clamped grasp along a path by the model: poses of the piece from rest on, branch frame [m,
+    rad], and wrenches of a rigid gripper [N, N m], [n, 6]; their derivative to the pose, [n, 6, 6],
+    and the forces' covariance from Young's modulus, [n, 3, 3]."""
 
     poses: np.ndarray
     wrenches: np.ndarray
@@ -153,11 +129,8 @@ class Predicted:
                          self.young_covariance[:count])
 
     def felt(self, cell: Cell, rest_pose: np.ndarray) -> ExpectedWrench:
-        """Return the wrench expected at a cell's gripper, which has some compliance itself.
-
-        Args:
-            rest_pose: Pose of the gripper when it closes, base frame [m, rad], shape [6].
-        """
+        """Return the wrench expected at a cell's gripper, which yields a little itself;
+        ``rest_pose``: where it closes, base frame [m, rad], shape [6]."""
         count = len(self.poses)
         yielding = np.tile(np.eye(6), (count, 1, 1))
         yielding[:, :, :3] += cell.tool.compliance_m_per_n * self.stiffness[:, :, :3]
@@ -207,17 +180,10 @@ def _crossing(vectors: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of the tool over time.
-
-    Attributes:
-        times: [s], from 0, ascending, shape [n].
-        poses: Poses of the tool's centre, the robot's base frame [m, rad], shape [n, 6].
-        expected: Expected wrench of the branch at each pose, or None without a prediction.
-        joints: Joint angles for which reach, limits and obstacles were checked at each pose [rad],
-            shape [n, joints]; None if nothing was checked.
-        by_joints: The motion is interpolated in joint space, and the poses follow from it: a path
-            of the arm alone, which may pass singularities.
-    """
+    """Poses of the tool's centre, base frame [m, rad], [n, 6], over ascending times from 0 [s]; the
+    branch's expected wrenches, if predicted; joint angles for which each pose was checked [rad].
+    ``by_joints``: interpolated in joint space, a path of the arm alone, which may pass
+    singularities."""
 
     times: np.ndarray
     poses: np.ndarray
@@ -290,13 +256,8 @@ class Trajectory:
 
 def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: float = 0.5,
           pause: float = 0.0) -> np.ndarray:
-    """Return times [s] at which ``poses`` [n, 6] are passed, from rest to rest, shape [n].
-
-    Args:
-        speed, acceleration: Limits of the tool's centre [m/s], [m/s^2].
-        turn_speed: Greatest angular speed [rad/s].
-        pause: Time added before the start [s].
-    """
+    """Return times [s] at which ``poses`` [n, 6] are passed, from rest to rest after ``pause`` [s],
+    within limits of speed [m/s], acceleration [m/s^2] and turn [rad/s]."""
     turns = matrices(poses)[:, :3, :3]
     angles = np.arccos(np.clip((np.einsum("nij,nij->n", turns[1:], turns[:-1]) - 1) / 2, -1, 1))
     steps = np.maximum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1),
@@ -313,13 +274,8 @@ def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: f
 
 
 def along_bounded(steps: np.ndarray, speeds: np.ndarray, acceleration: float) -> np.ndarray:
-    """Return times [s] at which the positions of a path are passed, from rest to rest, shape [n].
-
-    Args:
-        steps: Distances between the positions [m], shape [n - 1].
-        speeds: Greatest speeds at the positions [m/s], shape [n].
-        acceleration: [m/s^2].
-    """
+    """Return times [s], shape [n], from rest to rest, of positions ``steps`` [m] apart, [n - 1],
+    with greatest speeds [m/s] at them, [n], and acceleration [m/s^2]."""
     steps = np.maximum(steps, 1e-9)
     bound = np.r_[0.0, speeds[1:-1], 0.0]
     for k in range(len(steps)):

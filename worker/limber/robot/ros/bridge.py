@@ -20,14 +20,8 @@ SECONDS = 2.0
 
 
 class Bridge:
-    """A connection to a rosbridge server.
-
-    Args:
-        url: Such as ``ws://127.0.0.1:9090``.
-
-    Raises:
-        WorkError: the address does not answer, or websockets is not installed.
-    """
+    """A connection to a rosbridge server, such as ``ws://127.0.0.1:9090``; WorkError if it does not
+    answer, or websockets is not installed."""
 
     def __init__(self, url: str):
         require_extra("ros", ("websockets",), "The door to ROS 2")
@@ -48,11 +42,7 @@ class Bridge:
                             ) from error
 
     def send(self, **content: Any) -> None:
-        """Send an operation.
-
-        Raises:
-            ConnectionError: the connection was lost.
-        """
+        """Send an operation; ConnectionError if the connection was lost."""
         from websockets.exceptions import ConnectionClosed
 
         try:
@@ -61,11 +51,8 @@ class Bridge:
             raise ConnectionError(f"the connection to {self.url} was lost") from error
 
     def receive(self, seconds: float) -> dict[str, Any] | None:
-        """Return the next message, waiting at most ``seconds``; None if none arrived.
-
-        Raises:
-            ConnectionError: the connection was lost.
-        """
+        """Return the next message, None if none arrived in ``seconds`` [s]; ConnectionError if the
+        connection was lost."""
         from websockets.exceptions import ConnectionClosed
 
         end = time.monotonic() + seconds
@@ -100,21 +87,10 @@ _SUCCEEDED = 4  # action_msgs/msg/GoalStatus
 
 def drive(bridge: Bridge, action: str, position: float, effort: float, seconds: float,
           ) -> dict[str, Any]:
-    """Move a gripper and wait for its result.
-
-    Args:
-        action: Name of the action.
-        position: As its controller counts it [m or rad].
-        effort: Greatest [N]; 0 leaves it to the controller.
-        seconds: Longest wait for the result [s].
-
-    Returns:
-        ``position``, ``stalled`` (something stopped it) and ``reached_goal``, as it reports them.
-
-    Raises:
-        WorkError: no result, or it failed.
-        ConnectionError: the connection was lost.
-    """
+    """Move a gripper to a position as its controller counts it [m or rad], with at most ``effort``
+    [N] (0: its choice), and wait for ``position``, ``stalled`` (something stopped it) and
+    ``reached_goal``. WorkError without result in ``seconds`` [s], or a failed one; ConnectionError
+    if the connection was lost."""
     bridge.send(op="send_action_goal", id=_GOAL, action=action, action_type=_GRIPPER_COMMAND,
                 feedback=False, args={"command": {"position": position, "max_effort": effort}})
     end = time.monotonic() + seconds
@@ -138,13 +114,8 @@ _SERVICE_SECONDS = 0.2
 
 
 class TriggerService:
-    """Offers a service until it is closed; a context manager.
-
-    Args:
-        bridge: Connection to rosbridge, which this service alone uses.
-        name: Of the service.
-        act: Called for each call; returns success and a message.
-    """
+    """Offers a service over a connection to rosbridge of its own until it is closed; a context
+    manager. ``act`` is called for each call and returns success and a message."""
 
     def __init__(self, bridge: Bridge, name: str, act: Callable[[], tuple[bool, str]]):
         self._bridge, self._name, self._act = bridge, name, act
@@ -159,10 +130,7 @@ class TriggerService:
 
     def answer(self, seconds: float = _SERVICE_SECONDS) -> dict[str, Any] | None:
         """Answer a call if one comes within ``seconds``; return the answer, or None.
-
-        Raises:
-            ConnectionError: the connection was lost.
-        """
+        ConnectionError if the connection was lost."""
         message = self._bridge.receive(seconds)
         if message is None or message.get("op") != "call_service" or (
                 message.get("service") != self._name):

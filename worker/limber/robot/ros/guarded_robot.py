@@ -60,23 +60,11 @@ _OFF_PATH_M = 0.02  # a ROS controller lags its trajectory by an unknown time
 
 
 class RosRobot:
-    """A robot and its force sensor as ROS reports them.
-
-    Args:
-        cell: Arm, tool, sensor and limits.
-        bridge: Connection to rosbridge.
-        topics: Their names.
-        on_sample: Called with time [s], pose [6] and smoothed wrench [6], branch frame.
-
-    Attributes:
-        warnings: Delays of the loop, and how a motion was broken off.
-        reported: What the controller reports of itself, by the names of :class:`.Sample`; empty
-            for an arm whose driver does not.
-
-    Raises:
-        InputError: as :func:`wrench_topic`, or the joint states are of another arm.
-        WorkError: a topic sends nothing.
-    """
+    """A cell's robot and force sensor as ROS reports them. ``on_sample`` is called with time [s],
+    pose [6] and smoothed wrench [6], branch frame; ``warnings`` are delays of the loop and how a
+    motion was broken off, ``reported`` what the controller says of itself, by the names of
+    :class:`.Sample`. InputError as :func:`wrench_topic`, or for another arm's joint states;
+    WorkError if a topic sends nothing."""
 
     def __init__(self, cell: Cell, bridge: Bridge, topics: Topics,
                  on_sample: Callable[[float, np.ndarray, np.ndarray], None] | None = None):
@@ -179,11 +167,8 @@ class RosRobot:
         return np.array(times), np.array(forces).reshape(-1, 3)
 
     def recall_tare(self) -> None:
-        """Judge forces by the tare of the leg before: the gripper holds the branch now.
-
-        Raises:
-            SafetyStop: none is known.
-        """
+        """Judge forces by the tare of the leg before, as the gripper holds the branch now;
+        SafetyStop if none is known."""
         followed = read_followed_path(self._cell)
         if followed is None or followed.bias is None:
             raise SafetyStop("No tare is known from the approach.",
@@ -195,11 +180,8 @@ class RosRobot:
         self.guard.tared()
 
     def tare(self, seconds: float = 0.5) -> np.ndarray:
-        """Tare the present force; returns the tare's standard error [6].
-
-        Raises:
-            WorkError: too few readings, or the gripper is touched.
-        """
+        """Tare the present force; return the standard error [6]. WorkError for too few readings, or
+        if the gripper is touched."""
         self._chain.start_tare()
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -228,16 +210,10 @@ class RosRobot:
 
     def follow(self, trajectory: Trajectory, *, goes_on: bool = False,
                check: PullPlausibility | None = None) -> dict[str, Any]:
-        """Follow a trajectory to its end; returns the event that ended it, as
-        :meth:`.RobotLink.follow`: ``reached``, or ``stopped`` with its reason.
-
-        Args:
-            goes_on: The branch is held as in the leg before, whose path belongs to this one.
-            check: Stops the motion where its force cannot be right.
-
-        Raises:
-            SafetyStop: the arm is not at its start, or the guard refuses.
-        """
+        """Follow a trajectory to its end; return the event that ended it, as
+        :meth:`.RobotLink.follow`. ``goes_on``: the branch is held as in the leg before, whose path
+        belongs to this one; ``check`` stops it where its force cannot be right. SafetyStop if the
+        arm is not at its start, or the guard refuses."""
         assert trajectory.joints is not None
         # It takes a while for a long path; what arrives meanwhile is read before it is sent.
         goal = goal_of(trajectory, self._states.ordered)
@@ -257,14 +233,9 @@ class RosRobot:
         return self._watched_goal(trajectory, goal, check)
 
     def retreat(self) -> dict[str, Any]:
-        """Go back along the path that was followed, while the force falls; a person has chosen it.
-
-        Returns:
-            ``reached``, or ``stopped`` with its reason; and ``force_n``, the force that is left.
-
-        Raises:
-            SafetyStop: the arm moves, no path is known, the arm left it, or the guard refuses.
-        """
+        """Go back along the followed path while the force falls, as a person has chosen; return
+        ``reached``, or ``stopped`` with its reason, and the force left [N]. SafetyStop if the arm
+        moves, left the path, or none is known, or the guard refuses."""
         assert self.last is not None
         before = self.last.joints
         spare_what_is_loaded()
@@ -303,10 +274,8 @@ class RosRobot:
 
     def _watched_goal(self, trajectory: Trajectory, content: dict[str, Any],
                       check: PullPlausibility | None = None) -> dict[str, Any]:
-        """Send a trajectory as the goal ``content`` and watch it to its end.
-
-        Whatever ends this, an error or Ctrl-C too, cancels the goal and publishes a stop.
-        """
+        """Send a trajectory as the goal ``content`` and watch it to its end; whatever ends this, an
+        error or Ctrl-C too, cancels the goal and publishes a stop."""
         if (decision := self._modes()).verdict != Verdict.GO:
             raise SafetyStop(f"The arm cannot be moved: {decision}.", "Limber neither releases "
                              "stops nor starts the program on the controller.",
@@ -373,10 +342,8 @@ class RosRobot:
         return self.guard.modes(replace(self.last, **self.reported))
 
     def _standstill(self, sample: Sample, place: int) -> Decision:
-        """Judge that the arm stands under its goal for longer than its path rests there.
-
-        Time counts as the controller passes it: scaled by its speed.
-        """
+        """Judge that the arm stands under its goal for longer than its path rests there, in the
+        controller's time, which its speed scales."""
         passed, self._clock = sample.clock - self._clock, sample.clock
         if not self._is_sent or np.abs(sample.joints - self._stood_at).max() > _STILL_RAD:
             self._stood, self._stood_at = 0.0, sample.joints
@@ -481,11 +448,9 @@ class RosRobot:
         return {"event": "stopped", "reason": reason, "stands": stands}
 
     def _cancelled(self, goal: str, *, is_over: bool = False) -> bool:
-        """Cancel a goal and publish a stop; returns whether the arm stands.
-
-        Both are said until the goal has ended: rosbridge drops the cancel of a goal that the
-        controller has not accepted yet, and what it has not processed when the connection closes.
-        """
+        """Cancel a goal and publish a stop until it has ended; return whether the arm stands.
+        Rosbridge drops the cancel of a goal not accepted yet, and what it has not processed when
+        the connection closes."""
         end, said, stands = time.monotonic() + SECONDS, -np.inf, False
         is_over = is_over or not self._is_sent
         while True:

@@ -42,15 +42,9 @@ def stamp_of(message: dict[str, Any]) -> float:
 
 
 class JointStates:
-    """Turns joint states into samples of a cell's arm; those of other nodes are passed over.
-
-    Args:
-        cell: Its arm and tool.
-
-    Attributes:
-        ordered: The joints' names in ROS, in the arm's order; empty before its first message.
-        others: Names in the last message that was not of this arm.
-    """
+    """Turns joint states into samples of a cell's arm, past those of other nodes; ``ordered``: its
+    joints' names in ROS, empty before its first message, ``others``: those of the last message not
+    of it."""
 
     def __init__(self, cell: Cell):
         self._arm = cell.arm
@@ -60,17 +54,10 @@ class JointStates:
 
     def sample(self, message: dict[str, Any], arrived: float,
                status: Mapping[str, Any] = RUNNING) -> Sample | None:
-        """Return the sample of a message that arrived at ``arrived`` [s, monotonic]; None if it
-        does not have all joints of the arm.
-
-        Missing numbers are NaN, for which the guard stops.
-
-        Args:
-            status: What the controller reports of itself, by the names of :class:`.Sample`.
-
-        Raises:
-            InputError: a joint of the arm matches two names, or another arm's joints come too.
-        """
+        """Return the sample of a message that arrived at ``arrived`` [s, monotonic], None if it
+        lacks joints of the arm; missing numbers are NaN, for which the guard stops. ``status``: by
+        the names of :class:`.Sample`. InputError if a joint matches two names, or another arm's
+        joints come too."""
         if (chosen := self._chosen(message["name"])) is None:
             self.others = list(message["name"])
             return None
@@ -130,13 +117,9 @@ def wrench_of(message: dict[str, Any]) -> np.ndarray:
 
 
 def cloud_of(message: dict[str, Any]) -> np.ndarray:
-    """Return the finite points [m] of a PointCloud2 as rosbridge sends it, shape [n, 3].
-
-    Its data is base64 text (rosbridge v2 protocol: byte arrays).
-
-    Raises:
-        InputError: it has no coordinates, or another size than it states.
-    """
+    """Return the finite points [m], shape [n, 3], of a PointCloud2 as rosbridge sends it, in base64
+    (rosbridge v2 protocol: byte arrays); InputError without coordinates, or of another size than
+    stated."""
     try:
         data = base64.b64decode(message["data"], validate=True)
         kinds = {field["name"]: (int(field["offset"]), _FLOATS[field["datatype"]])
@@ -159,14 +142,9 @@ def cloud_of(message: dict[str, Any]) -> np.ndarray:
 
 
 def goal_of(trajectory: Trajectory, names: list[str]) -> dict[str, Any]:
-    """Return the goal of FollowJointTrajectory for a trajectory with joints.
-
-    It has only the points that the controller's own interpolation needs, so that a long path is a
-    small message: while a bridge reads a large one it sends no samples.
-
-    Args:
-        names: Names of the joints in ROS, in the arm's order.
-    """
+    """Return the goal of FollowJointTrajectory, ``names`` in the arm's order, with only the points
+    that the controller's interpolation needs: while a bridge reads a large message it sends no
+    samples."""
     if trajectory.joints is None:
         raise InputError("The motion has no joint angles.", "ROS follows joint angles.", "")
     times, joints = trajectory.times, trajectory.joints
@@ -185,14 +163,9 @@ def goal_of(trajectory: Trajectory, names: list[str]) -> dict[str, Any]:
 
 def spline(time: float | np.ndarray, times: np.ndarray, joints: np.ndarray, speeds: np.ndarray,
            ) -> np.ndarray:
-    """Return the joint angles at times [s] between two points, shape [..., joints].
-
-    A cubic spline, as ROS' joint_trajectory_controller makes it of positions and velocities
-    (ros2_controllers, "Trajectory Representation").
-
-    Args:
-        times, joints, speeds: Of the two points, shapes [2], [2, joints] and [2, joints].
-    """
+    """Return the joint angles at times [s] between two points, shape [..., joints], by the cubic
+    spline of ROS' joint_trajectory_controller (ros2_controllers, "Trajectory Representation");
+    their times, joints and speeds have shapes [2], [2, joints], [2, joints]."""
     length = times[1] - times[0]
     part = (np.asarray(time, float)[..., None] - times[0]) / length
     rest = 1.0 - part
@@ -224,10 +197,8 @@ def _knots(times: np.ndarray, joints: np.ndarray, speeds: np.ndarray) -> list[in
 
 @dataclass(frozen=True)
 class Topics:
-    """Names of the robot's topics and actions; by default those of the UR driver.
-
-    ``safety_mode`` to ``slider`` are what a UR arm's driver publishes of its controller.
-    """
+    """Names of the robot's topics and actions, by default the UR driver's; ``safety_mode`` to
+    ``slider`` are what a UR arm's driver publishes of its controller."""
 
     joint_states: str = "/joint_states"
     wrench: str = "/force_torque_sensor_broadcaster/wrench"
@@ -244,14 +215,8 @@ _USUAL = Topics()
 
 
 def wrench_topic(cell: Cell, own: str = _USUAL.wrench) -> str:
-    """Return the topic of the cell's force sensor.
-
-    Args:
-        own: Topic of the arm's own sensor.
-
-    Raises:
-        InputError: the cell names no sensor that is heard in ROS, or a CB3's own estimate.
-    """
+    """Return the topic of the cell's force sensor, ``own`` for the arm's; InputError if the cell
+    names none that is heard in ROS, or a CB3's own estimate."""
     require_sensor(cell)
     sensor = cell.sensor
     if sensor.kind == "replay":
@@ -283,17 +248,8 @@ _STANDS_RAD_S = 1e-3
 
 
 class CloudTopic:
-    """A camera's clouds; where it looks from follows from the cell and the arm's joints.
-
-    Args:
-        cell: Its [camera] states where the camera is mounted.
-        bridge: Connection to rosbridge.
-        topic: The cloud's topic, in the camera's optical frame.
-        joint_states: That of the arm, for a camera on the flange.
-
-    Raises:
-        InputError: the cell has no camera.
-    """
+    """A camera's clouds in its optical frame; where it looks from follows from the cell's [camera]
+    and, on the flange, the arm's ``joint_states``. InputError if the cell has no camera."""
 
     def __init__(self, cell: Cell, bridge: Bridge, topic: str, joint_states: str):
         if cell.camera is None:
@@ -309,11 +265,8 @@ class CloudTopic:
             bridge.subscribe(joint_states, JOINT_STATE)
 
     def next_cloud(self) -> np.ndarray:
-        """Return the points of the next cloud [m], branch frame, shape [n, 3].
-
-        Raises:
-            WorkError: none arrives. InputError: it is no cloud.
-        """
+        """Return the points of the next cloud [m], branch frame, shape [n, 3]. WorkError if none
+        arrives; InputError if it is no cloud."""
         end = time.monotonic() + _CLOUD_SECONDS
         while time.monotonic() < end:
             message = self._bridge.receive(_CLOUD_LISTEN_SECONDS)

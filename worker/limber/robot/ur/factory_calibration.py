@@ -30,13 +30,8 @@ _LONGEST = 1 << 16  # bytes of a message
 
 @dataclass(frozen=True)
 class FactoryCalibration:
-    """An arm's own Denavit-Hartenberg table.
-
-    Attributes:
-        theta, a, d, alpha: Offsets of the angles [rad], lengths along x and z [m], twists [rad],
-            shape [6] each.
-        checksums: One per joint; they tell two arms apart.
-    """
+    """An arm's own Denavit-Hartenberg table: offsets of the angles [rad], lengths along x and z
+    [m], twists [rad], shape [6] each, and a checksum per joint, by which two arms differ."""
 
     theta: np.ndarray
     a: np.ndarray
@@ -77,11 +72,8 @@ def one_arm(arm: UrArm, most: float, rng: np.random.Generator) -> UrArm:
 
 
 def read_calibration(address: str, seconds: float = 1.0) -> FactoryCalibration | None:
-    """Return the calibration of the arm at ``address``; None if its controller does not send it.
-
-    Args:
-        seconds: Longest wait for it [s].
-    """
+    """Return the calibration of the arm at ``address``; None if its controller does not send it
+    within ``seconds`` [s]."""
     end = time.monotonic() + seconds
     data = b""
     try:
@@ -110,11 +102,8 @@ def kinematics_message(calibration: FactoryCalibration) -> bytes:
 
 
 def _taken(data: bytes) -> tuple[FactoryCalibration | None, bytes]:
-    """The calibration among the complete messages of ``data``, and the bytes left.
-
-    Raises:
-        ValueError: these are no messages.
-    """
+    """The calibration among the complete messages of ``data``, and the bytes left; ValueError if
+    these are no messages."""
     while len(data) >= _HEAD.size:
         size, kind = _HEAD.unpack_from(data)
         if not _HEAD.size <= size <= _LONGEST:

@@ -37,14 +37,8 @@ REQUEST = checked(struct.pack(">BBHH", SLAVE, READ, FIRST_REGISTER, COUNT))
 
 
 class Ft300Line:
-    """The serial line to a sensor; nothing here waits, except while it opens.
-
-    Args:
-        device: Such as ``/dev/ttyUSB0``.
-
-    Raises:
-        InputError: this system has no such lines. WorkError: nothing answers as an FT300.
-    """
+    """The serial line to a sensor, such as ``/dev/ttyUSB0``; only opening waits. InputError without
+    such lines on this system; WorkError if nothing answers as an FT300."""
 
     def __init__(self, device: str, seconds: float = _OPEN_SECONDS):
         self.device = device
@@ -70,11 +64,8 @@ class Ft300Line:
             raise
 
     def poll(self) -> np.ndarray | None:
-        """Return a reading that has arrived, shape [6] in N and N m, and ask for the next.
-
-        Raises:
-            ConnectionError: the line was lost.
-        """
+        """Return a reading that has arrived, shape [6] in N and N m, and ask for the next;
+        ConnectionError if the line was lost."""
         try:
             self._data += self._arrived()
             found = self._reading()

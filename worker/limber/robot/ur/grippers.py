@@ -31,15 +31,9 @@ _VALUE = re.compile(rb"([A-Z]{3}) (\d+)")
 
 
 class RobotiqGripper:
-    """A connection to the gripper; a context manager.
-
-    Args:
-        address: Address of the controller.
-        seconds: Longest wait for an answer [s].
-
-    Raises:
-        WorkError: nothing answers, or the gripper is not activated or reports a fault.
-    """
+    """A connection to the gripper at a controller's address, with at most ``seconds`` [s] for an
+    answer; a context manager. WorkError if nothing answers, or it is not activated or reports a
+    fault."""
 
     def __init__(self, address: str, seconds: float = _ANSWER_SECONDS):
         self.address = address
@@ -73,25 +67,16 @@ class RobotiqGripper:
                             "Activate it on the pendant, with nothing in the jaws.")
 
     def drive(self, close: bool, force: float) -> None:
-        """Begin to close or open, without waiting.
-
-        Args:
-            force: Share of its greatest force, 0 to 1.
-
-        Raises:
-            WorkError: no acknowledgement.
-        """
+        """Begin to close or open, without waiting, with a share of its greatest force, 0 to 1;
+        WorkError without acknowledgement."""
         command = f"SET POS {CLOSED if close else 0} SPE 255 FOR {round(255 * force)} GTO 1"
         if self._asked(command).strip() != b"ack":
             raise WorkError("The Robotiq gripper did not acknowledge its command.", "",
                             "See its status on the pendant.")
 
     def stopped(self, seconds: float) -> int:
-        """Return why it stopped (``OBJ``), waiting at most ``seconds`` [s] until it has.
-
-        Raises:
-            WorkError: it moves still.
-        """
+        """Return why it stopped (``OBJ``), waiting at most ``seconds`` [s]; WorkError if it moves
+        still."""
         end = time.monotonic() + seconds
         while (why := self._get("OBJ")) == MOVING:
             if time.monotonic() > end:
@@ -138,11 +123,8 @@ class _Outputs(SampleStream):
 
 
 def switch_output(address: str, number: int, on: bool) -> None:
-    """Switch a standard digital output.
-
-    Raises:
-        WorkError: no answer, another program drives the outputs, or the output did not switch.
-    """
+    """Switch a standard digital output; WorkError without answer, if another program drives the
+    outputs, or it did not switch."""
     bit = 1 << number
     stream = _Outputs(address)
     try:
@@ -169,11 +151,8 @@ def is_driven(cell: Cell) -> bool:
 
 
 def drive_gripper(cell: Cell, close: bool) -> None:
-    """Close or open the gripper, without waiting until it has.
-
-    Raises:
-        InputError: Limber does not drive it. WorkError: it does not answer.
-    """
+    """Close or open the gripper, without waiting until it has. InputError if Limber does not drive
+    it; WorkError if it does not answer."""
     tool = cell.tool
     if tool.gripper == "robotiq":
         with RobotiqGripper(cell.robot.address) as gripper:
@@ -186,11 +165,8 @@ def drive_gripper(cell: Cell, close: bool) -> None:
 
 
 def holds(cell: Cell) -> bool | None:
-    """Return whether something is in the closed jaws; None if the gripper does not tell.
-
-    Raises:
-        WorkError: it does not answer, or it moves still.
-    """
+    """Return whether something is in the closed jaws, None if the gripper does not tell; WorkError
+    if it does not answer, or moves still."""
     if cell.tool.gripper != "robotiq":
         return None
     with RobotiqGripper(cell.robot.address) as gripper:

@@ -102,11 +102,9 @@ class Recipe:
         return frame(DATA, bytes([self.number]) + self.layout.pack(*flat))
 
     def unpacked(self, body: bytes) -> dict[str, Any]:
-        """Return the values of a data frame's body (without its recipe number).
-
-        A shorter body gives the complete values: ur-rtde sends some commands through a recipe that
-        has more fields than the command has arguments.
-        """
+        """Return the values of a data frame's body without its recipe number; of a shorter body the
+        complete ones, as ur-rtde sends some commands by a recipe with more fields than they have
+        arguments."""
         values, offset = {}, 0
         for name, kind in zip(self.names, self.types, strict=True):
             part = struct.Struct(">" + _FORMATS[kind])
@@ -124,11 +122,8 @@ def frame(command: int, body: bytes) -> bytes:
 
 
 def split_frames(data: bytearray) -> list[tuple[int, bytes]]:
-    """Remove the complete frames from the front of ``data``: command and body of each.
-
-    Raises:
-        ValueError: an impossible size; the other side is not an RTDE server.
-    """
+    """Remove the complete frames from the front of ``data``: command and body of each; ValueError
+    for an impossible size, as of no RTDE server."""
     frames = []
     while len(data) >= 3:
         size, command = struct.unpack_from(">HB", data)
@@ -172,15 +167,8 @@ _NEWER = ("tcp_offset", "payload", "payload_cog")  # not known to every version
 
 
 class SampleStream:
-    """The controller's RTDE output, read without loss.
-
-    Args:
-        address: Address of the controller.
-        timeout: Longest wait for an answer while connecting [s].
-
-    Raises:
-        WorkError: the address does not answer, or it is not an RTDE server.
-    """
+    """The RTDE output of the controller at ``address``, read without loss; ``timeout`` [s] holds
+    while connecting. WorkError if it does not answer, or is no RTDE server."""
 
     inputs: tuple[str, ...] = ()
     """Names of RTDE inputs that :meth:`write` sends; a plain stream only reads."""
@@ -250,16 +238,9 @@ class SampleStream:
         self._queue += split_frames(self._data)
 
     def read(self, timeout: float, beside: Sequence[socket.socket] = ()) -> list[Sample]:
-        """Return the next samples, waiting at most ``timeout`` [s] for the first.
-
-        After a delay they arrive in small batches, so that the caller can act in between.
-
-        Args:
-            beside: Other connections: data there ends the wait as well, without samples.
-
-        Raises:
-            ConnectionError: the connection to the robot was lost.
-        """
+        """Return the next samples, waiting at most ``timeout`` [s] for the first, or until data
+        comes ``beside``; after a delay in small batches, so that the caller can act in between.
+        ConnectionError if the connection was lost."""
         if not self._queue:
             ready = select.select([self._socket, *beside], [], [], timeout)[0]
             if self._socket in ready:
@@ -271,11 +252,7 @@ class SampleStream:
         return [self._sample(body) for kind, body in taken if kind == DATA]
 
     def write(self, values: Mapping[str, float]) -> None:
-        """Send a value for each of :attr:`inputs`.
-
-        Raises:
-            OSError: the connection is broken.
-        """
+        """Send a value for each of :attr:`inputs`; OSError if the connection is broken."""
         self._socket.sendall(self._input_recipe.packed(values))
 
     def skip(self) -> None:
@@ -307,11 +284,8 @@ def _array(numbers: Sequence[float] | None) -> np.ndarray | None:
 
 
 class Dashboard:
-    """The controller's dashboard: its description, and the second channel to stop it.
-
-    Raises:
-        WorkError: it does not answer.
-    """
+    """The controller's dashboard: its description, and the second channel to stop it; WorkError if
+    it does not answer."""
 
     def __init__(self, address: str, timeout: float = 2.0):
         self.address = address
@@ -327,11 +301,7 @@ class Dashboard:
                             ) from error
 
     def ask(self, command: str) -> str:
-        """Return the reply to a command.
-
-        Raises:
-            ConnectionError: there is no reply.
-        """
+        """Return the reply to a command; ConnectionError if there is none."""
         try:
             self._socket.sendall(f"{command}\n".encode())
             return self._file.readline().strip()

@@ -19,16 +19,9 @@ _STOP_DECELERATION = 8.0  # rad/s^2 of the joints
 
 
 class UrControl(SampleStream):
-    """One controller: its samples, the program that moves its arm, and its dashboard.
-
-    See :class:`limber.robot.interface.ArmControl`.
-
-    Args:
-        cell: Robot, tool and gripper.
-
-    Raises:
-        InputError: it is another robot. SafetyStop: it must not be moved now. WorkError: no data.
-    """
+    """One controller, as a :class:`limber.robot.interface.ArmControl`: its samples, the program
+    that moves its arm, and its dashboard. InputError if it is another robot, SafetyStop if it must
+    not be moved now, WorkError without data."""
 
     lookahead = 0.06
     silence = 1.0 / _WATCHDOG_HZ
@@ -82,12 +75,8 @@ class UrControl(SampleStream):
         return facts
 
     def connect(self) -> None:
-        """Connect with ur-rtde, set tool, payload and watchdog.
-
-        Raises:
-            SafetyStop: another program runs. WorkError: the robot rejects its settings.
-            RuntimeError: ur-rtde's own.
-        """
+        """Connect with ur-rtde, set tool, payload and watchdog. SafetyStop if another program runs,
+        WorkError if the robot rejects its settings, RuntimeError of ur-rtde."""
         from rtde_control import RTDEControlInterface
 
         if self._first.program_runs:
@@ -146,11 +135,8 @@ class UrControl(SampleStream):
         return self._control.kickWatchdog()
 
     def grip(self, close: bool) -> None:
-        """Close or open the gripper.
-
-        Raises:
-            InputError: its gripper is not driven from here. WorkError: the robot does not do it.
-        """
+        """Close or open the gripper; InputError if it is not driven from here, WorkError if the
+        robot does not do it."""
         tool = self._cell.tool
         if self._gripper is not None:
             self._gripper.drive(close, tool.grip_force)

@@ -33,21 +33,11 @@ def joined(first: Bends, then: Bends) -> Bends:
 
 @dataclass
 class Solution:
-    """The branch at one pose of the held patch.
-
-    Attributes:
-        frame: Frame of the patch, branch frame, shape [4, 4].
-        wrench: Wrench of the gripper on the branch, about the patch's position, branch frame [N, N
-        m].
-        stiffness: Its derivative to position and rotation, shape [6, 6].
-        points: Seen points [m], shape [n, 3].
-        point_slopes: Their derivative to position and rotation, shape [3 n, 6].
-        peak_strain: Greatest principal strain.
-        seconds: Computing time.
-        converged: Whether it is an equilibrium; if not, the rest is of the last one.
-        bends: Changes of the stiffness, first over the displacement from an earlier solution, then
-            over those tried when the gripper closed.
-    """
+    """The branch at one pose of the held patch, branch frame [4, 4]: the gripper's wrench on it
+    about the patch [N, N m], its derivative to position and rotation [6, 6], seen points [m], [n,
+    3], with theirs [3 n, 6], and the greatest principal strain. If not ``converged``, these are of
+    the last equilibrium. ``bends``: changes of the stiffness, first over the displacement from an
+    earlier solution, then over those tried when the gripper closed."""
 
     frame: np.ndarray
     wrench: np.ndarray
@@ -60,10 +50,8 @@ class Solution:
     bends: Bends = NO_BENDS
 
     def wrench_at(self, patch: np.ndarray, compliance: float) -> np.ndarray:
-        """Return the wrench [6] at the patch's frame ``patch`` of a rigid gripper.
-
-        The patch stays behind by ``compliance`` [m/N] times the force; valid near its own frame.
-        """
+        """Return the wrench [6] at the frame ``patch`` of a rigid gripper, near the solution's own;
+        the patch stays behind by ``compliance`` [m/N] times the force."""
         return steer(self.frame, self.wrench, self.stiffness, *self.bends, patch, compliance)
 
     def change_to(self, patch: np.ndarray) -> np.ndarray:
@@ -128,14 +116,9 @@ class BranchSetting:
     @classmethod
     def of_truth(cls, truth: Any, cell: Any, path: Path, *, poisson: float = 0.35,
                  density: float = 900.0, wave: float = 0.0) -> BranchSetting:
-        """Return the setting of a :class:`~limber.estimation.simulated_pull.TrueBranch` in a cell.
-
-        Its mesh is written to ``path``. The seen points are the control points and the tip.
-
-        Args:
-            wave: Deviation of log E between the control points from the linear course that a fit
-                assumes.
-        """
+        """Return the setting of a :class:`~limber.estimation.simulated_pull.TrueBranch` in a cell,
+        its mesh at ``path``, control points and tip seen; ``wave``: deviation of log E between the
+        control points from the linear course that a fit assumes."""
         from limber.mechanics.materials.materials import young_weights
 
         mesh, count = truth.mesh, truth.mesh.tet_count
@@ -196,10 +179,8 @@ class BranchSolver:
         return self._points + (self._operator @ self._state.ravel()).reshape(-1, 3)
 
     def look(self, camera: dict[str, Any], is_held: bool) -> bytes:
-        """Return a depth camera's image of the branch, with its noise: 16 bits a pixel, packed.
-
-        Not held, the branch is at rest.
-        """
+        """Return a depth camera's noisy image of the branch, at rest if not held: 16 bits a pixel,
+        packed."""
         from limber.geometry.cloud.camera import Camera
         from limber.perception.simulated_camera import render_depth, with_noise
 
@@ -273,10 +254,8 @@ class BranchSolver:
         return self._last
 
     def _guessed(self, patch: np.ndarray) -> np.ndarray | None:
-        """Approximate positions of the nodes at a frame of the patch, [node_count, 3].
-
-        From the tangent of the solution before and its change.
-        """
+        """Approximate positions of the nodes at a frame of the patch, [node_count, 3], from the
+        tangent of the solution before and its change."""
         if self._last is None or self._follows is None:
             return None
         change, follows = self._last.change_to(patch), self._follows

@@ -59,14 +59,8 @@ class RobotMode(IntEnum):
 
 @dataclass
 class SensorFault:
-    """Faults of the force readings, for tests.
-
-    Attributes:
-        added: Wrench added to the sensor's report, flange frame [N, N m].
-        frozen: Repeats the last reading.
-        nan: Reports no numbers.
-        joints_nan: Reports no numbers as joint angles.
-    """
+    """Faults of the force readings, for tests: a wrench added in the flange's frame [N, N m], the
+    last reading repeated, no numbers as forces, or none as joint angles."""
 
     added: np.ndarray = field(default_factory=lambda: np.zeros(6))
     frozen: bool = False
@@ -106,12 +100,9 @@ class Braking:
 
 
 class Servo:
-    """Follows a target that is updated at any rate (servoj).
-
-    The controller scales the time of its own motion by the speed slider. Below 1 the arm follows
-    the target at that fraction of the target's speed and falls behind; it catches up when the
-    slider is at 1 again.
-    """
+    """Follows a target that is updated at any rate (servoj). Below 1 the speed slider scales its
+    time: the arm follows at that fraction of the target's speed, falls behind, and catches up at
+    1."""
 
     def __init__(self) -> None:
         self.finished = False
@@ -151,11 +142,8 @@ Motion = Servo | Braking
 
 
 def nearest_joints(arm: Arm, pose: np.ndarray, tool: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return the joint angles nearest to ``near`` that bring the tool to ``pose``.
-
-    Raises:
-        Unreachable: no joint angles reach it.
-    """
+    """Return the joint angles nearest to ``near`` that bring the tool to ``pose``; Unreachable if
+    none does."""
     solutions = arm.inverse(matrices(pose) @ inverted(tool), near)
     solutions = solutions[np.isfinite(solutions).all(axis=1)]
     if len(solutions) == 0:
@@ -293,16 +281,9 @@ _SLOW_HZ = 125.0  # the rate of a CB3
 
 
 class Controller:
-    """A controller with its arm.
-
-    Args:
-        model: Name of the arm.
-        joints: Initial joint angles [rad], shape [6]; the arm's home if absent.
-        mass, centre: Actual payload at the flange [kg], [m].
-        seed: Seed of the sensors' noise.
-        load: The gripper's load.
-        off_nominal: Largest difference of a length of this arm from the nominal one [m].
-    """
+    """A controller with its arm: model, initial joint angles [rad] (else its home), actual payload
+    at the flange [kg], [m], the gripper's load; ``seed`` of the sensors' noise, ``off_nominal``:
+    largest difference of a length of this arm from the nominal one [m]."""
 
     def __init__(self, model: str, *, joints: np.ndarray | None = None, mass: float = 0.0,
                  centre: tuple[float, float, float] = (0.0, 0.0, 0.0), seed: int = 0,
@@ -419,10 +400,8 @@ class Controller:
             self._brake()
 
     def safeguard_stop(self) -> None:
-        """Open the safeguard input, as a light curtain does: the arm stops, the program is paused.
-
-        It stays paused until it is played (user manual, "Safety functions": category 2 stop).
-        """
+        """Open the safeguard input, as a light curtain does: the arm stops, and the program is
+        paused until it is played (user manual, "Safety functions": category 2 stop)."""
         if self.can_move:
             self.say("safeguard stop")
             self.safety_mode = SafetyMode.SAFEGUARD_STOP
@@ -430,10 +409,8 @@ class Controller:
             self._brake()
 
     def reduce(self) -> None:
-        """Switch to reduced mode, as its input or a safety plane does: programs go on.
-
-        The controller then holds other, lower limits (user manual, "Safety modes").
-        """
+        """Switch to reduced mode, as its input or a safety plane does: programs go on within other,
+        lower limits (user manual, "Safety modes")."""
         if self.safety_mode == SafetyMode.NORMAL:
             self.say("reduced mode")
             self.safety_mode = SafetyMode.REDUCED
@@ -611,11 +588,8 @@ class Controller:
 
 
 def _six(joints: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return joint angles as an array, if they are those of an arm that RTDE supports.
-
-    Raises:
-        InputError: they are not six finite numbers.
-    """
+    """Return joint angles as an array; InputError if they are not the six finite numbers of an arm
+    that RTDE supports."""
     angles = np.array(joints, float)
     if angles.shape != (6,) or not np.isfinite(angles).all():
         raise InputError("The joint angles are "

@@ -108,10 +108,8 @@ class HeldBranch:
         return self._at_flange(-on_branch, patch, flange)
 
     def grasp(self) -> None:
-        """Close the gripper at its present pose; the arm's loop does not wait for the solver.
-
-        The state is ``closing``, then ``held``, or ``empty`` if no branch is between the jaws.
-        """
+        """Close the gripper at its present pose, without waiting for the solver: ``closing``, then
+        ``held``, or ``empty`` if no branch is between the jaws."""
         self.state, self._solution = "closing", None
         self._closed_at = self._gripper
         self._asked = False
@@ -172,11 +170,8 @@ class HeldBranch:
         return ((self.points - self._base[:3, 3]) @ self._base[:3, :3]).tolist()
 
     def look(self, camera: dict[str, Any]) -> None:
-        """Ask for a depth image; it is in ``picture`` when the solver has computed it.
-
-        Args:
-            camera: Content of a :class:`~limber.geometry.cloud.camera.Camera`.
-        """
+        """Ask for a depth image of a :class:`~limber.geometry.cloud.camera.Camera`; it is in
+        ``picture`` when the solver has computed it."""
         self._view, self.picture = camera, None
 
     def _take_picture(self) -> None:

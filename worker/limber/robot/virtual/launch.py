@@ -27,13 +27,8 @@ _START_SECONDS = 240.0  # the first start on a machine compiles the kernels of t
 
 
 class VirtualRobot:
-    """A virtual robot in its own process; a context manager.
-
-    Args:
-        model: Name of the arm.
-        address: Loopback address to serve on.
-        options: Further options of ``python -m limber.robot.virtual``.
-    """
+    """A virtual robot in its own process, on a loopback address; a context manager. ``options`` are
+    further ones of ``python -m limber.robot.virtual``."""
 
     def __init__(self, model: str = "ur5e", address: str = "127.0.0.1",
                  options: Sequence[str] = ()):
@@ -58,11 +53,8 @@ class VirtualRobot:
         self.close()
 
     def ask(self, action: str, **values: Any) -> dict[str, Any]:
-        """Do ``action`` of :data:`ACTIONS` in the robot; returns its state after it.
-
-        Raises:
-            WorkError: the process does not answer, or refuses.
-        """
+        """Do ``action`` of :data:`ACTIONS` in the robot; return its state after it. WorkError if
+        the process does not answer, or refuses."""
         try:
             self._child.send({"action": action, **values})
         except ConnectionError as error:
@@ -98,11 +90,8 @@ class VirtualRobot:
 
 def serve(controller: Controller, address: str, *, control: bool = False,
           seconds: float | None = None, say: Callable[[str], None] = lambda line: None) -> Server:
-    """Serve ``controller`` until interrupted, its input ends (``control``) or time is up.
-
-    Raises:
-        WorkError: a port is in use.
-    """
+    """Serve ``controller`` until interrupted, its input ends (``control``) or time is up; WorkError
+    if a port is in use."""
     _warm_up(controller)
     loop = new_loop()
     asyncio.set_event_loop(loop)
@@ -240,16 +229,11 @@ ACTIONS: dict[str, Callable[..., Any]] = {
 _SECONDS = 30.0
 _LARGEST_STEP_M = 0.01
 """Largest depth step between neighbouring pixels of one surface; more is a silhouette with flying
-pixels.
-"""
+pixels."""
 
 
 class VirtualCamera:
-    """A depth camera at any pose; a context manager.
-
-    Raises:
-        WorkError: the port does not answer.
-    """
+    """A depth camera at any pose; a context manager. WorkError if the port does not answer."""
 
     def __init__(self, address: str):
         try:
@@ -268,11 +252,8 @@ class VirtualCamera:
         self._socket.close()
 
     def depth(self, camera: Camera) -> np.ndarray:
-        """Return a camera's depth image [m], 0 where nothing is seen, shape [height, width].
-
-        Raises:
-            WorkError: the virtual robot has ended.
-        """
+        """Return a camera's depth image [m], 0 where nothing is seen, shape [height, width];
+        WorkError if the virtual robot has ended."""
         try:
             self._socket.sendall(camera.model_dump_json().encode() + b"\n")
             header = json.loads(self._stream.readline() or b"{}")
@@ -288,8 +269,7 @@ class VirtualCamera:
 
 def views_around(middle: np.ndarray, distance: float, count: int,
                  camera: Camera = D455) -> list[Camera]:
-    """Return cameras around a position [3], ``distance`` [m] away, alternately high and low.
-    """
+    """Return cameras around a position [3], ``distance`` [m] away, alternately high and low."""
     if count < 1 or not distance > 0:
         raise InputError(f"{count} views from a distance of {distance:g} m were "
                          "requested.", "A scan needs at least one view "
@@ -304,11 +284,8 @@ def views_around(middle: np.ndarray, distance: float, count: int,
 
 
 def scanned(address: str, cameras: list[Camera]) -> np.ndarray:
-    """Return the points [m, 3] that cameras see together, without silhouettes.
-
-    Raises:
-        WorkError: there is no camera, or none of them sees anything.
-    """
+    """Return the points [m, 3] that cameras see together, without silhouettes; WorkError without
+    cameras, or if none sees anything."""
     parts = []
     with VirtualCamera(address) as eye:
         for camera in cameras:

@@ -46,11 +46,8 @@ FT300 = SensorTraits(force_sigma=0.1, torque_sigma=0.005, force_bias=2.0, torque
 
 
 class ForceSensor:
-    """One sensor: true wrench in, reading out, both in the sensor's frame.
-
-    Attributes:
-        gain: Reading for one newton.
-    """
+    """One sensor: true wrench in, reading out, in the sensor's frame; ``gain``: reading for one
+    newton."""
 
     def __init__(self, traits: SensorTraits, rng: np.random.Generator):
         self.traits = traits
@@ -161,15 +158,8 @@ class Nothing:
 
 
 class RobotiqRegisters:
-    """The registers of a Robotiq gripper, as its URCap answers for them.
-
-    Args:
-        drive: Closes (True) or opens the jaws.
-        load_state: Returns the state of what is between them, as :class:`.HeldBranch` names it.
-
-    Attributes:
-        values: The registers by name.
-    """
+    """The registers of a Robotiq gripper, as its URCap answers for them; ``drive`` closes (True) or
+    opens the jaws, ``load_state`` names what is between them, as :class:`.HeldBranch` does."""
 
     def __init__(self, drive: Callable[[bool], None], load_state: Callable[[], str]):
         self._drive, self._load_state = drive, load_state

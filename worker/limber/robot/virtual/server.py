@@ -142,14 +142,9 @@ _SENDS_BEHIND = 1 << 20  # bytes that a client may leave unread before it is dis
 
 
 class Server:
-    """Serves one controller on a loopback address.
-
-    Attributes:
-        delay: Delay of every message in each direction (a bad cable) [s].
-        silent: Ports accept and read, but do not answer.
-        ft300_fault: ``silent`` sends nothing, ``nonsense`` no numbers, ``cut`` ends the
-            connection; empty: none.
-    """
+    """Serves one controller on a loopback address; ``delay`` of every message [s], as by a bad
+    cable; ``silent`` ports accept and read, but do not answer; ``ft300_fault``: ``silent`` sends
+    nothing, ``nonsense`` no numbers, ``cut`` ends the connection."""
 
     def __init__(self, controller: Controller, address: str):
         if not address.startswith("127.") and address not in ("localhost", "::1"):
@@ -343,10 +338,8 @@ class Server:
 
 
 class _Client(asyncio.Protocol):
-    """One client whose messages are taken as they arrive.
-
-    A stream's reader would leave them for the loop's next cycle, which is part of a stop's time.
-    """
+    """One client whose messages are taken as they arrive: a stream's reader would leave them for
+    the loop's next cycle, which is part of a stop's time."""
 
     def __init__(self, server: Server):
         self._server = server

@@ -11,14 +11,8 @@ _FARTHEST = 0.03  # m over which a change of the tangent is extrapolated
 @compiled
 def tool_state(flange: np.ndarray, slopes: np.ndarray, speeds: np.ndarray, tool: np.ndarray,
                ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tool's pose [6] and its speed [6] in the base's frame.
-
-    Args:
-        flange: Frame of the flange, shape [4, 4].
-        slopes: The arm's Jacobian, shape [6, n].
-        speeds: Joint speeds [rad/s], shape [n].
-        tool: Frame of the tool in the flange's, shape [4, 4].
-    """
+    """Return the tool's pose [6] and speed [6] in the base's frame, by the flange's frame [4, 4],
+    the Jacobian [6, n], joint speeds [rad/s], and the tool's frame in the flange's [4, 4]."""
     tip = flange @ tool
     motion = slopes @ speeds
     lever = tip[:3, 3] - flange[:3, 3]
@@ -34,15 +28,11 @@ def tool_state(flange: np.ndarray, slopes: np.ndarray, speeds: np.ndarray, tool:
 @compiled
 def servo_step(joints: np.ndarray, speeds: np.ndarray, target: np.ndarray, gain: float,
                lookahead: float, step: float, largest: float) -> tuple[np.ndarray, np.ndarray]:
-    """One step of servoj: a spring of ``gain`` [1/s^2] to the target, damped by ``lookahead`` [s].
-
-    The controller's own law is not published. This one has its known properties: a steadily moving
-    target is followed ``lookahead`` seconds behind, more gain follows more closely, and a short
-    lookahead with a high gain overshoots.
-
-    Returns:
-        New joints [n] and speeds [n]; accelerations stay within ``largest`` [rad/s^2].
-    """
+    """One step of servoj, as new joints and speeds [n] with accelerations up to ``largest``
+    [rad/s^2]: a spring of ``gain`` [1/s^2] to the target, damped by ``lookahead`` [s]. The
+    controller's law is not published; this has its known properties: it lags ``lookahead`` behind a
+    steady target, more gain follows more closely, and a short lookahead with a high gain
+    overshoots."""
     new_speeds = np.empty_like(joints)
     new_joints = np.empty_like(joints)
     # Implicit in the speed, so that any gain is stable at 125 Hz as well.
@@ -58,16 +48,10 @@ def servo_step(joints: np.ndarray, speeds: np.ndarray, target: np.ndarray, gain:
 @compiled
 def steer(frame: np.ndarray, wrench: np.ndarray, stiffness: np.ndarray, directions: np.ndarray,
           bends: np.ndarray, patch: np.ndarray, compliance: float) -> np.ndarray:
-    """Return the wrench [6] of a held branch near where it was solved.
-
-    Args:
-        frame, wrench, stiffness: Frame of the solution [4, 4], the wrench there [6] and its
-            derivative to position and rotation [6, 6].
-        directions, bends: Displacements [m], shape [n, 3], and the change of stiffness over each,
-            shape [n, 6, 6]; earlier ones take precedence.
-        patch: Frame of the held patch with zero compliance, shape [4, 4].
-        compliance: Distance of the patch behind the gripper per force [m/N].
-    """
+    """Return the wrench [6] of a held branch near a solution's frame [4, 4], by its wrench,
+    stiffness [6, 6], and changes of that [n, 6, 6] over displacements [m], [n, 3], of which earlier
+    ones take precedence; ``patch``: the held one's frame without compliance [m/N], which lets it
+    lag."""
     change = np.empty(6)
     change[:3] = patch[:3, 3] - frame[:3, 3]
     change[3:] = rotation_vector(patch @ inverse_of(frame))
