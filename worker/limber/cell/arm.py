@@ -22,13 +22,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rods:
-    """Links of an arm, or parts of its gripper, in some poses: capsules in the base's frame.
-
-    Attributes:
-        names: Names of the links, one per rod.
-        starts, ends: End points of the rods' axes [m], shape [poses, rods, 3].
-        radii: [m], shape [rods].
-    """
+    """Links of an arm, or parts of its gripper, in some poses as capsules in the base's frame:
+    names and radii [m], [rods], end points of their axes [m], [poses, rods, 3]."""
 
     names: tuple[str, ...]
     starts: np.ndarray

@@ -325,14 +325,8 @@ class Cell(_Entry):
                                 np.minimum(limits[:, 1], own[:, 1])])
 
     def flange_frames(self, grasp_poses: np.ndarray) -> np.ndarray:
-        """Return the flange's frames in the robot's base for grasp poses in the branch's frame.
-
-        Args:
-            grasp_poses: [m, rad], shape [..., 6].
-
-        Returns:
-            Shape [..., 4, 4].
-        """
+        """Return the flange's frames in the robot's base, [..., 4, 4], for grasp poses in the
+        branch's frame [m, rad], shape [..., 6]."""
         return (inverted(matrices(np.array(self.base.pose))) @ matrices(grasp_poses)
                 @ inverted(matrices(np.array(self.tool.grasp_pose))))
 
@@ -343,12 +337,8 @@ class Cell(_Entry):
 
 
 def read_cell(path: str | Path) -> Cell:
-    """Read a cell file.
-
-    Raises:
-        InputError: it cannot be read, is not TOML (the line is named), or an entry makes no sense
-            (the field is named).
-    """
+    """Read a cell file; InputError if it cannot be read, is not TOML (with the line), or an entry
+    makes no sense (with the field)."""
     path = Path(path)
     content = read_toml(path, Text("the description of a robot's cell (TOML; ",
                                    Command("robot calibrate"), " makes one)"), finite=False)
@@ -662,11 +652,8 @@ _SAME_M, _SAME_RAD = 1e-3, 5e-3
 
 
 def require_payload(cell: Cell) -> None:
-    """Refuse to move an arm whose payload is not stated.
-
-    Raises:
-        InputError: the cell does not state the gripper's mass.
-    """
+    """Refuse to move an arm whose payload is not stated: InputError if the cell lacks the gripper's
+    mass."""
     if cell.tool.mass_kg is None:
         raise InputError("The cell file does not state tool.mass_kg, so the payload is not set.",
                          "The controller and the guard would interpret the gripper's weight as a "
@@ -675,14 +662,8 @@ def require_payload(cell: Cell) -> None:
 
 
 def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
-    """Return a warning if a plan was made without a robot's cell.
-
-    Args:
-        made_for: What the plan's file states about its robot.
-
-    Raises:
-        InputError: it was made for another robot, another branch or another pose of the base.
-    """
+    """Return a warning if a plan was made without a robot's cell; ``made_for``: what its file
+    states. InputError if that is another robot, branch or pose of the base."""
     if not made_for:
         return Text("The plan was made without a cell (", Command("plan", Option("cell")), "), so "
                     "obstacles and the gripper's shape were not checked.")
@@ -709,11 +690,8 @@ def check_plan(made_for: dict[str, Any] | None, cell: Cell) -> str | None:
 
 
 def check_branch(cell: Cell, uuid: str, folder: object) -> str | None:
-    """Return a warning if the cell names no branch.
-
-    Raises:
-        InputError: the cell was calibrated for another branch.
-    """
+    """Return a warning if the cell names no branch; InputError if it was calibrated for another
+    one."""
     if cell.branch is None:
         return Text("The cell file names no branch, so it is assumed that base.pose was calibrated "
                     "for this one. ", Command("robot calibrate"), " writes the name.")

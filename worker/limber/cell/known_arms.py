@@ -26,12 +26,8 @@ def register_arm(arm: Arm) -> None:
 
 
 def arm_named(name: str) -> Arm:
-    """Return the arm called ``name``, in any case and with or without a hyphen, or a URDF file's.
-
-    Raises:
-        InputError: the arm is unknown, the file does not describe an arm, or an installed package
-            of arms is incomplete.
-    """
+    """Return the arm called ``name``, in any case and with or without a hyphen, or a URDF file's;
+    InputError if unknown, no arm, or if an installed package of arms is incomplete."""
     if name.lower().endswith(ENDING):
         return arm_of_file(name)
     if _plain(name) not in _ARMS:
@@ -51,11 +47,7 @@ def _plain(name: str) -> str:
 
 @functools.cache
 def _import_packages() -> None:
-    """Import the arms that installed packages register.
-
-    Raises:
-        InputError: one cannot be imported.
-    """
+    """Import the arms that installed packages register; InputError if one cannot be imported."""
     for entry in entry_points(group="limber.arms"):
         try:
             entry.load()

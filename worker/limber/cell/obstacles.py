@@ -126,11 +126,8 @@ class Limbs:
 
 
 def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
-    """Return the cell's obstacles; mesh files are in ``folder``.
-
-    Raises:
-        InputError: a mesh cannot be read, has holes, or is in another unit.
-    """
+    """Return the cell's obstacles; mesh files are in ``folder``. InputError if a mesh cannot be
+    read, has holes, or is in another unit."""
     found: list[Obstacle] = []
     for number, entry in enumerate(cell.obstacles):
         name = entry.name or f"obstacle {number + 1}"

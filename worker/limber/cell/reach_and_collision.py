@@ -31,21 +31,15 @@ Blocked = Callable[[np.ndarray, np.ndarray], NoPathError | None]
 
 
 def rods_of(cell: Cell, joints: np.ndarray, flange: np.ndarray | None = None) -> Rods:
-    """Return the rods of arm and gripper at joint angles [n, joints], base frame.
-
-    Args:
-        flange: Frames of the flange there if they are known, base frame, shape [n, 4, 4].
-    """
+    """Return the rods of arm and gripper at joint angles [n, joints], base frame; ``flange``: its
+    frames there, if known, [n, 4, 4]."""
     flange = cell.arm.forward(joints) if flange is None else flange
     return cell.arm.rods(joints).joined(_stated_gripper(cell, flange))
 
 
 def drawn_arm(arm: Arm, joints: np.ndarray, base: np.ndarray) -> Rods:
-    """Return the rods of an arm's foot and links at joint angles [n, joints].
-
-    Args:
-        base: Frame of its base in that of the rods, shape [4, 4].
-    """
+    """Return the rods of an arm's foot and links at joint angles [n, joints]; ``base``: its frame
+    in theirs, [4, 4]."""
     links = arm.rods(joints).placed(base)
     first = links.starts[:, :1]
     foot = np.broadcast_to(base[:3, 3], first.shape)
@@ -72,13 +66,8 @@ def _stated_gripper(cell: Cell, flange: np.ndarray) -> Rods:
 
 
 class ArmSurroundings:
-    """Computes the distance of an arm with its gripper from all obstacles.
-
-    Args:
-        cell: Arm, gripper and base.
-        obstacles: Obstacles of the cell, branch frame.
-        branch: The branch, also an obstacle; None: there is none.
-    """
+    """Computes the distance of a cell's arm with its gripper from all obstacles, branch frame, and
+    from the branch, if there is one."""
 
     def __init__(self, cell: Cell, obstacles: tuple[Obstacle, ...], branch: Skeleton | None):
         self._cell, self._obstacles = cell, obstacles
@@ -176,13 +165,9 @@ def _apart(rods: Rods, first: int, second: int) -> np.ndarray:
 
 def clearance_in(cell: Cell, asked: float | None, obstacles: tuple[Obstacle, ...],
                  grasp: np.ndarray, nodes: np.ndarray) -> float:
-    """Return the clearance from obstacles [m]: ``asked`` if given, else a value that covers the
-    uncertainty of the grasp position, limited to nearly the clearance at rest.
-
-    Args:
-        grasp, nodes: Grasp and nodes of the branch at rest, branch frame [m], shapes [3] and [n,
-        3].
-    """
+    """Return the clearance from obstacles [m]: ``asked`` if given, else what covers the uncertainty
+    of the grasp position, limited to nearly the clearance at rest; grasp and nodes of the branch
+    there, branch frame [m], shapes [3] and [n, 3]."""
     if asked is not None or not obstacles:
         return asked or 0.0
     base, arm = cell.base, float(np.linalg.norm(grasp - np.array(cell.base.pose[:3])))
@@ -202,12 +187,8 @@ def blocked_by(cell: Cell, obstacles: tuple[Obstacle, ...], clearance: float = 0
 
 def _obstructing(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
                  joints: np.ndarray, clearance: float) -> NoPathError | None:
-    """Return the error for the deepest point in an obstacle or its ``clearance`` [m], or None.
-
-    Args:
-        flange: Flange frames in the robot's base, shape [n, 4, 4].
-        joints: The same as angles [rad], shape [n, joints].
-    """
+    """Return the error for the deepest point in an obstacle or its ``clearance`` [m], or None, of
+    flange frames in the robot's base, [n, 4, 4], that are joint angles [rad], [n, joints]."""
     base = matrices(np.array(cell.base.pose))
     rods = rods_of(cell, joints, flange)
     ends = np.stack([rods.starts, rods.ends], axis=2).reshape(len(joints), -1, 3)
@@ -248,8 +229,7 @@ def _distances(points: np.ndarray) -> np.ndarray:
 
 def outer_reach(arm: Arm, entry: SecondArmEntry) -> float:
     """Return the largest distance of an arm's grasp from its shoulder [m]: all links in line plus
-    the tool's length.
-    """
+    the tool."""
     joints = np.array(arm.home, float)
     points = np.vstack([arm.shoulder, arm.link_frames(joints)[:, :3, 3],
                         arm.forward(joints)[:3, 3]])
@@ -258,9 +238,8 @@ def outer_reach(arm: Arm, entry: SecondArmEntry) -> float:
 
 
 def untaken(entry: SecondArmEntry, place: np.ndarray, _surface: object) -> str:
-    """Return in words that an arm cannot grasp a target at ``place`` [3] from any side; empty if it
-    can.
-    """
+    """Return in words that an arm cannot grasp a target at ``place`` [3] from any side; "" if it
+    can."""
     arm = arm_named(entry.model)
     turns = Rotation.random(_TURNS, rng=np.random.default_rng(0)).as_matrix()
     frames = np.tile(np.eye(4), (_TURNS, 1, 1))

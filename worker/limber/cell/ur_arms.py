@@ -113,19 +113,11 @@ class UrArm:
         return frames.reshape(*joints.shape[:-1], 6, 4, 4)
 
     def inverse(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
-        """Return every joint pose that brings the flange to ``frames``, angles within half a turn.
-
-        The order is fixed, so that one row followed along a path is one continuous branch: bit 2
-        of its number is the shoulder's side, bit 1 the wrist's, bit 0 the elbow's.
-
-        Args:
-            frames: Frames of the flange in the base's, shape [..., 4, 4].
-            near: Angles [..., 6] whose last joint is kept where the wrist is singular and only the
-                sum of two joints is determined; zero where absent.
-
-        Returns:
-            Joint angles [rad], shape [..., 8, 6].
-        """
+        """Return every joint pose [rad] that brings the flange to ``frames`` [..., 4, 4], base
+        frame, within half a turn, shape [..., 8, 6]. The order is fixed, so that a row followed
+        along a path is one continuous branch: bit 2 is the shoulder's side, bit 1 the wrist's, bit
+        0 the elbow's. The last joint of ``near`` (zero where absent) is kept where the wrist is
+        singular, as only the sum of two joints is determined."""
         frames = np.asarray(frames, float)
         flat = for_kernels(frames.reshape(-1, 4, 4))
         last = np.zeros(len(flat)) if near is None else np.broadcast_to(
@@ -154,11 +146,9 @@ class UrArm:
         return distances.reshape(*joints.shape[:-1], 3)
 
     def rods(self, joints: np.ndarray) -> Rods:
-        """Return the links at joint angles [rad], shape [n, 6].
-
-        The tubes are offset from the lines of the Denavit-Hartenberg table, by the offsets of
-        shoulder and elbow. The base's foot is omitted: it touches its mount.
-        """
+        """Return the links at joint angles [rad], shape [n, 6]: tubes offset from the
+        Denavit-Hartenberg lines at shoulder and elbow, without the base's foot, which touches its
+        mount."""
         frames = self.link_frames(joints)
         positions, axis = frames[:, :, :3, 3], frames[:, 0, :3, 2]
         at_shoulder, at_forearm = self.lateral

@@ -79,11 +79,9 @@ def singularity_distance(table: np.ndarray, reach: float, joints: np.ndarray) ->
 
 @compiled
 def inverse(table: np.ndarray, frames: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Analytic solution after Hawkins, "Analytic inverse kinematics for the UR-5/UR-10 arms".
-
-    Angles come from arc tangents throughout, even where the paper has arc cosines: those lose half
-    of the digits near a singularity.
-    """
+    """Analytic solution after Hawkins, "Analytic inverse kinematics for the UR-5/UR-10 arms", by
+    arc tangents also for the paper's arc cosines, which lose half of the digits near a
+    singularity."""
     solutions = np.full((len(frames), 8, 6), np.nan)
     d4, d5, d6 = table[3, 0], table[4, 0], table[5, 0]
     a2, a3 = table[1, 1], table[2, 1]

@@ -31,15 +31,8 @@ Element = ElementTree.Element
 
 @dataclass(frozen=True)
 class Joint:
-    """A revolute joint.
-
-    Attributes:
-        name: Name in the file.
-        origin: Its frame at angle 0 in that of the previous joint, shape [4, 4].
-        axis: Axis of rotation, its frame, unit length, shape [3].
-        limits: Least and greatest angle [rad], infinite for an endless joint.
-        speed: Greatest [rad/s].
-    """
+    """A revolute joint: its frame at angle 0 in the previous joint's, [4, 4], unit axis in its own,
+    [3], least and greatest angle [rad], infinite for an endless one, and greatest speed [rad/s]."""
 
     name: str
     origin: np.ndarray
@@ -61,13 +54,8 @@ class Rod:
 
 @dataclass(frozen=True)
 class Chain:
-    """An arm as its file describes it.
-
-    Attributes:
-        joints: Joints from the base on.
-        flange: Its frame in the last joint's, shape [4, 4].
-        rods: Shapes of the moving links, as far as the file has cylinders, spheres and boxes.
-    """
+    """An arm as its file describes it: joints from the base on, the flange's frame in the last
+    one's, [4, 4], and the moving links' cylinders, spheres and boxes."""
 
     joints: tuple[Joint, ...]
     flange: np.ndarray
@@ -81,14 +69,9 @@ class _WithoutDoctype(ElementTree.TreeBuilder):
 
 
 def read_chain(path: Path) -> Chain:
-    """Read the arm of a URDF file.
-
-    It runs from the link ``base`` (else the root) to ``tool0``, ``flange``, or else the end of the
-    only chain with six or more joints.
-
-    Raises:
-        InputError: the file cannot be read, or is not an arm of six or more revolute joints.
-    """
+    """Read the arm of a URDF file, from the link ``base`` (else the root) to ``tool0``, ``flange``,
+    or the end of the only chain with six or more joints. InputError if it cannot be read, or is no
+    arm of six or more revolute joints."""
     try:
         # Entities need a document type, which is refused.
         root = ElementTree.XML(read_text(path, "the description of an arm (URDF)"),
@@ -324,14 +307,9 @@ def chain_jacobian(axes: np.ndarray, frames: np.ndarray) -> np.ndarray:
 @compiled
 def solved(origins: np.ndarray, axes: np.ndarray, frames: np.ndarray, starts: np.ndarray,
            is_path: bool) -> np.ndarray:
-    """Return the angles that bring the flange to ``frames`` [k, 4, 4], shape [k, n].
-
-    Gauss-Newton steps with Levenberg-Marquardt damping; NaN if they do not converge.
-
-    Args:
-        starts: Start angles of each search, shape [k, n].
-        is_path: Search each but the first from the one before; NaN from the first unreached one on.
-    """
+    """Return the angles that bring the flange to ``frames`` [k, 4, 4] from ``starts``, shape [k,
+    n], by Gauss-Newton steps with Levenberg-Marquardt damping; NaN where they do not converge.
+    ``is_path``: search each from the one before; NaN from the first unreached one on."""
     count = len(axes)
     found = np.full((len(frames), count), np.nan)
     chain, tried = np.empty((count + 1, 4, 4)), np.empty((count + 1, 4, 4))
@@ -481,11 +459,9 @@ class UrdfArm:
         return values[..., -1:] / values[..., :1]
 
     def rods(self, joints: np.ndarray) -> Rods:
-        """Return the moving links: their simple shapes, or else thick lines between the joints.
-
-        The link that moves with the first joint alone is omitted if it is such a line: it begins in
-        the base's foot, and touches the mount.
-        """
+        """Return the moving links: their simple shapes, or else thick lines between the joints, but
+        no such line of the first joint's link alone: it begins in the base's foot, and touches the
+        mount."""
         frames = self.link_frames(joints)
         names: list[str] = []
         starts, ends, radii = [], [], []
@@ -543,11 +519,8 @@ class UrdfArm:
 
 
 def arm_of_file(name: str) -> UrdfArm:
-    """Return the arm of a URDF file; its name is the file's.
-
-    Raises:
-        InputError: the file cannot be read, or does not describe a supported arm.
-    """
+    """Return the arm of a URDF file, named as the file; InputError if it cannot be read, or is no
+    supported arm."""
     path = Path(name)
     try:
         stamp = path.stat()

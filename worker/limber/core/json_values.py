@@ -19,11 +19,9 @@ still finite in single precision.
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` in JSON form: models, numpy and paths become dicts, lists, numbers.
-
-    A number that is not finite, or beyond ``LARGEST_NUMBER``, becomes None: JSON has no NaN, and no
-    reader would take the other, such as the end of an interval that is open.
-    """
+    """Return ``value`` in JSON form: models, numpy and paths become dicts, lists, numbers. One not
+    finite, as JSON has no NaN, or beyond ``LARGEST_NUMBER``, such as the end of an open interval,
+    becomes None."""
     if isinstance(value, BaseModel):
         return plain(value.model_dump())
     if isinstance(value, Mapping):
@@ -41,10 +39,7 @@ def plain(value: Any) -> Any:
 
 def number_array(values: Any, *, gaps: bool = False) -> np.ndarray:
     """Return nested lists of numbers as an array of floats; with ``gaps`` None becomes NaN.
-
-    Raises:
-        ValueError: they are ragged, or there is anything else among them: a text, a Boolean, None.
-    """
+    ValueError if they are ragged, or contain anything else: a text, a Boolean, None."""
     held = np.array(values, object)
     if not {type(value) for value in held.ravel().tolist()} <= {int, float, *[type(None)] * gaps}:
         raise ValueError("a value that is not a number")
@@ -52,13 +47,8 @@ def number_array(values: Any, *, gaps: bool = False) -> np.ndarray:
 
 
 def validated(kind: type[Content], content: Any) -> Content:
-    """Return values from a file or a user as ``kind``, any type that pydantic checks.
-
-    Unlike pydantic by itself, this takes no Boolean for a number: ``width: true`` is no 1.
-
-    Raises:
-        ValidationError: they are not of that kind.
-    """
+    """Return values from a file or a user as ``kind``, any type that pydantic checks, but take no
+    Boolean for a number: ``width: true`` is no 1. ValidationError if they are not of that kind."""
     made = TypeAdapter(kind).validate_python(content)
     if (place := _boolean_as_number(content, made)) is not None:
         raise ValidationError.from_exception_data("content", [InitErrorDetails(

@@ -24,13 +24,9 @@ def text_of(value: Any, form: str = "") -> str:
 
 def table_of(records: Iterable[Any], *columns: tuple[Any, ...], missing: str = "",
              ) -> list[list[str]]:
-    """Return one row for each record below a header; empty without records.
-
-    Args:
-        columns: Each a heading, a record's key or a function of it, and the form of
-            :func:`text_of`.
-        missing: Shown for None.
-    """
+    """Return one row for each record below a header, none without records. A column is a heading, a
+    record's key or a function of it, and the form of :func:`text_of`; ``missing`` stands for
+    None."""
     def cell(record: Any, value: str | Callable[[Any], Any], form: str = "") -> str:
         found = value(record) if callable(value) else record.get(value)
         return missing if found is None else text_of(found, form)

@@ -37,12 +37,8 @@ _TOO_MANY = _codes("EMFILE", "ENFILE")
 
 
 def machine_error(error: BaseException, path: Path | None = None) -> LimberError | None:
-    """Return a readable text for an error of the machine; None for any other error.
-
-    Args:
-        error: As Python or the system raised it.
-        path: The file or folder in use, if the error does not name one.
-    """
+    """Return a readable text for an error of the machine about ``path``, unless it names another;
+    None for any other error."""
     if isinstance(error, MemoryError):
         return WorkError("Out of memory.", "", "Use a coarser mesh or a thinner cloud.")
     if isinstance(error, ImportError):

@@ -6,14 +6,8 @@ Value = TypeVar("Value")
 
 
 def present(value: Value | None, what: str) -> Value:
-    """Return ``value``.
-
-    Args:
-        what: The value's name, for the message.
-
-    Raises:
-        ValueError: it is None. This is a bug, not an error in the user's input.
-    """
+    """Return ``value``; a ValueError names it if it is None, which is a bug, not an error of the
+    user's."""
     if value is None:
         raise ValueError(f"There is no {what}.")
     return value

@@ -17,16 +17,8 @@ DISTRIBUTION = "limber-branch"
 
 
 def require_extra(extra: str, packages: tuple[str, ...], what: str) -> None:
-    """Check that the packages of a Limber extra are installed, before work begins.
-
-    Args:
-        extra: Name of the extra, as ``report``.
-        packages: Its packages, by their import names.
-        what: The feature that needs it, for the message.
-
-    Raises:
-        MissingDependencyError: a package is missing.
-    """
+    """Check that an extra's packages, by their import names, are installed before work on ``what``
+    begins; MissingDependencyError if one is not."""
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
         raise MissingDependencyError(
@@ -60,12 +52,8 @@ def pip_install(*words: str) -> str:
 
 def exports(package: str, modules: Mapping[str, str],
             ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return ``__getattr__`` and ``__dir__`` of a package (PEP 562).
-
-    Args:
-        package: Name of the package.
-        modules: Names, each with the module (relative to the package) that defines it.
-    """
+    """Return ``__getattr__`` and ``__dir__`` of a package (PEP 562) for names, each with the
+    module, relative to the package, that defines it."""
     def get(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")

@@ -159,10 +159,8 @@ class BarSink:
 
 
 class LogSink:
-    """Writes a line to standard error every ten seconds: for a log, where no bar can be drawn.
-
-    A thread writes it, so that it comes during a long step too.
-    """
+    """Writes a line to standard error every ten seconds, during a long step too as a thread does
+    it: for a log, where no bar can be drawn."""
 
     def __init__(self, title: str, stream: TextIO | None = None, *,
                  interval_seconds: float = 10.0):
@@ -234,10 +232,8 @@ def _short(value: Any) -> str:
 
 @contextlib.contextmanager
 def report_damage_to(tell: Callable[[str], None]) -> Iterator[None]:
-    """Pass the first warning about a damaged cache to ``tell``; it comes from a lower layer.
-
-    If one file of a cache is damaged, others usually are too: the user is told once.
-    """
+    """Pass the first warning about a damaged cache, which comes from a lower layer, to ``tell``: of
+    others, usually damaged too, the user need not hear."""
     reported: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("always", DamagedCacheWarning)

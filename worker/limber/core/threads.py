@@ -18,11 +18,9 @@ _VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLI
 
 
 def same_digits() -> None:
-    """Let every BLAS and OpenMP library of this process use one thread and one kernel from now on.
-
-    Libraries that are loaded later, here or in child processes, read it from the environment. Those
-    already loaded by numpy and others are set now, in some milliseconds.
-    """
+    """Let every BLAS and OpenMP library of this process use one thread and one kernel from now on:
+    those loaded later, here or in children, read it from the environment, those that numpy and
+    others have loaded are set now, in some milliseconds."""
     os.environ.update(dict.fromkeys(_VARIABLES, "1"))
     if _has_another_kernel():
         # A library that is loaded already keeps its own.

@@ -20,10 +20,7 @@ _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d
 
 def in_unit(value: Any, unit: str) -> Any:
     """Return a number, or numbers, of a text with a unit in ``unit``; other values unchanged.
-
-    Raises:
-        ValueError: the text has a unit that cannot be converted to ``unit``.
-    """
+    ValueError for a unit that cannot be converted."""
     if isinstance(value, list):
         return [in_unit(item, unit) for item in value]
     match = _QUANTITY.match(value) if isinstance(value, str) else None

@@ -37,11 +37,8 @@ def owned_name(name: str) -> str:
 
 
 def sweep(folder: Path) -> list[str]:
-    """Remove unfinished files and folders of ended processes below ``folder``.
-
-    Returns:
-        The names of the removed files and folders, relative to ``folder``, sorted.
-    """
+    """Remove unfinished files and folders of ended processes below ``folder``; return their names
+    relative to it, sorted."""
     removed = []
     for path in _abandoned(folder):
         _remove(path)
@@ -119,23 +116,16 @@ def _start_second(process_id: int) -> int:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file so that a reader sees the old or the new content, never a partial one.
-
-    When this returns, content and name are on the disk.
-    """
+    """Write a file so that a reader sees the old or the new content, never a partial one; when this
+    returns, content and name are on the disk."""
     with replacing(path) as stream:
         stream.write(content.encode("utf-8") if isinstance(content, str) else content)
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Open a stream whose content replaces a file as a whole if the block succeeds.
-
-    Otherwise the file is unchanged.
-
-    Raises:
-        InputError: the path is a device or a pipe, which a file would replace.
-    """
+    """Open a stream whose content replaces a file as a whole if the block succeeds; else it is
+    unchanged. InputError if it is a device or a pipe, which a file would replace."""
     require_no_pipe(path)
     path = Path(path)
     temporary = path.with_name(owned_name(path.name))
@@ -178,22 +168,16 @@ def flush_tree(folder: Path) -> None:
 
 
 def file_digest(path: str | os.PathLike) -> str:
-    """Return the sha256 of a file's bytes, in hexadecimal.
-
-    Raises:
-        InputError: it is a pipe or a device.
-    """
+    """Return the sha256 of a file's bytes, in hexadecimal; InputError if it is a pipe or a
+    device."""
     require_no_pipe(path)
     with open(path, "rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def require_no_pipe(path: str | os.PathLike) -> None:
-    """Refuse a pipe, a socket or a device. A path that does not exist passes.
-
-    Raises:
-        InputError: it is one of these. It may never end, and cannot be read twice.
-    """
+    """Refuse a pipe, a socket or a device with an InputError: it may never end, and cannot be read
+    twice. A path that does not exist passes."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
@@ -206,11 +190,7 @@ def require_no_pipe(path: str | os.PathLike) -> None:
 
 
 def require_file(path: Path, what: str) -> Path:
-    """Return ``path`` if it is a file.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Return ``path`` if it is a file, else InputError."""
     require_no_pipe(path)
     if not Path(path).is_file():
         raise InputError(f"There is no file {path}.", f"{what} was expected.", "Check the path.")

@@ -40,11 +40,8 @@ def known_caches() -> list[Cache]:
 
 
 def trim(folder: Path, most_bytes: float) -> int:
-    """Remove the least recently used files until those of ``folder`` take ``most_bytes`` or less.
-
-    Returns:
-        Bytes freed. Files that another program holds open or removes meanwhile are skipped.
-    """
+    """Remove the least recently used files until those of ``folder`` take ``most_bytes`` or less;
+    return the bytes freed. Files that another program holds open or removes are skipped."""
     files = _files(folder)
     total, freed = sum(size for _, size, _ in files), 0
     for _, size, path in sorted(files):
@@ -57,11 +54,8 @@ def trim(folder: Path, most_bytes: float) -> int:
 
 
 def clear(folder: Path) -> int:
-    """Remove every file below ``folder``, and subfolders that are then empty.
-
-    Returns:
-        Bytes freed. Files that another program holds open are skipped.
-    """
+    """Remove every file below ``folder``, and subfolders then empty; return the bytes freed. Files
+    that another program holds open are skipped."""
     freed = 0
     for _, size, path in _files(folder):
         with contextlib.suppress(OSError):

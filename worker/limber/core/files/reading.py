@@ -52,11 +52,8 @@ class FileContent(BaseModel):
 
 
 def read_text(path: str | os.PathLike, what: str) -> str:
-    """Return a file's text (UTF-8, with or without a BOM); ``what`` names it in errors.
-
-    Raises:
-        InputError: it cannot be read, or is not text.
-    """
+    """Return a file's text (UTF-8, with or without a BOM); ``what`` names it in errors. InputError
+    if it cannot be read, or is not text."""
     require_no_pipe(path)
     try:
         return Path(path).read_text(encoding="utf-8-sig")
@@ -74,21 +71,14 @@ def _require_modest_text(path: str | os.PathLike, most_bytes: int, what: str) ->
 
 
 def read_json(path: str | os.PathLike, what: str) -> Any:
-    """Return the content of a JSON file; all its numbers are finite.
-
-    Raises:
-        InputError: it is not JSON, or a number in it is not finite, or beyond ``LARGEST_NUMBER``.
-    """
+    """Return the content of a JSON file; InputError if it is not JSON, or a number is not finite,
+    or beyond ``LARGEST_NUMBER``."""
     _require_modest_text(path, MOST_JSON_BYTES, what)
     return json_content(read_text(path, what), path, what)
 
 
 def json_content(text: str, path: str | os.PathLike, what: str) -> Any:
-    """Return the content of a JSON text read from ``path``, as :func:`read_json` does.
-
-    Raises:
-        InputError: as :func:`read_json`.
-    """
+    """Return the content of a JSON text read from ``path``; InputError as :func:`read_json`."""
     try:
         return json.loads(text, parse_constant=_refused, parse_float=_finite, parse_int=_integer)
     except (ValueError, RecursionError) as error:
@@ -96,25 +86,16 @@ def json_content(text: str, path: str | os.PathLike, what: str) -> Any:
 
 
 def read_json_as(path: str | os.PathLike, kind: type[Content], what: str) -> Content:
-    """Return the content of a JSON file as ``kind``, any type that pydantic checks.
-
-    Raises:
-        InputError: it is not JSON, or not of that kind; the message names the position.
-    """
+    """Return the content of a JSON file as ``kind``, any type that pydantic checks; InputError,
+    with the position, if it is not JSON, or not of that kind."""
     return checked_as(path, kind, read_json(path, what), what)
 
 
 def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what: str, *,
                strict: bool = False) -> Content:
-    """Return content read from ``path`` as ``kind``.
-
-    Args:
-        strict: Whether a number must be a number in the file as well, not a text; a Boolean is
-            never one. For content that is used unconverted.
-
-    Raises:
-        InputError: it is not of that kind; the message names the position.
-    """
+    """Return content read from ``path`` as ``kind``; ``strict``, for content used unconverted: a
+    number must be one in the file, not a text (a Boolean is never one). InputError, with the
+    position, if it is not of that kind."""
     try:
         # Only pydantic's strict JSON mode accepts a list for a tuple.
         return (TypeAdapter(kind).validate_json(json.dumps(content), strict=True) if strict
@@ -129,25 +110,17 @@ def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what:
 
 
 def read_toml(path: str | os.PathLike, what: str, *, finite: bool = True) -> dict[str, Any]:
-    """Return the content of a TOML file; all its numbers are finite.
-
-    Args:
-        finite: False if the caller itself refuses values that are not finite, by name and line.
-
-    Raises:
-        InputError: it is not TOML (the line is named), or a number in it is not finite.
-    """
+    """Return the content of a TOML file; InputError if it is not TOML (with the line), or a number
+    is not finite, unless not ``finite``: the caller refuses such values itself, by name and
+    line."""
     _require_modest_text(path, MOST_TOML_BYTES, what)
     return toml_content(read_text(path, what), path, what, finite=finite)
 
 
 def toml_content(text: str, path: str | os.PathLike, what: str, *, finite: bool = True,
                  ) -> dict[str, Any]:
-    """Return the content of a TOML text read from ``path``, as :func:`read_toml` does.
-
-    Raises:
-        InputError: as :func:`read_toml`; or a key is nested too deeply.
-    """
+    """Return the content of a TOML text read from ``path``; InputError as :func:`read_toml`, or if
+    a key is nested too deeply."""
     try:
         if len(text) > MOST_TOML_BYTES:
             raise ValueError(f"it has {len(text)} characters")
@@ -160,11 +133,8 @@ def toml_content(text: str, path: str | os.PathLike, what: str, *, finite: bool 
 
 
 def read_arrays(path: str | os.PathLike, what: str) -> dict[str, np.ndarray]:
-    """Return the arrays of an NPZ file, or the one of an NPY file as ``arr_0``.
-
-    Raises:
-        InputError: it is damaged, contains objects, or declares more than it can hold.
-    """
+    """Return the arrays of an NPZ file, or the one of an NPY file as ``arr_0``; InputError if it is
+    damaged, contains objects, or declares more than it can hold."""
     require_no_pipe(path)
     try:
         with open(path, "rb") as stream:
@@ -188,11 +158,8 @@ def read_arrays(path: str | os.PathLike, what: str) -> dict[str, np.ndarray]:
 
 
 def require_finite(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], what: str) -> None:
-    """Refuse arrays that contain numbers that are not finite, or beyond ``LARGEST_NUMBER``.
-
-    Raises:
-        InputError: there is such an array; the message names it.
-    """
+    """Refuse arrays with numbers not finite, or beyond ``LARGEST_NUMBER``: an InputError names
+    it."""
     for name, values in arrays.items():
         if not are_moderate(values):
             raise InputError(f"{path}: {name} has values that are not finite, or beyond "
@@ -203,15 +170,8 @@ def require_finite(path: str | os.PathLike, arrays: Mapping[str, np.ndarray], wh
 def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
                    shapes: Mapping[str, tuple[int | str, ...]], what: str,
                    flags: Sequence[str] = ()) -> None:
-    """Refuse arrays that are missing, not finite numbers, or of another shape.
-
-    Args:
-        shapes: Name to shape; the same letter means the same length everywhere.
-        flags: Names of the arrays that may hold Booleans.
-
-    Raises:
-        InputError: an array does not fit; the message names the first.
-    """
+    """Refuse arrays that are missing, not finite numbers (those of ``flags`` may be Booleans), or
+    of another shape, the same letter meaning the same length: an InputError names the first."""
     lengths: dict[int | str, int] = {}
     for name, shape in shapes.items():
         array = arrays.get(name)
@@ -231,15 +191,8 @@ def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
 
 
 def require_size(path: str | os.PathLike, announced: float, held: float, what: str) -> None:
-    """Refuse a file whose header declares more bytes than it holds, before memory is allocated.
-
-    Args:
-        announced: Fewest bytes that the declared number of ``what`` take.
-        held: Available bytes.
-
-    Raises:
-        InputError: it holds fewer.
-    """
+    """Refuse a file with fewer bytes, ``held``, than the number of ``what`` that its header
+    declares takes at least, before memory is allocated: an InputError."""
     if announced > held:
         raise InputError(f"{path} announces {what}: at least {announced:.3g} bytes. It contains "
                          f"only {max(held, 0):.3g}.",
@@ -317,11 +270,7 @@ _LAZ_EXPANSION = 1000.0
 
 
 def check_ply(path: Path) -> None:
-    """Refuse a PLY file that holds fewer elements than its header declares.
-
-    Raises:
-        InputError: it holds fewer.
-    """
+    """Refuse a PLY file that holds fewer elements than its header declares: an InputError."""
     lines, body = _text_header(path, b"end_header")
     is_text, announced, count, width = False, 0.0, 0, 0
     for words in [line.split() for line in lines] + [["element", "", "0"]]:
@@ -340,11 +289,7 @@ def check_ply(path: Path) -> None:
 
 
 def check_pcd(path: Path) -> None:
-    """Refuse a PCD file that holds fewer points than its header declares.
-
-    Raises:
-        InputError: it holds fewer.
-    """
+    """Refuse a PCD file that holds fewer points than its header declares: an InputError."""
     lines, body = _text_header(path, b"\nDATA")
     header = {words[0]: words[1:] for line in lines if (words := line.split())}
     count = max(_count(path, word) for word in
@@ -371,11 +316,8 @@ def check_pcd(path: Path) -> None:
 
 
 def check_las(path: Path) -> None:
-    """Refuse a LAS or LAZ file that holds fewer points than its header declares.
-
-    Raises:
-        InputError: it holds fewer, or it is not such a file.
-    """
+    """Refuse a LAS or LAZ file that is none, or holds fewer points than its header declares: an
+    InputError."""
     size = path.stat().st_size
     with open(path, "rb") as stream:
         head = stream.read(375)
@@ -405,11 +347,8 @@ def _text_header(path: Path, end: bytes) -> tuple[list[str], int]:
 
 
 def header_bytes(path: Path, end: bytes) -> tuple[bytes, int]:
-    """Return a header up to and including the line of ``end``, and its end position.
-
-    Raises:
-        InputError: there is no such line.
-    """
+    """Return a header up to and including the line of ``end``, and its end position; InputError
+    without such a line."""
     with open(path, "rb") as stream:
         head = stream.read(_LONGEST_HEADER)
     at = head.find(end)

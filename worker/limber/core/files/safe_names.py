@@ -25,13 +25,9 @@ FOLLOW_LINKS = "LIMBER_FOLLOW_LINKS"
 
 
 def relative_name(name: str) -> str:
-    """Return ``name``, relative and with ``/``, in its shortest form.
-
-    The rule is the same on every system, so that a folder valid on one is valid on all.
-
-    Raises:
-        InputError: it is absolute, leads upwards, names a drive, or is no valid file name.
-    """
+    """Return ``name``, relative and with ``/``, in its shortest form; the rule is the same on every
+    system, so that a folder valid on one is valid on all. InputError if it is absolute, leads
+    upwards, names a drive, or is no valid file name."""
     is_device = _DEVICE.search(name) is not None
     if _PLAIN.fullmatch(name) and not is_device:
         return name
@@ -56,9 +52,8 @@ def relative_name(name: str) -> str:
 
 
 def same_named(names: Sequence[str]) -> list[list[int]]:
-    """Return the indices of names that are one on some system: equal but for their case, or for
-    how accents are coded.
-    """
+    """Return the indices of names that are one on some system: equal but for case, or the coding of
+    accents."""
     groups: dict[str, list[int]] = {}
     for index, name in enumerate(names):
         groups.setdefault(unicodedata.normalize(
@@ -67,11 +62,8 @@ def same_named(names: Sequence[str]) -> list[list[int]]:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """Return the path of ``name`` in ``folder``, whether or not it exists.
-
-    Raises:
-        InputError: the name points outside the folder, or its path contains a link.
-    """
+    """Return the path of ``name`` in ``folder``, whether or not it exists; InputError if it points
+    outside, or its path contains a link."""
     path = Path(folder)
     for part in PurePosixPath(relative_name(name)).parts:
         path = path / part
@@ -81,12 +73,8 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse a folder that contains a link; ``folder`` itself may be one.
-
-    Raises:
-        InputError: the folder contains a link, or is nested too deeply to be checked; the message
-            names it.
-    """
+    """Refuse a folder that contains a link; it may be one itself. InputError, which names the link,
+    also if it is nested too deeply to be checked."""
     top = len(Path(folder).parts)
     for parent, folders, files in os.walk(folder):
         if folders and len(Path(parent).parts) - top >= _MOST_LEVELS:
@@ -114,11 +102,8 @@ def is_link(path: Path) -> bool:
 
 
 def has_other_names(path: Path) -> bool:
-    """Whether a file has a second name (a hard link), which may be outside its folder.
-
-    Replacing a file does not affect its other name. Code that changes a file in place or passes it
-    on must check first.
-    """
+    """Whether a file has a second name (a hard link), perhaps outside its folder: to be checked
+    before it is changed in place or passed on; replacing does not affect the other name."""
     about = os.lstat(path)
     return stat.S_ISREG(about.st_mode) and about.st_nlink > 1
 

@@ -23,12 +23,8 @@ DIGITS = 9
 
 
 def table_line(cells: Iterable[Any], digits: int = DIGITS) -> str:
-    """Return a line of a table, without its end.
-
-    Args:
-        cells: Texts, whole numbers, and other numbers, of which NaN and None become empty.
-        digits: Significant digits of the other numbers.
-    """
+    """Return a line of a table, without its end, of texts, whole numbers, and others with that many
+    significant digits, of which NaN and None become empty."""
     text = io.StringIO()
     csv.writer(text, lineterminator="").writerow([_cell(cell, digits) for cell in cells])
     return text.getvalue()
@@ -46,17 +42,9 @@ def write_table(path: str | os.PathLike, titles: Sequence[str], rows: Iterable[I
 
 
 def csv_records(path: str | os.PathLike, what: str, comment: str = "") -> list[dict[str, Any]]:
-    """Return the fields of each line of a CSV file, keyed by the titles in its first line.
-
-    A missing field is None; fields beyond the titles are listed under None.
-
-    Args:
-        what: What was expected, for messages.
-        comment: Lines that begin with this are skipped.
-
-    Raises:
-        InputError: it cannot be read, or a field has more than 131,072 characters.
-    """
+    """Return the fields of each line of a CSV file, keyed by the titles in its first line; a
+    missing one is None, those beyond are listed under None. Lines that begin with ``comment`` are
+    skipped. InputError if it cannot be read, or a field has more than 131,072 characters."""
     lines = [line for line in read_text(path, what).splitlines()
              if not (comment and line.startswith(comment))]
     try:
@@ -67,11 +55,8 @@ def csv_records(path: str | os.PathLike, what: str, comment: str = "") -> list[d
 
 def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
                  ) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV file with a header that contain only finite numbers.
-
-    Raises:
-        InputError: it cannot be read, has no rows, or one of ``needed`` is not among them.
-    """
+    """Return the columns of a CSV file with a header that contain only finite numbers; InputError
+    if it cannot be read, has no rows, or one of ``needed`` is not among them."""
     columns = {}
     for name, *values in zip(*csv_rows(path, what), strict=False):
         with contextlib.suppress(ValueError):
@@ -87,11 +72,8 @@ def read_columns(path: str | os.PathLike, needed: Sequence[str], what: str,
 
 
 def csv_rows(path: str | os.PathLike, what: str) -> list[list[str]]:
-    """Return the fields of each line of a CSV file that is not empty.
-
-    Raises:
-        InputError: as :func:`csv_records`.
-    """
+    """Return the fields of each line of a CSV file that is not empty; InputError as
+    :func:`csv_records`."""
     try:
         return [row for row in csv.reader(read_text(path, what).splitlines()) if row]
     except csv.Error as error:

@@ -70,12 +70,8 @@ def plain(name: str) -> str:
 
 
 def split_title(title: str, units: Iterable[str]) -> tuple[str, str | None]:
-    """Split the unit from a title: ``x_mm``, ``X (mm)``, ``Position [m] X``, ``x/mm``, ``x in mm``.
-
-    Args:
-        title: Title of a column.
-        units: Units that need no brackets at the end, in lower case.
-    """
+    """Split the unit from a title: ``x_mm``, ``X (mm)``, ``Position [m] X``, ``x/mm``, ``x in mm``;
+    ``units``, in lower case, need no brackets at the end."""
     text = title.strip().replace("\u00b5", "u").replace("\u03bc", "u")
     bracket = re.search(r"[(\[]\s*([^)\]]*?)\s*[)\]]", text)
     if bracket and bracket.end() == len(text):
@@ -112,11 +108,8 @@ def counts_up(column: np.ndarray) -> bool:
 
 
 def counting_columns(values: np.ndarray) -> int:
-    """Return how many columns before the coordinates count points, or a scanner's rows and columns.
-
-    Args:
-        values: Columns without titles, shape [n, k].
-    """
+    """Return how many untitled columns [n, k] before the coordinates count points, or a scanner's
+    rows and columns."""
     for count in (1, 2) if len(values) >= _COUNTED else ():
         lead, after = values[:, :count], values[:, count:count + 3]
         if after.shape[1] < 3 or not (after % 1 != 0).any(axis=0).all() or (lead % 1 != 0).any():
@@ -130,11 +123,9 @@ def counting_columns(values: np.ndarray) -> int:
 
 
 def guessed_titles(extra: np.ndarray, intensity_first: bool) -> list[str]:
-    """Return names of columns [n, k] after x, y, z, in the order of scanners and CloudCompare.
-
-    Of four columns, a scanner writes intensity and colour, CloudCompare colour and a scalar. If
-    their values are ambiguous, ``intensity_first`` decides.
-    """
+    """Return names of columns [n, k] after x, y, z, in the order of scanners and CloudCompare: of
+    four, a scanner writes intensity and colour, CloudCompare colour and a scalar; if their values
+    are ambiguous, ``intensity_first`` decides."""
     count = extra.shape[1]
     if count == 3:
         return ["red", "green", "blue"]
@@ -163,15 +154,9 @@ class ColumnsError(ValueError):
 
 @dataclass(frozen=True)
 class Columns:
-    """A table of points.
-
-    Attributes:
-        names: In lower case, without units; coordinates are x, y, z.
-        titles: Titles as in the file.
-        values: Shape [n, columns].
-        unit: Unit of the coordinates, one of the values of :data:`LENGTHS`, if the file states it.
-        notes: Parts of the file that were not used.
-    """
+    """A table of points [n, columns]: names in lower case without units, coordinates x, y, z;
+    titles as in the file, the coordinates' unit among the values of :data:`LENGTHS`, if stated, and
+    notes on what was not used."""
 
     names: list[str]
     titles: list[str]
@@ -181,9 +166,8 @@ class Columns:
 
 
 def coding_of(path: Path) -> str:
-    """Return the coding of a text file: UTF-8, UTF-16 or, as spreadsheets write it, a Windows code
-    page.
-    """
+    """Return the coding of a text file: UTF-8, UTF-16 or, as of spreadsheets, a Windows code
+    page."""
     reader = codecs.getincrementaldecoder("utf-8")()
     with open(path, "rb") as stream:
         start = stream.read(_BLOCK)
@@ -215,19 +199,11 @@ def read_columns(path: Path) -> Columns:
 
 
 class Table:
-    """The columns of a text file, read in pieces.
-
-    Numbers are separated by blanks, tabs, commas or semicolons. Lines above them may name the
-    columns and state a unit. The number of points may precede the points of each scan. Decimals may
-    be commas if commas are not separators.
-
-    Attributes:
-        axes: Which columns of a piece are the coordinates.
-
-    Raises:
-        ColumnsError: there are no numbers, too few columns, coordinates of several or unknown
-            units, or a line that does not fit; the message names it. Also while pieces are read.
-    """
+    """The columns of a text file, read in pieces; ``axes`` are the coordinates. Numbers are
+    separated by blanks, tabs, commas or semicolons, decimals may be commas where these do not
+    separate. Lines above may name the columns and a unit, the number of points may precede those of
+    each scan. ColumnsError, also later, without numbers or enough columns, for several or unknown
+    units, or a line that does not fit, which it names."""
 
     def __init__(self, path: Path):
         self._path = path
@@ -273,9 +249,8 @@ class Table:
         return (line.replace('"', "") for line in lines_of(self._path, self._coding))
 
     def _rows(self) -> Iterator[str]:
-        """Lines without comments and counts of points; COLMAP's without the images of a point,
-        whose number varies.
-        """
+        """Lines without comments and counts of points; COLMAP's without a point's images, whose
+        number varies."""
         rows = (line for line in self._lines() if line.strip() and not _is_comment(line))
         if self._is_colmap:
             return (" ".join(line.split()[:len(_COLMAP_TITLES)]) for line in rows)
@@ -415,9 +390,8 @@ def fields_of(line: str, separator: str | None) -> list[str]:
 
 
 def number_of(part: str, commas: bool) -> float | None:
-    """Return the number of a field, whose decimals may be commas; NaN for a word that means that
-    it is missing, None for any other word.
-    """
+    """Return the number of a field, whose decimals may be commas; NaN for a word that means
+    missing, None for any other."""
     if part.lower() in MISSING:
         return float("nan")
     try:

@@ -62,10 +62,7 @@ def _writable(folder: Path) -> Path | None:
 
 @functools.cache
 def _layout() -> str:
-    """Digest of the compilation options.
-
-    numba itself detects a changed source, but would use a kernel compiled with other options.
-    """
+    """Digest of the compilation options: numba detects a changed source, but not other options."""
     return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:12]
 
 
@@ -125,11 +122,9 @@ class _FirstStart(Listener):
 
 
 class _CheckedFile(IndexDataCacheFile):
-    """numba's files of one kernel, each with a checksum appended to numba's content.
-
-    numba unpickles these files and passes them to the linker. A file truncated by a full disk or a
-    crash would end every command, or the process. Here such a file counts as missing.
-    """
+    """numba's files of one kernel, each with a checksum: numba unpickles and links them, and one
+    truncated by a full disk or a crash would end every command, or the process. Here it counts as
+    missing."""
 
     def _load_index(self) -> dict:
         return super()._load_index() if self._is_whole(self._index_path) else {}
@@ -185,11 +180,9 @@ def _digest_of(path: str) -> bytes:
 
 
 def _stamp(function: Any) -> str:
-    """Return a digest of a kernel's file and of what it takes from others: kernels and constants.
-
-    numba alone would use a kernel's old code after a change in another file's kernel, which was
-    inlined, and compile it again after each installation, as it compares the file's date.
-    """
+    """Return a digest of a kernel's file and of the kernels and constants that it takes from
+    others. numba alone would use old code after a change in another file's inlined kernel, and
+    compile again after each installation, as it compares the file's date."""
     digest = hashlib.sha256(_digest_of(function.__code__.co_filename))
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
     # All that its module has so far, and thus has imported: what it calls may stand below it.
@@ -232,15 +225,9 @@ class _Stored(CompileResultCacheImpl):
 
 
 class KernelCache(FunctionCache):
-    """A kernel's compiled code: shipped, or else the user's.
-
-    It is compiled again if it is unusable, and not stored if that fails. Argument types are
-    stored by module and name: after an update that moves one, they cannot be read.
-
-    Attributes:
-        name: Beginning of the names of its files.
-        stamp: Digest of what it was compiled from.
-    """
+    """A kernel's compiled code, shipped or the user's, in files of this name, by the digest of its
+    sources. It is compiled again if unusable (argument types are stored by module and name, and an
+    update may move one), and not stored if that fails."""
 
     _impl_class = _Stored
 

@@ -56,12 +56,8 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def pose_between(first: np.ndarray, second: np.ndarray, part: float | np.ndarray) -> np.ndarray:
-    """Return poses at fraction ``part`` of a straight line and the shortest rotation.
-
-    Args:
-        first, second: Poses, shape [6] or [n, 6].
-        part: One number, or one per returned pose, shape [n].
-    """
+    """Return poses at fraction ``part`` (one, or [n]) of a straight line and the shortest rotation
+    between poses [6] or [n, 6]."""
     part = np.asarray(part)[..., None]
     turns = part * turn_between(first[..., 3:], second[..., 3:])
     return np.concatenate([first[..., :3] + part * (second[..., :3] - first[..., :3]),
@@ -69,13 +65,8 @@ def pose_between(first: np.ndarray, second: np.ndarray, part: float | np.ndarray
 
 
 def rotations_at(times: np.ndarray, vectors: np.ndarray, query: np.ndarray) -> np.ndarray:
-    """Return rotation vectors [rad] at ``query`` times, along the shortest rotations.
-
-    Args:
-        times: Ascending, shape [n], n > 1.
-        vectors: Rotation vectors at those times, shape [n, 3].
-        query: Times within that range, shape [m].
-    """
+    """Return rotation vectors [rad] at ``query`` times [m] within ascending ``times`` [n], along
+    the shortest rotations between ``vectors`` [n, 3]."""
     return scipy.spatial.transform.Slerp(times, _rotations(vectors))(query).as_rotvec()
 
 
@@ -128,10 +119,8 @@ def rigid_fit(points: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def principal_axes(points: np.ndarray) -> np.ndarray:
-    """Return unit vectors of the principal axes of points [n, d], the largest spread first.
-
-    They are rows. Their signs are arbitrary.
-    """
+    """Return unit vectors of the principal axes of points [n, d] as rows, the largest spread first,
+    their signs arbitrary."""
     return np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
 
 

@@ -20,13 +20,9 @@ class NotPositiveDefiniteError(ArithmeticError):
 
 
 class CholmodFactor:
-    """Supernodal Cholesky factor of a matrix with a fixed pattern, analysed once.
-
-    Args:
-        rows, columns: Entries of the lower triangle by columns, sorted, shape [nnz].
-        size: Rows of the matrix.
-        is_ordered: Whether rows are already in a good elimination order; else CHOLMOD finds one.
-    """
+    """Supernodal Cholesky factor of a matrix with a fixed pattern, analysed once: sorted entries
+    [nnz] of the lower triangle by columns, ``size`` rows, perhaps in a good elimination order
+    already; else CHOLMOD finds one."""
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, size: int, *,
                  is_ordered: bool = True):
@@ -46,11 +42,8 @@ class CholmodFactor:
         return CholmodFactor(self._rows, self._columns, self._size, is_ordered=self._is_ordered)
 
     def factorise(self, values: np.ndarray) -> None:
-        """Factorise the matrix with these ``values``, shape [nnz].
-
-        Raises:
-            NotPositiveDefiniteError: it is not positive definite.
-        """
+        """Factorise the matrix with these ``values`` [nnz]; NotPositiveDefiniteError if it is
+        not."""
         from cvxopt import cholmod, matrix
 
         self._view[:] = values

@@ -32,20 +32,10 @@ _TICK_SECONDS, _MODULE_TICK_SECONDS, _MEMORY_SECONDS = 0.1, 0.05, 0.1
 
 class Child:
     """A program that writes JSON objects line by line, and may be sent some; a context manager.
-
-    Args:
-        command: The program and its arguments.
-        hear: Takes each object, in a thread of its own; those for which it returns False are kept
-            in ``objects``.
-        then: Called in that thread when no more objects come.
-        most_objects: How many objects are kept; the oldest go.
-        keeps_errors: Whether :meth:`tail` tells what it wrote on standard error.
-        options: Of :class:`subprocess.Popen`.
-
-    Attributes:
-        objects: Objects that it wrote, oldest first; change them with ``news`` held.
-        has_ended: Whether no more objects come.
-    """
+    ``hear`` takes each in a thread; those for which it returns False are kept in ``objects``, the
+    newest ``most_objects``, changed with ``news`` held. ``then`` is called there when no more come
+    (``has_ended``); ``keeps_errors``: :meth:`tail` tells its standard error; options are of
+    :class:`subprocess.Popen`."""
 
     def __init__(self, command: Sequence[str], hear: Callable[[dict[str, Any]], bool] | None = None,
                  then: Callable[[], object] = lambda: None, *, most_objects: int | None = None,
@@ -78,11 +68,8 @@ class Child:
         return self.process.poll() is None
 
     def send(self, content: dict[str, Any] | str) -> None:
-        """Write an object, or its JSON, to its standard input.
-
-        Raises:
-            ConnectionError: it has ended, or its input is closed.
-        """
+        """Write an object, or its JSON, to its standard input; ConnectionError if it has ended, or
+        closed it."""
         line = content if isinstance(content, str) else json.dumps(content)
         try:
             with self._writing:
@@ -93,9 +80,8 @@ class Child:
             raise ConnectionError(str(error)) from error
 
     def wait(self, find: Callable[[], Found | None], seconds: float) -> Found | None:
-        """Return what ``find`` finds in ``objects``, as soon as it does; None if it does not within
-        ``seconds``, nor when no more objects come.
-        """
+        """Return what ``find`` finds in ``objects``, as soon as it does; None if not within
+        ``seconds``, nor when no more come."""
         end = time.monotonic() + seconds
         with self.news:
             while True:
@@ -182,23 +168,9 @@ def run_module(module: str, arguments: list[str], name: str, limits: Limits, *,
                folder: Path | None = None,
                waiting: Callable[[float], None] = lambda _seconds: None) -> tuple[int, str]:
     """Run ``python -m MODULE ARGUMENTS PARENT``, for compiled code that may crash, hang or exhaust
-    the memory; PARENT is for :func:`~.end_with_parent.end_by_kernel`.
-
-    Args:
-        module: Its full name.
-        arguments: Arguments before this process's id.
-        name: Description of the task, for messages.
-        limits: Limits of the process.
-        folder: Its working directory, if not the current one.
-        waiting: Called while it runs with the elapsed seconds; an exception from it ends the
-        process.
-
-    Returns:
-        The exit code, and the last line on standard error (empty if there is none).
-
-    Raises:
-        WorkError: it exceeded its limits.
-    """
+    the memory; PARENT is for :func:`~.end_with_parent.end_by_kernel`. Returns the exit code, and
+    the last line on standard error or "". ``waiting`` is called with the elapsed seconds; an
+    exception from it ends the process. WorkError, with ``name``, if it exceeded its limits."""
     command = [sys.executable, "-m", module, *arguments, str(os.getpid())]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with Child(command, keeps_errors=True, env=environment, cwd=folder, stdin=subprocess.DEVNULL,
@@ -214,19 +186,10 @@ def run_module(module: str, arguments: list[str], name: str, limits: Limits, *,
 
 
 def run_stage(arguments: Sequence[str], progress: Progress = SILENT) -> dict[str, Any]:
-    """Run ``limber ARGUMENTS`` in a separate process and return its JSON result.
-
-    Memory and native crashes are confined to that process. Cancelling ``progress``, or Ctrl-C, ends
-    it.
-
-    Args:
-        arguments: The stage and its options.
-        progress: Gets the reports of the stage.
-
-    Raises:
-        LimberError: the stage's own error, by its exit code; :class:`WorkError` if it crashed or
-            exceeded its limits.
-    """
+    """Run ``limber ARGUMENTS`` in a process, to which memory and native crashes are confined, and
+    return its JSON result; ``progress`` gets its reports, and ends it when cancelled, as Ctrl-C
+    does. LimberError of the stage by its exit code; WorkError if it crashed or exceeded its
+    limits."""
     command = [sys.executable, "-m", "limber", *map(str, arguments),
                "--json", "--progress", "json"]
     return run_json_process(arguments[0], command, progress,
@@ -236,20 +199,10 @@ def run_stage(arguments: Sequence[str], progress: Progress = SILENT) -> dict[str
 def run_json_process(name: str, command: Sequence[str], progress: Progress = SILENT, *,
                      limits: Limits = UNLIMITED, cores: int | None = None,
                      fix: str = "") -> dict[str, Any]:
-    """Run a program that writes progress and result as stages do; returns its result.
-
-    Args:
-        name: Its name in error messages.
-        command: The program and its arguments. Its standard input closes when this process ends;
-            ``LIMBER_PARENT_PIPE=stdin`` informs it of that.
-        progress: Gets the reports of the stage.
-        limits: Limits of the process.
-        cores: Number of our cores it may use; all by default.
-        fix: What to do if it ends without a result.
-
-    Raises:
-        LimberError: as :func:`run_stage`.
-    """
+    """Run a program that writes progress and result as stages do; return its result. Its standard
+    input closes when this process ends, as ``LIMBER_PARENT_PIPE=stdin`` tells it; ``cores``: how
+    many of ours it may use, else all; ``fix``: what to do if it ends without a result. LimberError
+    as :func:`run_stage`."""
     environment = os.environ | {PARENT_PIPE: "stdin"}
     if cores is not None:
         environment[CORES] = str(cores)

@@ -28,11 +28,8 @@ def end_by_kernel(parent_id: int) -> None:
 
 
 def end_with_parent_pipe(grace_seconds: float = 10.0) -> None:
-    """If the parent holds this standard input open: when it closes, cancel, and then exit.
-
-    The main thread gets a KeyboardInterrupt, so that it can clean up. After ``grace_seconds`` the
-    process exits in any case.
-    """
+    """If the parent holds this standard input open: when it closes, the main thread gets a
+    KeyboardInterrupt to clean up, and after ``grace_seconds`` the process exits in any case."""
     if os.environ.pop(PARENT_PIPE, None) != "stdin":
         return
 

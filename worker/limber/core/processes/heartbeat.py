@@ -18,12 +18,8 @@ INTERVAL_SECONDS = 2.0
 
 
 class Heartbeat:
-    """Reports this process to ``say`` during the ``with`` block.
-
-    Args:
-        say: Receives the numbers, from another thread.
-        interval_seconds: Interval between reports.
-    """
+    """Reports this process's numbers to ``say``, from another thread, every ``interval_seconds`` of
+    a block."""
 
     def __init__(self, say: Callable[[dict[str, Any]], None],
                  interval_seconds: float = INTERVAL_SECONDS):

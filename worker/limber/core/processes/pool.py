@@ -138,14 +138,9 @@ _GRACE_SECONDS = 3.0
 
 
 class Pool:
-    """Processes that compute tasks; close the pool, or use it in a ``with``.
-
-    Args:
-        workers: Number of processes; by default the core budget, which is divided among them.
-        begin: Called in each process before its first task.
-        begin_arguments: Arguments of ``begin``.
-        name: Description of the computation, for messages.
-    """
+    """Processes that compute tasks, by default one for each core of the budget, which they share;
+    close it, or use it in a ``with``. ``begin`` is called in each before its first task; ``name``
+    is for messages."""
 
     def __init__(self, workers: int | None = None, *, begin: Callable[..., None] | None = None,
                  begin_arguments: tuple = (), name: str = "the computation"):
@@ -166,11 +161,8 @@ class Pool:
 
     def submit(self, function: Callable, *arguments: Any, limits: Limits = UNLIMITED,
                progress: Progress = SILENT) -> Future:
-        """Submit ``function(*arguments)``, both picklable; returns its future at once.
-
-        A function that takes ``progress`` gets one whose reports are passed to the ``progress``
-        given here, from another thread.
-        """
+        """Submit ``function(*arguments)``, both picklable; return its future at once. If it takes
+        ``progress``, its reports are passed to the one given here, from another thread."""
         job = Job(Task(function, arguments), limits, progress)
         with self._guard:
             if self._closing.is_set():
@@ -181,20 +173,11 @@ class Pool:
 
     def map(self, function: Callable, tasks: Sequence[tuple], *, limits: Limits = UNLIMITED,
             progress: Progress = SILENT, message: str = "") -> list:
-        """Return ``[function(*task) for task in tasks]``, in this order, computed in parallel.
-
-        Args:
-            function: May take ``progress``.
-            tasks: Its arguments, once per call.
-            limits: Limits of each call.
-            progress: Gets the mean of the calls' fractions, ``message``, the number of finished
-                calls, and ``remaining_s`` once known. Cancelling it stops all.
-            message: Description of the work.
-
-        Raises:
-            WorkError: a process crashed or exceeded its limits.
-            Exception: the first error of a call; the other calls are stopped.
-        """
+        """Return ``[function(*task) for task in tasks]``, in this order, in parallel within limits
+        for each; it may take ``progress``. The progress given here gets the mean fraction, the
+        number of finished calls and ``remaining_s`` once known; cancelled, it stops all. WorkError
+        if a process crashed or exceeded its limits; else the first error of a call, which stops the
+        others."""
         course = _Course(len(tasks), progress, message)
         futures = [self.submit(function, *task, limits=limits, progress=course.part(number))
                    for number, task in enumerate(tasks)]
@@ -381,18 +364,8 @@ class _Course:
 
 def run_tasks(function: Callable, tasks: Sequence[tuple], *, workers: int | None = None,
               progress: Progress = SILENT, message: str = "") -> list:
-    """Return ``[function(*task) for task in tasks]``, in parallel if cores allow.
-
-    Otherwise, or with a single task, it is computed in this process; the results are the same. See
-    :meth:`Pool.map`.
-
-    Args:
-        function: May take ``progress``.
-        tasks: Its arguments, once per call.
-        workers: Most processes; by default the core budget.
-        progress: Overall progress.
-        message: Description of the work.
-    """
+    """Return ``[function(*task) for task in tasks]`` as :meth:`Pool.map` if cores allow, else, or
+    of a single task, in this process with the same results; ``workers``: most processes."""
     count = worker_count(len(tasks), requested=workers)
     if count > 1:
         with Pool(count, name=message or "the computation") as pool:

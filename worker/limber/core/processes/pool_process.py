@@ -72,13 +72,9 @@ class Failed:
 
 
 def serve(pipe: Connection, begin: tuple[Callable | None, tuple], cores: int) -> None:
-    """Execute the tasks that come over ``pipe``; ends when it closes, with the parent or the pool.
-
-    Args:
-        pipe: Receives tasks, and None to cancel the current one; sends progress and results.
-        begin: Function to call first, and its arguments.
-        cores: This process's part of the core budget.
-    """
+    """Execute the tasks that come over ``pipe`` (None cancels the current one), and send progress
+    and results; ends when it closes, with parent or pool. ``begin``: a function to call first, and
+    its arguments; ``cores``: this process's part of the budget."""
     # Ctrl-C reaches the whole process group; the parent ends this process in order.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ[CORES] = str(cores)

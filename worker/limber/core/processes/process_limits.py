@@ -51,16 +51,9 @@ def _of_each(process_id: int, do: Callable[[Any], Any]) -> list[Any]:
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a task; its process is killed when it exceeds them.
-
-    Attributes:
-        seconds: From its start, or None.
-        memory_mb: Memory of its process and all descendants, or None.
-        computed_seconds: Processor time of its process and all descendants, or None. Other load on
-            the machine does not count.
-        idle_seconds: Longest time without any processor time, or None; detects a process that waits
-        in vain.
-    """
+    """Limits of a task, whose process is killed beyond them: seconds from its start; memory [MB]
+    and processor time [s] of it and all descendants, without other load of the machine; and the
+    longest time without processor time [s], as of one that waits in vain. None: no limit."""
 
     seconds: float | None = None
     memory_mb: float | None = None
@@ -72,14 +65,8 @@ UNLIMITED = Limits()
 
 
 class LimitWatch:
-    """Checks a process against limits, from now on.
-
-    Args:
-        name: Description of the task, for messages.
-        limits: Limits of the process.
-        process_id: Process whose memory counts, including its descendants.
-        memory_interval: Time between two checks of memory and processor time [s].
-    """
+    """Checks a process with its descendants against limits, from now on; ``name`` is for messages,
+    ``memory_interval`` the time between checks of memory and processor time [s]."""
 
     def __init__(self, name: str, limits: Limits, process_id: int, memory_interval: float = 0.5):
         self._name, self._limits, self._process_id = name, limits, process_id
@@ -143,11 +130,8 @@ _SPARED_MEMORY = 0.15
 
 
 def core_budget() -> int:
-    """Return how many cores this process may use.
-
-    Raises:
-        InputError: ``LIMBER_CORES`` is not a positive whole number.
-    """
+    """Return how many cores this process may use; InputError if ``LIMBER_CORES`` is no positive
+    whole number."""
     text = os.environ.get(CORES)
     if text is None:
         return _machine_cores()
@@ -164,14 +148,8 @@ def core_budget() -> int:
 
 def worker_count(task_count: int, *, requested: int | None = None,
                  memory_mb_each: float = 0.0) -> int:
-    """Return how many processes to start for ``task_count`` tasks, at least 1.
-
-    Args:
-        task_count: Number of tasks; more processes would idle.
-        requested: Number requested by the user; the budget still applies.
-        memory_mb_each: Estimated memory per task; only as many processes run as fit into the free
-        memory.
-    """
+    """Return how many processes to start for ``task_count`` tasks, at least 1: within the budget,
+    even if the user requested more, and with memory for each [MB] free."""
     count = min(core_budget(), max(task_count, 1), requested or task_count or 1)
     if memory_mb_each > 0:
         room = (1 - _SPARED_MEMORY) * free_memory_mb() / memory_mb_each
