@@ -1,5 +1,6 @@
 """What every test shares: real recordings; small meshes, branches and pulls with known truth."""
 
+import os
 import shutil
 import signal
 from dataclasses import replace
@@ -24,6 +25,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a shell, or under one that ignores Ctrl-C: the programs that
     # tests start would inherit that, and no user's does.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Other tests run beside each one and have the other cores: no stage starts processes for them. What
+# is about processes asks for its own number.
+os.environ.setdefault("LIMBER_CORES", "1")
 
 
 @pytest.fixture(scope="session")
@@ -109,6 +114,15 @@ def branch_template(tmp_path_factory, small, small_bench):
     settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=12, seed=4, phase=0.5)
     virtual_pull(folder, "pull-1", settings)
     return folder
+
+
+@pytest.fixture
+def unpainted(monkeypatch):
+    """Figures of a report are drawn, but no pixels are made of them, which takes five seconds."""
+    from matplotlib import pyplot
+
+    monkeypatch.setattr("limber.results.report.section._png",
+                        lambda figure: pyplot.close(figure) or b"\x89PNG")
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import importlib.util
 import inspect
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -111,6 +112,7 @@ def test_names_for_programs_are_those_for_type_checkers():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unpainted")
 @pytest.mark.filterwarnings("ignore:A gap")
 def test_the_docstrings_examples(own, tmp_path, monkeypatch):
     """They run as they stand, in a folder with a scan and a branch."""
@@ -385,6 +387,7 @@ def test_surfaces_become_branches(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unpainted")
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_verbs_are_the_commands(own, tmp_path):
     """A command with the same settings finds all done, and prints what the verb returned."""
@@ -438,7 +441,7 @@ def test_a_script_needs_no_guard(example, tmp_path):
                       f"branch = limber.open({str(folder)!r})\n"
                       "print(branch.energy_field(samples=30, workers=2))\n")
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False,
-                          timeout=250)
+                          timeout=250, env=os.environ | {"LIMBER_CORES": "2"})
     assert done.returncode == 0, done.stderr
     begun, result = done.stdout.splitlines()
     assert begun == "begun" and result.startswith("EnergyField(samples 3")

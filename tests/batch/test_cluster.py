@@ -34,9 +34,10 @@ reach = 0.2
 
 
 @pytest.mark.slow
-def test_two_workers_on_loopback_one_killed(tmp_path, branch_template):
+def test_two_workers_on_loopback_one_killed(tmp_path, branch_template, monkeypatch):
     """Kill -9 of a worker at work costs a stage; the files are those of the stage run alone."""
     pytest.importorskip("distributed")
+    monkeypatch.setenv("LIMBER_CORES", "2")
     for name in ("one", "two"):
         shutil.copytree(branch_template, tmp_path / f"{name}.branch")
     alone = shutil.copytree(branch_template, tmp_path / "alone")
