@@ -103,6 +103,7 @@ def test_gusts_that_make_no_sense(tmp_path, content, settings, told):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unpainted")
 def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     """Its table and picture on the page, its frames in the scene; a damaged file is named."""
     from limber.results.scene.contents import scene_data

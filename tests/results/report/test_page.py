@@ -26,6 +26,8 @@ from limber.stages.registry import result_of
 from limber.stages.results.report import page_of, write_report
 from limber.store import Branch
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 @pytest.fixture
 def meshed(tmp_path) -> Branch:
