@@ -12,6 +12,7 @@ from limber.core.progress import SILENT
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.geometry.io.depth_images import depth_metres
 from limber.perception.observe import write_depth
+from limber.recordings import bag_reader
 from limber.recordings.bag_pull import _Messages, pull_of_bag, write_mcap
 from limber.recordings.bag_reader import Bag, Topic, read_bag, stamped
 from limber.recordings.recording import read_pull, write_pull
@@ -20,6 +21,18 @@ from limber.stages.pulls.export_pull import export_pull
 from limber.stages.pulls.import_pull import import_pull
 
 pytest.importorskip("rosbags")
+
+
+@pytest.fixture
+def apart():
+    """Bags are read by another process, as in earnest."""
+
+
+@pytest.fixture(autouse=True)
+def read_here(request, monkeypatch):
+    """Elsewhere by this one: to start another takes a second."""
+    if "apart" not in request.fixturenames:
+        monkeypatch.setattr(bag_reader, "read_apart", lambda reader, path: reader(path))
 
 
 @pytest.fixture
@@ -95,6 +108,7 @@ def pulled(bag: Written, *, wrench="/wrench", pose="/pose", shift=0.0):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("apart")
 def test_a_pull_comes_back_as_it_was(mcap, bare_folder, plain_pull):
     """Poses, wrenches and markers through MCAP; frames need no option."""
     result = import_pull(bare_folder, mcap, "again", ImportSettings())
@@ -252,6 +266,7 @@ def test_what_was_asked_can_be_answered(tmp_path, bare_folder):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("apart")
 def test_damaged_bags_are_refused_or_read_never_crash(mcap, tmp_path, bare_folder):
     """Five ways of spoiling bytes: an answer in words each time, in seconds."""
     whole = mcap.read_bytes()

@@ -2,8 +2,6 @@
 
 import inspect
 import json
-import subprocess
-import sys
 
 import click
 import pytest
@@ -144,13 +142,11 @@ def test_help_shows_at_most_ten_options():
                    for about in stage_schema(name)[part].get("properties", {}).values()) <= 10
 
 
-@pytest.mark.slow
-def test_schema_commands_print_json():
+def test_schema_commands_print_json(capsys):
     """`limber schema` has what `limber STAGE --schema` has of each stage."""
     def printed(*arguments):
-        done = subprocess.run([sys.executable, "-m", "limber", *arguments], check=True,
-                              capture_output=True, text=True)
-        return json.loads(done.stdout)
+        assert main.call([*arguments]) == 0
+        return json.loads(capsys.readouterr().out)
     told = printed("schema")
     assert told == json.loads(json.dumps(all_schemas()))
     assert told["stages"]["plan"] == printed("plan", "--schema")

@@ -1,12 +1,11 @@
 """`limber verify`: names each damaged file, and what is there beside."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from limber.cli.main import call
 from limber.store import Branch
 
 
@@ -19,25 +18,28 @@ def branch(tmp_path: Path) -> Branch:
     return branch
 
 
-def verify(branch: Branch) -> tuple[int, dict]:
-    done = subprocess.run([sys.executable, "-m", "limber", "verify", str(branch.folder), "--json"],
-                          capture_output=True, text=True, check=False)
-    return done.returncode, json.loads(done.stdout.splitlines()[-1])
+@pytest.fixture
+def verify(capsys):
+    """The command's exit code and what it says."""
+    def verified(folder: Path) -> tuple[int, dict]:
+        code = call(["verify", str(folder), "--json"])
+        return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+    return verified
 
 
-def test_a_whole_folder_verifies(branch: Branch):
+def test_a_whole_folder_verifies(branch: Branch, verify):
     """With its UUID and size; files of others and streams left by a kill are named, no damage."""
     (branch.folder / "notes.txt").write_text("mine")
     with branch.stream("pulls/b/robot.csv") as stream:
         stream.append("time")
-    code, said = verify(branch)
+    code, said = verify(branch.folder)
     assert (code, said["status"]) == (0, "done")
     assert (said["uuid"], said["file_count"], said["byte_count"]) == (branch.uuid, 7, 49)
     assert said["unlisted"] == ["notes.txt"]
     assert said["unfinished_streams"] == ["pulls/b/robot.csv"]
 
 
-def test_each_damaged_file_is_named(branch: Branch):
+def test_each_damaged_file_is_named(branch: Branch, verify):
     """Changed, cut off or gone: all of them, with exit code 2."""
     clouds = branch.folder / "pulls" / "a" / "clouds"
     for number in (0, 1):
@@ -46,7 +48,7 @@ def test_each_damaged_file_is_named(branch: Branch):
         (clouds / f"{number}.ply").write_text("cl")
     for number in (4, 5):
         (clouds / f"{number}.ply").unlink()
-    code, said = verify(branch)
+    code, said = verify(branch.folder)
     assert (code, said["status"]) == (2, "failed")
     for number, trouble in enumerate(["other content"] * 2 + ["2 bytes instead of 7"] * 2
                                      + ["missing"] * 2):
@@ -55,7 +57,5 @@ def test_each_damaged_file_is_named(branch: Branch):
     assert "pull:a" in said["error"]
 
 
-def test_no_branch_folder_is_an_input_error(tmp_path: Path):
-    code = subprocess.run([sys.executable, "-m", "limber", "verify", str(tmp_path)],
-                          capture_output=True, check=False).returncode
-    assert code == 2
+def test_no_branch_folder_is_an_input_error(tmp_path: Path, verify):
+    assert verify(tmp_path)[0] == 2
