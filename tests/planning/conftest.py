@@ -126,8 +126,8 @@ def planned_branch(tmp_path_factory, small_mesh, small_skeleton):
 
 @pytest.fixture
 def coarse_bound(monkeypatch):
-    """The bound without its last, finest grid, where something else is tested: half a minute."""
-    monkeypatch.setattr(lower_bound, "_MOST_CELLS", 60_000)
+    """The bound without its last, finest grids, where something else is tested: half a minute."""
+    monkeypatch.setattr(lower_bound, "_MOST_CELLS", 15_000)
 
 
 @pytest.fixture

@@ -236,6 +236,7 @@ def arm_cell(tip):
 
 
 @pytest.mark.slow  # two plans on the full model
+@pytest.mark.usefixtures("coarse_bound")
 @pytest.mark.parametrize("kind", ["second_arm", "in_view"])
 def test_a_target_is_brought_where_it_can_be_taken_or_seen(planned_branch, tmp_path, kind):
     """From rest, where it cannot: the end does on the full model, and is not far in."""
