@@ -197,6 +197,7 @@ def test_the_plan_has_its_certificate(example):
         plan.model_copy(update={"damage": None}).plot_damage()
 
 
+@pytest.mark.slow
 def test_the_energy_field_answers_between_its_samples(example):
     """At a sample it has about the sample's energy; force and energy have a row a point."""
     field = example.results["energy"]

@@ -49,6 +49,7 @@ def written_pages(monkeypatch) -> dict[str, str]:
     return reference_tables.pages()
 
 
+@pytest.mark.slow
 def test_every_option_of_help_is_explained(written_pages):
     """What `limber COMMAND --help` lists has a row with a meaning in the page of commands."""
     from limber.cli.main import main

@@ -141,6 +141,7 @@ def test_refused_setting_is_named(arguments, capfd):
     assert arguments[0].split("=")[0] in json.loads(lines[-1])["error"]
 
 
+@pytest.mark.slow
 def test_every_listed_command_exists():
     """`limber --help` lists only commands whose module loads and has help."""
     for name in main.command_summaries():

@@ -53,6 +53,7 @@ def missed(interval, truth):
     return interval[1] < truth, interval[0] > truth
 
 
+@pytest.mark.slow
 def test_a_soft_piece_is_missed_as_often_to_one_side_as_to_the_other():
     """Of 1,500 draws 2.5 % each; by the curvature twice as often, all of them too soft."""
     rng, plain, found = np.random.default_rng(1), [], []

@@ -57,6 +57,7 @@ def test_depth_frames_with_an_empty_mask(tmp_path, scene, pull):
     assert any("1 of 6 frames do not show the branch" in warning for warning in warnings)
 
 
+@pytest.mark.slow
 def test_a_camera_pose_that_is_off_is_corrected(tmp_path, scene, pull):
     """25 mm sideways: told with its size, and the points are right nevertheless."""
     off = np.array(scene.camera.pose)

@@ -69,6 +69,7 @@ def test_all_positions_are_moved_and_boxes_refused(tmp_path, name):
             inputs.in_branch(settings.model_copy(update={field: (0.0, 0.0, 0.0)}))
 
 
+@pytest.mark.slow
 def test_tables_in_frames_of_their_own(tmp_path):
     """Markers in a motion capture's frame, poses and forces in a robot's, both known in the scan's
     coordinates: the pull is that of tables in the branch's frame.

@@ -86,6 +86,7 @@ def test_plain_names_are_taken(tmp_path):
         assert inside(tmp_path, name) == tmp_path / name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in OUTSIDE if name not in ("", ".", "..")])
 @pytest.mark.parametrize("listed_by", ["manifest", "commit", "old manifest"])
 def test_no_file_outside_is_removed_or_written(folder, name, listed_by):

@@ -117,6 +117,7 @@ def test_a_folder_that_goes_while_a_stage_runs(tmp_path):
     assert Branch.open(folder, verify=True).manifest.stages["a"].settings == {"n": 2}
 
 
+@pytest.mark.slow
 def test_what_a_failed_writer_has_open_is_closed(tmp_path):
     """Removed but open, it would keep its room: the next stage would find the disk as full."""
     branch, held = Branch.create(tmp_path / "a.branch"), []

@@ -284,6 +284,7 @@ def test_doubtful_leaves_are_judged_by_the_sure_ones() -> None:
     assert found(1) == [1000]
 
 
+@pytest.mark.slow
 def test_points_off_all_axes_are_asked_whether_they_are_leaves() -> None:
     """Those of a seedling's leaves show leaves, those of its stems and of noise do not."""
     case = leafy_case(3)

@@ -48,6 +48,7 @@ def test_two_stakes_and_nothing_else_are_two_stakes() -> None:
     assert [each.kind for each in found] == ["stake", "stake"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["monopodial", "opposite"])
 def test_pot_and_stake_of_a_potted_plant_are_named(source: str) -> None:
     """With nearly all of their points and few of the plant's; the plant without them has none."""
@@ -60,6 +61,7 @@ def test_pot_and_stake_of_a_potted_plant_are_named(source: str) -> None:
     assert find_supports(bare.points, np.array(bare.settings["up"])) == []
 
 
+@pytest.mark.slow
 def test_a_stake_is_straight_and_even_and_a_stem_is_not() -> None:
     """A rod beside a stem is a stake, one of 30 mm radius a post; a tapered or bent rod is wood."""
     stem = _rod(0.01, 1.0, tip=0.004, bend=0.1)
@@ -73,6 +75,7 @@ def test_a_stake_is_straight_and_even_and_a_stem_is_not() -> None:
         assert find_supports(np.vstack([stem, wood]), UP) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sag", [0.0, 0.04])
 def test_a_wire_hangs_from_border_to_border_or_from_its_posts(sag: float) -> None:
     """Straight or sagging; one that thins, bends, sags upwards or ends in the air is wood."""
@@ -91,6 +94,7 @@ def test_a_wire_hangs_from_border_to_border_or_from_its_posts(sag: float) -> Non
         assert find_supports(np.vstack([stem, *wood]), UP) == []
 
 
+@pytest.mark.slow
 def test_supports_of_a_dense_scan_have_all_of_their_points() -> None:
     """More points than are looked at: the others follow the nearest of these."""
     scan = np.vstack([_rod(0.01, 1.0, tip=0.004, bend=0.1, count=160_000),

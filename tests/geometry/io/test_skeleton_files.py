@@ -173,6 +173,7 @@ def written(path: Path, *, count: int = 1, creator: str = "") -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_it_is_read_as_one_of_version_7(tmp_path):
     write_treeqsm(AXIS, tmp_path / "old.mat")
     old, new = read_treeqsm(tmp_path / "old.mat"), read_treeqsm(written(tmp_path / "new.mat"))

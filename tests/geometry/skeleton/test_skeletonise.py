@@ -183,6 +183,7 @@ def test_thinning_keeps_the_limit_and_the_extent():
     assert np.ptp(points[chosen][:, 2]) > 0.99
 
 
+@pytest.mark.slow
 def test_radius_uncertainty_by_far_apart_probes(monkeypatch, forked_branch, of_forked):
     """One solve for nodes far apart gives the same deviations as one solve for each node."""
     def deviations() -> np.ndarray:

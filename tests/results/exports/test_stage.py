@@ -14,6 +14,7 @@ from limber.store.loading import load_skeleton
 EXAMPLE = Path(__file__).parents[3] / "blend_files" / "bending_branch"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "columns"), [
     ("a.mat", "rtwig"), ("a.csv", "rtwig"), ("a.csv", "simpleforest"), ("a.swc", "rtwig"),
     ("a.mtg", "rtwig")])
@@ -64,6 +65,7 @@ def test_what_cannot_be_written_is_told(tmp_path):
         export(EXAMPLE, tmp_path / "a.sdf", ExportSettings())
 
 
+@pytest.mark.slow
 def test_a_mat_file_of_something_else_is_refused(tmp_path):
     """A MAT file without cylinders, and bytes that are none."""
     from scipy.io import savemat
