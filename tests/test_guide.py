@@ -31,15 +31,6 @@ def test_the_guide_builds_without_a_warning(tmp_path):
     assert "--max-strain" in commands and "--gap-factor" in commands
 
 
-def test_every_public_name_says_what_it_is():
-    """All that `import limber` gives has a docstring."""
-    import limber
-
-    for name in limber.__all__:
-        if name != "__version__":
-            assert (getattr(limber, name).__doc__ or "").strip(), name
-
-
 @pytest.fixture
 def written_pages(monkeypatch) -> dict[str, str]:
     """The pages that are written from code and data, by their path in the guide."""

@@ -281,7 +281,8 @@ def test_a_free_frame_is_put_right_though_it_is_turned_far(small_bench, small, s
     pull = replace(small_pull, entry=entry,
                    observations=replace(small_pull.observations, positions=wrong))
     settings = SETTINGS.model_copy(update={
-        "free_frame": True, "field": "inverse_distance", "poisson_sigma": 0.0, "key_frames": 4})
+        "free_frame": True, "field": "inverse_distance", "poisson_sigma": 0.0, "key_frames": 4,
+        "mesh_check": False})
     found = fit_branch([pull], subject_of(small_bench, small), settings,
                        log=EvaluationLog(None, ""))
     assert found.is_bad is None
@@ -515,8 +516,8 @@ def test_a_zero_larger_than_the_force_ends_soon_with_a_wide_interval(small_bench
     seen = CellErrors.drawn(known, rng).recorded(pull, rng)
     assert np.linalg.norm(seen.wrenches[:, :3], axis=1).max() > 9 * peak
     subject = subject_of(small_bench, small)
-    found = fit_branch([seen], subject, SETTINGS.model_copy(update={"mesh_check": False}),
-                       log=EvaluationLog(None, ""))
+    found = fit_branch([seen], subject, SETTINGS.model_copy(update={
+        "mesh_check": False, "key_frames": 4}), log=EvaluationLog(None, ""))
     low, high = found.uncertainty.young_interval.T
     assert found.is_bad is None and found.objective.forward_count < 60
     assert np.all((low < TRUTH) & (TRUTH < high)) and np.log(high / low).max() > 0.5

@@ -32,6 +32,7 @@ def breaking(strains):
     return -np.expm1(-(strains / SCALE)**SHAPE)
 
 
+@pytest.mark.slow
 def test_a_limit_by_few_tests_breaks_as_many_as_allowed():
     """Over many sets of eight tests, a strain limit for 5 % breaks 5 % of new branches; by the fit
     alone, as if it were exact, it would break more."""

@@ -80,6 +80,7 @@ def test_a_pull_elsewhere_tells_more_than_the_same_again(subject):
     assert there > again > 0.0
 
 
+@pytest.mark.slow
 def test_a_few_simulated_frames_tell_as_much_as_all_recorded(subject, monkeypatch):
     """Of what pulls tell, in each direction; four times as many tell more, but no four times:
     the cell's errors stay."""

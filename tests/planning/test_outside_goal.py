@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from pydantic import Field
+from tests.stages.test_registry import parsed
 
-from limber.cli.main import call
 from limber.core.errors import InputError, NoPathError
 from limber.core.settings import Groups
 from limber.planning.goals.goal import GoalKind
@@ -103,17 +103,10 @@ def test_a_goal_from_outside_is_planned_to(planned_branch, tmp_path):
     assert plan_paths(folder, settings, name="side") == done
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("side", "coarse_bound")
-def test_a_goal_from_outside_has_its_option(planned_branch, tmp_path, monkeypatch, capsys):
-    """The command with those settings takes it, and says what it is."""
-    folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
+def test_a_goal_from_outside_has_its_option(monkeypatch):
+    """The command with those settings takes it."""
     monkeypatch.setattr(plan_stage, "STAGE", replace(plan_stage.STAGE, settings=SideSettings))
-    rest = read_plan(folder / "plans/there.json").motion.poses[0]
-    code = call(["plan", str(folder), "--name", "side", "--goal-side", f"{rest[0] + 0.05:.3f}",
-                 "--iterations", "100", "--json"])
-    last = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    assert code == 0 and last["goal"]["kind"] == "side"
+    assert parsed("plan", ["a.branch", "--goal-side", "0.3"])[1] == SideSettings(goal_side=0.3)
 
 
 @pytest.mark.usefixtures("side")

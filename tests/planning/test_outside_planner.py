@@ -41,6 +41,7 @@ def line():
     del PLANNERS["line"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_planner_from_outside_finds_the_baseline(planned_branch, tmp_path, line):
     """Asked for the shortest and the gentle path, its line is the baseline, named as its own."""
