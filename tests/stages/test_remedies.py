@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 
 import click
-import pytest
 from pydantic import TypeAdapter
 
 from limber.cli.main import call, main
@@ -125,12 +124,3 @@ def test_an_option_that_the_command_lacks_is_not_offered(tmp_path, capsys):
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert [each["command"] for each in told["remedies"]] == ["reconstruct"]
     assert "`limber reconstruct CLOUD -o NAME.branch`" in told["fix"]
-
-
-@pytest.mark.slow
-def test_the_place_is_in_the_result(capsys):
-    """A cut beside the branch: the last line says where it was asked for. Slow: loads a branch."""
-    example = ROOT / "blend_files" / "bending_branch"
-    assert call(["load", str(example), "--cut", "9", "8", "7", "--json"]) == 2
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert told["place"] == [9.0, 8.0, 7.0], told["error"]
