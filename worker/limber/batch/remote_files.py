@@ -37,11 +37,8 @@ def is_address(text: str) -> bool:
 
 
 def checked_address(address: str) -> str:
-    """Return an address without a slash at its end.
-
-    Raises:
-        InputError: it is chained, contains a password, or contains ``..``.
-    """
+    """Return an address without a slash at its end; InputError if it is chained, or contains a
+    password or ``..``."""
     # Checked first: the other messages show the address.
     for part in address.split("::"):
         host = part.partition("://")[2].partition("/")[0]
@@ -60,11 +57,8 @@ def checked_address(address: str) -> str:
 
 
 def plain_name(address: str) -> str:
-    """Return the last part of an address: the name of the local file.
-
-    Raises:
-        InputError: it is not a name that every system accepts.
-    """
+    """Return the last part of an address, the local file's name; InputError if not every system
+    accepts it."""
     name = address.rstrip("/").rpartition("/")[2]
     if not _PLAIN_NAME.match(name):
         raise InputError(f"{address!r} ends with {name!r}, which is not a valid file name "
@@ -76,11 +70,8 @@ def plain_name(address: str) -> str:
 
 
 def matching(pattern: str) -> list[str]:
-    """Return the addresses that match a pattern or an address, sorted.
-
-    Raises:
-        InputError: it is invalid. WorkError: the server cannot be read.
-    """
+    """Return the addresses that match a pattern or an address, sorted. InputError if it is invalid;
+    WorkError if the server cannot be read."""
     address = checked_address(pattern)
     system, path = _system(address)
     before = _before(system, address, path)
@@ -90,16 +81,9 @@ def matching(pattern: str) -> list[str]:
 
 
 def fetch(address: str, target: Path, stop: Callable[[], None]) -> None:
-    """Copy a file or folder to ``target``, unless an unchanged copy is there.
-
-    The copy is complete or does not exist.
-
-    Args:
-        stop: Called repeatedly; ends the copy by raising.
-
-    Raises:
-        WorkError: it does not exist, was interrupted, or exceeds the free space.
-    """
+    """Copy a file or folder to ``target``, unless an unchanged copy is there; it is complete or
+    does not exist. ``stop`` is called repeatedly and ends the copy by raising. WorkError if it does
+    not exist, was interrupted, or exceeds the free space."""
     system, path = _system(address)
     with _explained(address, "read"):
         system.invalidate_cache()
@@ -142,11 +126,7 @@ def copy_here(address: str, target: Path, stop: Callable[[], None]) -> None:
 
 
 def put(source: Path, address: str) -> None:
-    """Put a file at an address.
-
-    Raises:
-        WorkError: it cannot be written there.
-    """
+    """Put a file at an address; WorkError if it cannot be written there."""
     system, path = _system(address)
     with _explained(address, "written"):
         try:
@@ -158,11 +138,8 @@ def put(source: Path, address: str) -> None:
 
 
 def read_bytes(address: str) -> bytes | None:
-    """Return the content of a small file at an address; None if it does not exist.
-
-    Raises:
-        WorkError: the server cannot be read, or the file is large.
-    """
+    """Return the content of a small file at an address, None if it does not exist; WorkError if the
+    server cannot be read, or the file is large."""
     system, path = _system(address)
     with _explained(address, "read"):
         system.invalidate_cache()
@@ -244,11 +221,7 @@ def _digest(found: dict[str, dict[str, Any]]) -> str:
 
 
 def _inside(folder: str, path: str) -> PurePosixPath:
-    """The relative path of a file in its folder.
-
-    Raises:
-        InputError: a component of it is not a plain name.
-    """
+    """The relative path of a file in its folder; InputError if a part of it is not a plain name."""
     inner = PurePosixPath(path).relative_to(PurePosixPath(folder))
     for part in inner.parts:
         plain_name(part)

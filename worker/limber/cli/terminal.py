@@ -21,10 +21,8 @@ _SHOWN = 12
 
 
 def result_lines(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a stage's result as lines ``name: value``; nested values are indented below their name.
-
-    Numbers have five digits; empty values are omitted. ``--json`` has everything.
-    """
+    """Yield a stage's result as lines ``name: value`` with five digits, nested values indented,
+    without empty ones, which ``--json`` has."""
     for name, value in result.items():
         if _is_empty(value):
             continue
@@ -53,9 +51,8 @@ def found_lines(lines: Sequence[Line], values: Mapping[str, Any]) -> Iterator[st
 
 
 def command_to_type(template: str, values: Mapping[str, Any]) -> str:
-    """Return a command with its names and paths filled in, quoted for a shell; empty if one of them
-    is missing. ``{name:if}`` requires a value but prints nothing.
-    """
+    """Return a command with names and paths filled in, quoted for a shell; "" if one is missing.
+    ``{name:if}`` requires a value but prints nothing."""
     try:
         return _QUOTED.vformat(template, (), values)
     except _NotThere:

@@ -30,13 +30,9 @@ _SINGULARITY = 0.08
 
 
 def bending_modulus(skeleton: Skeleton, fraction: float, force: float, travel: float) -> float:
-    """Return the modulus [Pa] with which ``force`` [N] across a branch moves it by ``travel`` [m].
-
-    By slender beam theory of the straight branch: the virtual work of the force.
-
-    Args:
-        fraction: Fraction of the main path at which the force acts.
-    """
+    """Return the modulus [Pa] with which ``force`` [N] across a branch, at a fraction of its main
+    path, moves it by ``travel`` [m]: by slender beam theory of the straight branch, the virtual
+    work of the force."""
     path = skeleton.main_path()
     along, radius = skeleton.arc_length[path], skeleton.radius[path]
     distance = fraction * along[-1]
@@ -46,16 +42,9 @@ def bending_modulus(skeleton: Skeleton, fraction: float, force: float, travel: f
 
 
 def base_beside(arm: Arm, tool: np.ndarray, point: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Return the base pose [6] from which an upright arm best reaches a branch, branch frame.
-
-    Args:
-        tool: Frame of the grasp in the flange's frame, shape [4, 4].
-        point: Position of the grasp [m], shape [3].
-        axis: Axis of the branch there, shape [3].
-
-    Raises:
-        NoPathError: there is no such pose around it.
-    """
+    """Return the base pose [6] from which an upright arm best reaches a branch at ``point`` [m, 3]
+    with its axis there [3], branch frame; ``tool``: the grasp's frame in the flange's, [4, 4].
+    NoPathError if there is none around it."""
     best: tuple[float, np.ndarray] | None = None
     for turn in np.arange(6) * np.pi / 3:
         aside = np.array([np.cos(turn), np.sin(turn), 0.0])
@@ -73,11 +62,8 @@ def base_beside(arm: Arm, tool: np.ndarray, point: np.ndarray, axis: np.ndarray)
 
 
 def gripper_at(cell: Cell, point: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return joints [rad, 6] and the gripper's rotation [rad, 3] with the gripper on the branch.
-
-    Raises:
-        NoPathError: it does not reach the surroundings of that point.
-    """
+    """Return joints [rad, 6] and the gripper's rotation [rad, 3] with the gripper on the branch;
+    NoPathError if it does not reach the surroundings of that point."""
     found = _held(cell.arm, np.array(cell.base.pose), matrices(np.array(cell.tool.grasp_pose)),
                   point, axis)
     if found is None:
@@ -108,14 +94,9 @@ def _held(arm: Arm, base: np.ndarray, tool: np.ndarray, point: np.ndarray, axis:
 
 def write_touched(path: Path, base: np.ndarray, moved: np.ndarray, axis_points: np.ndarray,
                   sigma: float, rng: np.random.Generator) -> None:
-    """Write points for `limber robot calibrate`: on the branch, and as touched by the robot.
-
-    Args:
-        base: The robot's true base in the scan's frame [m, rad], shape [6].
-        moved: Added to the scan's coordinates to get the branch's [m], shape [3].
-        axis_points: Points of the branch that are touched, the scan's frame [m], shape [n, 3].
-        sigma: Standard deviation of the touching error, per axis [m].
-    """
+    """Write points for `limber robot calibrate`, on the branch and as touched with an error of
+    ``sigma`` [m] per axis: ``axis_points`` [m], [n, 3], in the scan's frame, as ``base`` [m, rad],
+    the robot's true one, is; ``moved`` [m], [3], leads to the branch's."""
     turn = np.arange(_MARKS) * 2 * np.pi / _MARKS
     rim = _RIM_M * np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
     points = np.vstack([rim, axis_points])
@@ -158,13 +139,9 @@ _BEYOND = 1.5
 
 @dataclass(frozen=True)
 class TaskSizes:
-    """A goal for the flower, and the effort to hold it there by the branch's model.
-
-    Attributes:
-        target: Position of the flower, branch frame [m], shape [3].
-        holding_force: [N] of the gripper.
-        deflection: Displacement of the grasp, as a fraction of the branch's length up to it.
-    """
+    """A goal for the flower, branch frame [m], shape [3], and the effort to hold it there by the
+    branch's model: force of the gripper [N], and displacement of the grasp over the branch's length
+    up to it."""
 
     target: np.ndarray
     holding_force: float
@@ -189,14 +166,9 @@ class TaskSizes:
 
 
 def wish_for(branch: Branch, direction: np.ndarray, travel: float) -> TaskSizes:
-    """Return a position for the branch's first target in which the branch can be held.
-
-    A force along ``direction`` [3] that moves the grasp by ``travel`` [m] takes the target there;
-    the branch is then bent, and neither stretched nor compressed.
-
-    Raises:
-        WorkError: no such force moves it so far.
-    """
+    """Return a position for the branch's first target in which it is bent, neither stretched nor
+    compressed: where a force along ``direction`` [3] that moves the grasp by ``travel`` [m] takes
+    it. WorkError if no such force moves it so far."""
     model = load_grasp_model(branch, gravity=True)
     size = force_for_travel(model.model, model.grasp, direction, travel)
     state = solve_static(model.model, grasp=model.grasp, grasp_force=size * direction).require()

@@ -23,12 +23,8 @@ _EVERY_SECONDS, _CLOSELY_SECONDS = 0.05, 0.004
 
 @dataclass(frozen=True)
 class Overload:
-    """Effects of a provoked overload.
-
-    Attributes:
-        standstill: Time from the overload until the arm stood still [s].
-        travel: Distance that the gripper still moved [m].
-    """
+    """Effects of a provoked overload: time until the arm stood still [s], and how far the gripper
+    still moved [m]."""
 
     standstill: float
     travel: float
@@ -36,16 +32,9 @@ class Overload:
 
 @dataclass
 class Watch:
-    """Records the robot and its branch in a thread; a context manager.
-
-    Args:
-        robot: No other code may query it meanwhile.
-        overload: Wrench on the sensor from when the branch is driven [N, N m], shape [6], or None.
-
-    Attributes:
-        states: As returned by :attr:`VirtualRobot.state`.
-        overloaded: Effects of the overload; None if there was none.
-    """
+    """Records the states of robot and branch in a thread, which alone may query it meanwhile; a
+    context manager. ``overload``: wrench on the sensor from when the branch is driven [N, N m],
+    shape [6], or None; ``overloaded``: its effects."""
 
     robot: VirtualRobot
     overload: np.ndarray | None = None
@@ -70,10 +59,8 @@ class Watch:
         return max((state.get("extrapolation_error_n", 0.0) for state in self.states), default=0.0)
 
     def at_the_end(self) -> np.ndarray | None:
-        """Return positions of the branch's visible points at the end of the path [m], shape [n, 3].
-
-        That is where it was held still, farthest from where it was grasped.
-        """
+        """Return positions of the branch's visible points at the end of the path [m], shape [n, 3]:
+        where it was held still, farthest from where it was grasped."""
         held = [state for state in self.states if state["branch"] == "held"]
         still = [state for state in held if _speed(state) < STILL_M_S]
         if not still:

@@ -74,18 +74,9 @@ _DONE = {"generate": 0.02, "scan": 0.08, "reconstruct": 0.15, "calibrate": 0.16,
 
 @dataclass
 class ClosedLoop:
-    """One run of the loop on a branch of its own.
-
-    Args:
-        folder: Parent folder of all results.
-        seed: Seed of the branch, the sensors' noise and the touching.
-        address: Loopback address of the virtual robot.
-        model: Model of its arm.
-        say: Gets one line per part.
-
-    Attributes:
-        seconds: Duration of each part.
-    """
+    """One run of the loop on a branch of its own, below ``folder``, with a virtual robot of this
+    model and loopback address; ``seed`` of the branch, the sensors' noise and the touching, ``say``
+    gets one line per part, ``seconds`` the duration of each."""
 
     folder: Path
     seed: int = 1
@@ -106,14 +97,9 @@ class ClosedLoop:
         return self.folder / "cell.toml"
 
     def run(self) -> dict[str, Any]:
-        """Run the loop once.
-
-        Returns:
-            The result of :func:`.comparison.compared`, and the seconds of each part.
-
-        Raises:
-            LimberError: a part failed; the robot is then stopped, files made so far are kept.
-        """
+        """Run the loop once; return the result of :func:`.comparison.compared`, and the seconds of
+        each part. LimberError if one failed: the robot is then stopped, files made so far are
+        kept."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.branch.exists():
             raise InputError(f"{self.branch} already exists.", "The loop starts with a new "
@@ -180,9 +166,8 @@ class ClosedLoop:
                     "contact_n_per_m": _SOFTER * _PEAK_N / _TRAVEL_M})
 
     def _reconstructed(self, truth: TrueBranch, cell: Cell) -> np.ndarray:
-        """Scan, reconstruct, calibrate, name the flower; return the shift from the scan's frame to
-        the branch's [m], shape [3].
-        """
+        """Scan, reconstruct, calibrate, name the flower; return the shift from scan to branch [m],
+        [3]."""
         nodes = truth.mesh.nodes
         middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
         scan = self.folder / "scan.ply"
@@ -253,9 +238,8 @@ class ClosedLoop:
                    *options, "--speed", _PULL_SPEED_M_S, "--after-stop", "hold")
 
     def _planned(self, goal: np.ndarray | None = None) -> Planned:
-        """Estimate, sample the energy field and plan the flower's path to a position [3], or to one
-        that suits the branch.
-        """
+        """Estimate, sample the field, plan the flower's path to a position [3], or one that suits
+        the branch."""
         estimated = self._part("estimate", "Young's modulus from the pull", "estimate",
                                self.branch)
         branch = Branch.open(self.branch)
