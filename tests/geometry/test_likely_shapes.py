@@ -86,13 +86,13 @@ def test_twigs_are_missing_as_often_as_they_are_doubted():
 
 @pytest.mark.slow
 def test_new_scans_scatter_as_the_drawn_shapes_foretell():
-    """20 scans with fresh noise, fitted: mean radius and axis scatter as the shapes of one do."""
+    """12 scans with fresh noise, fitted: mean radius and axis scatter as the shapes of one do."""
     def means(shape: Skeleton) -> list[float]:
         return [shape.radius[15:35].mean(), shape.nodes[15:35, 0].mean()]
 
     rng = np.random.default_rng(2)
     for arc in (2 * np.pi, np.pi):
-        fits = [fit_axes(_tube(), _scan(rng, arc)).skeleton for _ in range(20)]
+        fits = [fit_axes(_tube(), _scan(rng, arc)).skeleton for _ in range(12)]
         points = _scan(rng, arc)
         # Without stated deviations, only the noise scatters: these scans share no other error.
         tube = replace(fit_axes(_tube(), points).skeleton, radius_sigma=np.zeros(51))

@@ -343,7 +343,8 @@ def test_cancel_in_each_step_leaves_nothing(generated, tmp_path, step):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [
+    0, *(pytest.param(seed, marks=pytest.mark.campaign) for seed in (1, 2, 3))])
 def test_a_leafy_plants_leaves_are_cut_off(tomato_draws, seed):
     """Of few points of a seedling whose leaves outweigh its stem, too: a few fat rods that explain
     most of them do not pass for wood."""

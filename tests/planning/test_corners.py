@@ -78,6 +78,7 @@ def test_a_hull_is_as_far_from_zero_as_its_nearest_point():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse_bound")
 @pytest.mark.parametrize("share", [1.02, 1.5])
 def test_no_allowed_pose_lies_in_a_closed_cell_nor_costs_less_than_is_claimed(
         bowing_field, share, monkeypatch):

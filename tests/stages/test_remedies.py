@@ -1,12 +1,14 @@
 """What a message names is data: options and commands that exist, and a position."""
 
 import ast
+import functools
 import json
 import pickle
 import re
 from pathlib import Path
 
 import click
+import pytest
 from pydantic import TypeAdapter
 
 from limber.cli.main import call, main
@@ -14,12 +16,15 @@ from limber.core.errors import Command, InputError, Option, Text
 from limber.stages.registry import stage_description, stage_summaries
 
 ROOT = Path(__file__).parents[2]
-SOURCE = [(path, ast.parse(path.read_text(encoding="utf-8")))
-          for path in sorted((ROOT / "worker" / "limber").rglob("*.py"))]
 TYPED = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]+|`limber ")
 FOREIGN = ("dask worker --no-nanny", "limber --follow-links")
 """What is typed, but is no option or command of ours."""
-STAGES = [stage_description(name) for name in stage_summaries()]
+
+
+@functools.cache
+def _source() -> list[tuple[Path, ast.Module]]:
+    return [(path, ast.parse(path.read_text(encoding="utf-8")))
+            for path in sorted((ROOT / "worker" / "limber").rglob("*.py"))]
 
 
 def _commands(command: click.Command, name: str = ""):
@@ -32,13 +37,14 @@ def _commands(command: click.Command, name: str = ""):
             yield from _commands(command.get_command(context, each), f"{name} {each}".strip())
 
 
-COMMANDS = dict(_commands(main))
-FLAGS = set().union(*COMMANDS.values())
+@functools.cache
+def _known() -> dict[str, set[str]]:
+    return dict(_commands(main))
 
 
 def _calls(*names: str):
     """The calls of these names in the source, each with its place and the name."""
-    for path, tree in SOURCE:
+    for path, tree in _source():
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and (
                     name := ast.unparse(node.func).split(".")[-1]) in names:
@@ -52,7 +58,7 @@ def _values(node: ast.Call) -> list:
 
 def _is_taken(option: Option) -> bool:
     """Whether a command has the option; with a value, whether a stage's field of it takes that."""
-    fields = [model.model_fields[option.name] for stage in STAGES
+    fields = [model.model_fields[option.name] for stage in map(stage_description, stage_summaries())
               for model in (stage.inputs, stage.settings, stage.options)
               if option.name in model.model_fields]
 
@@ -63,23 +69,26 @@ def _is_taken(option: Option) -> bool:
                 field.annotation).validate_python(option.value) or True)
         except ValueError:
             return False
-    return str(Option(option.name)) in FLAGS and (
+    return any(str(Option(option.name)) in flags for flags in _known().values()) and (
         option.value is None or not fields or any(map(takes, fields)))
 
 
+@pytest.mark.slow
 def test_options_and_commands_of_messages_exist():
     """A command with the options that are named with it; an option with a value that it takes."""
+    commands = _known()
     wrong = [place for place, node, name in _calls("Option", "Command") if (known := _values(node))
-             and not (known[0] in COMMANDS and COMMANDS[known[0]].issuperset(
+             and not (known[0] in commands and commands[known[0]].issuperset(
                  str(Option(*_values(each)[:1])) for each in node.args if isinstance(each, ast.Call)
                  and ast.unparse(each.func) == "Option")
                  if name == "Command" else _is_taken(Option(*known)))]
     assert not wrong
 
 
+@pytest.mark.slow
 def test_no_error_or_warning_names_an_option_in_its_text():
     """Only as data, which each interface shows in its own way."""
-    names = {ast.unparse(node.exc.func) for _, tree in SOURCE for node in ast.walk(tree)
+    names = {ast.unparse(node.exc.func) for _, tree in _source() for node in ast.walk(tree)
              if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call)}
     found = []
     for place, node, _name in _calls(*names, "warn", "warned", "Text"):

@@ -81,6 +81,7 @@ def test_a_thinned_image_says_how_many_of_its_pixels_are_left() -> None:
     assert found[~truth[half]].mean() < 0.01
 
 
+@pytest.mark.slow
 def test_the_image_is_found_in_turned_axes_and_beside_nothing_else() -> None:
     """An image stays one when its frame is turned; a scan from all around is none."""
     branch, camera, depth, _ = seen(62, 0.0)
@@ -124,7 +125,7 @@ def test_flying_pixels_are_counted() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [64, 65])
+@pytest.mark.parametrize("seed", [64, pytest.param(65, marks=pytest.mark.campaign)])
 def test_flying_pixels_grow_no_twigs(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the rule they made false forks; with it the true ones alone are found."""
     branch, camera, depth, _ = seen(seed, 0.05)
