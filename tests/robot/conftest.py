@@ -14,6 +14,7 @@ import pytest
 from benchmarks.machine_stalls import HELD_UP_SECONDS, Witness
 from benchmarks.robot_cells import sideways
 from benchmarks.robot_faults import new_robot, restored
+from benchmarks.robot_stepped import SteppedRobot
 from limber.core.numerics.rigid_kernels import pose_between
 from limber.mechanics.statics.result import Status
 from limber.robot.driver.real_time import claim_real_time, may_use_two_processors
@@ -162,6 +163,24 @@ def e_series(robots):
 def robot(request, robots):
     """Each of the two."""
     return request.getfixturevalue({"ur5": "cb3", "ur5e": "e_series"}[request.param])
+
+
+def _stepped(model: str):
+    controller = Controller(model, seed=5, ft300=model == "ur5")
+    with SteppedRobot(controller).here() as robot:
+        yield robot
+
+
+@pytest.fixture
+def stepped_cb3():
+    """A UR5 with an FT300 and its driver in this process, in the robot's own time."""
+    yield from _stepped("ur5")
+
+
+@pytest.fixture
+def stepped():
+    """A UR5e and its driver in this process, in the robot's own time."""
+    yield from _stepped("ur5e")
 
 
 @contextmanager

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.robot_stepped import Run, Spring
+from benchmarks.robot_stepped import Spring, SteppedRobot
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.robot.driver.guard import ForceErrors, noise_at_rest, not_seen, white_noise
+from limber.robot.driver.link import RobotLink
 from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.payload import Nothing
@@ -31,7 +32,7 @@ class OffSpring(Spring):
         return super().wrench(flange, seconds) + np.r_[force, np.cross(TOOL, force)]
 
 
-def followed_with(patch, fault: str, peak: float, seed: int = 1, **cell: object) -> dict:
+def followed_with(fault: str, peak: float, seed: int = 1, **cell: object) -> dict:
     """Follow a path whose predicted force grows to ``peak`` [N]; return how that ended."""
     controller = Controller("ur5e", seed=seed)
     controller.set_tool(np.r_[TOOL, 0, 0, 0])
@@ -49,17 +50,19 @@ def followed_with(patch, fault: str, peak: float, seed: int = 1, **cell: object)
     poses = densely(np.array([start, start + [0, WAY_M, 0, 0, 0, 0]]))
     path = Trajectory(along(poses, 0.05, 0.3), poses, expected_at(poses, stiffness))
 
-    def sampled(sample) -> None:
-        if sample.pose[1] - start[1] > 0.6 * WAY_M:
+    robot = SteppedRobot(controller)
+
+    def on_the_way() -> None:
+        if controller.pose[1] - start[1] > 0.6 * WAY_M:
             if fault == "broken":
                 load.stiffness = np.zeros((3, 3))
             elif fault == "slip" and not load._rest[1] > start[1]:
-                load._rest[1] = sample.pose[1]
-    run = Run(CELL.model_copy(update=cell), controller, patch)
-    run.control.each_sample = sampled
-    event = run.follow({"order": "follow", "times": path.times, "poses": path.poses,
-                        "expected": vars(path.expected)}, seconds=6.0)
-    return event | {"noise_n": next(e["noise_n"] for e in run.told if e["event"] == "tared")}
+                load._rest[1] = controller.pose[1]
+    robot.each_step = on_the_way
+    with robot.here(), RobotLink(CELL.model_copy(update=cell)) as link:
+        link.wait_for_samples()
+        tared = link.tare(0.1)
+        return link.follow(path) | {"noise_n": tared["noise_n"]}
 
 
 def expected_at(poses: np.ndarray, stiffness: np.ndarray, young: float = 0.0) -> ExpectedWrench:
@@ -75,26 +78,27 @@ def expected_at(poses: np.ndarray, stiffness: np.ndarray, young: float = 0.0) ->
     return ExpectedWrench(wrenches, slopes, covariance, poses[0])
 
 
-@pytest.mark.parametrize("peak", [1.5, 4.0])
+@pytest.mark.parametrize("peak", [1.5, pytest.param(4.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_lost_branch_stops_a_path_of_small_forces(monkeypatch, fault, peak):
+def test_a_lost_branch_stops_a_path_of_small_forces(fault, peak):
     """On the way, far below 3 N: with each of these a path of 1.67 N once ran to its end."""
-    event = followed_with(monkeypatch, fault, peak)
+    event = followed_with(fault, peak)
     assert event["event"] == "stopped", event
     assert "branch slipped, broke" in event["reason"] or "differs" in event["reason"]
 
 
 @pytest.mark.parametrize("peak", [0.5, 1.5, 4.0])
-@pytest.mark.parametrize("seed", [2, 3, 10])
-def test_a_branch_that_is_held_raises_no_alarm(monkeypatch, peak, seed):
-    event = followed_with(monkeypatch, "none", peak, seed)
+@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.slow)
+                                       for seed in (3, 10))])
+def test_a_branch_that_is_held_raises_no_alarm(peak, seed):
+    event = followed_with("none", peak, seed)
     assert event["event"] == "reached", event
     # Of single readings it is 0.15 N.
     assert event["noise_n"] == pytest.approx(white_noise(0.15, np.exp(-0.2)), rel=0.3)
 
 
-def test_what_the_fingers_press_aside_is_no_alarm(monkeypatch):
-    assert followed_with(monkeypatch, "pressed aside", 1.5)["event"] == "reached"
+def test_what_the_fingers_press_aside_is_no_alarm():
+    assert followed_with("pressed aside", 1.5)["event"] == "reached"
 
 
 def path_to(peak: float, young: float = 0.0, seconds: float = 5.0) -> Trajectory:

@@ -1,7 +1,6 @@
 """Motions of the arm by itself: past what is in its way, slow near the branch, dry by default."""
 
 import json
-import time
 
 import numpy as np
 import pytest
@@ -106,82 +105,78 @@ def run(arguments: list[str], capfd) -> tuple[int, dict]:
     return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
 
 
-def test_home_and_retreat_move_only_when_armed(e_series, tmp_path, capfd):
+@pytest.mark.slow
+def test_home_and_retreat_move_only_when_armed(stepped, tmp_path, capfd):
     """Back along the way of a killed program; then home from there, joints exact."""
-    cell = cell_for(e_series.address)
+    cell = cell_for(stepped.address)
     cell = cell.model_copy(update={"tool": cell.tool.model_copy(update={
         "grasp_pose": GRASP, "mass_kg": 0.0, "gripper": "digital_output",
         "grip_seconds": 0.1})})
     path = str(cell_file(cell, tmp_path))
     with RobotLink(cell) as link:
-        begin = np.array(e_series.state["pose"])
-        set_off(e_series, link, straight(e_series, (0.0, 0.1, 0.0), expected=False))
+        begin = np.array(stepped.state["pose"])
+        set_off(stepped, link, straight(stepped, (0.0, 0.1, 0.0), expected=False))
         link.process.kill()
-    while np.linalg.norm(e_series.state["tool_speed"]) > 1e-3:
-        time.sleep(0.02)
-    before = e_series.state["joints"]
+    while np.linalg.norm(stepped.state["tool_speed"]) > 1e-3:
+        stepped.rest(0.02)
+    before = stepped.state["joints"]
     code, told = run(["retreat", path], capfd)
     assert code == 0 and not told["armed"] and told["way_m"] > 0.002 and told["tare_known"]
     code, told = run(["retreat", path, "--arm", "--confirm", "nothing"], capfd)
-    assert code == 2 and e_series.state["joints"] == before
+    assert code == 2 and stepped.state["joints"] == before
     code, told = run(["retreat", path, "--arm", "--confirm", "retreat"], capfd)
     assert code == 0 and told["retreated"] and not told["gripper_opened"]
-    assert np.allclose(e_series.state["pose"][:3], begin[:3], atol=2e-3)
-    e_series.ask("stand", joints=list(np.array(cell.arm.home) + [0.1, 0, 0, 0.1, 0, 0]))
+    assert np.allclose(stepped.state["pose"][:3], begin[:3], atol=2e-3)
+    stepped.ask("stand", joints=list(np.array(cell.arm.home) + [0.1, 0, 0, 0.1, 0, 0]))
     code, told = run(["home", path, "--arm", "--confirm", "home"], capfd)
     assert code == 0 and told["reached"]
-    assert e_series.state["joints"] == pytest.approx(cell.arm.home, abs=1e-4)
+    assert stepped.state["joints"] == pytest.approx(cell.arm.home, abs=1e-4)
 
 
 @pytest.mark.slow
-def test_release_opens_the_gripper_and_goes_away_from_the_branch(e_series, tmp_path, capfd):
-    """Slow: the command starts a driver, and the arm goes back 20 mm in real time."""
-    cell = cell_for(e_series.address)
+def test_release_opens_the_gripper_and_goes_away_from_the_branch(stepped, tmp_path, capfd):
+    cell = cell_for(stepped.address)
     cell = cell.model_copy(update={
         "tool": cell.tool.model_copy(update={
             "grasp_pose": GRASP, "mass_kg": 0.0, "grip_seconds": 0.1,
             "gripper": "digital_output"}),
         "approach": cell.approach.model_copy(update={"distance_m": 0.02})})
     path = str(cell_file(cell, tmp_path))
-    e_series.ask("outputs", value=1)
-    begin = matrices(np.array(e_series.state["pose"]))
+    stepped.ask("outputs", value=1)
+    begin = matrices(np.array(stepped.state["pose"]))
     code, told = run(["release", path], capfd)
-    assert code == 0 and not told["armed"] and e_series.state["outputs"] == 1
+    assert code == 0 and not told["armed"] and stepped.state["outputs"] == 1
     code, told = run(["release", path, "--arm", "--confirm", "release"], capfd)
-    assert code == 0 and told["reached"] and e_series.state["outputs"] == 0
-    moved = np.array(e_series.state["pose"][:3]) - begin[:3, 3]
+    assert code == 0 and told["reached"] and stepped.state["outputs"] == 0
+    moved = np.array(stepped.state["pose"][:3]) - begin[:3, 3]
     assert moved == pytest.approx(-0.02 * begin[:3, 2], abs=2e-4)
 
 
 @pytest.mark.slow
-def test_goto_start_ends_where_execute_begins(e_series, planned_folder, tmp_path, capfd):
-    """Slow: two dry runs of the plan, and a motion in real time."""
-    cell = standing_at(Branch.open(planned_folder), e_series.address, grip_seconds=0.1)
+def test_goto_start_ends_where_execute_begins(stepped, planned_folder, tmp_path, capfd):
+    """Slow: two dry runs of the plan."""
+    cell = standing_at(Branch.open(planned_folder), stepped.address, grip_seconds=0.1)
     path = str(cell_file(cell, tmp_path))
     code, told = run(["goto-start", path, str(planned_folder)], capfd)
     assert code == 0 and not told["armed"], told
     goal = np.array(told["end_joints_rad"])
-    e_series.ask("stand", joints=list(goal + [0.03, 0, 0, 0, 0, 0.05]))
+    stepped.ask("stand", joints=list(goal + [0.03, 0, 0, 0, 0, 0.05]))
     code, told = run(["goto-start", path, str(planned_folder), "--arm", "--confirm",
                       "goto-start"], capfd)
     assert code == 0 and told["reached"], told
-    assert e_series.state["joints"] == pytest.approx(goal, abs=1e-4)
+    assert stepped.state["joints"] == pytest.approx(goal, abs=1e-4)
 
 
-@pytest.mark.slow
-def test_the_gripper_opens_while_the_robot_is_stopped(own_address, tmp_path, capfd):
-    """Slow: a robot in a process. After an emergency stop no program runs, and none is needed."""
-    from benchmarks.robot_faults import new_robot
-
-    cell = cell_for(own_address)
+def test_the_gripper_opens_while_the_robot_is_stopped(stepped, tmp_path, capfd):
+    """After an emergency stop no program runs, and none is needed."""
+    cell = cell_for(stepped.address)
     cell = cell.model_copy(update={"tool": cell.tool.model_copy(update={
         "grasp_pose": GRASP, "gripper": "digital_output", "grip_seconds": 0.1,
         "close_output": 3})})
     path = str(cell_file(cell, tmp_path))
-    with new_robot(own_address, "ur5e", 1) as robot:
-        robot.ask("outputs", value=0b1001)
-        robot.ask("emergency_stop")
-        code, told = run(["open", path], capfd)
-        assert code == 0 and robot.state["outputs"] == 0b1001
-        code, told = run(["open", path, "--arm", "--confirm", "open"], capfd)
-        assert code == 0 and told["armed"] and robot.state["outputs"] == 0b0001
+    stepped.ask("outputs", value=0b1001)
+    stepped.ask("emergency_stop")
+    code, told = run(["open", path], capfd)
+    assert code == 0 and stepped.state["outputs"] == 0b1001
+    code, told = run(["open", path, "--arm", "--confirm", "open"], capfd)
+    assert code == 0 and told["armed"] and stepped.state["outputs"] == 0b0001

@@ -5,7 +5,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,7 +14,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
+from benchmarks.robot_cells import (
+    cell_file,
+    robot_holding,
+    sideways,
+    standing_at,
+    stepped_robot_holding,
+)
 from benchmarks.robot_faults import restored
 from limber.cell.cell_file import CameraEntry, Cell
 from limber.cell.known_arms import arm_named
@@ -63,13 +68,32 @@ def shared_robot(branch_template, worker_address, tmp_path_factory):
         yield it
 
 
+@pytest.fixture(scope="module")
+def shared_stepped(branch_template, own_address, tmp_path_factory):
+    """The same without its process, in its own time."""
+    cell = cell_at(branch_template, own_address)
+    return stepped_robot_holding(Branch.open(branch_template), cell,
+                                 tmp_path_factory.mktemp("truth"))
+
+
 @pytest.fixture
-def robot(shared_robot, monkeypatch):
-    """Before a pull it is waited for less than beside a real branch."""
+def _soon(monkeypatch):
+    """Before a pull a robot is waited for less than beside a real branch."""
     monkeypatch.setattr("limber.stages.pulls.record._TARE_SECONDS", 0.3)
     monkeypatch.setattr("limber.stages.pulls.record._SETTLE_SECONDS", 0.2)
+
+
+@pytest.fixture
+def robot(shared_robot, _soon):
     restored(shared_robot)
     return shared_robot
+
+
+@pytest.fixture
+def stepped(shared_stepped, _soon):
+    with shared_stepped.here():
+        restored(shared_stepped)
+        yield shared_stepped
 
 
 def test_a_recorded_pull_is_what_the_branch_did(branch_folder, tmp_path, robot):
@@ -118,13 +142,14 @@ def test_a_cell_of_another_branch_is_refused(branch_folder, tmp_path):
         record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm="r"))
 
 
-def test_a_stop_keeps_what_was_recorded(branch_folder, tmp_path, robot):
+@pytest.mark.slow
+def test_a_stop_keeps_what_was_recorded(branch_folder, tmp_path, stepped):
     """A force limit that the pull breaks: exit 4, a recording that says where it ended."""
-    cell = cell_at(branch_folder, robot.address, soft_force_n=1.2, hard_force_n=1.4)
+    cell = cell_at(branch_folder, stepped.address, soft_force_n=1.2, hard_force_n=1.4)
     with pytest.raises(SafetyStop, match=r"force limit.*samples are in"):
         record(branch_folder, cell_file(cell, tmp_path), "stopped", sideways_pull(branch_folder),
                RecordOptions(confirm="stopped"))
-    assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
+    assert np.linalg.norm(stepped.state["tool_speed"]) < 1e-3
     found = Branch.open(branch_folder).manifest.stages["record:stopped"].result
     assert "force limit" in found["ended"] and found["sample_count"] > 100
     assert read_pull(branch_folder / "pulls" / "stopped").entry.observation == "none"
@@ -138,23 +163,18 @@ def flange_of(robot) -> np.ndarray:
 @contextmanager
 def after_a_way(robot, way: float, action: str, **values):
     """Do ``action`` in the robot once its flange is ``way`` [m] away from where it stood."""
-    start, over = flange_of(robot), threading.Event()
+    start = flange_of(robot)
 
     def watch() -> None:
-        while not over.wait(0.01):
-            if np.linalg.norm(flange_of(robot) - start) > way:
-                robot.ask(action, **values)
-                return
-    watching = threading.Thread(target=watch)
-    watching.start()
-    try:
-        yield
-    finally:
-        over.set()
-        watching.join()
+        if np.linalg.norm(robot.controller.flange[:3, 3] - start) > way:
+            robot.each_step = lambda: None
+            robot.ask(action, **values)
+    robot.each_step = watch
+    yield
 
 
-def test_a_sensor_that_a_nudge_finds_wrong_stops_before_the_pull(branch_folder, tmp_path, robot,
+@pytest.mark.slow
+def test_a_sensor_that_a_nudge_finds_wrong_stops_before_the_pull(branch_folder, tmp_path, stepped,
                                                                  monkeypatch):
     """The prediction is turned round instead of the sensor: nothing is recorded, the name is free.
     """
@@ -165,13 +185,14 @@ def test_a_sensor_that_a_nudge_finds_wrong_stops_before_the_pull(branch_folder, 
         motions.append(trajectory)
         return found if len(motions) == 1 else replace(found, forces=-found.forces)
     monkeypatch.setattr(PullModel, "predicted", turned_round)
-    begin = flange_of(robot)
+    begin = flange_of(stepped)
+    path = cell_file(cell_at(branch_folder, stepped.address), tmp_path)
     with pytest.raises(SafetyStop, match="implausible: the force points against") as stop:
-        record(branch_folder, cell_file(cell_at(branch_folder, robot.address), tmp_path), "turned",
-               sideways_pull(branch_folder), RecordOptions(confirm="turned"))
+        record(branch_folder, path, "turned", sideways_pull(branch_folder),
+               RecordOptions(confirm="turned"))
     assert stop.value.result["sample_count"] == 0
-    assert np.linalg.norm(flange_of(robot) - begin) < 0.005
-    assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
+    assert np.linalg.norm(flange_of(stepped) - begin) < 0.005
+    assert np.linalg.norm(stepped.state["tool_speed"]) < 1e-3
     branch = Branch.open(branch_folder)
     assert branch.streams() == [] and not branch.has("pulls/turned/pull.toml")
 
@@ -181,27 +202,26 @@ def test_a_sensor_that_a_nudge_finds_wrong_stops_before_the_pull(branch_folder, 
     ("creep", {"part": 1.0}, "slips slowly in the gripper"),
     ("tool", {"offset": [0.005, 0, 0.15, 0, 0, 0]}, "tool centre point in the controller was")])
 def test_what_goes_wrong_during_a_pull_is_noticed_within_ten_millimetres(
-        branch_folder, tmp_path, robot, action, values, told):
-    """Slow: two pulls in real time, beside those of the other tests.
-
-    From 6 mm on, which the nudge does not reach, the branch slides in the jaws; the tool is set
+        branch_folder, tmp_path, stepped, action, values, told):
+    """From 6 mm on, which the nudge does not reach, the branch slides in the jaws; the tool is set
     anew on the pendant.
     """
-    path = cell_file(cell_at(branch_folder, robot.address), tmp_path)
-    begin = flange_of(robot)
-    with after_a_way(robot, 0.006, action, **values), pytest.raises(SafetyStop, match=told):
+    path = cell_file(cell_at(branch_folder, stepped.address), tmp_path)
+    begin = flange_of(stepped)
+    with after_a_way(stepped, 0.006, action, **values), pytest.raises(SafetyStop, match=told):
         record(branch_folder, path, "wrong", sideways_pull(branch_folder, distance=0.03),
                RecordOptions(confirm="wrong"))
-    assert 0.006 < np.linalg.norm(flange_of(robot) - begin) < 0.016
-    assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
+    assert 0.006 < np.linalg.norm(flange_of(stepped) - begin) < 0.016
+    assert np.linalg.norm(stepped.state["tool_speed"]) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folder, tmp_path,
-                                                                    robot, capfd):
+                                                                    stepped, capfd):
     """Along its axis a branch is stiff: 30 N within a millimetre or two, and more on the way."""
     skeleton = load_skeleton(Branch.open(branch_folder))
     axis = skeleton.point_at(0.92) - skeleton.point_at(0.87)
-    path = cell_file(cell_at(branch_folder, robot.address), tmp_path)
+    path = cell_file(cell_at(branch_folder, stepped.address), tmp_path)
     with pytest.raises(SystemExit) as stop:
         command_of(stage_description("record"), "").main(
             [str(branch_folder), "--cell", str(path), "--name", "stiff", "--confirm", "stiff",
@@ -209,7 +229,7 @@ def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folde
              "--distance", "0.03", "--speed", "0.007", "--json"], standalone_mode=False)
     out, errors = capfd.readouterr()
     told = json.loads(out.splitlines()[-1])
-    assert stop.value.code == 4, (told, errors, robot.state)
+    assert stop.value.code == 4, (told, errors, stepped.state)
     assert "force limit" in told["ended"] and told["peak_force_n"] > 30
     after = told["after_stop"]
     assert after["choice"] == "retreat" and after["retreated"] and not after["gripper_opened"]

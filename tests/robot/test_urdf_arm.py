@@ -8,6 +8,7 @@ from tests.robot.conftest import Registers
 
 from benchmarks.robot_cells import cell_file, standing_at
 from benchmarks.robot_faults import cell_for, straight, tared
+from benchmarks.robot_stepped import SteppedRobot
 from limber.cell.cell_file import Cell, read_cell, write_cell
 from limber.cell.known_arms import arm_named
 from limber.cell.ur_arms import ARMS
@@ -18,7 +19,6 @@ from limber.robot.driver.link import RobotLink
 from limber.robot.motion.joint_path import follow, joint_path
 from limber.robot.motion.trajectory import densely
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.launch import VirtualRobot
 from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute
 from limber.store import Branch
 
@@ -144,7 +144,7 @@ def seven(tmp_path):
 def test_seven_joints_are_planned_with(seven):
     joints = np.array([0.3, 0.6, -0.2, 1.1, 0.4, 0.7, 0.1])
     start = pose_vectors(seven.forward(joints))
-    frames = matrices(densely(np.array([start, start + [0.05, 0.08, -0.03, 0, 0, 0.1]])))
+    frames = matrices(densely(np.array([start, start + [0.02, 0.032, -0.012, 0, 0, 0.04]])))
     path = joint_path(seven, frames)
     assert path.joints.shape == (len(frames), 7) and path.limit_margin > 0.05
     assert np.abs(seven.forward(path.joints) - frames).max() < 1e-9
@@ -272,13 +272,11 @@ def test_an_address_elsewhere_is_refused(ur5_file):
         control_of(cell)
 
 
-@pytest.mark.slow
-def test_the_driver_moves_it_on_the_virtual_robot(worker_address, ur5_file):
+def test_the_driver_moves_it_on_the_virtual_robot(ur5_file):
     """Tare, a line under the guard, and a stop, as with any arm."""
-    pytest.importorskip("rtde_control")
     model = str(ur5_file)
-    with (VirtualRobot(model, worker_address) as robot,
-          RobotLink(cell_for(worker_address, model)) as link):
+    robot = SteppedRobot(Controller(model))
+    with robot.here(), RobotLink(cell_for(robot.address, model)) as link:
         tared(link)
         event = link.follow(straight(robot, (0.0, 0.0, -0.03)))
         assert event["event"] == "reached" and event["error_m"] < 1e-3

@@ -13,7 +13,7 @@ from limber.core.errors import InputError, WorkError
 from limber.robot.ur import rtde
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.launch import VirtualRobot
-from limber.robot.virtual.server import FT300_PORT, RTDE_PORT, Server, _RtdeClient, answer
+from limber.robot.virtual.server import FT300_PORT, RTDE_PORT, RtdeClient, Server, answer
 
 
 class Wire(asyncio.Transport):
@@ -30,8 +30,8 @@ class Wire(asyncio.Transport):
         self.sent += data
 
 
-def connected(server: Server) -> _RtdeClient:
-    client = _RtdeClient(server)
+def connected(server: Server) -> RtdeClient:
+    client = RtdeClient(server)
     client.connection_made(Wire())
     return client
 

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from benchmarks.robot_stepped import Run, Wall
+from benchmarks.robot_stepped import SteppedRobot, Wall
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices
+from limber.robot.driver.link import RobotLink
 from limber.robot.motion.trajectory import (
     ExpectedWrench,
     Trajectory,
@@ -23,15 +24,9 @@ CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
             tool={"grasp_pose": (*TOOL, 0, 0, 0), "mass_kg": 0.0})
 
 
-def order_of(trajectory: Trajectory) -> dict:
-    expected = trajectory.expected
-    return {"order": "follow", "times": trajectory.times, "poses": trajectory.poses,
-            "expected": None if expected is None else vars(expected)}
-
-
-def facing_a_wall(patch, speed: float, stiffness: float, *, predicted: bool,
-                  cell: Cell = CELL) -> tuple[Run, Wall, dict]:
-    """A way of 60 mm at ``speed`` and a wall 30 mm away: the run, the wall, the order."""
+def facing_a_wall(speed: float, stiffness: float, *, predicted: bool,
+                  ) -> tuple[SteppedRobot, Wall, Trajectory]:
+    """A way of 60 mm at ``speed`` and a wall 30 mm away: the robot, the wall, the way."""
     controller = Controller("ur5e", seed=1)
     controller.set_tool(np.r_[TOOL, 0, 0, 0])
     start = controller.pose.copy()
@@ -40,23 +35,28 @@ def facing_a_wall(patch, speed: float, stiffness: float, *, predicted: bool,
     poses = densely(np.array([start, start + [0, 0.06, 0, 0, 0, 0]]))
     path = Trajectory(along(poses, speed, 0.3), poses,
                       ExpectedWrench.nothing(poses) if predicted else None)
-    return Run(cell, controller, patch), wall, order_of(path)
+    return SteppedRobot(controller), wall, path
 
 
-def against_a_wall(*arguments, **named) -> tuple[Run, Wall, dict]:
-    """Go it: the run, the wall, and how it ended."""
-    run, wall, order = facing_a_wall(*arguments, **named)
-    return run, wall, run.follow(order)
+def against_a_wall(*arguments, cell: Cell = CELL, **named) -> tuple[SteppedRobot, Wall, dict]:
+    """Go it: the robot, the wall, and how it ended."""
+    robot, wall, path = facing_a_wall(*arguments, **named)
+    with robot.here(), RobotLink(cell) as link:
+        link.wait_for_samples()
+        link.tare(0.1)
+        event = link.follow(path)
+        robot.rest(0.3)
+        assert np.abs(robot.controller.speeds).max() < 1e-3
+    return robot, wall, event
 
 
 @pytest.mark.parametrize("predicted", [True, False])
-def test_a_wall_at_full_speed_stays_below_the_hard_limit(monkeypatch, predicted):
+def test_a_wall_at_full_speed_stays_below_the_hard_limit(predicted):
     """20 N/mm at 50 mm/s: without a prediction the soft limit pauses, and brakes for it."""
-    run, wall, event = against_a_wall(monkeypatch, 0.05, 2e4, predicted=predicted)
+    _, wall, event = against_a_wall(0.05, 2e4, predicted=predicted)
     assert event["event"] in ("paused", "stopped")
     assert wall.peak > 5.0
     assert wall.peak <= 1.1 * CELL.limits.hard_force_n
-    assert np.abs(run.control.controller.speeds).max() < 1e-3
 
 
 def stating(stiffness: float) -> Cell:
@@ -65,9 +65,10 @@ def stating(stiffness: float) -> Cell:
 
 
 @pytest.mark.parametrize("predicted", [True, False])
-@pytest.mark.parametrize("stiffness", [5e3, 1e5, None])
+@pytest.mark.parametrize("stiffness", [5e3, *(pytest.param(stiffness, marks=pytest.mark.slow)
+                                              for stiffness in (1e5, None))])
 def test_at_the_speed_that_is_chosen_a_contact_stays_below_the_hard_limit(
-        monkeypatch, stiffness, predicted):
+        stiffness, predicted):
     """A soft one needs no less than the cell's speed; a rigid one, the default, is met slowly."""
     cell, told = CELL if stiffness is None else stating(stiffness), []
     speed = speed_within(cell, 0.05, told.append)
@@ -76,8 +77,7 @@ def test_at_the_speed_that_is_chosen_a_contact_stays_below_the_hard_limit(
     if told:
         assert f"at {1e3 * speed:.1f} mm/s instead of 50.0 mm/s" in told[0]
         assert "state limits.contact_n_per_m" in told[0]
-    _, wall, event = against_a_wall(monkeypatch, speed, stiffness or 2e5, predicted=predicted,
-                                    cell=cell)
+    _, wall, event = against_a_wall(speed, stiffness or 2e5, predicted=predicted, cell=cell)
     assert event["event"] in ("paused", "stopped")
     assert 3.0 < wall.peak <= 1.1 * CELL.limits.hard_force_n
 
@@ -102,24 +102,31 @@ def test_a_contact_that_no_speed_is_slow_enough_for_is_refused():
     assert contact_speed(slow) < contact_speed(CELL)
 
 
-def test_after_a_pause_it_goes_on_from_where_it_braked(monkeypatch):
+@pytest.mark.slow
+def test_after_a_pause_it_goes_on_from_where_it_braked():
     """The wall is taken away; nothing jumps, and the end of the path is reached."""
-    run, wall, order = facing_a_wall(monkeypatch, 0.05, 2e4, predicted=False)
-    stood = []
-
-    def take_away() -> str:
-        wall.stiffness = 0.0
-        stood.append(run.control.controller.pose[:3].copy())
-        return "resume"
-    assert run.follow(order, at_pause=take_away)["event"] == "reached"
-    places = run.rows[:, 1:4]
+    robot, wall, path = facing_a_wall(0.05, 2e4, predicted=False)
+    rows = []
+    with robot.here(), RobotLink(CELL, rows.append) as link:
+        link.wait_for_samples()
+        link.tare(0.1)
+        assert link.follow(path)["event"] == "paused"
+        robot.rest(0.3)
+        wall.stiffness, stood = 0.0, robot.controller.pose[:3].copy()
+        assert link.resume()["event"] == "reached"
+    places = np.concatenate(rows)[:, 1:4]
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 0.05 * 0.002 * 1.5
-    assert np.linalg.norm(places[-1] - stood[0]) > 0.02
+    assert np.linalg.norm(places[-1] - stood) > 0.02
 
 
-def test_from_a_pause_at_something_stiff_it_goes_back_until_no_force_is_left(monkeypatch):
-    run, wall, order = facing_a_wall(monkeypatch, 0.05, 2e4, predicted=False)
-    event = run.follow(order, at_pause=lambda: "retreat")
-    assert event["event"] == "reached", event
+@pytest.mark.slow
+def test_from_a_pause_at_something_stiff_it_goes_back_until_no_force_is_left():
+    robot, wall, path = facing_a_wall(0.05, 2e4, predicted=False)
+    with robot.here(), RobotLink(CELL) as link:
+        link.wait_for_samples()
+        link.tare(0.1)
+        assert link.follow(path)["event"] == "paused"
+        event = link.retreat()
+        assert event["event"] == "reached", event
     assert wall.peak > CELL.limits.soft_force_n and wall.now == 0.0
-    assert run.control.controller.pose[:3] == pytest.approx(order["poses"][0, :3], abs=1e-3)
+    assert robot.controller.pose[:3] == pytest.approx(path.poses[0, :3], abs=1e-3)

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.robot_stepped import BranchHere, SteppedRobot
 from limber.cell.cell_file import Cell, write_cell
 from limber.cell.known_arms import arm_named
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.estimation.simulated_pull import PullSpec
 from limber.robot.motion.execution import across
 from limber.robot.virtual.branch_solver import BranchSetting
+from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.launch import VirtualRobot
 from limber.stages.pulls.virtual_pull import load_truth
 from limber.store import Branch
@@ -52,11 +54,22 @@ def sideways(branch: Branch, fraction: float = 0.92) -> np.ndarray:
     return np.linalg.svd(line - line.mean(axis=0))[2][2]
 
 
+def _true_branch(branch: Branch, cell: Cell, folder: Path, young: tuple[float, ...] = (),
+                 ) -> BranchSetting:
+    truth = load_truth(branch, PullSpec(young=young))
+    return BranchSetting.of_truth(truth, cell, folder / "truth.vtu")
+
+
+def stepped_robot_holding(branch: Branch, cell: Cell, folder: Path) -> SteppedRobot:
+    """Return the robot of :func:`robot_holding` without its process, in its own time."""
+    load = BranchHere(_true_branch(branch, cell, folder))
+    return SteppedRobot(Controller(cell.robot.model, load=load), cell.robot.address)
+
+
 def robot_holding(branch: Branch, cell: Cell, folder: Path, *, seed: int = 0,
                   young: tuple[float, ...] = ()) -> VirtualRobot:
     """Return a virtual robot with the true branch of a folder in its gripper."""
-    truth = load_truth(branch, PullSpec(young=young))
-    setting = BranchSetting.of_truth(truth, cell, folder / "truth.vtu")
+    setting = _true_branch(branch, cell, folder, young)
     path = folder / "setting.json"
     path.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}), encoding="utf-8")
     options = ["--branch", path, "--seed", seed]

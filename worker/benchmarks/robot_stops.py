@@ -5,21 +5,19 @@ changes nothing. The branch is a linear spring, stiff along its axis; its nudge 
 judged as `limber record` judges them, with moduli known to a factor of two.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from benchmarks.robot_stepped import Patch, Run, Spring, Wall
+from benchmarks.robot_stepped import Spring, SteppedRobot, Wall
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.trials import column, sound
 from limber.cell.cell_file import Cell
-from limber.core.errors import LimberError
+from limber.core.errors import LimberError, SafetyStop, WorkError
 from limber.core.numerics.rigid_kernels import crossed
-from limber.robot.driver.link import COLUMNS
-from limber.robot.interface import Sample
+from limber.robot.driver.link import RobotLink
 from limber.robot.motion.trajectory import Trajectory, along, densely, speed_within
 from limber.robot.recorder import (
     NUDGE_M,
@@ -39,35 +37,12 @@ _COUNT, _LEFT_N = 50, 1.0
 TOOL = np.array([0.0, 0.0, 0.15])
 _WAY_M = 0.03
 _SECONDS = 100.0  # of the robot's time
+_TARE_S, _AFTER_S = 0.1, 0.3
 _OVER = "the program that drives the robot has ended"  # the bench's own end of a run
 _FARTHEST_M, _WRONG_WAY_M, _AT_M = 0.01, 0.02, 0.004
 _SEEDS, _FACTOR = 10, 2.0
 _CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
              tool={"grasp_pose": (*TOOL, 0, 0, 0), "mass_kg": 0.0})
-
-
-class _Patches:
-    """Attributes that are replaced, and put back."""
-
-    def __init__(self) -> None:
-        self._before: list[tuple[Any, str, Any]] = []
-
-    def setattr(self, target: Any, name: str, value: Any) -> None:
-        self._before.append((target, name, getattr(target, name)))
-        setattr(target, name, value)
-
-    def undo(self) -> None:
-        for target, name, value in reversed(self._before):
-            setattr(target, name, value)
-
-
-@contextmanager
-def patched() -> Iterator[_Patches]:
-    patches = _Patches()
-    try:
-        yield patches
-    finally:
-        patches.undo()
 
 
 def retreats(setting: Setting) -> list[Row]:
@@ -86,8 +61,7 @@ def retreats(setting: Setting) -> list[Row]:
 
 
 def _retreated(seed: int) -> dict[str, Any]:
-    with patched() as patches:
-        event, load = _retreat(np.random.default_rng(seed), patches)
+    event, load = _retreat(np.random.default_rng(seed))
     why = "" if event["event"] == "reached" else event["reason"]
     if _OVER in why:
         # Nobody waits so long for an arm that holds on to a branch.
@@ -97,8 +71,7 @@ def _retreated(seed: int) -> dict[str, Any]:
     return {"left_n": load.now, "peak_n": load.peak, "why": why}
 
 
-def _retreat(rng: np.random.Generator, patches: Patch,
-             ) -> tuple[dict[str, Any], Wall | Spring]:
+def _retreat(rng: np.random.Generator) -> tuple[dict[str, Any], Wall | Spring]:
     """Move against a wall or with a branch until something stops it; then retreat."""
     controller = Controller("ur5e", seed=int(rng.integers(1 << 30)))
     controller.set_tool(np.r_[TOOL, 0, 0, 0])
@@ -118,12 +91,31 @@ def _retreat(rng: np.random.Generator, patches: Patch,
     stop_at = rng.uniform(0.2, 0.95 * path.duration)
     if isinstance(load, Wall) and rng.random() < 0.5:
         stop_at = np.inf
-    run = Run(cell, controller, patches)
-    event = run.follow(
-        {"order": "follow", "times": path.times, "poses": path.poses, "expected": None},
-        seconds=_SECONDS, at_pause=lambda: "retreat", at_stop=lambda: "retreat",
-        stop_at=float(stop_at))
+    robot = SteppedRobot(controller)
+    with robot.here(), RobotLink(cell) as link:
+        link.wait_for_samples()
+        link.tare(_TARE_S)
+        link.start(path)
+        event = _ended(link, float(stop_at))
+        if event["event"] != "reached":
+            try:
+                event = link.retreat(_SECONDS)
+            except SafetyStop as error:
+                event = {"event": "refused", "reason": str(error)}
+            except WorkError:
+                event = {"event": "stopped", "reason": _OVER}
+        robot.rest(_AFTER_S)
     return event, load
+
+
+def _ended(link: RobotLink, stop_at: float) -> dict[str, Any]:
+    """How a motion ended, which is stopped then [s]."""
+    ends = ("reached", "stopped", "paused")
+    try:
+        return link.wait(*ends, seconds=min(stop_at, _SECONDS))
+    except WorkError:
+        link.stop()
+        return link.wait(*ends, seconds=1.0)
 
 
 def branch_spring(rng: np.random.Generator, rest: np.ndarray, way: np.ndarray) -> Spring:
@@ -211,7 +203,7 @@ def _way_of(wrong: _Wrong, seed: int) -> float | None:
     out = along(line, NUDGE_M_S, 0.3)
     nudge = {"times": np.r_[out, 2 * out[-1] + NUDGE_SECONDS - out[::-1]],
              "poses": np.concatenate([line, line[::-1]])}
-    noticed = _moved(wrong, controller, nudge, NUDGE_M * side, spring.stiffness, None)
+    noticed = _moved(wrong, controller, nudge, NUDGE_M * side, spring.stiffness)
     if noticed is not None:
         return noticed
     poses = densely(np.array([start, start + np.r_[_WRONG_WAY_M * way, 0, 0, 0]]))
@@ -220,30 +212,35 @@ def _way_of(wrong: _Wrong, seed: int) -> float | None:
 
 
 def _moved(wrong: _Wrong, controller: Controller, motion: dict[str, Any], way: np.ndarray,
-           stiffness: np.ndarray, later: Callable[[Sample], None] | None) -> float | None:
+           stiffness: np.ndarray, later: Callable[[], None] = lambda: None) -> float | None:
     """Way [m] after which a wrong state was noticed in a motion along ``way`` [3] [m]."""
     start, flange = controller.pose[:3].copy(), controller.flange[:3, 3].copy()
-    order = {"order": "follow", "expected": None, "start_joints": controller.joints.tolist()
-             } | motion
+    order = {"start_joints": controller.joints.tolist()} | motion
     if wrong.order is not None:
         order = wrong.order(order, controller.joints)
-    with patched() as patches:
-        run = Run(_CELL, controller, patches)
-        if later is not None:
-            run.control.each_sample = later
-        event = run.follow(order, seconds=10.0)
-    if event["event"] == "refused":
-        return 0.0
+    path = Trajectory(order["times"], order["poses"], None, np.tile(
+        order["start_joints"], (len(order["times"]), 1)))
+    robot, batches = SteppedRobot(controller), list[np.ndarray]()
+    robot.each_step = later
+    with robot.here(), RobotLink(_CELL, batches.append) as link:
+        link.wait_for_samples()
+        link.tare(_TARE_S)
+        try:
+            event = link.follow(path)
+        except SafetyStop:
+            return 0.0
+        robot.rest(_AFTER_S)
     if event["event"] == "stopped":
         return float(np.linalg.norm(controller.flange[:3, 3] - flange))
-    return _doubted(run.rows, np.linalg.norm(run.rows[:, 1:4] - start, axis=1), way, stiffness)
+    rows = np.concatenate(batches)
+    return _doubted(rows, np.linalg.norm(rows[:, 1:4] - start, axis=1), way, stiffness)
 
 
-def _later(wrong: _Wrong, controller: Controller, flange: np.ndarray) -> Callable[[Sample], None]:
+def _later(wrong: _Wrong, controller: Controller, flange: np.ndarray) -> Callable[[], None]:
     """Do it once, after 4 mm of the flange's way."""
     left = [wrong.later] if wrong.later is not None else []
 
-    def step(sample: Sample) -> None:
+    def step() -> None:
         if left and np.linalg.norm(controller.flange[:3, 3] - flange) > _AT_M:
             left.pop()(controller)
     return step
@@ -257,9 +254,7 @@ def _doubted(rows: np.ndarray, ways: np.ndarray, way: np.ndarray, stiffness: np.
         places * np.linalg.norm(way), places[:, None] * (stiffness @ way), _FACTOR,
         certain_directions(stiffness, way)))
     begin = int(np.argmax(ways > 1e-5))
-    padded = np.full((len(rows), len(COLUMNS)), np.nan)
-    padded[:, :rows.shape[1]] = rows
     for first in range(max(begin - 20, 0), len(rows), 10):
-        if doubt.take(padded[first:first + 10]):
+        if doubt.take(rows[first:first + 10]):
             return float(ways[:first + 10].max())
     return None

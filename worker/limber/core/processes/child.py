@@ -147,12 +147,12 @@ class Child:
             # A descendant may keep it open for longer: only who reads it can close it.
             with self.process.stdout or contextlib.nullcontext(()) as lines:
                 for content in json_objects(lines):
-                    if self._hear is not None and self._hear(content):
-                        continue
+                    was_taken = self._hear is not None and self._hear(content)
                     with self.news:
-                        self.objects.append(content)
-                        if self._most_objects is not None:
-                            del self.objects[:-self._most_objects]
+                        if not was_taken:
+                            self.objects.append(content)
+                            if self._most_objects is not None:
+                                del self.objects[:-self._most_objects]
                         self.news.notify_all()
         finally:
             # Who hears of the end may ask for its exit code.

@@ -85,22 +85,26 @@ class Driver:
         """Serve orders until they end."""
         self._control.skip()
         while not self.ended:
-            self._deadline.renew()
-            try:
-                samples = self._control.read(self._quiet, self._senses.connections)
-            except ConnectionError as error:
-                self._lose(str(error))
-                return
-            self._hold_ups.note(None if self._last is None else self._last.arrived,
-                                moving=self._under_way.following is not None)
-            if samples:
-                self._look(samples)
-            elif self._last is not None and not self._bears_silence(self._last):
-                return
-            self._take(orders)
-            if samples and not self.ended:
-                self._move(len(samples) / self._control.rate)
-            self._senses.send_batch()
+            self.turn(orders)
+
+    def turn(self, orders: Orders) -> None:
+        """Take the samples that come next, and the orders; move on by that."""
+        self._deadline.renew()
+        try:
+            samples = self._control.read(self._quiet, self._senses.connections)
+        except ConnectionError as error:
+            self._lose(str(error))
+            return
+        self._hold_ups.note(None if self._last is None else self._last.arrived,
+                            moving=self._under_way.following is not None)
+        if samples:
+            self._look(samples)
+        elif self._last is not None and not self._bears_silence(self._last):
+            return
+        self._take(orders)
+        if samples and not self.ended:
+            self._move(len(samples) / self._control.rate)
+        self._senses.send_batch()
 
     def _look(self, samples: list[Sample]) -> None:
         for sample in samples:

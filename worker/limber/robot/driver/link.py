@@ -50,8 +50,7 @@ class RobotLink:
     def __init__(self, cell: Cell, on_samples: Callable[[np.ndarray], None] | None = None,
                  python: str | None = None):
         self._on_samples = on_samples
-        self._sampled = threading.Event()
-        self._latest = np.empty(0)
+        self._fresh: np.ndarray | None = None
         self.warnings: list[str] = []
         self._has_started = False
         self._cell = cell
@@ -87,11 +86,12 @@ class RobotLink:
     def wait_for_samples(self, seconds: float = 5.0) -> np.ndarray:
         """Return the latest of the next samples, shape [37] as in :data:`COLUMNS`; WorkError if
         none arrives."""
-        self._sampled.clear()
-        if not self._sampled.wait(seconds):
+        self._fresh = None
+        sample = self._child.wait(lambda: self._fresh, seconds)
+        if sample is None:
             raise WorkError(f"The robot's driver sent no samples within {seconds:.0f} s.",
                             "The connection may be silent.", "Check the robot.")
-        return self._latest
+        return sample
 
     def tare(self, seconds: float = 0.5) -> dict[str, Any]:
         """Tare the present force; the gripper hangs free and still."""
@@ -118,15 +118,15 @@ class RobotLink:
         self.start(trajectory)
         return self.wait("reached", "stopped", "paused", seconds=10 * trajectory.duration + 30.0)
 
-    def retreat(self) -> dict[str, Any]:
+    def retreat(self, seconds: float = 600.0) -> dict[str, Any]:
         """Retreat along its path, slower, as a person asked; return ``reached``, or ``stopped``
         with its reason, for example that the force does not fall. SafetyStop if there is no path
-        back, or the arm left it; WorkError if the driver has ended."""
+        back, or the arm left it; WorkError if the driver has ended, or not in ``seconds`` [s]."""
         # Until the arm is at rest, and the smoothed force is that of its position.
         time.sleep(_STANDS_SECONDS)
         self._order(order="retreat")
         self.wait("started", seconds=5.0)
-        return self.wait("reached", "stopped", "paused", seconds=600.0)
+        return self.wait("reached", "stopped", "paused", seconds=seconds)
 
     def acknowledge(self) -> None:
         """A person has seen the stop."""
@@ -225,8 +225,7 @@ class RobotLink:
                          for row in content["samples"]], float)
         if self._on_samples is not None:
             self._on_samples(rows)
-        self._latest = rows[-1]
-        self._sampled.set()
+        self._fresh = rows[-1]
         return True
 
     def _ended(self) -> None:

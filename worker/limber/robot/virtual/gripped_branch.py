@@ -41,12 +41,7 @@ class HeldBranch:
         steer(np.eye(4), np.zeros(6), np.eye(6), *NO_BENDS, np.eye(4), 0.0)
         self._base = frame_of(np.array(setting.base_pose, float))
         self._tool = frame_of(np.array(setting.grasp_pose, float))
-        context = get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=solve_for_ever, args=(setting, theirs),
-                                        name="branch", daemon=True)
-        self._process.start()
-        theirs.close()
+        self._start()
         self.rest_points = self._receive("ready")["points"]
         self.state = "free"
         self._offset = np.eye(4)
@@ -64,6 +59,14 @@ class HeldBranch:
         self._view: dict[str, Any] | None = None
         self._is_looking = False
         self.picture: bytes | None = None
+
+    def _start(self) -> None:
+        context = get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=solve_for_ever, args=(self.setting, theirs),
+                                        name="branch", daemon=True)
+        self._process.start()
+        theirs.close()
 
     @property
     def points(self) -> np.ndarray:

@@ -131,7 +131,8 @@ MARKER_PORT = 63400
 CAMERA_PORT = 63401
 """Simulated depth camera: one image for each camera received."""
 
-_FT300_SECONDS = 1 / 100
+FT300_SECONDS = 1 / 100
+"""Between two readings of the FT300."""
 _MARKER_SECONDS = 1 / 30
 _MARKER_SIGMA_M = 0.5e-3
 
@@ -158,7 +159,7 @@ class Server:
         self.lost_seconds = 0.0
         self._servers: list[asyncio.Server] = []
         self.transports: set[asyncio.WriteTransport] = set()
-        self.streams: list[_RtdeClient] = []
+        self.streams: list[RtdeClient] = []
         self.owners: dict[str, object] = {}
         self._one_picture = asyncio.Lock()
 
@@ -181,7 +182,7 @@ class Server:
             ports[CAMERA_PORT] = self._serve_camera
         loop = asyncio.get_running_loop()
         try:
-            for port, client in ((RTDE_PORT, _RtdeClient), (DASHBOARD_PORT, _DashboardClient)):
+            for port, client in ((RTDE_PORT, RtdeClient), (DASHBOARD_PORT, DashboardClient)):
                 self._servers.append(await loop.create_server(
                     partial(client, self), self.address, port))
             for port, serve in ports.items():
@@ -223,7 +224,7 @@ class Server:
                 await asyncio.sleep(0)
             stepped = time.perf_counter()
             self.controller.step()
-            self._publish()
+            self.publish()
             due += step
 
     def later(self, action: Callable[[], None]) -> None:
@@ -239,7 +240,8 @@ class Server:
             return
         self.later(lambda: None if to.is_closing() else to.write(data))
 
-    def _publish(self) -> None:
+    def publish(self) -> None:
+        """Send the controller's state to every client that has a sample due."""
         values = None
         for stream in self.streams:
             if stream.is_due(self.controller):
@@ -293,16 +295,19 @@ class Server:
                            writer: asyncio.StreamWriter) -> None:
         due = time.perf_counter()
         while not writer.is_closing():
-            fields = " , ".join(f"{value:.4f}" for value in self.controller.ft300_reading)
-            if self.ft300_fault == "cut":
+            if not self.send_ft300(writer):
                 return
-            if self.ft300_fault != "silent":
-                line = "( - , - , - )" if self.ft300_fault else f"( {fields} )"
-                self.send(writer, line.encode())
             # After a delay it omits readings and keeps its cycle.
             behind = time.perf_counter() - due
-            due += _FT300_SECONDS * (1 + behind // _FT300_SECONDS)
+            due += FT300_SECONDS * (1 + behind // FT300_SECONDS)
             await asyncio.sleep(due - time.perf_counter())
+
+    def send_ft300(self, to: asyncio.StreamWriter | asyncio.Transport) -> bool:
+        """Send the FT300's reading; returns False where it ends the connection."""
+        fields = " , ".join(f"{value:.4f}" for value in self.controller.ft300_reading)
+        if self.ft300_fault not in ("silent", "cut"):
+            self.send(to, ("( - , - , - )" if self.ft300_fault else f"( {fields} )").encode())
+        return self.ft300_fault != "cut"
 
     async def _serve_markers(self, _reader: asyncio.StreamReader,
                              writer: asyncio.StreamWriter) -> None:
@@ -365,7 +370,7 @@ class _Client(asyncio.Protocol):
         raise NotImplementedError
 
 
-class _DashboardClient(_Client):
+class DashboardClient(_Client):
     """One client of the dashboard: a line, an answer."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -382,7 +387,7 @@ class _DashboardClient(_Client):
         self._server.send(self.transport, f"{answer(self._server.controller, text)}\n".encode())
 
 
-class _RtdeClient(_Client):
+class RtdeClient(_Client):
     """One client of the RTDE port: its recipes and whether data flows."""
 
     def __init__(self, server: Server):
