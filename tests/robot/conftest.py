@@ -6,18 +6,25 @@ import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import psutil
 import pytest
 
+from benchmarks import robot_rosbridge
 from benchmarks.machine_stalls import HELD_UP_SECONDS, Witness
 from benchmarks.robot_cells import sideways
 from benchmarks.robot_faults import new_robot, restored
+from benchmarks.robot_rosbridge import RosBridge, SteppedBridge
 from benchmarks.robot_stepped import SteppedRobot
+from limber.cell.cell_file import Cell
 from limber.core.numerics.rigid_kernels import pose_between
 from limber.mechanics.statics.result import Status
+from limber.robot.driver import force_samples
 from limber.robot.driver.real_time import claim_real_time, may_use_two_processors
+from limber.robot.ros import guarded_robot
+from limber.robot.ros.guarded_robot import RosRobot, Topics
 from limber.robot.virtual.controller import Controller
 from limber.store import Branch
 from limber.store.loading import load_grasp_model, load_skeleton
@@ -181,6 +188,29 @@ def stepped_cb3():
 def stepped():
     """A UR5e and its driver in this process, in the robot's own time."""
     yield from _stepped("ur5e")
+
+
+ROS_CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
+                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})
+
+
+@pytest.fixture
+def stepped_ros(monkeypatch):
+    """Make a server and a robot that follows as fast as it is watched, in the server's time.
+
+    ``plan(server, step)`` makes the faults.
+    """
+    def made(plan=None, cell: Cell = ROS_CELL, **settings) -> tuple[RosBridge, RosRobot]:
+        server = RosBridge(np.array(ROS_CELL.arm.home))
+        vars(server).update(settings)
+        bridge = SteppedBridge(server, None if plan is None else lambda step: plan(server, step))
+        clock = SimpleNamespace(monotonic=lambda: bridge.now)
+        for module in (guarded_robot, force_samples, robot_rosbridge):
+            monkeypatch.setattr(module, "time", clock)
+        robot = RosRobot(cell, bridge, Topics())
+        robot.tare()
+        return server, robot
+    return made
 
 
 @contextmanager

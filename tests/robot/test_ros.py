@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from tests.robot.conftest import ROS_CELL
 
 from benchmarks.robot_rosbridge import RosBridge
 from limber.cell.cell_file import Cell, write_cell
@@ -24,8 +25,7 @@ from limber.robot.ros.bridge import Bridge
 from limber.robot.ros.guarded_robot import RosRobot, Topics
 from limber.robot.ros.messages import CloudTopic, JointStates, cloud_of, goal_of, spline
 
-CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
-            tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})
+CELL = ROS_CELL
 ROOT = Path(__file__).parents[2]
 HOME = np.array(CELL.arm.home)
 TOOL = matrices(np.array(CELL.tool.grasp_pose))
@@ -82,34 +82,30 @@ def test_a_plan_is_followed_and_a_force_stops_it_in_time():
 
 
 @pytest.mark.slow
-@pytest.mark.real_time
-@pytest.mark.usefixtures("first_in_line")
-def test_after_a_stop_it_goes_back_along_its_way_until_no_force_is_left(monkeypatch, tmp_path):
-    """Slow: there and back in real time. Another program goes back, by the tare of the first."""
+def test_after_a_stop_it_goes_back_along_its_way_until_no_force_is_left(monkeypatch, tmp_path,
+                                                                        stepped_ros):
+    """Another program goes back, by the tare of the first."""
     monkeypatch.setenv("LIMBER_STATE", str(tmp_path))
     start = CELL.arm.forward(HOME)[:3, 3]
-    with RosBridge(HOME) as server:
-        server.wrench = np.array([2.0, 0, 0, 0, 0, 0])
-        robot = robot_at(server)
-        server.load = lambda joints: np.r_[0, 0, 400.0 * np.linalg.norm(
-            CELL.arm.forward(joints)[:3, 3] - start), 0, 0, 0]
-        path = line(0.05)
-        event = robot.follow(Trajectory(path.times, path.poses, None, path.joints))
-        assert event["event"] == "stopped" and "soft force" in event["reason"]
-        robot.close()
-        assert np.abs(server.joints - HOME).max() > 0.01
-        other = RosRobot(CELL, Bridge(server.url), Topics())
-        other.recall_tare()
-        event = other.retreat()
-        assert event["event"] == "reached" and event["force_n"] < 1.0, event
-        assert server.joints == pytest.approx(HOME, abs=2e-3)
-        other.close()
+    server, robot = stepped_ros(wrench=np.array([2.0, 0, 0, 0, 0, 0]))
+    server.load = lambda joints: np.r_[0, 0, 400.0 * np.linalg.norm(
+        CELL.arm.forward(joints)[:3, 3] - start), 0, 0, 0]
+    path = line(0.05)
+    event = robot.follow(Trajectory(path.times, path.poses, None, path.joints))
+    assert event["event"] == "stopped" and "soft force" in event["reason"]
+    robot.close()
+    assert np.abs(server.joints - HOME).max() > 0.01
+    # Who connects anew is told all.
+    robot._bridge._told.clear()
+    other = RosRobot(CELL, robot._bridge, Topics())
+    other.recall_tare()
+    event = other.retreat()
+    assert event["event"] == "reached" and event["force_n"] < 1.0, event
+    assert server.joints == pytest.approx(HOME, abs=2e-3)
 
 
-@pytest.mark.real_time
-@pytest.mark.usefixtures("first_in_line")
 @pytest.mark.parametrize("sign, told", [(1.0, None), (-1.0, "the force points against")])
-def test_a_nudge_shows_a_sensor_whose_sign_is_wrong(sign, told):
+def test_a_nudge_shows_a_sensor_whose_sign_is_wrong(stepped_ros, sign, told):
     """A branch of 500 N/m, there and back by 4 mm; judged as in `limber record`."""
     out, start = line(0.004, 0.01), CELL.arm.forward(HOME)[:3, 3]
     nudge = Trajectory(np.r_[out.times, out.duration + 0.5 + out.times],
@@ -124,28 +120,21 @@ def test_a_nudge_shows_a_sensor_whose_sign_is_wrong(sign, told):
     travels = np.array([0.0, 0.004])
     check = PullPlausibility(CELL, PredictedPull(
         travels, 500.0 * travels[:, None] * [0.0, 1.0, 0.0], None))
-    with RosBridge(HOME) as server:
-        server.load = felt
-        robot = robot_at(server)
-        event = robot.follow(nudge, check=check)
-        assert event["event"] == ("stopped" if told else "reached"), event
-        assert told is None or f"implausible: {told}" in event["reason"]
-        robot.close()
+    _, robot = stepped_ros(load=felt)
+    event = robot.follow(nudge, check=check)
+    assert event["event"] == ("stopped" if told else "reached"), event
+    assert told is None or f"implausible: {told}" in event["reason"]
 
 
-@pytest.mark.real_time
-@pytest.mark.usefixtures("first_in_line")
 @pytest.mark.parametrize("fault, told", [
     (lambda server: server.silent.add("/joint_states"), "no data from the robot"),
     (lambda server: server.silent.add("/force_torque_sensor_broadcaster/wrench"),
      "the wrench has been silent")])
-def test_silence_stops_it(fault, told):
-    with RosBridge(HOME) as server:
-        robot = robot_at(server)
-        threading.Timer(0.2, fault, (server,)).start()
-        event = robot.follow(line(0.1))
-        assert event["event"] == "stopped" and told in event["reason"]
-        assert any(order["op"] == "cancel_action_goal" for _, order in server.heard)
+def test_silence_stops_it(stepped_ros, fault, told):
+    server, robot = stepped_ros(lambda server, step: fault(server) if step == 25 else None)
+    event = robot.follow(line(0.1))
+    assert event["event"] == "stopped" and told in event["reason"]
+    assert any(order["op"] == "cancel_action_goal" for _, order in server.heard)
 
 
 def test_an_arm_elsewhere_is_refused_and_nobody_there_is_told_soon():

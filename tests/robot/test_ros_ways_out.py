@@ -4,20 +4,16 @@ import json
 import os
 import signal
 import threading
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from tests.robot.test_ros import CELL, HOME, ROOT, line, robot_at
 
-from benchmarks import robot_rosbridge
 from benchmarks.robot_rosbridge import STEP, RosBridge, SteppedBridge
 from limber.cell.cell_file import Cell, write_cell
 from limber.cli.commands.ros import command
 from limber.core.errors import Cancelled, InputError, SafetyStop, WorkError
-from limber.robot.driver import force_samples as delays
 from limber.robot.motion.trajectory import Trajectory
-from limber.robot.ros import guarded_robot
 from limber.robot.ros.guarded_robot import RosRobot, Topics
 from limber.robot.ros.messages import wrench_topic
 
@@ -28,25 +24,6 @@ GRIPPER = {"name": ["finger_joint", "other_finger_joint"], "position": [0.4, 0.4
 @pytest.fixture(autouse=True)
 def own_state(monkeypatch, tmp_path):
     monkeypatch.setenv("LIMBER_STATE", str(tmp_path / "state"))
-
-
-@pytest.fixture
-def stepped(monkeypatch):
-    """Make a server and a robot that follows as fast as it is watched, in the server's time.
-
-    ``plan(server, step)`` makes the faults.
-    """
-    def made(plan=None, cell: Cell = CELL, **settings) -> tuple[RosBridge, RosRobot]:
-        server = RosBridge(HOME)
-        vars(server).update(settings)
-        bridge = SteppedBridge(server, None if plan is None else lambda step: plan(server, step))
-        clock = SimpleNamespace(monotonic=lambda: bridge.now)
-        for module in (guarded_robot, delays, robot_rosbridge):
-            monkeypatch.setattr(module, "time", clock)
-        robot = RosRobot(cell, bridge, Topics())
-        robot.tare()
-        return server, robot
-    return made
 
 
 def at(step: int, act):
@@ -85,8 +62,8 @@ def require_stopped(server: RosBridge, robot: RosRobot) -> None:
 
 @pytest.mark.parametrize("error", [ValueError("a fault"), KeyboardInterrupt(), SystemExit(3),
                                    InputError("bad"), MemoryError()])
-def test_an_error_or_an_interrupt_cancels_the_goal(stepped, error):
-    server, robot = stepped(at(30, raising(error)))
+def test_an_error_or_an_interrupt_cancels_the_goal(stepped_ros, error):
+    server, robot = stepped_ros(at(30, raising(error)))
     with pytest.raises(type(error)):
         robot.follow(line(0.1))
     require_stopped(server, robot)
@@ -95,41 +72,41 @@ def test_an_error_or_an_interrupt_cancels_the_goal(stepped, error):
         robot.guard.begin()
 
 
-def test_an_error_while_the_motion_is_watched_cancels_the_goal(stepped):
+def test_an_error_while_the_motion_is_watched_cancels_the_goal(stepped_ros):
     """As an add-on's drawing may raise, or a cancelled job."""
-    server, robot = stepped()
+    server, robot = stepped_ros()
     robot._on_sample = raising(Cancelled())
     with pytest.raises(Cancelled):
         robot.follow(line(0.1))
     assert {"stop", "cancel"} <= set(said(server)) and not server.is_busy
 
 
-def test_an_error_that_comes_again_does_not_hinder_the_cancel(stepped):
+def test_an_error_that_comes_again_does_not_hinder_the_cancel(stepped_ros):
     """The joint states of a second arm: each of its messages raises."""
     def second(server):
         server.others = [{"name": [f"second_{name}_joint" for name in CELL.arm.ros_joints],
                           "position": [0.0] * 6, "velocity": [0.0] * 6}]
-    server, robot = stepped(at(30, second))
+    server, robot = stepped_ros(at(30, second))
     with pytest.raises(InputError, match="2 joints of ROS are named like"):
         robot.follow(line(0.1))
     server.others = []
     require_stopped(server, robot)
 
 
-def test_a_cancel_is_said_again_until_the_goal_has_ended(stepped):
+def test_a_cancel_is_said_again_until_the_goal_has_ended(stepped_ros):
     """rosbridge drops that of a goal which the controller has not accepted yet."""
-    server, robot = stepped(at(2, raising(KeyboardInterrupt())), accepts_after=20)
+    server, robot = stepped_ros(at(2, raising(KeyboardInterrupt())), accepts_after=20)
     with pytest.raises(KeyboardInterrupt):
         robot.follow(line(0.1))
     require_stopped(server, robot)
     assert sum(order["op"] == "cancel_action_goal" for _, order in server.heard) > 1
 
 
-def test_a_connection_that_is_lost_meanwhile_is_told(stepped):
+def test_a_connection_that_is_lost_meanwhile_is_told(stepped_ros):
     def lose(server):
         server.obey = raising(ConnectionError("the connection was lost"))
         raise KeyboardInterrupt
-    _, robot = stepped(at(30, lose))
+    _, robot = stepped_ros(at(30, lose))
     with pytest.raises(KeyboardInterrupt):
         robot.follow(line(0.1))
     assert "the connection was lost: whether the arm stands is not known" in robot.warnings[-1]
@@ -146,8 +123,8 @@ SAFETY, MODE, PROGRAM, SCALING = RosBridge(HOME).status
     (PROGRAM, {"data": False}, "the program on the controller was stopped"),
     (SCALING, {"data": 0.0}, "scales the speed to 0"),
     (SCALING, {"data": None}, "scales the speed to 0")])
-def test_what_the_controller_reports_cancels_at_once(stepped, topic, message, told):
-    server, robot = stepped(at(30, lambda server: server.status.update({topic: message})))
+def test_what_the_controller_reports_cancels_at_once(stepped_ros, topic, message, told):
+    server, robot = stepped_ros(at(30, lambda server: server.status.update({topic: message})))
     event = robot.follow(line(0.1))
     assert event["event"] == "stopped" and told in event["reason"] and event["stands"]
     assert len(server.followed) <= 31
@@ -156,29 +133,29 @@ def test_what_the_controller_reports_cancels_at_once(stepped, topic, message, to
 
 
 @pytest.mark.parametrize("pause", [1, 200])
-def test_after_a_released_protective_stop_nothing_moves_and_nothing_is_reached(stepped, pause):
+def test_after_a_released_protective_stop_nothing_moves_and_nothing_is_reached(stepped_ros, pause):
     def plan(server, step):
         if step == 30:
             server.protective_stop()
         elif step == 30 + pause:
             server.release()
-    server, robot = stepped(plan)
+    server, robot = stepped_ros(plan)
     event = robot.follow(line(0.1))
     assert event["event"] == "stopped" and "protective stop" in event["reason"]
     robot.watched(STEP * pause)
     require_stopped(server, robot)
 
 
-def test_a_protective_stop_is_named_also_where_the_ended_program_is_heard_first(stepped):
+def test_a_protective_stop_is_named_also_where_the_ended_program_is_heard_first(stepped_ros):
     def stop(server):
         server.status = {PROGRAM: {"data": False}, SAFETY: {"mode": 3}}
-    _, robot = stepped(at(30, stop))
+    _, robot = stepped_ros(at(30, stop))
     assert robot.follow(line(0.1))["reason"] == (
         "the program on the controller was stopped (protective stop)")
 
 
-def test_a_robot_in_a_protective_stop_is_sent_no_goal(stepped):
-    server, robot = stepped()
+def test_a_robot_in_a_protective_stop_is_sent_no_goal(stepped_ros):
+    server, robot = stepped_ros()
     server.protective_stop()
     robot.watched(STEP)
     with pytest.raises(SafetyStop, match="cannot be moved: protective stop"):
@@ -186,60 +163,60 @@ def test_a_robot_in_a_protective_stop_is_sent_no_goal(stepped):
     assert said(server) == []
 
 
-def test_standstill_under_a_goal_is_stopped_and_named(stepped):
-    server, robot = stepped(at(30, lambda server: setattr(server, "sticks", True)))
+def test_standstill_under_a_goal_is_stopped_and_named(stepped_ros):
+    server, robot = stepped_ros(at(30, lambda server: setattr(server, "sticks", True)))
     event = robot.follow(line(0.1))
     assert event["event"] == "stopped" and "stood still for 2.0 s" in event["reason"]
     server.sticks = False
     require_stopped(server, robot)
 
 
-def test_a_goal_that_is_never_accepted_is_stopped(stepped):
-    server, robot = stepped(accepts_after=10**6)
+def test_a_goal_that_is_never_accepted_is_stopped(stepped_ros):
+    server, robot = stepped_ros(accepts_after=10**6)
     event = robot.follow(line(0.02))
     assert "stood still" in event["reason"] and server.followed == []
     assert "did not confirm" in robot.warnings[-1]
 
 
 @pytest.mark.parametrize("scaling", [100.0, 50.0])
-def test_a_rest_of_the_path_and_a_slow_controller_are_no_standstill(stepped, scaling):
+def test_a_rest_of_the_path_and_a_slow_controller_are_no_standstill(stepped_ros, scaling):
     out = line(0.001, 0.02)
     path = Trajectory(np.r_[out.times, out.duration + 3.0 + out.times],
                       np.concatenate([out.poses, out.poses[::-1]]), None,
                       np.concatenate([out.joints, out.joints[::-1]]))
-    server, robot = stepped()
+    server, robot = stepped_ros()
     server.status[SCALING] = {"data": scaling}
     assert robot.follow(path) == {"event": "reached"}
 
 
-def test_another_nodes_joint_states_do_not_disturb_a_motion(stepped):
-    server, robot = stepped(at(5, lambda server: server.others.append(GRIPPER)))
+def test_another_nodes_joint_states_do_not_disturb_a_motion(stepped_ros):
+    server, robot = stepped_ros(at(5, lambda server: server.others.append(GRIPPER)))
     path = line(0.02)
     assert robot.follow(path) == {"event": "reached"}
     assert server.joints == pytest.approx(path.joints[-1])
 
 
-def test_another_nodes_joint_states_are_no_sign_of_life(stepped):
+def test_another_nodes_joint_states_are_no_sign_of_life(stepped_ros):
     def only_the_gripper(server):
         server.others.append(GRIPPER)
         server.has_arm = False
-    server, robot = stepped(at(30, only_the_gripper))
+    server, robot = stepped_ros(at(30, only_the_gripper))
     event = robot.follow(line(0.1))
     assert "no data from the robot" in event["reason"]
     server.has_arm = True
     require_stopped(server, robot)
 
 
-def test_a_robot_whose_joint_states_are_of_another_node_alone_is_refused(stepped):
+def test_a_robot_whose_joint_states_are_of_another_node_alone_is_refused(stepped_ros):
     with pytest.raises(WorkError, match="does not have the joints of a ur5e: finger_joint"):
-        stepped(others=[GRIPPER], has_arm=False)
+        stepped_ros(others=[GRIPPER], has_arm=False)
 
 
 @pytest.mark.parametrize("topic", [SAFETY, MODE, PROGRAM, SCALING])
-def test_a_ur_arm_is_not_moved_without_what_its_driver_publishes(stepped, topic):
+def test_a_ur_arm_is_not_moved_without_what_its_driver_publishes(stepped_ros, topic):
     with pytest.raises(WorkError, match=f"Nothing came on {topic} within 2 s.*"
                                         "ur_control.launch.py ur_type:=ur5e"):
-        stepped(silent={topic})
+        stepped_ros(silent={topic})
 
 
 @pytest.mark.parametrize("status, values, told", [
@@ -247,8 +224,8 @@ def test_a_ur_arm_is_not_moved_without_what_its_driver_publishes(stepped, topic)
     (5, {}, "no reason was given"),
     (4, {"error_code": -5, "error_string": "goal tolerance"}, "goal tolerance"),
     (4, {"error_code": 0}, "calls its goal reached, but the arm is")])
-def test_a_goal_that_the_controller_ends_early_is_not_reached(stepped, status, values, told):
-    server, robot = stepped()
+def test_a_goal_that_the_controller_ends_early_is_not_reached(stepped_ros, status, values, told):
+    server, robot = stepped_ros()
     robot._bridge.plan = lambda step: (
         robot._bridge.end_goal(status, **values) if step == 30 else None)
     event = robot.follow(line(0.1))
@@ -256,20 +233,20 @@ def test_a_goal_that_the_controller_ends_early_is_not_reached(stepped, status, v
     require_stopped(server, robot)
 
 
-def test_a_stop_of_another_node_is_obeyed(stepped):
-    server, robot = stepped()
+def test_a_stop_of_another_node_is_obeyed(stepped_ros):
+    server, robot = stepped_ros()
     robot._bridge.plan = lambda step: step == 30 and server.obey(
         None, {"op": "publish", "topic": "/limber/stop", "msg": {"data": True}})
     assert robot.follow(line(0.1))["reason"] == "a stop was published"
     require_stopped(server, robot)
 
 
-def test_a_leg_to_its_end_gives_the_node_an_end_word_and_no_stop(stepped, monkeypatch):
+def test_a_leg_to_its_end_gives_the_node_an_end_word_and_no_stop(stepped_ros, monkeypatch):
     """The example's node, which hears these words, reports no silence after the leg."""
     monkeypatch.syspath_prepend(str(ROOT / "scripts" / "examples" / "ros2" / "limber_stop"))
     from limber_stop.watch import Watch
 
-    server, robot = stepped()
+    server, robot = stepped_ros()
     assert robot.follow(line(0.02)) == {"event": "reached"}
     assert said(server) == ["beat", "goal", "end"] and robot.warnings == []
     watch = Watch()
@@ -282,27 +259,27 @@ def test_a_leg_to_its_end_gives_the_node_an_end_word_and_no_stop(stepped, monkey
     assert not watch.is_silent(when + 1.0)
 
 
-def test_joint_states_without_numbers_stop_it(stepped):
+def test_joint_states_without_numbers_stop_it(stepped_ros):
     names = [f"{name}_joint" for name in CELL.arm.ros_joints]
     lost = {"name": names, "position": [None] * 6, "velocity": [None] * 6}
-    server, robot = stepped(at(30, lambda server: server.others.append(lost)))
+    server, robot = stepped_ros(at(30, lambda server: server.others.append(lost)))
     event = robot.follow(line(0.1))
     assert event["event"] == "stopped" and "gives no number" in event["reason"]
     server.others = []
     require_stopped(server, robot)
 
 
-def test_a_bridge_that_a_goal_blocks_is_noticed(stepped):
+def test_a_bridge_that_a_goal_blocks_is_noticed(stepped_ros):
     """rosbridge's default: a stop waits there until the goal has ended."""
-    _, robot = stepped(blocks=True)
+    _, robot = stepped_ros(blocks=True)
     event = robot.follow(line(0.1, 0.01))
     assert event["event"] == "stopped" and not event["stands"]
     assert "send_action_goals_in_new_thread:=true" in event["reason"]
     assert "did not confirm" in robot.warnings[-1]
 
 
-def test_a_bridge_that_does_not_tell_what_is_published_is_warned_of(stepped):
-    _, robot = stepped()
+def test_a_bridge_that_does_not_tell_what_is_published_is_warned_of(stepped_ros):
+    _, robot = stepped_ros()
     robot._bridge._server._subscribed[robot._bridge._inbox] -= {"/limber/stop", "/limber/end"}
     assert robot.follow(line(0.02)) == {"event": "reached"}
     assert "does not come back" in robot.warnings[-1]
@@ -339,11 +316,11 @@ def with_sensor(cell: Cell, **entries) -> Cell:
     return cell.model_copy(update={"sensor": cell.sensor.model_copy(update=entries)})
 
 
-def test_the_guard_listens_to_the_stated_sensor(stepped):
+def test_the_guard_listens_to_the_stated_sensor(stepped_ros):
     assert wrench_topic(CELL) == Topics().wrench
     stated = with_sensor(PAPER, topic="/ft300/wrench")
     assert wrench_topic(stated) == "/ft300/wrench"
-    server, robot = stepped(cell=stated, wrench_topic="/ft300/wrench")
+    server, robot = stepped_ros(cell=stated, wrench_topic="/ft300/wrench")
     server.wrench = np.array([3.0, 0, 0, 0, 0, 0])
     _, forces = robot.watched(1.0)
     assert forces.mean(axis=0) == pytest.approx([3, 0, 0], abs=0.1)
