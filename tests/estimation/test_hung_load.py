@@ -14,7 +14,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.hung_load import settled
-from limber.recordings.markers_under_load import against_load
+from limber.recordings.importing import against_load
 from limber.recordings.recording import GraspEntry, Observations, grasp_on, read_pull
 from limber.recordings.registration import read_nominal, register
 

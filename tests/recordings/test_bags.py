@@ -15,6 +15,7 @@ from limber.perception.observe import write_depth
 from limber.recordings import bag_reader
 from limber.recordings.bag_pull import _Messages, pull_of_bag, write_mcap
 from limber.recordings.bag_reader import Bag, Topic, read_bag, stamped
+from limber.recordings.import_request import ImportRequest
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.settings import ImportSettings
 from limber.stages.pulls.export_pull import export_pull
@@ -61,8 +62,8 @@ class Written:
         self._writer.finish()
         self._stream.close()
 
-    def add(self, topic, kind, message, logged):
-        store = self.made.store
+    def add(self, topic, message, logged):
+        store, kind = self.made.store, message.__msgtype__
         if topic not in self._channels:
             text, _ = store.generate_msgdef(kind, ros_version=2)
             schema = self._writer.register_schema(kind, "ros2msg", text.encode())
@@ -72,27 +73,22 @@ class Written:
                                  bytes(store.serialize_cdr(message, kind)), stamp)
 
     def wrench(self, topic, seconds, force, frame="branch", stamp=None):
-        made = self.made
-        self.add(topic, "geometry_msgs/msg/WrenchStamped", made.make(
-            "geometry_msgs/msg/WrenchStamped",
-            header=made.header(seconds if stamp is None else stamp, frame),
-            wrench=made.make("geometry_msgs/msg/Wrench", force=made.vector(force),
-                             torque=made.vector(np.zeros(3)))), seconds)
+        message = self.made.wrench(np.r_[force, np.zeros(3)], seconds if stamp is None else stamp)
+        message.header.frame_id = frame
+        self.add(topic, message, seconds)
 
     def pose(self, topic, seconds, position, frame="branch"):
-        made = self.made
-        self.add(topic, "geometry_msgs/msg/PoseStamped", made.make(
-            "geometry_msgs/msg/PoseStamped", header=made.header(seconds, frame),
-            pose=made.make("geometry_msgs/msg/Pose", position=made.vector(position, "Point"),
-                           orientation=made.turn(np.zeros(3)))), seconds)
+        message = self.made.pose(np.r_[position, np.zeros(3)], seconds)
+        message.header.frame_id = frame
+        self.add(topic, message, seconds)
 
     def transform(self, seconds, child, pose, parent="branch"):
-        moved = self.made.transform(seconds, child, np.asarray(pose, float))
+        moved = self.made.transform(child, np.asarray(pose, float), seconds)
         moved.transforms[0].header.frame_id = parent
-        self.add("/tf", "tf2_msgs/msg/TFMessage", moved, seconds)
+        self.add("/tf", moved, seconds)
 
     def joints(self, seconds, names, angles):
-        self.add("/joint_states", "sensor_msgs/msg/JointState", self.made.make(
+        self.add("/joint_states", self.made.make(
             "sensor_msgs/msg/JointState", header=self.made.header(seconds, ""), name=names,
             position=np.array(angles, float), velocity=np.zeros(0), effort=np.zeros(0)), seconds)
 
@@ -390,7 +386,8 @@ def test_the_reported_bag(tmp_path, clock):
     pytest.importorskip("rosbags")
     if not REPORTED.exists():
         pytest.skip("the reports are not beside this checkout")
-    found = pull_of_bag(read_bag(REPORTED), tmp_path, ImportSettings(bag_clock=clock))
+    found = pull_of_bag(read_bag(REPORTED), ImportRequest(
+        REPORTED, tmp_path, settings=ImportSettings(bag_clock=clock)))
     assert found.robot.times[-1] == pytest.approx(5.2, abs=0.1) and len(found.robot.times) == 21
     assert sum("have a time of 0" in text for text in found.warnings) == 3
 

@@ -99,7 +99,7 @@ def test_robot_tables_of_ur_and_with_quaternions(tmp_path):
 def test_pose_without_rotation_is_told(tmp_path):
     """A gripper of which only the place is known is taken not to turn, with a word."""
     stream = robot_stream(written(tmp_path, "t_s,x_m,y_m,z_m\n0,1,2,3\n1,1,2,3\n"))
-    assert np.all(stream.values[:, 3:] == 0) and "point grasp" in stream.warnings[0]
+    assert np.all(stream.values[:, 3:6] == 0) and "point grasp" in stream.warnings[0]
 
 
 def test_what_is_no_table(tmp_path):

@@ -243,10 +243,10 @@ def _bag(_template: Path, path: Path) -> Any:
     """A bag, up to the pull made from it."""
     from limber.recordings.bag_pull import pull_of_bag
     from limber.recordings.bag_reader import read_bag
-    from limber.recordings.settings import ImportSettings
+    from limber.recordings.import_request import ImportRequest
 
     with tempfile.TemporaryDirectory() as folder:
-        made = pull_of_bag(read_bag(path), Path(folder), ImportSettings())
+        made = pull_of_bag(read_bag(path), ImportRequest(path, Path(folder)))
     return made.robot, made.seen
 
 

@@ -1,4 +1,4 @@
-"""Input of an import: recording, target folder, settings, branch and robot."""
+"""An import: what is asked, what its source holds, and the slips that its frames and units show."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,17 +16,21 @@ from limber.core.files.reading import read_toml
 from limber.core.not_none import present
 from limber.core.numerics.rigid import rotation_matrix
 from limber.core.progress import SILENT, Progress
-from limber.recordings.bag_pull import JointPoses
 from limber.recordings.recording import (
     CalibrationEntry,
     GraspEntry,
+    Observations,
     Pull,
     PullEntry,
     SensorEntry,
     entry_with,
 )
-from limber.recordings.registration import Registration, read_nominal, register
+from limber.recordings.registration import read_nominal, register
 from limber.recordings.settings import ImportSettings
+from limber.recordings.time_series import Stream
+
+JointPoses = Callable[[tuple[str, ...], np.ndarray], np.ndarray]
+"""From names and angles [rad] of joints, [n, k], to poses of the gripper in the base, [n, 6]."""
 
 # Slips in hand-made tables of a pull: exchanged tables or titles, units, frames, no force.
 
@@ -194,27 +198,22 @@ class ImportRequest:
             return points
         return self.branch.alignment.apply_metres(points)
 
-    def markers_in_branch(self, points: np.ndarray) -> np.ndarray:
-        """Transform markers [m] from their stated frame, if any; shape [..., 3].
+    def tracks(self, times: np.ndarray, positions: np.ndarray) -> Observations:
+        """Return markers [m], shape [f, m, 3], transformed from their stated frame, if any.
 
         Raises:
             InputError: nominal positions are given as well.
         """
         pose = self.settings.marker_frame
         if pose is None:
-            return points
+            return Observations(times, positions)
         if self.settings.nominal is not None:
             raise InputError(Text("Both ", Option("marker_frame"), " and ", Option("nominal"),
                                   " are given."),
                              "Each determines where the markers are on the branch.",
                              "Give ", Option("marker_frame"), " if the pose of their frame was "
                              "measured; else ", Option("nominal"), ".")
-        return points @ rotation_matrix(np.array(pose[3:])).T + pose[:3]
-
-    def own_markers(self, seen: np.ndarray) -> bool:
-        """Whether markers [f, m, 3] cannot be the branch's control points."""
-        known = self.branch.control_points
-        return self.settings.marker_frame is not None or known not in (None, seen.shape[1])
+        return Observations(times, positions @ rotation_matrix(np.array(pose[3:])).T + pose[:3])
 
     def grasp_or(self, otherwise: Callable[[], np.ndarray]) -> tuple[float, float, float]:
         """Return the grasp point in the branch's frame [m]; if none was given, the alternative."""
@@ -225,13 +224,40 @@ class ImportRequest:
             x, y, z = otherwise()[:3] if distance is None else self.branch.at(distance)
         return float(x), float(y), float(z)
 
-    def registered(self, rest: np.ndarray, labels: list[str]) -> Registration | None:
-        """Return the fit of markers [m, 3] to their nominal positions on the branch, if given.
+    def placed(self, found: "Recorded", rest: np.ndarray | None = None) -> "Placed":
+        """Return the markers on the branch; ``rest``: where they are known to be at rest [m, 3].
+
+        Without it they are at rest in the first frame. One that is not seen there is discarded.
+
+        Raises:
+            InputError: none is seen at rest, or one is far from the branch; as :func:`register`.
         """
-        if self.settings.nominal is None:
-            return None
-        known, nominal = read_nominal(self.settings.nominal)
-        return register(rest, labels, known, self.in_branch(nominal), self.name)
+        seen, labels = present(found.seen, "markers"), found.labels
+        start, nominal = seen.positions[0] if rest is None else rest, self.settings.nominal
+        if nominal is not None:
+            known, positions = read_nominal(nominal)
+            fit = register(start, labels, known, self.in_branch(positions), self.name)
+            at_rest = fit.apply(start[fit.used])
+            require_near(at_rest, self.name, self.branch)
+            return Placed(replace(seen, positions=fit.apply(seen.positions[:, fit.used])), at_rest,
+                          [labels[k] for k in fit.used], fit.rms, fit.warnings)
+        is_control_points = self.settings.marker_frame is None and (
+            self.branch.control_points in (None, seen.point_count))
+        if rest is None and found.is_table and is_control_points:
+            require_near(start, self.name, self.branch)
+            return Placed(seen, None, labels)
+        there = np.isfinite(start).all(axis=1)
+        if not there.any():
+            raise InputError(f"{self.name}: no marker is visible in the first frame.",
+                             "The markers' positions at rest are not known.",
+                             "Start the recording before the pull, or give ", Option("nominal"),
+                             ".")
+        require_near(start, self.name, self.branch)
+        unseen = [label for label, here in zip(labels, there, strict=True) if not here]
+        return Placed(replace(seen, positions=seen.positions[:, there]), start[there],
+                      [labels[k] for k in np.flatnonzero(there)], None, tuple(
+            f"{self.name}: {label} is not visible in the first frame, where the branch is at rest, "
+            "and was discarded." for label in unseen))
 
     @cached_property
     def replaced(self) -> dict[str, Any]:
@@ -243,29 +269,69 @@ class ImportRequest:
         path = self.settings.pull_toml
         return {} if path is None else read_toml(path, "entries of a pull.toml")
 
-    def as_stated(self, entry: PullEntry) -> PullEntry:
-        """Return the entry with the user's entries in place of its own.
+    def as_stated(self, entry: PullEntry, **own: Any) -> PullEntry:
+        """Return the entry with ``own`` values, and the user's in place of its own.
 
         Raises:
             InputError: an entry of the user's file makes no sense; names it.
         """
-        return entry_with(entry, self.replaced, str(self.settings.pull_toml))
+        return entry_with(entry.model_copy(update=own), self.replaced,
+                          str(self.settings.pull_toml))
 
-    def entry(self, observation: Any, rest: np.ndarray | None, *, drive: Any, mode: Any,
-              sigma: float, grasp: tuple[float, float, float]) -> PullEntry:
-        """Return the description of the pull: markers at rest [m, 3] and the grasp in the
-        branch's frame [m], and the standard deviation of positions [m].
+    def entry(self, observation: Any, rest: np.ndarray | None, grasp: tuple[float, float, float],
+              **stated: Any) -> PullEntry:
+        """Return the description of the pull: markers at rest [m, 3], and the grasp [m], in the
+        branch's frame; ``stated``: what takes the place of settings.
         """
-        settings = self.settings
+        settings = self.settings.model_copy(update=stated)
         return PullEntry(
-            observation=observation, drive=drive, motion=settings.motion,
+            observation=observation, drive=settings.drive, motion=settings.motion,
             gravity_m_s2=self.branch.gravity if settings.own_weight else None,
             time_offset_s=settings.time_offset or 0.0, source=self.source.name,
-            grasp=GraspEntry(point_m=grasp, radius_m=settings.grasp_radius, mode=mode),
-            sensor=SensorEntry(position_sigma_m=sigma, force_sigma_n=settings.force_sigma,
+            grasp=GraspEntry(point_m=grasp, radius_m=settings.grasp_radius,
+                             mode=settings.grasp_mode),
+            sensor=SensorEntry(position_sigma_m=settings.position_sigma or 1e-3,
+                               force_sigma_n=settings.force_sigma,
                                torque_sigma_nm=settings.torque_sigma),
             recorded=settings.recorded,
             rest_points_m=None if rest is None else tuple(map(tuple, rest.tolist())))
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a source holds: named series in SI units in the branch's frame, before they are a pull.
+
+    Attributes:
+        observation: ``markers``, ``clouds``, ``depth`` (files in the pull's folder) or ``none``.
+        robot: Poses and wrenches; None: they are in the table of the setting ``robot``.
+        seen: Tracked markers, or None.
+        labels: Their names.
+        is_table: Whether it was made by hand, so that columns and units may be mistaken.
+        written: What Limber wrote about the pull beside a bag's messages.
+        warnings: Faults of the files and assumptions that were made.
+    """
+
+    observation: str
+    robot: Stream | None = None
+    seen: Observations | None = None
+    labels: list[str] = field(default_factory=list)
+    is_table: bool = True
+    written: PullEntry | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Markers in the branch's frame over time, and at rest [m, 3]; None: the control points.
+
+    ``rms`` is their distance from the nominal positions [m], if such were given.
+    """
+
+    seen: Observations | None = None
+    rest: np.ndarray | None = None
+    labels: list[str] = field(default_factory=list)
+    rms: float | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def require_on_branch(grasp: GraspEntry, name: str, branch: BranchFrame) -> None:
@@ -296,43 +362,16 @@ def require_near(rest: np.ndarray, name: str, branch: BranchFrame) -> None:
     Raises:
         InputError: one is farther from the mesh than a quarter of its extent.
     """
-    nodes = present(branch.nodes, "mesh of the branch")
-    off = np.array([np.linalg.norm(nodes - point, axis=1).min() for point in rest])
+    nodes, seen = branch.nodes, rest[np.isfinite(rest).all(axis=1)]
+    if nodes is None or not len(seen):
+        return
+    off = np.array([np.linalg.norm(nodes - point, axis=1).min() for point in seen])
     extent = float(np.linalg.norm(np.ptp(nodes, axis=0)))
     if off.max() > 0.25 * extent:
-        slip = likely_slip(rest[np.isfinite(rest).all(axis=1)], nodes, branch.alignment,
-                           0.25 * extent)
+        slip = likely_slip(seen, nodes, branch.alignment, 0.25 * extent)
         raise InputError(
             f"{name}: at rest a marker is {off.max() * 1e3:.0f} mm away from the branch, which is "
             f"{extent * 1e3:.0f} mm long.",
             f"The recording has another frame of reference or another unit. {slip}".rstrip(),
             "Give the markers' positions on the branch with ", Option("nominal"), ", or the pose "
             "of their frame with ", Option("marker_frame"), ", and check ", Option("unit"), ".")
-
-
-def of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
-    """Return the pull completed by values from its robot's cell.
-
-    A pull that states its calibration is unchanged; without a cell the assumed values are reported.
-    """
-    settings, robot = request.settings, request.robot
-    if pull.entry.calibration is not None or "calibration" in request.replaced:
-        return pull
-    if robot is None:
-        taken = CalibrationEntry()
-        return pull.warned(Text(
-            f"{pull.name}: the calibration errors of gripper and force sensor are not stated. "
-            f"Assumed standard deviations: gripper frame {1e3 * taken.pose_sigma_m:g} mm and "
-            f"{np.degrees(taken.pose_sigma_rad):.1g} degrees, force "
-            f"{100 * taken.force_gain_sigma:g} %, force zero {taken.force_bias_sigma_n:g} N, force "
-            f"drift {taken.force_drift_sigma_n:g} N. They widen the interval of an estimate. Give "
-            "the robot's cell file with ", Option("cell"), ", or [calibration] in ",
-            Option("pull_toml"), "."))
-    sensor = pull.entry.sensor.model_copy(update={
-        "force_range_n": robot.noise.force_range_n,
-        **({} if "force_sigma" in request.stated else {
-            "force_sigma_n": robot.noise.force_sigma_n}),
-        **({} if settings.torque_sigma is not None or pull.entry.sensor.torque_sigma_nm is None
-           else {"torque_sigma_nm": robot.noise.torque_sigma_nm})})
-    return replace(pull, entry=pull.entry.model_copy(update={
-        "sensor": sensor, "calibration": robot.errors(float(pull.times[-1] - pull.times[0]))}))

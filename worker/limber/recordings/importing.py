@@ -1,7 +1,13 @@
-"""Import of a recording of another program into ``pulls/NAME``."""
+"""Import of a recording of another program into ``pulls/NAME``.
+
+Each format gives a :class:`.Recorded`, or a pull in our format. Its markers are placed on the
+branch, and the settings describe the pull: of a robot, of a load that hangs from the branch, of a
+force gauge.
+"""
 
 import re
 import shutil
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -9,36 +15,36 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import InputError, Option, Text
+from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.safe_names import refuse_links
 from limber.core.files.tables import write_table
+from limber.core.not_none import present
 from limber.recordings.bag_pull import pull_of_bag
-from limber.recordings.bag_reader import LIMBER, Bag, read_bag
+from limber.recordings.bag_reader import LIMBER, read_bag
 from limber.recordings.force_slope import (
     WHY_NO_MODULUS,
     ForceTable,
     force_slope,
     read_force_displacement,
 )
+from limber.recordings.hung_load import settled, swung
 from limber.recordings.image_folders import copy_clouds, copy_rgbd, moved_into
 from limber.recordings.import_request import (
     ImportRequest,
-    of_known_robot,
-    require_near,
+    Placed,
+    Recorded,
     require_no_slip,
     require_on_branch,
 )
-from limber.recordings.markers_under_load import (
-    import_gauge,
-    import_load,
-    require_loadable,
-)
 from limber.recordings.recording import (
     POSE_COLUMNS,
+    WITHOUT_GRIPPER,
     WRENCH_COLUMNS,
+    CalibrationEntry,
     Observations,
     Pull,
     PullEntry,
+    SwingEntry,
     calibration_of,
     entry_of_text,
     no_pose,
@@ -51,7 +57,7 @@ from limber.recordings.recording_formats import (
     RecordingFormat,
     recording_format,
 )
-from limber.recordings.robot_tables import is_robot_table, robot_stream, with_columns
+from limber.recordings.robot_tables import is_robot_table, robot_stream
 from limber.recordings.sensor_checks import clean
 from limber.recordings.synchronisation import DETERMINED_S, estimate_offset
 from limber.recordings.tables import (
@@ -63,6 +69,10 @@ from limber.recordings.tables import (
     split_title,
 )
 from limber.recordings.time_series import MAD_TO_SIGMA, Stream
+
+UNLOADED = 0.01
+"""Fraction of the largest force of a table below which the branch is unloaded."""
+_GRASP = {"grasp_point", "grasp_distance"}
 
 # Detection and reading of recordings other than bags: folders, tables, logs.
 
@@ -105,8 +115,7 @@ def is_robot_log(path: Path) -> bool:
 def read_robot(path: Path, request: ImportRequest) -> Stream:
     """Return the gripper's poses and the wrenches about them, in the branch's frame."""
     settings = request.settings
-    robot = robot_stream(path, settings.force_unit, settings.rate_hz)
-    stream = with_columns(robot, POSE_COLUMNS + WRENCH_COLUMNS)
+    stream = robot_stream(path, settings.force_unit, settings.rate_hz)
     if settings.frame_pose is None:
         return stream
     moved = moved_into(settings.frame_pose, stream.values[:, :6], stream.values[:, 6:])
@@ -148,49 +157,64 @@ def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
     """
     request.progress(0.1, f"reading {kind}")
     chosen, settings = recording_format(kind), request.settings
-    if chosen.holds == "force":
-        table = _read(chosen, request)
-        if table.distance is not None and not request.stated & {"grasp_point", "grasp_distance"}:
+    is_loaded = settings.weight is not None or settings.load is not None
+    if is_loaded and chosen.holds != "force":
+        _require_loadable(chosen, request)
+    else:
+        request = replace(request, progress=request.progress.part(0.1, 1.0))
+    found = _read(chosen, request)
+    if isinstance(found, ForceTable):
+        if found.distance is not None and not request.stated & _GRASP:
             request = replace(request, settings=settings.model_copy(
-                update={"grasp_distance": table.distance}))
-        is_placed = request.branch.nodes is not None and (
-            request.stated & {"grasp_point", "grasp_distance"})
-        return (import_gauge if is_placed else _import_force)(table, request)
-    if settings.weight is not None or settings.load is not None:
-        require_loadable(chosen, request)
-        return import_load(_read(chosen, request), request)
-    return _import_motion(chosen, replace(request, progress=request.progress.part(0.1, 1.0)))
+                update={"grasp_distance": found.distance}))
+        if request.branch.nodes is None or not request.stated & _GRASP:
+            return _slope_alone(found, request)
+        pull, numbers = _gauge(found, request)
+    elif is_loaded:
+        pull, numbers = _under_load(found, request)
+    else:
+        return _moved_by_robot(found, request)
+    write_pull(request.folder, pull)
+    seen = present(pull.observations, "markers")
+    return {"frame_count": len(seen.times), "point_count": seen.point_count,
+            "time_offset_s": 0.0} | numbers
 
 
 def _read(chosen: RecordingFormat, request: ImportRequest) -> Any:
+    """What a source holds: a :class:`Recorded`, a whole :class:`Pull`, or a force table."""
     read = RECORDINGS.read_as(chosen, request.source, request=request)
     if chosen.holds == "markers":
         stream, labels = read
-        points = stream.values.reshape(len(stream), -1, 3)
-        moved = request.markers_in_branch(points).reshape(stream.values.shape)
-        return replace(stream, values=moved), labels
-    return read
+        positions = stream.values.reshape(len(stream), -1, 3)
+        return Recorded("markers", seen=request.tracks(stream.times, positions), labels=labels,
+                        warnings=stream.warnings)
+    if chosen.holds == "robot":
+        return Recorded("none", read)
+    return read if chosen.holds in ("pull", "force") else Recorded(chosen.holds, warnings=(*read,))
 
 
-def _import_force(read: ForceTable, request: ImportRequest) -> dict[str, Any]:
-    displacement, force = read.displacement, read.force
-    found = force_slope(displacement, force, warnings=read.warnings)
-    for message in found.warnings:
+def _tell(request: ImportRequest, messages: Iterable[str]) -> None:
+    for message in messages:
         request.progress.warn(message)
-    request.progress.warn(f"{request.source.name} does not give a modulus. {WHY_NO_MODULUS}")
-    write_table(request.folder / "force.csv", ("displacement_m", "force_n"),
-                zip(displacement, force, strict=True))
-    return {"slope_n_per_m": found.slope, "slope_interval_n_per_m": list(found.interval),
-            "contact_m": found.contact, "contact_seen": found.contact_seen,
-            "baseline_n": found.baseline, "stiffening": found.stiffening,
-            "slips_m": list(found.slips), "slope_before_slip_n_per_m": found.slope_before_slip,
-            "return_slope_n_per_m": found.return_slope, "energy_lost": found.energy_lost,
-            "frame_count": len(force), "why_no_modulus": WHY_NO_MODULUS}
 
 
-def _import_motion(chosen: RecordingFormat, request: ImportRequest) -> dict[str, Any]:
-    is_whole = chosen.holds == "pull"
-    pull = _read(chosen, request) if is_whole else _assembled(chosen, request)
+def _pull(request: ImportRequest, entry: PullEntry, robot: Stream, seen: Observations | None,
+          warnings: tuple[str, ...] = (), *, is_table: bool = False) -> Pull:
+    """The pull of a gripper's stream or a load's; InputError if the grasp is off the branch."""
+    poses, wrenches = (np.ascontiguousarray(part) for part in np.hsplit(robot.values, 2))
+    pull = Pull(request.name, entry, robot.times, poses, wrenches, seen, warnings)
+    if is_table:
+        pull = require_no_slip(pull)
+    require_on_branch(entry.grasp, request.name, request.branch)
+    return pull
+
+
+# A pull of a robot, from tables or a bag.
+
+
+def _moved_by_robot(found: Recorded | Pull, request: ImportRequest) -> dict[str, Any]:
+    """Write the pull, with the faults of its sensors told, and its clocks' offset."""
+    pull = found if isinstance(found, Pull) else _of_robot(found, request)
     if request.replaced:
         pull = replace(pull, entry=request.as_stated(pull.entry))
     if not (request.folder / "pull.toml").exists():
@@ -198,15 +222,53 @@ def _import_motion(chosen: RecordingFormat, request: ImportRequest) -> dict[str,
     elif request.replaced:
         write_entry(request.folder / "pull.toml", pull.entry)
     cleaned = clean(pull)
-    for message in cleaned.warnings:
-        request.progress.warn(message)
+    _tell(request, cleaned.warnings)
     entry, seen = pull.entry, cleaned.observations
-    if not is_whole and request.settings.time_offset is None and seen is not None:
+    if (isinstance(found, Recorded) and found.is_table and seen is not None
+            and request.settings.time_offset is None):
         entry = _with_offset(cleaned, seen.times, request)
         write_entry(request.folder / "pull.toml", entry)
     return {"frame_count": len(seen.times) if seen is not None else len(pull.times),
             "point_count": seen.point_count if seen is not None else 0,
             "time_offset_s": entry.time_offset_s}
+
+
+def _of_robot(found: Recorded, asked: ImportRequest) -> Pull:
+    """The pull of the branch's observations, and of the recording's gripper or the table of it."""
+    request, settings = asked, asked.settings
+    if found.is_table and found.robot is not None and settings.robot is not None:
+        raise InputError(
+            Text(f"{request.source.name} holds a gripper's positions and forces, and ",
+                 Option("robot"), " was given as well."), "The two tables are likely exchanged.",
+            "Give the markers as SOURCE, and ", Option("robot", request.source.name), ".")
+    written, rest = found.written, None
+    if not found.is_table and found.robot is not None:
+        if settings.torque_sigma is None:
+            request = replace(request, settings=settings.model_copy(update={
+                "torque_sigma": _torque_noise(found.robot.values[:, 9:])}))
+        at_rest = written.rest_points_m if written is not None else None
+        if at_rest and settings.nominal is None and len(at_rest) == len(found.labels):
+            rest = np.array(at_rest)
+    markers = Placed() if found.seen is None else request.placed(found, rest)
+    robot = _gripper(request) if found.robot is None else found.robot
+    known = np.isfinite(robot.values[:, :6]).all(axis=1)
+    if not known.any():
+        raise no_pose(Path(settings.robot or request.source))
+    entry = request.entry(found.observation, markers.rest,
+                          request.grasp_or(lambda: robot.values[known][0]))
+    if written is not None:
+        entry = _with_written(entry, written, request)
+    pull = _pull(request, entry, robot, markers.seen,
+                 (*found.warnings, *markers.warnings, *robot.warnings), is_table=found.is_table)
+    return pull if found.robot is None else _of_known_robot(pull, asked)
+
+
+def _gripper(request: ImportRequest) -> Stream:
+    if request.settings.robot is None:
+        raise InputError("No robot table was given.", "A pull needs the gripper's pose, and its "
+                         "force where measured.", "Give the table with ", Option("robot"),
+                         " ROBOT.csv, or a hung weight with ", Option("weight"), ".")
+    return read_robot(Path(request.settings.robot), request)
 
 
 def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEntry:
@@ -243,73 +305,186 @@ def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEn
     return entry
 
 
-def _assembled(chosen: RecordingFormat, request: ImportRequest) -> Pull:
-    """The pull of the branch's observations, or of the robot's log, and the robot's table."""
-    if chosen.holds == "robot" and request.settings.robot is not None:
+def _of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
+    """Return the pull completed by values from its robot's cell.
+
+    A pull that states its calibration is unchanged; without a cell the assumed values are reported.
+    """
+    settings, robot = request.settings, request.robot
+    if pull.entry.calibration is not None or "calibration" in request.replaced:
+        return pull
+    if robot is None:
+        taken = CalibrationEntry()
+        return pull.warned(Text(
+            f"{pull.name}: the calibration errors of gripper and force sensor are not stated. "
+            f"Assumed standard deviations: gripper frame {1e3 * taken.pose_sigma_m:g} mm and "
+            f"{np.degrees(taken.pose_sigma_rad):.1g} degrees, force "
+            f"{100 * taken.force_gain_sigma:g} %, force zero {taken.force_bias_sigma_n:g} N, force "
+            f"drift {taken.force_drift_sigma_n:g} N. They widen the interval of an estimate. Give "
+            "the robot's cell file with ", Option("cell"), ", or [calibration] in ",
+            Option("pull_toml"), "."))
+    sensor = pull.entry.sensor.model_copy(update={
+        "force_range_n": robot.noise.force_range_n,
+        **({} if "force_sigma" in request.stated else {
+            "force_sigma_n": robot.noise.force_sigma_n}),
+        **({} if settings.torque_sigma is not None or pull.entry.sensor.torque_sigma_nm is None
+           else {"torque_sigma_nm": robot.noise.torque_sigma_nm})})
+    return replace(pull, entry=pull.entry.model_copy(update={
+        "sensor": sensor, "calibration": robot.errors(float(pull.times[-1] - pull.times[0]))}))
+
+
+# Pulls without a robot: markers on a branch that is bent by a steady load, or released from it.
+
+
+def _require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
+    """Refuse settings that do not fit a load.
+
+    Raises:
+        InputError: no markers, two loads, a load without a position, or a dynamic pull.
+    """
+    settings = request.settings
+    if chosen.holds != "markers":
         raise InputError(
-            Text(f"{request.source.name} holds a gripper's positions and forces, and ",
-                 Option("robot"), " was given as well."), "The two tables are likely exchanged.",
-            "Give the markers as SOURCE, and ", Option("robot", request.source.name), ".")
-    found, settings = _read(chosen, request), request.settings
-    observations: Observations | None = None
-    rest: np.ndarray | None = None
-    messages: list[str] = []
-    if chosen.holds == "markers":
-        observations, rest, messages = _seen(found, request)
-    elif chosen.holds != "robot":
-        messages = found
-    robot: Stream = found if chosen.holds == "robot" else _gripper(request)
-    poses, wrenches = (np.ascontiguousarray(part) for part in np.hsplit(robot.values, 2))
-    if not np.isfinite(poses).all(axis=1).any():
-        raise no_pose(Path(request.settings.robot or request.source))
-    entry = request.entry(
-        "none" if chosen.holds == "robot" else chosen.holds, rest, drive=settings.drive,
-        mode=settings.grasp_mode, sigma=settings.position_sigma or 1e-3,
-        grasp=request.grasp_or(lambda: poses[np.isfinite(poses).all(axis=1)][0]))
-    pull = require_no_slip(Pull(request.name, entry, robot.times, poses, wrenches, observations,
-                                (*messages, *robot.warnings)))
-    require_on_branch(entry.grasp, request.name, request.branch)
-    return of_known_robot(pull, request) if chosen.holds == "robot" else pull
+            f"A steady load was given, but {request.source.name} is {chosen.name}.",
+            "The rest position is determined from marker tracks.",
+            "Give a CSV or C3D file of markers.")
+    if settings.weight is not None and settings.load is not None:
+        raise InputError(Text("Both ", Option("weight"), " and ", Option("load"), " were given."),
+                         "The branch carries one load.", "Give only one of them.")
+    sags = settings.weight == 0 and settings.own_weight
+    if settings.grasp_point is None and settings.grasp_distance is None and not sags:
+        raise InputError("A load was given without its position.",
+                         "The deflection of the branch depends on that position.",
+                         "Give ", Option("grasp_point"), " or ", Option("grasp_distance"), ".")
+    if settings.motion == "dynamic":
+        raise InputError("A steady load was given for a dynamic pull.",
+                         "A branch under a steady load either swings after release or is at rest.",
+                         "For a swing, give ", Option("motion", "swing"), " and run ",
+                         Command("swing"), ". For the rest position, omit ", Option("motion"), ".")
 
 
-def _gripper(request: ImportRequest) -> Stream:
-    if request.settings.robot is None:
-        raise InputError("No robot table was given.", "A pull needs the gripper's pose, and its "
-                         "force where measured.", "Give the table with ", Option("robot"),
-                         " ROBOT.csv, or a hung weight with ", Option("weight"), ".")
-    return read_robot(Path(request.settings.robot), request)
+def _under_load(found: Recorded, request: ImportRequest) -> tuple[Pull, dict[str, Any]]:
+    """The pull of a few frames at rest under a load, or of a swing with all its frames; numbers.
+    """
+    settings, seen = request.settings, present(found.seen, "markers")
+    nodes, load = present(request.branch.nodes, "mesh of the branch"), _load(request)
+    own: dict[str, Any] = {"calibration": WITHOUT_GRIPPER}
+    numbers: dict[str, Any] = {"load_n": load.tolist()}
+    _tell(request, found.warnings)
+    if settings.motion == "swing":
+        rest, noise = swung(seen, settings.swing_start, request.name)
+        markers = request.placed(found, rest)
+        _tell(request, markers.warnings)
+        sigma, mass = settings.position_sigma or noise, 0.0
+        if settings.weight is not None and settings.swing_start == "held":
+            mass = settings.weight / float(np.linalg.norm(request.branch.gravity))
+        own["swing"] = SwingEntry(start=settings.swing_start, load_mass_kg=mass, noise_m=noise,
+                                  registration_m=markers.rms)
+        numbers["load_mass_kg"] = mass
+        first = 0
+    else:
+        still = settled(seen, request.name)
+        markers = request.placed(replace(found, seen=Observations(still.times, still.positions)),
+                                 still.rest)
+        _tell(request, (*still.warnings, *markers.warnings))
+        sigma = settings.position_sigma or still.sigma(1e-3 if markers.rms is None
+                                                       else markers.rms)
+        first = -1
+        numbers |= {"settled_s": still.duration, "position_sigma_m": sigma}
+    tracks, rest = present(markers.seen, "markers"), present(markers.rest, "positions at rest")
+    moved = tracks.positions[first:] - rest
+    # A branch under its own weight has no point of load: use the marker that moves most.
+    # An invisible marker does not count as moving.
+    farthest = np.nan_to_num(np.linalg.norm(moved, axis=2)).max(axis=0).argmax()
+    grasp = request.grasp_or(lambda: nodes[np.linalg.norm(
+        nodes - rest[farthest], axis=1).argmin()])
+    entry = request.as_stated(request.entry(
+        "markers", rest, grasp, drive="force", grasp_mode="point", position_sigma=sigma),
+        **own)
+    row = np.r_[entry.grasp.point_m, np.zeros(3), load, np.zeros(3)]
+    robot = Stream(tracks.times[[0, -1]], np.tile(row, (2, 1)), POSE_COLUMNS + WRENCH_COLUMNS)
+    pull = _pull(request, entry, robot, tracks)
+    if settings.motion != "swing":
+        numbers["displacement_m"] = moved[0].tolist()
+        if suspicion := against_load(moved[0], load):
+            _tell(request, [f"{request.name}: {suspicion}"])
+    return pull, numbers | {"labels": markers.labels, "registration_rms_m": markers.rms}
 
 
-def _at_rest_first(seen: Observations, labels: list[str], stream: Stream, name: str,
-                   ) -> tuple[Observations, np.ndarray, list[str]]:
-    """The markers that the first frame shows, when the branch is at rest; those positions [m]."""
-    there = seen.visible[0]
-    if not there.any():
-        raise InputError(f"{name}: no marker is visible in the first frame.",
-                         "The markers' positions at rest are not known.",
-                         "Start the recording before the pull, or give ", Option("nominal"), ".")
-    unseen = [label for label, here in zip(labels, there, strict=True) if not here]
-    messages = [f"{name}: {label} is not visible in the first frame, where the branch is at rest, "
-                "and was discarded." for label in unseen]
-    used = seen.positions[:, there]
-    return replace(seen, positions=used), used[0], [*stream.warnings, *messages]
+def against_load(moved: np.ndarray, load: np.ndarray) -> str:
+    """Return a warning if markers move against the load (displacements [m], load [N]), else "".
+
+    Motion across the load is plausible: an upright branch bends sideways under a weight.
+    """
+    size = np.linalg.norm(moved, axis=1)
+    mean = moved[size >= 0.5 * np.nanmax(size)].mean(axis=0)
+    turn = np.degrees(np.arccos(np.clip(
+        mean @ load / max(np.linalg.norm(mean) * np.linalg.norm(load), 1e-12), -1, 1)))
+    if turn < 100:
+        return ""
+    return Text(f"the markers move at {turn:.0f} degrees to the load. Check that the recording is "
+                "in the branch's frame (", Option("nominal"), "), and check the direction of the "
+                "load.")
 
 
-def _seen(read: tuple[Stream, list[str]], request: ImportRequest,
-          ) -> tuple[Observations, np.ndarray | None, list[str]]:
-    """Markers [m], their nominal rest positions if given, and warnings."""
-    stream, labels = read
-    seen = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))
-    placed = request.registered(seen.positions[0], labels)
-    if placed is None:
-        if request.branch.nodes is not None:
-            require_near(seen.positions[0], request.name, request.branch)
-        if not request.own_markers(seen.positions):
-            return seen, None, list(stream.warnings)
-        return _at_rest_first(seen, labels, stream, request.name)
-    moved = placed.apply(seen.positions[:, placed.used])
-    return (replace(seen, positions=moved), moved[0],
-            [*stream.warnings, *placed.warnings])
+def _load(request: ImportRequest) -> np.ndarray:
+    """Force on the branch [N] in the branch's frame, shape [3]."""
+    settings, branch = request.settings, request.branch
+    if settings.load is None:
+        down = np.array(branch.gravity)
+        return settings.weight * down / np.linalg.norm(down)
+    turn = np.array(branch.alignment.rotation)
+    return turn @ settings.load if settings.coordinates == "scan" else np.array(settings.load)
+
+
+def _gauge(table: ForceTable, request: ImportRequest) -> tuple[Pull, dict[str, Any]]:
+    """The pull of a test with force gauge and ruler, and its numbers.
+
+    The branch was pulled in one direction, and its displacement was read in that direction at the
+    point where the gauge held it. A row without force, if there is one, is the ruler's zero.
+    """
+    settings = request.settings
+    peak = float(np.abs(table.force).max())
+    if peak == 0.0:
+        raise InputError(f"{request.source.name} has no force.", "Nothing pulled the branch.",
+                         "Check the columns of the table.")
+    _tell(request, table.warnings)
+    unloaded = np.abs(table.force) <= UNLOADED * peak
+    zero = float(table.displacement[unloaded].mean()) if unloaded.any() else 0.0
+    direction = np.array(settings.direction) / np.linalg.norm(settings.direction)
+    if settings.coordinates == "scan":
+        direction = np.array(request.branch.alignment.rotation) @ direction
+    point = np.array(request.grasp_or(lambda: np.zeros(3)))
+    entry = request.entry("markers", point[None], tuple(point.tolist()), drive="force",
+                          grasp_mode="point")
+    entry = request.as_stated(
+        entry, calibration=WITHOUT_GRIPPER.model_copy(update={
+            "point_sigma_m": CalibrationEntry().point_sigma_m, "camera_sigma_rad": 0.0}),
+        sensor=entry.sensor.model_copy(update={"measured_direction": tuple(direction.tolist())}))
+    times = np.arange(len(table.force), dtype=float)
+    seen = point + (table.displacement - zero)[:, None] * direction
+    still = np.zeros_like(seen)
+    robot = Stream(times, np.hstack([seen, still, table.force[:, None] * direction, still]),
+                   POSE_COLUMNS + WRENCH_COLUMNS)
+    return _pull(request, entry, robot, Observations(times, seen[:, None])), {
+        "load_n": (peak * direction).tolist(),
+        "displacement_m": (seen[[np.argmax(np.abs(table.force))]] - point).tolist()}
+
+
+def _slope_alone(read: ForceTable, request: ImportRequest) -> dict[str, Any]:
+    """Keep a force table, and return its slope: there is no branch yet, or no place on it."""
+    displacement, force = read.displacement, read.force
+    found = force_slope(displacement, force, warnings=read.warnings)
+    _tell(request, (*found.warnings, f"{request.source.name} does not give a modulus. "
+                    f"{WHY_NO_MODULUS}"))
+    write_table(request.folder / "force.csv", ("displacement_m", "force_n"),
+                zip(displacement, force, strict=True))
+    return {"slope_n_per_m": found.slope, "slope_interval_n_per_m": list(found.interval),
+            "contact_m": found.contact, "contact_seen": found.contact_seen,
+            "baseline_n": found.baseline, "stiffening": found.stiffening,
+            "slips_m": list(found.slips), "slope_before_slip_n_per_m": found.slope_before_slip,
+            "return_slope_n_per_m": found.return_slope, "energy_lost": found.energy_lost,
+            "frame_count": len(force), "why_no_modulus": WHY_NO_MODULUS}
 
 
 # C3D files of motion capture, read in a separate process.
@@ -353,94 +528,48 @@ def markers_of_arrays(path: Path, data: dict[str, np.ndarray], **_request: objec
     return marker_tracks(times, positions), labels[:positions.shape[1]]
 
 
-# Import of a bag into the pull format, including Limber's own records in it.
+# A bag, with Limber's own record in it.
 
 
-def read_bag_pull(path: Path, request: ImportRequest) -> Pull:
-    """Return the pull in a bag; images and clouds go into the pull's folder.
+def read_bag_pull(path: Path, request: ImportRequest) -> Recorded:
+    """Return the series of a bag; images and clouds go into the pull's folder.
 
     Raises:
-        InputError: see :func:`.bag_reader.read_bag` and :func:`.bag_pull.pull_of_bag`; or no
-            marker is seen in the first frame.
+        InputError: see :func:`.bag_reader.read_bag` and :func:`.bag_pull.pull_of_bag`.
     """
-    bag, robot, asked = read_bag(path), request.robot, request
-    found = pull_of_bag(bag, request.folder, request.settings,
-                        None if robot is None else robot.joint_poses, request.progress)
-    recorded, warnings = _recorded_by_limber(bag)
-    poses, wrenches = found.robot.values[:, :6], found.robot.values[:, 6:]
-    if request.settings.torque_sigma is None:
-        request = replace(request, settings=request.settings.model_copy(update={
-            "torque_sigma": _torque_noise(wrenches[:, 3:])}))
-    seen, rest = (None, None) if found.seen is None else _markers(found.seen, recorded, request)
-    settings = request.settings
-    entry = request.entry(found.observation, rest, drive=settings.drive, mode=settings.grasp_mode,
-                          grasp=request.grasp_or(lambda: poses[0]),
-                          sigma=settings.position_sigma or 1e-3)
-    if recorded is not None:
-        entry = _with_recorded(entry, recorded, request)
-    require_on_branch(entry.grasp, request.name, request.branch)
-    return of_known_robot(Pull(request.name, entry, found.robot.times, poses, wrenches, seen,
-                               (*found.warnings, *warnings)), asked)
-
-
-def _markers(seen: Observations, recorded: PullEntry | None, request: ImportRequest,
-             ) -> tuple[Observations, np.ndarray]:
-    """Markers with a known rest position, and those positions [m], shape [m, 3]."""
-    seen = replace(seen, positions=request.markers_in_branch(seen.positions))
-    placed = request.registered(seen.positions[0], [f"m{k}" for k in range(seen.point_count)])
-    at_rest = None if recorded is None or placed else recorded.rest_points_m
-    known = at_rest is not None and len(at_rest) == seen.point_count
-    used = placed.used if placed else np.flatnonzero(seen.visible[0] | known)
-    if not len(used):
-        raise InputError(f"{request.name}: no marker is visible in the first frame.",
-                         "The markers' positions at rest are not known.",
-                         "Start the recording before the pull, or give ", Option("nominal"), ".")
-    positions = seen.positions[:, used]
-    seen = replace(seen, positions=placed.apply(positions) if placed else positions)
-    rest = np.array(at_rest) if known else seen.positions[0]
-    if request.branch.nodes is not None:
-        require_near(rest, request.name, request.branch)
-    return seen, rest
-
-
-def _recorded_by_limber(bag: Bag) -> tuple[PullEntry | None, tuple[str, ...]]:
-    """The description that `limber export-pull` wrote beside the messages, and its faults.
-    """
+    bag = read_bag(path)
+    found = pull_of_bag(bag, request)
     if not bag.pull_toml:
-        return None, ()
+        return found
     try:
-        return entry_of_text(bag.pull_toml, f"{bag.path.name}, metadata {LIMBER}"), ()
+        return replace(found, written=entry_of_text(bag.pull_toml,
+                                                    f"{bag.path.name}, metadata {LIMBER}"))
     except InputError as error:
-        return None, (f"{error} Default values are used for grasp, noise and calibration.",)
+        return replace(found, warnings=(*found.warnings, f"{error} Default values are used for "
+                                        "grasp, noise and calibration."))
 
 
-def _with_recorded(entry: PullEntry, recorded: PullEntry, request: ImportRequest) -> PullEntry:
-    """The entry of a bag that Limber wrote; the import's settings take precedence."""
+def _with_written(entry: PullEntry, written: PullEntry, request: ImportRequest) -> PullEntry:
+    """The entry as `limber export-pull` wrote it; the import's settings take precedence."""
     requested = request.stated
-    kept: dict[str, Any] = {
-        "calibration": recorded.calibration, "weightless": recorded.weightless,
-        "truth": recorded.truth,
-        "source": f"{entry.source} ({recorded.source})" if recorded.source else entry.source}
-    if "own_weight" not in requested:
-        kept["gravity_m_s2"] = recorded.gravity_m_s2
-    kept |= {name: getattr(recorded, name) for name in ("drive", "motion") if name not in requested}
-    grasp: dict[str, Any] = {"mode": recorded.grasp.mode} if "grasp_mode" not in requested else {}
-    if "grasp_radius" not in requested:
-        grasp["radius_m"] = recorded.grasp.radius_m
+
+    def kept(source: Any, **keys: str) -> dict[str, Any]:
+        return {key: getattr(source, key) for name, key in keys.items() if name not in requested}
+
+    grasp = kept(written.grasp, grasp_mode="mode", grasp_radius="radius_m")
     if not requested & {"grasp_point", "frame_pose", "cell"}:
-        grasp["point_m"] = recorded.grasp.point_m
-    sensor: dict[str, float | None] = {} if "position_sigma" in requested else {
-        "position_sigma_m": recorded.sensor.position_sigma_m}
-    if "force_sigma" not in requested:
-        sensor["force_sigma_n"] = recorded.sensor.force_sigma_n
-    if "torque_sigma" not in requested:
-        sensor["torque_sigma_nm"] = recorded.sensor.torque_sigma_nm
-    return entry.model_copy(update=kept | {
+        grasp["point_m"] = written.grasp.point_m
+    sensor = kept(written.sensor, position_sigma="position_sigma_m", force_sigma="force_sigma_n",
+                  torque_sigma="torque_sigma_nm")
+    noise = ("position_sigma_m", "force_sigma_n", "torque_sigma_nm")
+    return entry.model_copy(update={
+        "calibration": written.calibration, "weightless": written.weightless,
+        "truth": written.truth,
+        "source": f"{entry.source} ({written.source})" if written.source else entry.source,
+        **kept(written, own_weight="gravity_m_s2", drive="drive", motion="motion"),
         "grasp": entry.grasp.model_copy(update=grasp),
-        "sensor": recorded.sensor.model_copy(update={
-            "position_sigma_m": entry.sensor.position_sigma_m,
-            "force_sigma_n": entry.sensor.force_sigma_n,
-            "torque_sigma_nm": entry.sensor.torque_sigma_nm} | sensor)})
+        "sensor": written.sensor.model_copy(
+            update={key: getattr(entry.sensor, key) for key in noise} | sensor)})
 
 
 def _torque_noise(torques: np.ndarray) -> float | None:

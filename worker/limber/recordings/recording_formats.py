@@ -18,7 +18,8 @@ class RecordingFormat(Format):
         holds: What ``read`` returns. ``markers``: their tracks as a stream with three columns each
             [m], and their labels. ``robot``: a stream of the gripper's poses and wrenches in the
             branch's frame. ``clouds`` and ``depth``: warnings; it writes them to the folder of the
-            pull. ``pull``: a whole :class:`Pull`. ``force``: a :class:`.force_slope.ForceTable`.
+            pull. ``pull``: a whole :class:`Pull`, or a :class:`.import_request.Recorded`.
+            ``force``: a :class:`.force_slope.ForceTable`.
     """
 
     holds: Literal["markers", "robot", "clouds", "depth", "pull", "force"] = "markers"

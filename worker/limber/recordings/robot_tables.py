@@ -1,6 +1,5 @@
 """Robot tables: the gripper's pose and wrench, whatever the names of the columns."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +45,7 @@ _UNITS = {"m": (LENGTH_UNITS_M, "m"), "rad": (ANGLE_UNITS_RAD, "rad"),
 
 def robot_stream(path: str | Path, force_unit: str | None = None,
                  rate_hz: float | None = None) -> Stream:
-    """Read a robot's table: those of the columns x_m .. rz_rad, fx_n .. tz_nm that are present.
+    """Read a robot's table: the columns x_m .. rz_rad, fx_n .. tz_nm; NaN if not measured.
 
     Known names are our own, those of UR's RTDE (``actual_TCP_pose_0``, ...) and Franka's libfranka
     (``O_T_EE_0``, ``O_F_ext_hat_K_0``, ...), and short ones with a unit. A rotation may be a
@@ -74,9 +73,9 @@ def robot_stream(path: str | Path, force_unit: str | None = None,
                          "The gripper's pose in the branch's frame is needed.",
                          f"Columns: t_s, {', '.join(POSE_COLUMNS + WRENCH_COLUMNS)}.")
     _add_rotation(values, titles, stream, warnings, Path(path))
-    names = tuple(name for name in _ALIASES if name in values)
-    return Stream(stream.times, np.column_stack([values[name] for name in names]), names,
-                  tuple(warnings))
+    unmeasured = np.full(len(stream), np.nan)
+    found = np.column_stack([values.get(name, unmeasured) for name in _ALIASES])
+    return Stream(stream.times, found, tuple(_ALIASES), tuple(warnings))
 
 
 def is_robot_table(titles: list[Title]) -> bool:
@@ -158,11 +157,3 @@ def _of_angles(angles: dict[str, np.ndarray], path: Path) -> np.ndarray:
     turns[known] = Rotation.from_euler("xyz", np.column_stack(list(angles.values()))[known]
                                        ).as_rotvec()
     return turns
-
-
-def with_columns(stream: Stream, names: tuple[str, ...]) -> Stream:
-    """Return the stream with these columns in this order; absent ones are NaN."""
-    empty = np.full(len(stream), np.nan)
-    values = [stream.values[:, stream.columns.index(name)] if name in stream.columns else empty
-              for name in names]
-    return replace(stream, values=np.column_stack(values), columns=names)

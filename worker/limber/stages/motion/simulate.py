@@ -273,8 +273,7 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
 
 def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
     from limber.mechanics.dynamics.drive import PoseTable
-    from limber.recordings.recording import POSE_COLUMNS
-    from limber.recordings.robot_tables import robot_stream, with_columns
+    from limber.recordings.robot_tables import robot_stream
     from limber.recordings.tables import read_table, time_column
 
     table = read_table(path)
@@ -283,7 +282,7 @@ def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
     stream = robot_stream(path, rate_hz=rate)
     for message in stream.warnings:
         progress.warn(message)
-    poses = with_columns(stream, POSE_COLUMNS).values
+    poses = stream.values[:, :6]
     if np.isnan(poses[:, 3:]).all():
         poses[:, 3:] = 0.0  # a table of positions only
     known = np.isfinite(poses).all(axis=1)
