@@ -34,12 +34,8 @@ _Placement = tuple[np.ndarray, Rotation]
 
 
 def pull_of_bag(bag: Bag, request: ImportRequest) -> Recorded:
-    """Return the series of a bag; images and clouds become files in the pull's folder.
-
-    Raises:
-        InputError: there is no wrench or pose, more than one gripper without a choice, or no common
-            time span of the clocks.
-    """
+    """Return the series of a bag; images and clouds become files in the pull's folder. InputError
+    without wrench or pose, with several grippers and no choice, or clocks that do not overlap."""
     return _BagReading(bag, request).recorded()
 
 
@@ -133,11 +129,8 @@ class _BagReading:
         return times, _six(*found), root
 
     def by_joints(self, name: str | None) -> tuple[np.ndarray, np.ndarray, str] | None:
-        """The gripper from the arm's joint angles.
-
-        Raises:
-            InputError: there are only angles, and no arm was named.
-        """
+        """The gripper from the arm's joint angles; InputError if there are only angles, and no arm
+        was named."""
         if not self.bag.of("joints"):
             return None
         if self.request.robot is None:
@@ -334,13 +327,8 @@ _Message = tuple[float, str, Callable[[float], Any]]
 
 
 def write_mcap(path: Path, folder: Path, pull: Pull) -> dict[str, int]:
-    """Write a pull and the frames in its folder; return the number of messages per topic.
-
-    Times start at 0. Wrenches and poses that were not measured are omitted.
-
-    Raises:
-        MissingDependencyError: the packages are not installed.
-    """
+    """Write a pull and the frames in its folder, from time 0, without what was not measured; return
+    the number of messages per topic. MissingDependencyError without the packages."""
     require_extra("bags", ("mcap", "rosbags"), "Writing an MCAP file")
     from mcap.writer import Writer
 

@@ -27,17 +27,10 @@ _SEPARATOR = "|"
 
 @dataclass(frozen=True)
 class Topic:
-    """Messages of one topic, or one pair of frames of a transform.
-
-    Attributes:
-        name: The topic; for transforms ``topic parent>child``.
-        frame: ``header.frame_id`` of the first message.
-        stamps: ``header.stamp`` of each [s], shape [n].
-        logged: Recording time of each [s], shape [n].
-        values: Their content, shape [n, ...]; see the readers.
-        labels: Names beside them: joints, an image's encoding, a transform's child.
-        counts: Number of points of each message, if it varies.
-    """
+    """Messages of one topic, or of one pair of frames of a transform (``topic parent>child``):
+    header and recording times [s], shape [n], and content, shape [n, ...]. ``labels`` are joints,
+    an image's encoding or a transform's child, ``counts`` the points of each message if they
+    vary."""
 
     name: str
     frame: str
@@ -50,16 +43,9 @@ class Topic:
 
 @dataclass(frozen=True)
 class Bag:
-    """Content of a bag.
-
-    Attributes:
-        path: Path of the file or folder.
-        kinds: ``wrench``, ``pose``, ``transform``, ``joints``, ``points``, ``image``, ``camera``
-            to the topics that hold such messages.
-        others: Topics with messages of other types, as ``topic (type)``.
-        broken: Number of messages that could not be decoded.
-        pull_toml: Limber's description of the pull if Limber wrote the bag; else empty.
-    """
+    """Content of a bag: topics by kind (``wrench``, ``pose``, ``transform``, ``joints``,
+    ``points``, ``image``, ``camera``), ``others`` as ``topic (type)``, the number of ``broken``
+    messages, and Limber's description of the pull if Limber wrote the bag."""
 
     path: Path
     kinds: dict[str, tuple[Topic, ...]]
@@ -73,12 +59,8 @@ class Bag:
 
 
 def read_bag(path: Path) -> Bag:
-    """Read a bag.
-
-    Raises:
-        MissingDependencyError: the package is not installed.
-        InputError: it is damaged, or none of its messages can be decoded.
-    """
+    """Read a bag. MissingDependencyError without the package; InputError if it is damaged, or none
+    of its messages can be decoded."""
     require_extra("bags", ("rosbags",), f"Reading {path.name}")
     arrays = read_apart(bag_arrays, path)
     kinds: dict[str, list[Topic]] = {}
@@ -269,19 +251,9 @@ _OFF_S = 3600.0
 
 
 def stamped(bag: Bag, clock: str, warnings: list[str]) -> Bag:
-    """Return a bag without the messages whose time is 0 or far from the others of their topic.
-
-    Drivers publish a few messages before their clock is set. Static data (a transform sent once or
-    twice, camera intrinsics) keep their time. Adds a sentence to ``warnings`` for each topic.
-
-    Args:
-        bag: As read.
-        clock: ``stamps`` or ``logged``: which of a topic's times count.
-        warnings: Gets a sentence on the messages left out.
-
-    Raises:
-        InputError: most of a topic's messages have no time.
-    """
+    """Return a bag without messages whose time (``stamps`` or ``logged``) is 0 or far from the
+    others of their topic, as drivers publish before their clock is set; static data keep theirs.
+    Says so in ``warnings``; InputError if most of a topic's messages have no time."""
     return replace(bag, kinds={
         kind: tuple(_of_topic(bag, topic, clock, warnings) if kind != "camera"
                     and len(topic.stamps) > 2 else topic for topic in topics)
@@ -322,13 +294,8 @@ _MOST_LINKS = 32
 
 @dataclass(frozen=True)
 class Motion:
-    """A frame in another over time, or a static one.
-
-    Attributes:
-        times: [s], increasing, shape [n].
-        positions: [m], shape [n, 3].
-        turns: Shape [n].
-    """
+    """A frame in another over time [s], increasing, or a static one: positions [m], shape [n, 3],
+    and rotations [n]."""
 
     times: np.ndarray
     positions: np.ndarray

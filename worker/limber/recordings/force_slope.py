@@ -39,22 +39,10 @@ WHY_NO_MODULUS = (
 
 @dataclass(frozen=True)
 class ForceSlope:
-    """Stiffness seen by the actuator.
-
-    Attributes:
-        slope: [N/m] over the loaded part of the outward path.
-        interval: Its 95 % interval [N/m]; wide enough for correlated residuals.
-        contact: Displacement at first contact [m], on the actuator's scale.
-        contact_seen: Whether the recording starts before contact.
-        baseline: Reading without load [N].
-        sample_count: Samples in the loaded part.
-        stiffening: Slope of the second half of the loaded part over that of the first, minus 1.
-        slips: Displacements at which the force drops suddenly [m].
-        slope_before_slip: [N/m] up to the first slip, or None if there is no slip.
-        return_slope: [N/m] of the return path, or None if there is none.
-        energy_lost: Fraction of the work of the outward path that is not returned, or None.
-        warnings: Problems found in the file.
-    """
+    """Stiffness [N/m] over the loaded part of the outward path, with a 95 % interval that allows
+    for correlated residuals; ``contact`` and ``slips`` [m] on the actuator's scale, ``baseline``
+    [N] without load. ``stiffening`` is the slope of the second half over that of the first, minus
+    1; ``energy_lost`` the fraction of the outward work that is not returned."""
 
     slope: float
     interval: tuple[float, float]
@@ -72,14 +60,8 @@ class ForceSlope:
 
 @dataclass(frozen=True)
 class ForceTable:
-    """Readings in the file's order.
-
-    Attributes:
-        displacement: [m], shape [n].
-        force: [N], shape [n].
-        distance: Distance of the load from the base along the branch [m]; None: not in the table.
-        warnings: Problems found in the file.
-    """
+    """Displacements [m] and forces [N], shape [n], in the file's order, and the distance of the
+    load from the base along the branch [m], if the table has it."""
 
     displacement: np.ndarray
     force: np.ndarray
@@ -89,21 +71,10 @@ class ForceTable:
 
 def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: str | None = None,
                             ) -> ForceTable:
-    """Read displacement [m] and force [N] in the file's order; units are those of the header.
-
-    Columns are found by name: ``Load Cell Reading (gf)`` or ``force [N]``, ``Displacement (mm)``,
-    with any separator and preamble; a third column such as ``distance from base (cm)`` states
-    where the branch was loaded. Incomplete rows are dropped with a warning.
-
-    Args:
-        path: The file.
-        unit: Unit of the displacement, instead of the header's.
-        force_unit: Unit of the force, instead of the header's.
-
-    Raises:
-        InputError: a column or its unit is missing, fewer than 3 rows remain, or the branch was
-            loaded at several distances.
-    """
+    """Read displacement [m] and force [N], found by name in any unit, separator and preamble:
+    ``Load Cell Reading (gf)``, ``Displacement (mm)``, ``distance from base (cm)``. Incomplete rows
+    are dropped with a warning. InputError for a missing column or unit, fewer than 3 rows, or
+    several distances."""
     table = read_table(path)
     force_at, force_scale = _column(table, r"force|load", FORCE_NAMES_N, force_unit)
     moved_at, moved_scale = _column(table, r"displacement|travel|position|stroke|deflection",
@@ -329,11 +300,8 @@ def _contact(moved: np.ndarray, force: np.ndarray) -> tuple[float, float]:
 
 
 def _first_contact(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
-    """Displacement and reading at the first contact, and the start of a later one (or the end).
-
-    The best-fitting bend may be that of an obstacle behind the branch; the force has then risen
-    before it.
-    """
+    """Displacement and reading at the first contact, and the start of a later one (or the end): the
+    best bend may be that of an obstacle behind the branch; the force has then risen before it."""
     contact, baseline = _contact(x, y)
     end = float(x[-1])
     for _ in range(3):
@@ -354,10 +322,8 @@ def _first_contact(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope and its standard error: Newey-West's, or that of a first-order autoregression.
-
-    The larger is used: the former is too small for few samples, the latter for long waves.
-    """
+    """Slope and its standard error: the larger of Newey-West's, too small for few samples, and that
+    of a first-order autoregression, too small for long waves."""
     features = np.column_stack([np.ones(len(x)), x - x.mean()])
     inverse = np.linalg.inv(features.T @ features)
     solved = inverse @ features.T @ y

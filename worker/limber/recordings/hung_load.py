@@ -18,35 +18,24 @@ STILL_SHARE = 0.005
 """
 HIDDEN_SHARE = 0.1
 """Ratio of noise to displacement above which start and end of the motion are found from the mean of
-all markers. Chosen, not measured.
-"""
+all markers. Chosen, not measured."""
 SURE = 4.0
 """Standard deviations by which a mean must differ to count as motion."""
 STRAY = 5.5
 """Standard deviations per axis that no marker of a still recording exceeds, except in 1 of 1,000
-recordings with 1,000 positions.
-"""
+recordings with 1,000 positions."""
 MEAN_WIDTH = 5
 """Frames of the running mean."""
 REGISTRATION_SHARE = 0.25
 """Displacement error of a marker, as a fraction of its position error on the body: the displacement
-of a bent body changes along it by about its slope.
-"""
+of a bent body changes along it by about its slope."""
 
 
 @dataclass(frozen=True)
 class Settled:
-    """Positions before the load and after the swinging.
-
-    Attributes:
-        rest: Markers without the load [m], shape [m, 3].
-        times: Middle of each block of the settled part [s], shape [f].
-        positions: Mean of each block [m], shape [f, m, 3]; NaN where a marker was not seen.
-        noise: Standard deviation of one reading per axis [m].
-        moved: Displacement of the marker that moved most [m].
-        duration: Duration of the settled part [s].
-        warnings: Warnings for the user.
-    """
+    """Markers without the load [m], shape [m, 3], and after the swinging: mean of each block at its
+    middle [s], shape [f, m, 3], NaN where not seen. ``noise`` [m] is that of one reading per axis,
+    ``moved`` [m] the farthest marker's displacement, ``duration`` [s] that of the settled part."""
 
     rest: np.ndarray
     times: np.ndarray
@@ -57,25 +46,17 @@ class Settled:
     warnings: tuple[str, ...] = ()
 
     def sigma(self, registration: float) -> float:
-        """Standard deviation [m] for each frame, since common errors do not average out.
-
-        Args:
-            registration: RMS distance of the markers at rest from their nominal positions [m].
-        """
+        """Standard deviation [m] for each frame, as common errors do not average out;
+        ``registration``: RMS distance of the markers at rest from their nominal positions [m]."""
         shared = REGISTRATION_SHARE * registration
         alone = self.noise * np.sqrt(2 / max(len(self.times), 1))
         return float(np.sqrt(len(self.times) * (shared**2 + alone**2 + 1e-10)))
 
 
 def settled(seen: Observations, name: str) -> Settled:
-    """Find the unloaded start and the settled end of a recording.
-
-    The end is the longest final part in which every marker's running mean stays in a band of 1 % of
-    the whole displacement. A slow creep inside the band is reported.
-
-    Raises:
-        InputError: nothing moved, or the branch still swings at the end of the recording.
-    """
+    """Find the unloaded start and the settled end: the longest final part in which every marker's
+    running mean stays in a band of 1 % of the whole displacement. A slow creep in the band is
+    reported. InputError if nothing moved, or the branch still swings at the end."""
     times, positions = seen.times, seen.positions
     whole = seen.visible.mean(axis=0) > 0.5
     if not whole.any() or not np.isfinite(positions[0, whole]).all(axis=1).any():
@@ -120,14 +101,9 @@ def settled(seen: Observations, name: str) -> Settled:
 
 
 def swung(seen: Observations, start: str, name: str) -> tuple[np.ndarray, float]:
-    """Return the markers in the branch's shape at rest [m], shape [m, 3], and their noise [m].
-
-    Args:
-        start: "held": at rest before it is released; "loaded": at rest when the swing is over.
-
-    Raises:
-        InputError: no marker stays in view, or a loaded one still swings at the end.
-    """
+    """Return the markers at rest [m], shape [m, 3], and their noise [m]; ``start``: "held", at rest
+    before the release, or "loaded", at rest when the swing is over. InputError if no marker stays
+    in view, or a loaded one still swings at the end."""
     whole = seen.visible.mean(axis=0) > 0.5
     if not whole.any():
         raise InputError(f"{name}: no marker stays in view.", "A swing is tracked over time.",
@@ -177,10 +153,8 @@ def _still_frames(positions: np.ndarray, end: np.ndarray, noise: float) -> int:
 
 def _settled_frame(positions: np.ndarray, rest: np.ndarray, end: np.ndarray, noise: float,
                    last: int) -> int:
-    """Return the first frame of the settled end, in the mean of all markers.
-
-    The end is the mean of the ``last`` frames.
-    """
+    """Return the first frame of the settled end in the mean of all markers; the end is the mean of
+    the ``last`` frames."""
     course, deviation = _course(positions, rest, end, noise)
     width = max(5, len(course) // 12)
     band = SURE * deviation * np.sqrt(1 / width + 1 / last) + STILL_SHARE

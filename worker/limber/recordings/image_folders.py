@@ -27,12 +27,8 @@ CAMERA_MOVES_M, CAMERA_TURNS_RAD = 3e-3, 0.005
 
 def moved_into(frame_pose: tuple[float, ...], poses: np.ndarray, wrenches: np.ndarray,
                ) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses [n, 6] and wrenches about them [n, 6] in the parent frame of ``frame_pose``.
-
-    Args:
-        frame_pose: Pose of the frame in which they are given: [m] and rotation vector [rad], shape
-        [6].
-    """
+    """Return poses [n, 6] and wrenches about them [n, 6] in the parent frame of ``frame_pose`` [m,
+    rad], shape [6], in which they are given."""
     known = np.isfinite(poses[:, 3:]).all(axis=1)
     turned = np.full((len(poses), 3), np.nan)
     turned[known] = composed(np.array(frame_pose[3:]), poses[known, 3:])
@@ -43,14 +39,8 @@ def moved_into(frame_pose: tuple[float, ...], poses: np.ndarray, wrenches: np.nd
 
 def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = SILENT,
                 ) -> list[str]:
-    """Import PLY files into ``clouds/``, in metres and named by their time stamps.
-
-    Returns:
-        Warnings.
-
-    Raises:
-        InputError: there are fewer than two files, or names without times and no rate.
-    """
+    """Import PLY files into ``clouds/``, in metres and named by their time stamps; return warnings.
+    InputError for fewer than two files, or names without times and no rate."""
     files = sorted(source.glob("*.ply"))
     if len(files) < 2:
         raise InputError(f"{source} has {len(files)} PLY files.",
@@ -90,19 +80,12 @@ def write_frame(path: Path, points: np.ndarray) -> None:
 
 def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SILENT,
               ) -> list[str]:
-    """Import an RGB-D folder into ``depth/``, ``mask/`` and ``camera.toml``.
-
-    ``depth.txt``, ``rgb.txt``, ``mask.txt`` and ``groundtruth.txt`` are read as in TUM's data
-    (``timestamp file``, ``timestamp tx ty tz qx qy qz qw``); without the lists, file names are
+    """Import an RGB-D folder into ``depth/``, ``mask/`` and ``camera.toml``; return warnings.
+    ``depth.txt``, ``rgb.txt``, ``mask.txt`` (``timestamp file``) and ``groundtruth.txt``
+    (``timestamp tx ty tz qx qy qz qw``) are as in TUM's data; without the lists, file names are
     time stamps. Intrinsics come from ``camera.toml``, else ``calibration.txt`` or
-    ``intrinsics.txt`` (fx fy cx cy), else ``camera_intrinsic.json`` (Open3D, RealSense).
-
-    Returns:
-        Warnings.
-
-    Raises:
-        InputError: there are no frames, no intrinsics, or the camera moves.
-    """
+    ``intrinsics.txt`` (fx fy cx cy), else ``camera_intrinsic.json`` (Open3D, RealSense). InputError
+    without frames or intrinsics, or if the camera moves."""
     present, warnings = _depth_images(source, settings)
     camera = _camera(source, present[0][1])
     camera, messages = _placed(camera, source, present[0][0], present[-1][0])
@@ -141,13 +124,8 @@ def _depth_images(source: Path, settings: Any) -> tuple[list[tuple[float, Path]]
 
 
 def tum_list(path: Path) -> list[tuple[float, str]]:
-    """Read TUM's ``timestamp value...`` lists; lines with # are comments.
-
-    An incomplete last line is discarded.
-
-    Raises:
-        InputError: a line does not start with a time stamp.
-    """
+    """Read TUM's ``timestamp value...`` lists; lines with # are comments, an incomplete last line
+    is discarded. InputError if a line does not start with a time stamp."""
     if not path.is_file():
         return []
     lines = [line.split(None, 1) for line in read_text(path, "a list of time stamps").splitlines()
@@ -174,11 +152,7 @@ def _listed(source: Path, what: str, settings: Any) -> list[tuple[float, Path]]:
 
 
 def _inside(source: Path, name: str) -> Path:
-    """The file named by a list, which must be in the recording's folder.
-
-    Raises:
-        InputError: it is elsewhere.
-    """
+    """The file named by a list; InputError if it is not in the recording's folder."""
     try:
         return inside(source, name)
     except InputError as error:
@@ -339,20 +313,10 @@ def _stamp(file: Path, index: int, settings: Any) -> float:
 def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,
                      background: np.ndarray | None = None, difference: float = 0.02,
                      smallest_share: float = 0.05) -> np.ndarray:
-    """Find the branch without a model: large foreground pieces.
-
-    Args:
-        depth: [m], shape [height, width]; 0 or NaN: no reading.
-        near: Smallest depth [m].
-        far: Largest depth [m].
-        background: Depth without the branch [m]; pixels nearer by ``difference`` are foreground.
-        difference: [m].
-        smallest_share: Pieces smaller than this fraction of the largest are discarded as flying
-            pixels. Other large pieces are kept, since a hand or a leaf may split a branch in two.
-
-    Returns:
-        True on the branch, shape [height, width]; all False if nothing is in range.
-    """
+    """Return where the branch is, bool [height, width]: large pieces from ``near`` to ``far`` [m],
+    and nearer than the background by ``difference`` [m]; depth [m] 0 or NaN is no reading. Pieces
+    below a share of the largest are flying pixels; others stay, as a hand or a leaf may split a
+    branch."""
     valid = np.isfinite(depth) & (depth > near) & (depth < far)
     if background is not None:
         if background.shape != depth.shape:
@@ -369,11 +333,9 @@ def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,
 
 
 class YoloSegmenter:
-    """A YOLO segmentation model from a weights file on this computer, through ``ultralytics``.
-
-    ``prompt`` is that of an open-vocabulary model (YOLO-World, YOLOE), such as the paper's "potted
-    plant", or one of the classes of a model that has only its own.
-    """
+    """A YOLO segmentation model from a weights file on this computer, through ``ultralytics``; the
+    prompt is that of an open-vocabulary model (YOLO-World, YOLOE), such as the paper's "potted
+    plant", or one of the classes of another."""
 
     def __init__(self, weights: Path, *, prompt: str | None = None,
                  confidence: float = 0.25):

@@ -41,12 +41,8 @@ _THOUSAND = (300.0, 3000.0)
 
 
 def require_no_slip(pull: Pull) -> Pull:
-    """Return the pull, with a warning if it has no force.
-
-    Raises:
-        InputError: times, positions, rotations or forces cannot be those of a robot; the message
-            names the likely slip.
-    """
+    """Return the pull, with a warning if it has no force. InputError, with the likely slip, if
+    times, positions, rotations or forces cannot be those of a robot."""
     name, times, poses = pull.name, pull.times, pull.poses
     length = float(np.ptp(times))
     seen = None if pull.observations is None else float(np.ptp(pull.observations.times))
@@ -86,14 +82,9 @@ def require_no_slip(pull: Pull) -> Pull:
 
 
 def likely_slip(points: np.ndarray, nodes: np.ndarray, alignment: Alignment, near: float) -> str:
-    """Return which slip explains points off the branch, as a sentence; "" if none does.
-
-    Args:
-        points: [m], shape [n, 3].
-        nodes: Nodes of the branch [m], shape [k, 3].
-        alignment: From the scan's coordinates to the branch's.
-        near: Distance from the branch within which all of them should lie [m].
-    """
+    """Return which slip explains points [m], shape [n, 3], farther than ``near`` [m] from the
+    branch's nodes [k, 3], as a sentence; "" if none does. ``alignment``: from the scan's
+    coordinates."""
     def fits(moved: np.ndarray) -> bool:
         return all(np.linalg.norm(nodes - point, axis=1).min() <= near for point in moved)
 
@@ -113,16 +104,9 @@ def likely_slip(points: np.ndarray, nodes: np.ndarray, alignment: Alignment, nea
 
 @dataclass(frozen=True)
 class BranchFrame:
-    """Properties of the branch that an import needs.
-
-    Attributes:
-        alignment: From the scan's coordinates to the branch's.
-        gravity: [m/s^2] in the branch's frame.
-        nodes: Nodes of its mesh [m], shape [n, 3]; needed for a steady load. None: there is no mesh
-            yet to compare with.
-        path: Nodes of its main path from base to tip [m], shape [m, 3].
-        control_points: Number of the mesh's control points; None as for ``nodes``.
-    """
+    """Properties of the branch that an import needs: alignment from the scan's coordinates, gravity
+    [m/s^2], the main path's nodes from base to tip [m], shape [m, 3]; of the mesh, if there is one,
+    the nodes [m], shape [n, 3], and the number of control points."""
 
     alignment: Alignment = field(default_factory=Alignment)
     gravity: tuple[float, float, float] = GRAVITY
@@ -131,11 +115,8 @@ class BranchFrame:
     control_points: int | None = None
 
     def at(self, distance: float) -> np.ndarray:
-        """Return the point at a distance from the base along the main path [m], shape [3].
-
-        Raises:
-            InputError: there is no skeleton, or its main path is shorter.
-        """
+        """Return the point at a distance from the base along the main path [m], shape [3];
+        InputError without a skeleton, or if the path is shorter."""
         if self.path is None:
             raise InputError("The branch has no skeleton.",
                              "A distance is measured along the main path.",
@@ -151,13 +132,8 @@ class BranchFrame:
 
 @dataclass(frozen=True)
 class RobotKnown:
-    """Known properties of the robot of a recording.
-
-    Attributes:
-        joint_poses: Gripper poses by its joint angles.
-        noise: Noise of its force sensor.
-        errors: Calibration errors of a recording of this many seconds.
-    """
+    """Known properties of a recording's robot: gripper poses by joint angles, noise of the force
+    sensor, calibration errors of a recording of so many seconds."""
 
     joint_poses: JointPoses
     noise: SensorEntry
@@ -199,11 +175,8 @@ class ImportRequest:
         return self.branch.alignment.apply_metres(points)
 
     def tracks(self, times: np.ndarray, positions: np.ndarray) -> Observations:
-        """Return markers [m], shape [f, m, 3], transformed from their stated frame, if any.
-
-        Raises:
-            InputError: nominal positions are given as well.
-        """
+        """Return markers [m], shape [f, m, 3], transformed from their stated frame, if any;
+        InputError if nominal positions are given as well."""
         pose = self.settings.marker_frame
         if pose is None:
             return Observations(times, positions)
@@ -225,13 +198,9 @@ class ImportRequest:
         return float(x), float(y), float(z)
 
     def placed(self, found: "Recorded", rest: np.ndarray | None = None) -> "Placed":
-        """Return the markers on the branch; ``rest``: where they are known to be at rest [m, 3].
-
-        Without it they are at rest in the first frame. One that is not seen there is discarded.
-
-        Raises:
-            InputError: none is seen at rest, or one is far from the branch; as :func:`register`.
-        """
+        """Return the markers on the branch. ``rest``: where they are known to be at rest [m, 3];
+        without it they are at rest in the first frame, and one unseen there is discarded.
+        InputError if none is seen, or one is far from the branch; as :func:`register`."""
         seen, labels = present(found.seen, "markers"), found.labels
         start, nominal = seen.positions[0] if rest is None else rest, self.settings.nominal
         if nominal is not None:
@@ -261,28 +230,21 @@ class ImportRequest:
 
     @cached_property
     def replaced(self) -> dict[str, Any]:
-        """The entries of ``pull.toml`` that the user's file replaces.
-
-        Raises:
-            InputError: the file is missing or not TOML.
-        """
+        """The entries of ``pull.toml`` that the user's file replaces; InputError if it is missing
+        or not TOML."""
         path = self.settings.pull_toml
         return {} if path is None else read_toml(path, "entries of a pull.toml")
 
     def as_stated(self, entry: PullEntry, **own: Any) -> PullEntry:
-        """Return the entry with ``own`` values, and the user's in place of its own.
-
-        Raises:
-            InputError: an entry of the user's file makes no sense; names it.
-        """
+        """Return the entry with ``own`` values, and the user's in place of its own; InputError
+        names an entry of the user's file that makes no sense."""
         return entry_with(entry.model_copy(update=own), self.replaced,
                           str(self.settings.pull_toml))
 
     def entry(self, observation: Any, rest: np.ndarray | None, grasp: tuple[float, float, float],
               **stated: Any) -> PullEntry:
         """Return the description of the pull: markers at rest [m, 3], and the grasp [m], in the
-        branch's frame; ``stated``: what takes the place of settings.
-        """
+        branch's frame; ``stated``: what takes the place of settings."""
         settings = self.settings.model_copy(update=stated)
         return PullEntry(
             observation=observation, drive=settings.drive, motion=settings.motion,
@@ -299,17 +261,10 @@ class ImportRequest:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a source holds: named series in SI units in the branch's frame, before they are a pull.
-
-    Attributes:
-        observation: ``markers``, ``clouds``, ``depth`` (files in the pull's folder) or ``none``.
-        robot: Poses and wrenches; None: they are in the table of the setting ``robot``.
-        seen: Tracked markers, or None.
-        labels: Their names.
-        is_table: Whether it was made by hand, so that columns and units may be mistaken.
-        written: What Limber wrote about the pull beside a bag's messages.
-        warnings: Faults of the files and assumptions that were made.
-    """
+    """What a source holds, in SI units in the branch's frame, before it is a pull. ``observation``:
+    ``markers``, ``clouds``, ``depth`` (files in the pull's folder) or ``none``; ``robot``: poses
+    and wrenches, None if in the table of the setting ``robot``; ``is_table``: made by hand, so that
+    columns and units may be mistaken; ``written``: what Limber wrote beside a bag's messages."""
 
     observation: str
     robot: Stream | None = None
@@ -322,10 +277,8 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Placed:
-    """Markers in the branch's frame over time, and at rest [m, 3]; None: the control points.
-
-    ``rms`` is their distance from the nominal positions [m], if such were given.
-    """
+    """Markers in the branch's frame over time, and at rest [m, 3] (None: the control points);
+    ``rms``: distance from the nominal positions [m], if such were given."""
 
     seen: Observations | None = None
     rest: np.ndarray | None = None
@@ -335,11 +288,8 @@ class Placed:
 
 
 def require_on_branch(grasp: GraspEntry, name: str, branch: BranchFrame) -> None:
-    """Refuse a grasp beside the branch.
-
-    Raises:
-        InputError: no node is within two grasp radii (and 5 mm) of it.
-    """
+    """Refuse a grasp beside the branch: InputError if no node is within two grasp radii and 5
+    mm."""
     nodes = branch.nodes
     if nodes is None:
         return
@@ -357,11 +307,8 @@ def require_on_branch(grasp: GraspEntry, name: str, branch: BranchFrame) -> None
 
 
 def require_near(rest: np.ndarray, name: str, branch: BranchFrame) -> None:
-    """Refuse markers that are not at the branch, such as those in a capture system's own frame.
-
-    Raises:
-        InputError: one is farther from the mesh than a quarter of its extent.
-    """
+    """Refuse markers that are not at the branch, such as those in a capture system's own frame:
+    InputError if one is farther from the mesh than a quarter of its extent."""
     nodes, seen = branch.nodes, rest[np.isfinite(rest).all(axis=1)]
     if nodes is None or not len(seen):
         return

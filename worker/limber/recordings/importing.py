@@ -272,11 +272,8 @@ def _gripper(request: ImportRequest) -> Stream:
 
 
 def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEntry:
-    """The pull's entry with the clocks' offset, if the recording determines it.
-
-    Args:
-        seen: Times of the observations [s].
-    """
+    """The pull's entry with the clocks' offset, if the recording determines it; ``seen``: times of
+    the observations [s]."""
     offset = 0.0
     if np.isin(np.round(seen, 6), np.round(pull.times, 6)).all():
         request.progress.warn(
@@ -306,10 +303,8 @@ def _with_offset(pull: Pull, seen: np.ndarray, request: ImportRequest) -> PullEn
 
 
 def _of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
-    """Return the pull completed by values from its robot's cell.
-
-    A pull that states its calibration is unchanged; without a cell the assumed values are reported.
-    """
+    """Return the pull completed by values from its robot's cell; one that states its calibration is
+    unchanged, and without a cell the assumed values are reported."""
     settings, robot = request.settings, request.robot
     if pull.entry.calibration is not None or "calibration" in request.replaced:
         return pull
@@ -337,11 +332,8 @@ def _of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
 
 
 def _require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
-    """Refuse settings that do not fit a load.
-
-    Raises:
-        InputError: no markers, two loads, a load without a position, or a dynamic pull.
-    """
+    """Refuse settings that do not fit a load: InputError without markers, with two loads, a load
+    without a position, or a dynamic pull."""
     settings = request.settings
     if chosen.holds != "markers":
         raise InputError(
@@ -364,8 +356,7 @@ def _require_loadable(chosen: RecordingFormat, request: ImportRequest) -> None:
 
 
 def _under_load(found: Recorded, request: ImportRequest) -> tuple[Pull, dict[str, Any]]:
-    """The pull of a few frames at rest under a load, or of a swing with all its frames; numbers.
-    """
+    """The pull of a few frames at rest under a load, or of a swing with all its frames; numbers."""
     settings, seen = request.settings, present(found.seen, "markers")
     nodes, load = present(request.branch.nodes, "mesh of the branch"), _load(request)
     own: dict[str, Any] = {"calibration": WITHOUT_GRIPPER}
@@ -413,9 +404,7 @@ def _under_load(found: Recorded, request: ImportRequest) -> tuple[Pull, dict[str
 
 def against_load(moved: np.ndarray, load: np.ndarray) -> str:
     """Return a warning if markers move against the load (displacements [m], load [N]), else "".
-
-    Motion across the load is plausible: an upright branch bends sideways under a weight.
-    """
+    Motion across it is plausible: an upright branch bends sideways under a weight."""
     size = np.linalg.norm(moved, axis=1)
     mean = moved[size >= 0.5 * np.nanmax(size)].mean(axis=0)
     turn = np.degrees(np.arccos(np.clip(
@@ -438,11 +427,8 @@ def _load(request: ImportRequest) -> np.ndarray:
 
 
 def _gauge(table: ForceTable, request: ImportRequest) -> tuple[Pull, dict[str, Any]]:
-    """The pull of a test with force gauge and ruler, and its numbers.
-
-    The branch was pulled in one direction, and its displacement was read in that direction at the
-    point where the gauge held it. A row without force, if there is one, is the ruler's zero.
-    """
+    """The pull of a test with force gauge and ruler, and its numbers: pulled in one direction,
+    displacement read in it where the gauge held. A row without force is the ruler's zero."""
     settings = request.settings
     peak = float(np.abs(table.force).max())
     if peak == 0.0:
@@ -491,10 +477,8 @@ def _slope_alone(read: ForceTable, request: ImportRequest) -> dict[str, Any]:
 
 
 def c3d_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the markers of a C3D file: ``points`` [3, m, n], rate, unit, labels.
-
-    Read by compiled code, which a corrupt file may crash.
-    """
+    """Return the markers of a C3D file: ``points`` [3, m, n], rate, unit, labels; read by compiled
+    code, which a corrupt file may crash."""
     import ezc3d
 
     data = ezc3d.c3d(str(path))
@@ -508,11 +492,8 @@ def c3d_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def markers_of_arrays(path: Path, data: dict[str, np.ndarray], **_request: object,
                       ) -> tuple[Stream, list[str]]:
-    """Return marker tracks [m] and labels of arrays from :func:`c3d_arrays`.
-
-    Raises:
-        InputError: there are no points, no times, or positions that are not finite.
-    """
+    """Return marker tracks [m] and labels of :func:`c3d_arrays`; InputError without points or
+    times, or if positions are not finite."""
     points, labels = data["points"], [str(label) for label in data["labels"]]
     if not points.size:
         raise InputError(f"{path} has no points.", "Marker tracks were expected.",
@@ -532,11 +513,8 @@ def markers_of_arrays(path: Path, data: dict[str, np.ndarray], **_request: objec
 
 
 def read_bag_pull(path: Path, request: ImportRequest) -> Recorded:
-    """Return the series of a bag; images and clouds go into the pull's folder.
-
-    Raises:
-        InputError: see :func:`.bag_reader.read_bag` and :func:`.bag_pull.pull_of_bag`.
-    """
+    """Return the series of a bag; images and clouds go into the pull's folder. InputError as of
+    :func:`.bag_reader.read_bag` and :func:`.bag_pull.pull_of_bag`."""
     bag = read_bag(path)
     found = pull_of_bag(bag, request)
     if not bag.pull_toml:
@@ -574,8 +552,7 @@ def _with_written(entry: PullEntry, written: PullEntry, request: ImportRequest) 
 
 def _torque_noise(torques: np.ndarray) -> float | None:
     """Standard deviation of measured torques [n, 3] from their steps [N m]; at least 2 % of the
-    peak, a typical sensor error. None if none was measured.
-    """
+    peak, a typical sensor error. None if none was measured."""
     peak = float(np.abs(np.nan_to_num(torques)).max(initial=0.0))
     steps = np.abs(np.diff(torques, axis=0)).ravel()
     steps = steps[np.isfinite(steps)]

@@ -76,11 +76,8 @@ class CalibrationEntry(BaseModel):
 
 
 def read_calibration(path: Path) -> CalibrationEntry:
-    """Read the table ``[calibration]`` of a TOML file; what it does not state is as by default.
-
-    Raises:
-        InputError: it cannot be read, or states another quantity.
-    """
+    """Read the table ``[calibration]`` of a TOML file, with defaults for what it does not state;
+    InputError if it cannot be read, or states another quantity."""
     what = "the errors of a cell (none, realistic or a TOML file with [calibration])"
     return checked_as(path, CalibrationEntry, read_toml(path, what).get("calibration", {}), what)
 
@@ -96,8 +93,7 @@ WITHOUT_GRIPPER = CalibrationEntry(
     force_drift_sigma_n=0.0, torque_bias_sigma_nm=0.0, camera_sigma_m=0.0, camera_sigma_rad=1e-3,
     point_sigma_m=0.0, clock_sigma_s=0.0, slip_sigma_m=0.0, held_length_sigma_m=0.0)
 """Calibration for a stated load and markers registered to the branch at rest. The remaining error
-is the rotation of that registration.
-"""
+is the rotation of that registration."""
 
 
 def calibration_of(entry: "PullEntry") -> CalibrationEntry:
@@ -290,32 +286,22 @@ def write_pull(folder: str | Path, pull: Pull) -> None:
 
 
 def read_entry(path: Path) -> PullEntry:
-    """Read ``pull.toml``.
-
-    Raises:
-        InputError: it is missing, not TOML, or an entry makes no sense; the message names the
-        entry.
-    """
+    """Read ``pull.toml``; InputError if it is missing, not TOML, or an entry, which it names, makes
+    no sense."""
     content = read_toml(path, Text("the description of a pull (", Command("import-pull"), " makes "
                                    "one)"))
     return _checked(content, str(path))
 
 
 def entry_of_text(text: str, where: str) -> PullEntry:
-    """Return the entry of a ``pull.toml`` text; ``where`` names its source in messages.
-
-    Raises:
-        InputError: as :func:`read_entry`.
-    """
+    """Return the entry of a ``pull.toml`` text; ``where`` names its source in messages. InputError
+    as of :func:`read_entry`."""
     return _checked(toml_content(text, where, "the description of a pull"), where)
 
 
 def entry_with(entry: PullEntry, content: dict[str, Any], where: str) -> PullEntry:
-    """Return an entry with values of ``content`` in place of its own, table by table.
-
-    Raises:
-        InputError: as :func:`read_entry`; ``where`` names the source of the values.
-    """
+    """Return an entry with values of ``content`` in place of its own, table by table; ``where``
+    names their source. InputError as of :func:`read_entry`."""
     known = _without_none(plain(entry))
     return _checked(known | {
         key: known.get(key, {}) | value if isinstance(value, dict) else value
@@ -380,14 +366,9 @@ LEAST_NODES = 6
 
 
 def grasp_on(mesh: TetMesh, entry: GraspEntry) -> Grasp:
-    """Return the recorded grasp as a patch of a mesh.
-
-    Its centre is the recorded point. A patch of under 6 nodes is widened; the recorded length held
-    by a clamping gripper is kept.
-
-    Raises:
-        InputError: the point is not on the branch, or is in its fixed base.
-    """
+    """Return the recorded grasp as a patch of a mesh about its point; one of under 6 nodes is
+    widened, the length held by a clamping gripper is kept. InputError if the point is not on the
+    branch, or is in its fixed base."""
     point = np.array(entry.point_m)
     distance = np.sort(np.linalg.norm(mesh.nodes - point, axis=1))
     if entry.mode == "rigid":

@@ -20,15 +20,9 @@ COLLINEAR = 0.03
 
 @dataclass(frozen=True)
 class Registration:
-    """From the capture frame to the branch's: ``x = rotation p + shift``.
-
-    Attributes:
-        rotation: Shape [3, 3].
-        shift: [m], shape [3].
-        used: Indices of the recording's markers that have a nominal position, shape [m].
-        residual: Distance of each from it at rest [m], shape [m].
-        warnings: Warnings for the user.
-    """
+    """From the capture frame to the branch's, ``x = rotation p + shift`` [m]; ``used``: indices of
+    the recording's markers with a nominal position, ``residual``: distance of each from it at rest
+    [m], shape [m] both."""
 
     rotation: np.ndarray
     shift: np.ndarray
@@ -48,11 +42,8 @@ class Registration:
 
 
 def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
-    """Read ``label,x_m,y_m,z_m`` (or another unit of length): labels, positions [m], [m, 3].
-
-    Raises:
-        InputError: the file cannot be read in this format.
-    """
+    """Read ``label,x_m,y_m,z_m`` (or another unit of length): labels, positions [m], shape [m, 3];
+    InputError if the file is not in this format."""
     path = Path(path)
     lines = [line for line in read_text(path, "a table of the markers' nominal positions")
              .splitlines() if line.strip() and not line.startswith("#")]
@@ -79,21 +70,10 @@ def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
 
 def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
              nominal: np.ndarray, name: str) -> Registration:
-    """Fit markers at rest rigidly to their nominal positions.
-
-    Markers are paired by name. An outlier is excluded from the fit if three others agree.
-
-    Args:
-        points: At rest in the capture frame [m], shape [n, 3].
-        labels: Labels of the recording's markers.
-        nominal_labels: Names in the table of nominal positions.
-        nominal: Nominal positions [m], shape [k, 3].
-        name: Name of the pull, for messages.
-
-    Raises:
-        InputError: fewer than three markers are shared, one with a nominal position is missing, or
-            they are on a line, mirrored, or mistaken for each other.
-    """
+    """Fit markers at rest in the capture frame [m], shape [n, 3], rigidly to their nominal
+    positions [k, 3], paired by name; an outlier is excluded if three others agree. InputError if
+    fewer than three are shared, one with a nominal position is missing, or they are on a line,
+    mirrored, or mistaken for each other."""
     pairs = [(k, j) for k, label in enumerate(labels) for j, known in enumerate(nominal_labels)
              if same_label(label, known) and np.isfinite(points[k]).all()]
     if len(pairs) < 3:
@@ -120,12 +100,8 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
 
 def _unpaired(labels: list[str], nominal_labels: list[str], pairs: list[tuple[int, int]],
               name: str) -> list[str]:
-    """State which markers have no nominal position.
-
-    Raises:
-        InputError: a marker with a nominal position is not in the recording, or not visible at its
-        start.
-    """
+    """State which markers have no nominal position; InputError if one with a nominal position is
+    not in the recording, or not visible at its start."""
     missing = [label for j, label in enumerate(nominal_labels) if j not in {j for _, j in pairs}]
     if missing:
         raise InputError(

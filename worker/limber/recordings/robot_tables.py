@@ -45,20 +45,12 @@ _UNITS = {"m": (LENGTH_UNITS_M, "m"), "rad": (ANGLE_UNITS_RAD, "rad"),
 
 def robot_stream(path: str | Path, force_unit: str | None = None,
                  rate_hz: float | None = None) -> Stream:
-    """Read a robot's table: the columns x_m .. rz_rad, fx_n .. tz_nm; NaN if not measured.
-
-    Known names are our own, those of UR's RTDE (``actual_TCP_pose_0``, ...) and Franka's libfranka
-    (``O_T_EE_0``, ``O_F_ext_hat_K_0``, ...), and short ones with a unit. A rotation may be a
-    quaternion qx, qy, qz, qw, or angles roll, pitch, yaw or KUKA's A, B, C.
-
-    Args:
-        path: The file.
-        force_unit: Unit of the forces (torques: times metres); None uses the titles' own.
-        rate_hz: Samples per second, if there is no time column.
-
-    Raises:
-        InputError: the position of the gripper is missing.
-    """
+    """Read a robot's table: the columns x_m .. rz_rad, fx_n .. tz_nm; NaN if not measured. Known
+    names are our own, those of UR's RTDE (``actual_TCP_pose_0``) and Franka's libfranka
+    (``O_T_EE_0``, ``O_F_ext_hat_K_0``), and short ones with a unit; a rotation may be a quaternion
+    qx .. qw, or angles roll, pitch, yaw or KUKA's A, B, C. ``force_unit`` overrides the titles',
+    ``rate_hz`` stands for a missing time column. InputError if the gripper's position is
+    missing."""
     table = read_table(path)
     stream = time_stream(table, rate_hz)
     titles = _known([split_title(title) for title in stream.columns])

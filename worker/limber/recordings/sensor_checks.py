@@ -59,10 +59,8 @@ def _require_possible(pull: Pull) -> None:
 
 
 def work_done(pull: Pull) -> np.ndarray:
-    """Return the cumulative work [J] of the gripper on the branch, shape [n].
-
-    Samples without a wrench are given the previous one.
-    """
+    """Return the cumulative work [J] of the gripper on the branch, shape [n]; samples without a
+    wrench are given the previous one."""
     wrench = pull.wrenches.copy()
     for column in range(6):
         measured = np.isfinite(wrench[:, column])
@@ -74,11 +72,8 @@ def work_done(pull: Pull) -> np.ndarray:
 
 
 def force_unit_suspicion(young_pa: float) -> str | None:
-    """Return the likely unit of the force if the implied modulus is implausible.
-
-    Args:
-        young_pa: Young's modulus [Pa] implied by the measured work, with forces in newtons.
-    """
+    """Return the likely unit of the force if the Young's modulus [Pa] that the measured work
+    implies, with forces in newtons, is implausible."""
     low, high = PLAUSIBLE_YOUNG_PA
     if low <= young_pa <= high:
         return None
@@ -91,12 +86,9 @@ def force_unit_suspicion(young_pa: float) -> str | None:
 
 
 def unswapped(observations: Observations) -> tuple[Observations, list[int]]:
-    """Restore the names of markers that exchanged them.
-
-    Each frame is compared with a constant-velocity prediction from the two before. Another
-    assignment is used if it at least halves the distance. Returns the corrected observations and
-    the frames at which names changed.
-    """
+    """Restore the names of markers that exchanged them: another assignment is used if it at least
+    halves the distance from a constant-velocity prediction from the two frames before. Returns the
+    observations and the frames at which names changed."""
     positions = observations.positions.copy()
     swaps: list[int] = []
     if observations.point_count < 2:
@@ -228,14 +220,8 @@ _Y_UP = {"up": [0.0, 1.0, 0.0], "camera_at": [0.0, 0.0, 0.0]}
 
 @dataclass(frozen=True)
 class SensorPreset:
-    """A sensor, the settings of a stage that it decides, and their source.
-
-    Attributes:
-        title: Its name.
-        stage: The stage that reads its data.
-        source: Where the values are from.
-        settings: Values by the names of the stage's settings.
-    """
+    """A sensor, the stage that reads its data, the settings of it that the sensor decides, and
+    where their values are from."""
 
     title: str
     stage: str
@@ -245,8 +231,7 @@ class SensorPreset:
 
 def _data_sheet(force: float, torque: float) -> dict[str, float]:
     """Return the noise of a sensor whose data sheet states a precision [N], [N m]: taken as two
-    standard deviations.
-    """
+    standard deviations."""
     return {"force_sigma": force / 2, "torque_sigma": torque / 2}
 
 

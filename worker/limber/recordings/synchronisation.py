@@ -29,17 +29,9 @@ _SURE = 3.0
 
 @dataclass(frozen=True)
 class Frames:
-    """Actions and observations at the same instants.
-
-    Attributes:
-        times: [s] on the robot's clock, shape [f].
-        poses: [m, rad], shape [f, 6].
-        wrenches: Gripper on branch [N, N m], shape [f, 6]; NaN where not measured.
-        wrench_counts: Readings averaged in each wrench, shape [f].
-        positions: Observed points [m], shape [f, m, 3]; NaN where not seen.
-        covariance: [m^2], shape [f, m, 3, 3].
-        warnings: Data that could not be used.
-    """
+    """Actions and observations at the same instants [s] of the robot's clock, shape [f]: poses [m,
+    rad], shape [f, 6]; wrenches of the gripper on the branch [N, N m], means of ``wrench_counts``
+    readings; points [m], shape [f, m, 3], with covariance [m^2]; NaN where not measured or seen."""
 
     times: np.ndarray
     poses: np.ndarray
@@ -101,19 +93,12 @@ def _reading_covariance(pull: Pull) -> np.ndarray:
 
 
 def estimate_offset(pull: Pull) -> tuple[float, float]:
-    """Find the offset [s] to add to the observations' stamps, and its standard deviation.
-
-    Without inertia the observed motion is a smooth function of the gripper's pose. The offset
-    returned is the one for which a quadratic function of the pose best fits the observed points.
-    A pull at constant speed, started and ended out of view, does not determine it, nor does one in
-    which others fit about as well: the standard deviation is then infinite. It includes the
-    rounding of poses and positions: as long as a rounded value stays the same, its error does not
-    average out.
-
-    Raises:
-        InputError: the best offset is at the end of the search, or several fit, but not the pull's
-            own one.
-    """
+    """Find the offset [s] to add to the observations' stamps, and its standard deviation. Without
+    inertia the motion is a smooth function of the gripper's pose: the offset is the one for which a
+    quadratic function of it fits best. At constant speed, started and ended out of view, or if
+    others fit about as well, the deviation is infinite; it includes the rounding of poses and
+    positions, whose error does not average out while a value stays. InputError if the best is at
+    the end of the search, or several fit, but not the pull's own."""
     seen = pull.observations
     if seen is None or len(seen.times) < 12:
         return pull.entry.time_offset_s, np.inf
@@ -210,14 +195,9 @@ class _Quadratic:
 
 def _rounding(rounded: np.ndarray, quanta: np.ndarray, observed: np.ndarray,
               poses: list[np.ndarray], step: float) -> float:
-    """Standard deviation of the offset from rounded poses and positions [s].
-
-    Args:
-        rounded: Recorded poses at the observed frames [m, rad], shape [f, 6].
-        quanta: Steps to which they were rounded, shape [6].
-        observed: Positions at the observed frames [m], shape [f, c].
-        poses: At the found offset less ``step`` [s], at it, and at it plus ``step``, [f, 6] each.
-    """
+    """Standard deviation of the offset [s] from poses [m, rad], shape [f, 6], rounded to ``quanta``
+    [6], and rounded positions [m], shape [f, c]; ``poses``: at the found offset and ``step`` [s]
+    before and after."""
     before, middle, after = poses
     target = observed - observed.mean(axis=0)
     basis = _Quadratic.of(middle)
@@ -239,10 +219,8 @@ def _rounding(rounded: np.ndarray, quanta: np.ndarray, observed: np.ndarray,
 
 
 def _coherent(effect: np.ndarray, values: np.ndarray) -> float:
-    """Variance of a sum of errors that are the same as long as a value stays the same, [f] each.
-
-    Those of neighbouring values are related as well, so the deviations add up.
-    """
+    """Variance of a sum of errors that are the same as long as a value stays the same, [f] each;
+    those of neighbouring values are related as well, so the deviations add up."""
     runs = np.r_[0, np.cumsum(np.diff(values) != 0)]
     return float(np.sum(np.abs(np.bincount(runs, effect))))**2
 

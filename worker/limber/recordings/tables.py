@@ -44,8 +44,7 @@ _COLUMN = _SAMPLE = 20
 
 def section_of(lines: list[str]) -> list[str]:
     """Return the lines that are not empty; of a Vicon file only its trajectories, of a LabVIEW file
-    those below its headers.
-    """
+    those below its headers."""
     ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")]
     if ends:
         return [line for line in lines[ends[-1] + 1:] if line.strip()]
@@ -63,11 +62,7 @@ def is_clock(part: str) -> bool:
 
 
 def text_of(path: Path) -> str:
-    """Return the text of a file.
-
-    Raises:
-        InputError: it cannot be read, or is not text.
-    """
+    """Return the text of a file; InputError if it cannot be read, or is not text."""
     try:
         text = path.read_text(encoding=coding_of(path), errors="replace")
     except OSError as error:
@@ -80,12 +75,8 @@ def text_of(path: Path) -> str:
 
 
 def number_of(text: str, comma: bool) -> float | None:
-    """Return a number, a date or time of day in seconds, NaN for an empty field, None for a word.
-
-    Args:
-        text: The field.
-        comma: Whether decimals may be commas.
-    """
+    """Return a number, a date or time of day in seconds, NaN for an empty field, None for a word;
+    ``comma``: whether decimals may be commas."""
     number = text_columns.number_of(text, comma)
     if number is None:
         return clock_seconds(text)
@@ -93,11 +84,8 @@ def number_of(text: str, comma: bool) -> float | None:
 
 
 def first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:
-    """Return the index of the first row of numbers, and the number of its fields.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the index of the first row of numbers, and the number of its fields; InputError if
+    there is none."""
     for index, row in enumerate(rows):
         words = words_in(row)
         known = [part for part in row if part.lower() not in MISSING]
@@ -139,14 +127,9 @@ _TYPES = ("marker", "rigid body marker", "bone marker", "rigid body", "bone")
 
 @dataclass(frozen=True)
 class Preamble:
-    """Content of the rows above the numbers of a capture.
-
-    Attributes:
-        titles: Titles of the columns; those of markers are ``NAME:X``, with a unit if rows have it.
-            None if they do not span several rows.
-        rate_hz: Frames per second, if stated.
-        unit: Unit of length, if the preamble states one, as spelled in the file.
-    """
+    """Content of the rows above a capture's numbers: titles, those of markers ``NAME:X`` with a
+    unit if rows have it (None if they do not span several rows), frames per second, and the unit of
+    length as spelled in the file."""
 
     titles: list[str] | None
     rate_hz: float | None
@@ -155,13 +138,8 @@ class Preamble:
 
 def capture_preamble(above: Sequence[Sequence[str]], width: int,
                      comments: Sequence[str] = ()) -> Preamble:
-    """Return what the rows above the numbers state about a capture.
-
-    Args:
-        above: Cells of these rows.
-        width: Number of columns of numbers.
-        comments: Lines of comments, without their marks.
-    """
+    """Return what the cells above ``width`` columns of numbers, and comments without their marks,
+    state about a capture."""
     rows = [[*row[:width], *[""] * (width - len(row))] for row in above]
     at = next((k for k in reversed(range(len(rows))) if len(above[k]) <= width + 1
                and sum(_axis(cell) is not None for cell in rows[k]) >= 3), None)
@@ -278,10 +256,8 @@ _PAIR = re.compile(r"([^\W\d][^:=]*)[:=]([-+.\d].*)")
 
 
 def without_arrows(lines: list[str]) -> list[str]:
-    """Return the lines of such a log as a table with titles; other lines as they are.
-
-    What the board prints before its first reading is left out, but for the titles right above.
-    """
+    """Return the lines of such a log as a table with titles, other lines as they are; what the
+    board prints before its first reading goes, but for the titles right above."""
     found = [_LINE.fullmatch(line) for line in lines]
     if 2 * sum(one is not None for one in found) <= len(lines):
         return lines
@@ -331,19 +307,9 @@ _COUNTERS = r"frames?|samples?|index|framenumber"
 
 @dataclass
 class Table:
-    """A table as read from a file.
-
-    Attributes:
-        path: The file.
-        titles: Titles of the columns, as written (a row of units below them is appended in
-        brackets).
-        values: Shape [n, columns]; NaN in cells without a number. Dates and times of day are
-            seconds.
-        warnings: Faults that were found.
-        clocks: Columns that were dates or times of day.
-        rate_hz: Frames per second, if the file states it.
-        unit: Unit of lengths without one in their titles, if the file states it.
-    """
+    """A table as read: titles as written (with a row of units below them in brackets), values [n,
+    columns] with NaN for no number and dates and times of day (columns ``clocks``) in seconds;
+    frames per second and the unit of untitled lengths, if the file states them."""
 
     path: Path
     titles: list[str]
@@ -412,11 +378,7 @@ def split_title(title: str) -> Title:
 
 
 def scale_of(title: Title, units: dict[str, float], default: str, where: Path) -> float:
-    """Return the factor to SI of a column.
-
-    Raises:
-        InputError: its unit is none of ``units``.
-    """
+    """Return the factor to SI of a column; InputError if its unit is none of ``units``."""
     unit = title.unit or default
     known = dict(units)
     known |= {key.lower(): value for key, value in units.items() if key.lower() not in known}
@@ -436,17 +398,9 @@ def time_column(table: Table) -> int | None:
 
 def time_stream(table: Table, rate_hz: float | None = None, *, keep_repeated: bool = False,
                 ) -> Stream:
-    """Return the table with its time stamps [s] in order; other columns keep their titles.
-
-    Args:
-        table: The table.
-        rate_hz: Rows per second, if it has no stamps.
-        keep_repeated: Keep all rows of the same stamp.
-
-    Raises:
-        InputError: there is no column of times (and no ``rate_hz``), or the rows are too few or too
-        disordered.
-    """
+    """Return the table with its time stamps [s] in order, or from its rows per second; rows of the
+    same stamp may be kept, other columns keep their titles. InputError without times and rate, or
+    if the rows are too few or too disordered."""
     titles = [split_title(title) for title in table.titles]
     at = time_column(table)
     warnings = list(table.warnings)
@@ -478,14 +432,9 @@ def time_stream(table: Table, rate_hz: float | None = None, *, keep_repeated: bo
 
 
 def at_rate(table: Table, rate_hz: float) -> Stream:
-    """Return the table with a stated number of rows per second, whatever its stamps.
-
-    The first row keeps its stamp [s], if that is known. A column that counts the rows shows missing
-    ones.
-
-    Raises:
-        InputError: the rows are too few.
-    """
+    """Return the table with a stated number of rows per second, whatever its stamps. The first row
+    keeps its stamp [s], if known; a column that counts the rows shows missing ones. InputError if
+    the rows are too few."""
     titles = [split_title(title) for title in table.titles]
     stamps = {k for k, title in enumerate(titles) if is_time(title.name)} | set(
         _split_stamps(titles) or ())
@@ -531,19 +480,9 @@ def _split_stamps(titles: list[Title]) -> tuple[int, int] | None:
 
 def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | None = None,
                   ) -> tuple[Stream, list[str]]:
-    """Read marker tracks: three columns per marker, named LABEL and x, y or z in any usual form.
-
-    Args:
-        path: The file.
-        unit: Unit of the positions; None uses the titles' own, or metres if they have none.
-        rate_hz: Frames per second, if there is no time column.
-
-    Returns:
-        Columns ``m0_x_m, m0_y_m, m0_z_m, ...`` [m], and the markers' labels.
-
-    Raises:
-        InputError: no marker has all three coordinates.
-    """
+    """Read marker tracks, three columns per marker named LABEL and x, y or z in any usual form:
+    columns ``m0_x_m, m0_y_m, m0_z_m, ...`` [m], and labels. ``unit`` overrides the titles',
+    ``rate_hz`` stands for a missing time column. InputError if no marker has all three."""
     table = read_table(path)
     stream = time_stream(table, rate_hz)
     columns = _column_indices(stream.columns)
@@ -582,14 +521,8 @@ def _column_indices(titles: Sequence[str]) -> dict[str, dict[str, int]]:
 
 def marker_tracks(times: np.ndarray, positions: np.ndarray, warnings: Sequence[str] = (),
                   ) -> Stream:
-    """Return marker tracks as a stream: ``m0_x_m``, ``m0_y_m``, ``m0_z_m``, ``m1_x_m``, ...
-
-    Args:
-        times: [s], shape [n].
-        positions: [m], shape [n, m, 3]. Motion capture writes (0, 0, 0) or NaN for an invisible
-            marker.
-        warnings: Faults of the file.
-    """
+    """Return marker tracks [m], shape [n, m, 3], as a stream ``m0_x_m``, ``m0_y_m``, ...; motion
+    capture writes (0, 0, 0) or NaN for an invisible marker."""
     seen = positions.copy(order="K")
     seen[np.all(positions == 0.0, axis=2)] = np.nan
     columns = tuple(f"m{k}_{axis}_m" for k in range(positions.shape[1]) for axis in "xyz")

@@ -23,14 +23,8 @@ _SHORTEST_STEP, _LONGEST_STEP = 1e-8, 1e8
 
 @dataclass(frozen=True)
 class Stream:
-    """Samples over time.
-
-    Attributes:
-        times: Increasing time stamps [s], shape [n].
-        values: One row per sample, shape [n, columns]; NaN if not measured.
-        columns: Names of the columns of ``values``.
-        warnings: Faults of the file and their repairs.
-    """
+    """Samples at increasing times [s], shape [n]: values [n, columns], NaN if not measured, names
+    of the columns, and the file's faults and their repairs."""
 
     times: np.ndarray
     values: np.ndarray
@@ -49,15 +43,10 @@ class _Rows:
 
 
 def read_stream(path: str | Path) -> Stream:
-    """Read a CSV file with a header and a column of time stamps [s].
-
-    An unfinished last line is dropped, rows are sorted by time, and of rows with the same stamp the
-    first is kept; each with a warning. Empty fields and ``nan`` mean "not measured".
-
-    Raises:
-        InputError: there is no such file, no time column, fewer than two rows, a field that is not
-            a number, or a tenth or more of the rows are out of order (the clock is then unusable).
-    """
+    """Read a CSV file with a header and a column ``t_s`` [s]. An unfinished last line is dropped,
+    rows are sorted, of rows with one stamp the first is kept, each with a warning; empty and
+    ``nan`` mean "not measured". InputError without file, times or two rows, for a field that is no
+    number, or if a tenth of the rows are out of order (the clock is then unusable)."""
     path = Path(path)
     rows = _read_rows(path)
     if "t_s" not in rows.header:
@@ -97,12 +86,9 @@ def inside_gap(times: np.ndarray, intervals: np.ndarray) -> np.ndarray:
 
 
 def spikes(values: np.ndarray, half_window: int = 3, threshold: float = 8.0) -> np.ndarray:
-    """Find readings far from their neighbours, shape [n] of bool.
-
-    Each window's middle is compared with a robust line through the window (Theil and Sen). A fast
-    pull is then not taken for a spike, and up to three consecutive spikes are found. A spike
-    differs by more than ``threshold`` robust standard deviations.
-    """
+    """Find readings, shape [n] of bool, more than ``threshold`` robust deviations off a robust line
+    (Theil and Sen) through their window: a fast pull is no spike then, and up to three in a row are
+    found."""
     width = 2 * half_window + 1
     if len(values) < width:
         return np.zeros(len(values), bool)
@@ -179,15 +165,9 @@ def _read_rows(path: Path) -> _Rows:
 
 def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[str], *,
              keep_repeated: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Sort rows by time and drop those without a stamp or with a duplicate one.
-
-    Each repair adds a sentence to ``warnings``. With ``keep_repeated`` rows with a duplicate stamp
-    are kept, in the order of the file.
-
-    Raises:
-        InputError: a tenth or more of the stamps run backwards, half or more are not unique, or
-            they are closer together, or farther apart, than those of any recorder.
-    """
+    """Sort rows by time and drop those without a stamp, or with another's unless ``keep_repeated``;
+    each repair adds to ``warnings``. InputError if a tenth of the stamps run backwards, half are
+    not unique, or their steps are no recorder's."""
     finite = np.isfinite(times)
     if not finite.all():
         warnings.append(f"{path.name}: {np.sum(~finite)} rows without a time stamp were "
@@ -293,20 +273,9 @@ def clock_seconds(text: str) -> float | None:
 
 def in_seconds(where: str, stamps: np.ndarray, unit: str | None, is_clock: bool,
                ) -> tuple[np.ndarray, list[str]]:
-    """Return time stamps in seconds, and the assumptions made.
-
-    Wrapped counters of 32 bits are continued, clocks of a day too; stamps of 0 among dates are
-    invalid.
-
-    Args:
-        where: The file and its column, for messages.
-        stamps: Shape [n], NaN if missing.
-        unit: One of :data:`TIME_UNITS_S`, if the column states it.
-        is_clock: Whether they were dates or times of day, which are seconds.
-
-    Raises:
-        InputError: the unit is not stated, and their steps do not determine it.
-    """
+    """Return stamps [n], NaN if missing, in seconds, and the assumptions made; dates and times of
+    day are seconds. Counters of 32 bits and clocks of a day are continued over their wrap; 0 among
+    dates is invalid. InputError if the unit is neither stated nor determined by the steps."""
     if is_clock:
         return _unwrapped(stamps, _DAY), []
     known = stamps[np.isfinite(stamps)]
