@@ -17,13 +17,15 @@ from limber.store.loading import load_skeleton
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from limber.mechanics.loads.loaded_branch import NamedTarget
+
 ORDER_COLOURS = ("#1f6f43", "#8a6d1d", "#6a4c93", "#7fb685", "#5d6a63")
 _CLOUD = "#a9b3ad"
 # Most points that are drawn; more only darken the picture and slow it.
 _SHOWN_POINTS = 30_000
 
 
-def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "Figure":
+def scan_and_skeleton(branch: Branch, targets: "Sequence[NamedTarget]") -> "Figure":
     """Cloud, centreline tree, control points and targets, from the front and from the side."""
     skeleton = load_skeleton(branch)
     points = _cloud_points(branch)
@@ -37,10 +39,10 @@ def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "
             axis.scatter(nodes[:, first], nodes[:, 2], s=60, facecolors="none",
                          edgecolors=MARK_COLOURS["control_points"], linewidths=1.4, zorder=5)
         for target in targets:
-            position = target["position_m"]
+            position = target.position
             axis.plot(position[first], position[2], marker="*", markersize=13,
                       color=MARK_COLOURS["targets"], markeredgecolor="#5c4300", zorder=6)
-            axis.annotate(target["name"], (position[first], position[2]), (7, 5), fontsize=9,
+            axis.annotate(target.name, (position[first], position[2]), (7, 5), fontsize=9,
                           textcoords="offset points", zorder=6)
     return figure
 

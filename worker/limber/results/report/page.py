@@ -34,16 +34,16 @@ _SOURCE_LABELS = {"file": "source", "unit": "unit of length", "sha256": "sha256 
 
 def draw_page(branch: Branch,
               results: Sequence[Callable[[Branch], Section | None]], *,
-              calipers: Sequence[Caliper] = (), progress: Progress = SILENT,
-              ) -> tuple[str, list[Section]]:
+              shape: list[list[str]], mesh: list[list[str]], calipers: Sequence[Caliper] = (),
+              progress: Progress = SILENT) -> tuple[str, list[Section]]:
     """Return the page for the stages that have been run, as HTML, and its sections, by builders of
-    each and caliper diameters to compare with the scan's. InputError for a diameter beyond the
-    branch; MissingDependencyError without the extra ``report``."""
+    each, rows of shape and mesh, and caliper diameters to compare with the scan's. InputError for a
+    diameter beyond the branch; MissingDependencyError without the extra ``report``."""
     require_extra("report", ("matplotlib", "jinja2"), "The report")
-    page = [_found(branch), *_held_back(branch), _summary(branch)]
+    page = [_found(branch), *_held_back(branch), _summary(branch, shape)]
     builders: list[Callable[[Branch], Section | None]] = [
-        scan_section, partial(cylinders_section, calipers=calipers), mesh_section,
-        *results, _provenance]
+        scan_section, partial(cylinders_section, calipers=calipers),
+        partial(mesh_section, rows=mesh), *results, _provenance]
     for number, build in enumerate(builders):
         progress(number / len(builders), "drawing")
         if section := build(branch):
@@ -102,28 +102,14 @@ def _held_back(branch: Branch) -> list[Section]:
         tables=[("", rows), *([("What to do next, best first", actions)] if actions else [])])]
 
 
-def _summary(branch: Branch) -> Section:
+def _summary(branch: Branch, shape: list[list[str]]) -> Section:
     section = Section("Summary")
-    result = branch.made.result if branch.made else {}
     rows = [["item", "value"]]
     source = branch.manifest.source
     rows += [[_SOURCE_LABELS.get(key, key.replace("_", " ")), str(value)]
              for key, value in source.items() if isinstance(value, str | int | float)]
-    for key, label, form in [
-            ("point_count", "points used", "{:,.0f}"), ("branch_count", "branches", "{:.0f}"),
-            ("length_m", "centreline, all branches [m]", "{:.3f}"),
-            ("radius_min_m", "smallest radius [m]", "{:.5f}"),
-            ("radius_max_m", "largest radius [m]", "{:.5f}"),
-            ("tet_count", "tetrahedra", "{:,.0f}")]:
-        if result.get(key) is not None:
-            rows.append([label, form.format(result[key])])
-    for name, unit, scale in (("length", "m", 1.0), ("volume", "m3", 1e6)):
-        interval = result.get(f"{name}_interval_{unit}")
-        if interval:
-            values = [f"{scale * v:.4g}" for v in (result[f"expected_{name}_{unit}"], *interval)]
-            rows.append([f"{name} of wood, uncertain twigs weighted by their probability (95 % "
-                         f"interval) [{'cm3' if scale > 1 else unit}]",
-                         f"{values[0]} ({values[1]} to {values[2]})"])
+    rows += [[f"{label} (95 % interval)", f"{value} ({between[0]})"] if any(between)
+             else [label, value] for label, value, *between in shape[1:]]
     section.tables.append(("", rows))
     return section
 

@@ -1,7 +1,6 @@
 """The report's sections on a branch's shape: scan and skeleton, cylinders, mesh."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -23,16 +22,6 @@ from limber.store import Branch
 from limber.store.loading import load_skeleton, load_targets
 
 _DOUBTS_SHOWN = 12
-_QUALITY_LABELS = {
-    "volume_ratio": "volume of the mesh over volume of the surface",
-    "min_dihedral_deg": "smallest angle between faces [degrees]",
-    "min_radius_ratio": "worst shape of a tetrahedron (1 regular, 0 flat)",
-    "mean_radius_ratio": "mean shape of the tetrahedra",
-    "elements_across": "elements across the branch",
-    "surface_distance_mean": "mean distance between mesh and surface [local radii]",
-    "surface_distance_max_m": "largest distance between mesh and surface [m]",
-    "fork_distance_mean": "mean distance at forks [local radii]",
-    "fork_distance_max": "largest distance at forks [local radii]"}
 
 
 def scan_section(branch: Branch) -> Section:
@@ -40,7 +29,7 @@ def scan_section(branch: Branch) -> Section:
     if not (branch.has("cloud.ply") and branch.has("skeleton.swc")):
         section.missing = "limber reconstruct CLOUD -o NAME.branch"
         return section
-    targets = _targets(branch)
+    targets = load_targets(branch)
     section.draw(figures.scan_and_skeleton(branch, targets),
                  "The aligned cloud (grey) with the centreline tree (one colour per branching "
                  "order), the control points (rings) and the named targets (stars), from the "
@@ -48,8 +37,8 @@ def scan_section(branch: Branch) -> Section:
     if targets:
         section.tables.append(("Named targets", [
             ["target", "x [m]", "y [m]", "z [m]", "mass [kg]"],
-            *([target["name"], *(f"{value:.3f}" for value in target["position_m"]),
-               f"{target['mass_kg']:.4g}"] for target in targets)]))
+            *([target.name, *(f"{value:.3f}" for value in target.position),
+               f"{target.mass:.4g}"] for target in targets)]))
     section.draw(figures.radii(branch), "Radius along the centreline, with its uncertainty where "
                                         "known; one colour per branching order.")
     result = branch.made.result if branch.made else {}
@@ -70,19 +59,10 @@ def scan_section(branch: Branch) -> Section:
 
 
 def _doubt_table(doubtful: list[DoubtfulPart]) -> tuple[str, list[list[str]]]:
-    rows = doubtful_rows(
-        [
-            {
-                "kind": uncertain_part.kind,
-                "branch": uncertain_part.branch,
-                "at": np.round(uncertain_part.at, 4),
-                "length_m": uncertain_part.length,
-                "radius_m": uncertain_part.radius,
-                "value": uncertain_part.value,
-            }
-            for uncertain_part in doubtful[:_DOUBTS_SHOWN]
-        ]
-    )
+    rows = doubtful_rows([{
+        "kind": part.kind, "branch": part.branch, "at": np.round(part.at, 4),
+        "length_m": part.length, "radius_m": part.radius, "value": part.value}
+        for part in doubtful[:_DOUBTS_SHOWN]])
     rest = len(doubtful) - _DOUBTS_SHOWN
     more = f"; `limber skeleton` lists {rest} more" if rest > 0 else ""
     return f"Uncertain parts of the skeleton, positions in the branch's frame [m]{more}", rows
@@ -110,27 +90,13 @@ def cylinders_section(branch: Branch, calipers: Sequence[Caliper]) -> Section:
     return section
 
 
-def _targets(branch: Branch) -> list[dict[str, Any]]:
-    return [{"name": target.name, "position_m": target.position, "mass_kg": target.mass}
-            for target in load_targets(branch)]
-
-
-def mesh_section(branch: Branch) -> Section:
+def mesh_section(branch: Branch, rows: list[list[str]]) -> Section:
     section = Section("Mesh")
     if not branch.has("mesh.vtu"):
         section.missing = "limber reconstruct or limber mesh"
         return section
     section.draw(figures.mesh_by_modulus(branch), "The tetrahedral mesh, coloured by Young's "
                                                   "modulus; base in brown, grasp patch in orange.")
-    result = branch.made.result if branch.made else {}
-    quality = result.get("mesh_quality") or {}
-    rows = [["quantity", "value"]]
-    for key in ("surface_volume_m3", "mesh_volume_m3"):
-        if result.get(key) is not None:
-            rows.append([key.replace("_m3", " [cm3]").replace("_", " "),
-                         f"{1e6 * result[key]:.4g}"])
-    rows += [[label, f"{quality[key]:.4g}"] for key, label in _QUALITY_LABELS.items()
-             if quality.get(key) is not None]
     if len(rows) > 1:
         section.tables.append(("", rows))
     return section

@@ -13,10 +13,21 @@ from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import PredictSettings
 from limber.stages.inputs import BranchInputs, NoOptions, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import Interval, Numbers, Result, Vector, kept, shown
 from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.recordings.recording import PullEntry
+
+
+class Prediction(Result):
+    """Where the points come to rest under another load."""
+
+    drop: float = shown("the points sink by", ".3g mm")
+    drop_interval: Interval = kept("its 95 % interval [m]")
+    drops: Numbers = kept("of each point, downwards [m]")
+    load: Vector = kept("the load [N]")
+    young: Numbers = kept("Young's modulus at the control points [Pa], shape [K]")
 
 
 def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progress = SILENT,
@@ -57,7 +68,7 @@ def _entry(branch: Branch, name: str | None) -> PullEntry:
 
 STAGE = StageDescription(
     "predict", 77, by_name(predict), BranchInputs, PredictSettings, NoOptions,
-    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "pulls/"),
+    result=Prediction, reads=("mesh.vtu", "skeleton.swc", "estimate.json", "pulls/"),
     found=("Under the load the points sink by {drop_m:m} ({drop_interval_m[0]:m} to "
            "{drop_interval_m[1]:m}, 95 % interval).",),
     step="estimate", label="Predict Another Load")

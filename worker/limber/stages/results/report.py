@@ -13,6 +13,7 @@ from limber.core.settings import Groups
 from limber.stages.inputs import BranchInputs, NoSettings, RunOptions, by_name
 from limber.stages.registry import StageDescription, result_kinds, result_of
 from limber.stages.result import Written
+from limber.stages.shape.mesh import MeshNumbers, Shape
 from limber.store import Branch
 from limber.version import VERSION
 
@@ -92,7 +93,9 @@ def page_of(branch: Branch, *, calipers: "Sequence[Caliper]" = (), progress: Pro
     """Return the page of a branch as HTML, and its sections."""
     from limber.results.report.page import draw_page
 
-    return draw_page(branch, _sections(branch), calipers=calipers, progress=progress)
+    values = branch.made.result if branch.made else {}
+    return draw_page(branch, _sections(branch), shape=Shape.of(values).rows(),
+                     mesh=MeshNumbers.of(values).rows(), calipers=calipers, progress=progress)
 
 
 def _section_of(branch: Branch, key: str) -> "Section | None":

@@ -15,7 +15,60 @@ from limber.geometry.io.surfaces import SURFACES, usable_surface
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.stages.inputs import RunOptions, argument, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import Interval, Result, kept, shown
 from limber.store import Branch
+
+
+class Shape(Result):
+    """Axes, radii and size of a branch."""
+
+    keys: ClassVar = {"length_interval_m": "expected_length_interval",
+                      "volume_interval_m3": "expected_volume_interval"}
+    point_count: int | None = shown("points used", ",")
+    branch_count: int | None = shown("branches")
+    length: float | None = shown("centreline, all branches", ".3f m")
+    radius_min: float | None = shown("smallest radius", ".5f m")
+    radius_max: float | None = shown("largest radius", ".5f m")
+    tet_count: int | None = shown("tetrahedra", ",")
+    expected_length: float | None = shown(
+        "length of wood, uncertain twigs weighted by their probability", ".4g m")
+    expected_length_interval: Interval | None = kept("its 95 % interval [m]")
+    expected_volume: float | None = shown(
+        "volume of wood, uncertain twigs weighted by their probability", ".4g cm3")
+    expected_volume_interval: Interval | None = kept("its 95 % interval [m3]")
+
+
+class MeshQuality(Result):
+    """Quality of a mesh, and its distance from the surface."""
+
+    keys: ClassVar = {"min_dihedral_deg": "min_dihedral"}
+    volume_ratio: float | None = shown("volume of the mesh over volume of the surface", ".4g")
+    min_dihedral: float | None = shown("smallest angle between faces", ".4g degrees")
+    min_radius_ratio: float | None = shown("worst shape of a tetrahedron (1 regular, 0 flat)",
+                                           ".4g")
+    mean_radius_ratio: float | None = shown("mean shape of the tetrahedra", ".4g")
+    elements_across: float | None = shown("elements across the branch", ".4g")
+    surface_distance_mean: float | None = shown(
+        "mean distance between mesh and surface", ".4g local radii",
+        meaning="mean distance between mesh and surface, in local radii")
+    surface_distance_max: float | None = shown("largest distance between mesh and surface",
+                                               ".4g m")
+    fork_distance_mean: float | None = shown("mean distance at forks", ".4g local radii",
+                                             meaning="the same at forks")
+    fork_distance_max: float | None = shown("largest distance at forks", ".4g local radii",
+                                            meaning="largest distance at forks, in local radii")
+
+
+class MeshNumbers(Result):
+    """Volumes and quality of a branch's mesh."""
+
+    surface_volume: float | None = shown("surface volume", ".4g cm3")
+    mesh_volume: float | None = shown("mesh volume", ".4g cm3")
+    mesh_quality: MeshQuality | None = kept("quality of the mesh")
+
+
+class Meshed(MeshNumbers, Shape):
+    """A branch that has been meshed."""
 
 
 class MeshInputs(Settings):
@@ -108,7 +161,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
 
 STAGE = StageDescription(
     "mesh", 30, by_name(mesh_surface, path="surface", folder="output"), MeshInputs,
-    MeshSurfaceSettings, RunOptions, key="mesh",
+    MeshSurfaceSettings, RunOptions, key="mesh", result=Meshed,
     writes=("skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu", "point_masses.json"),
     found=("{length_m:m} of centreline in {branch_count:#branch/branches}, radius "
            "{radius_min_m:m} to {radius_max_m:m}.",

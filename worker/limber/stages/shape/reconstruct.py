@@ -33,6 +33,7 @@ from limber.geometry.io.skeletons import SKELETONS, read_skeleton, read_swc, wri
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.inputs import RunOptions, argument
 from limber.stages.registry import StageDescription
+from limber.stages.shape.mesh import Meshed
 from limber.store import Branch, Stage
 from limber.store.manifest import MANIFEST
 
@@ -432,6 +433,7 @@ def run(inputs: ReconstructInputs, settings: ReconstructSettings, options: RunOp
 
 STAGE = StageDescription(
     "reconstruct", 20, run, ReconstructInputs, ReconstructSettings, RunOptions, key="reconstruct",
+    result=Meshed,
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
             "point_masses.json", f"{FOUND_SKELETON}.swc", f"{FOUND_SKELETON}.csv", SEARCH, EDITS,
             "truth/"),

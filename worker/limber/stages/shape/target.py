@@ -13,6 +13,7 @@ from limber.core.errors import InputError, Option, Text
 from limber.core.settings import POSITION, Groups, Settings
 from limber.stages.inputs import PlacedInputs, RunOptions, argument, by_name
 from limber.stages.registry import StageDescription
+from limber.stages.result import Result, Vector, kept, shown
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -43,6 +44,16 @@ class TargetSettings(Settings):
         0.0, ge=0, le=100, description="Additional mass [kg] that hung there when the branch was "
         "scanned.")
     remove: bool = Field(False, description="Remove this target.")
+
+
+class Target(Result):
+    """A named place on the branch; all but the name is None once it has been removed."""
+
+    target: str = shown("name")
+    position: Vector | None = kept("position at rest, in the branch's frame [m]")
+    branch_point: Vector | None = kept("nearest point of the branch, which it follows [m]")
+    distance: float | None = shown("distance from the branch", ".3g mm")
+    mass: float | None = shown("mass that hung there when the branch was scanned", ".3g kg")
 
 
 def set_target(branch_folder: Path, name: str, settings: TargetSettings, *, force: bool = False,
@@ -141,7 +152,7 @@ def _text(targets: list[NamedTarget]) -> str:
 
 STAGE = StageDescription(
     "target", 35, by_name(set_target), TargetInputs, TargetSettings, RunOptions,
-    key="target:{name}", reads=("mesh.vtu",), writes=("targets.json",),
+    key="target:{name}", result=Target, reads=("mesh.vtu",), writes=("targets.json",),
     found=("{target} is at {position_m} m, {distance_m:m} from the branch, and weighs "
            "{mass_kg:kg}.",),
     then="limber energy {branch_folder}", step="plan", label="Name a Target")
