@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError, Option, Text
+from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.optional import require_extra
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.geometry.io.clouds import read_points
@@ -28,10 +29,6 @@ MOST_MARKERS = 60
 
 _LONGEST_GAP = 0.1  # [s] between wrenches, or three of their steps, beyond which nothing is known
 _GRIPPERS = ("grasp", "gripper", "tcp", "tool", "tool0", "flange", "ee_link", "hand")
-
-_Placement = tuple[np.ndarray, Rotation]
-"""Position [m], shape [3], and rotation of a frame in the branch's."""
-
 
 def pull_of_bag(bag: Bag, request: ImportRequest) -> Recorded:
     """Return the series of a bag; images and clouds become files in the pull's folder. InputError
@@ -64,8 +61,7 @@ class _BagReading:
         self.require_one_clock("wrench", self.times(wrench), times)
         wrenches = self.on_branch(wrench, times, poses)
         self.placed = self.placement()
-        poses, wrenches = moved_into((*self.placed[0], *self.placed[1].as_rotvec()), poses,
-                                     wrenches)
+        poses, wrenches = moved_into(pose_vectors(self.placed), poses, wrenches)
         self.begin = float(times[0])
         robot = Stream(times - self.begin, np.hstack([poses, wrenches]),
                        POSE_COLUMNS + WRENCH_COLUMNS)
@@ -107,7 +103,7 @@ class _BagReading:
         if len(motion.times) < 2:
             raise InputError(f"{self.bag.path}: {topic.name} has {len(motion.times)} poses.",
                              "A pull needs at least two.", "Record it again.")
-        return motion.times, _six(motion.positions, motion.turns), topic.frame.lstrip("/")
+        return motion.times, motion.poses, topic.frame.lstrip("/")
 
     def by_frames(self, name: str | None) -> tuple[np.ndarray, np.ndarray, str] | None:
         """The gripper from the tree of frames, if it moves there."""
@@ -126,7 +122,7 @@ class _BagReading:
             return None
         self.warnings.append(
             f"{self.bag.path.name}: the gripper's pose is that of frame {frame} in {root}.")
-        return times, _six(*found), root
+        return times, pose_vectors(found), root
 
     def by_joints(self, name: str | None) -> tuple[np.ndarray, np.ndarray, str] | None:
         """The gripper from the arm's joint angles; InputError if there are only angles, and no arm
@@ -180,55 +176,49 @@ class _BagReading:
             self.warnings.append(f"{topic.name} is in frame {own or '(none)'}, whose pose in "
                                  f"{base or '(none)'} is not known. It is assumed to have the "
                                  "gripper's axes and centre.")
-            turns, lever = Rotation.from_rotvec(poses[:, 3:]), np.zeros((len(times), 3))
-        else:
-            turns, lever = found[1], found[0] - poses[:, :3]
-        force, torque = (turns.apply(np.nan_to_num(part)) for part in np.hsplit(wrench, 2))
+            found = matrices(poses)
+        lever = found[:, :3, 3] - poses[:, :3]
+        force, torque = (np.einsum("nij,nj->ni", found[:, :3, :3], np.nan_to_num(part))
+                         for part in np.hsplit(wrench, 2))
         turned = np.hstack([force, torque + np.cross(lever, force)])
         turned[lonely] = np.nan
         return turned
 
-    def placement(self) -> _Placement:
-        """The poses' frame in the branch's."""
+    def placement(self) -> np.ndarray:
+        """The poses' frame in the branch's, shape [4, 4]."""
         base, stated = self.base, self.settings.frame_pose
         where = f"Poses are in frame {base or '(none)'}"
         if stated is not None:
-            position, turn = np.array(stated[:3]), Rotation.from_rotvec(stated[3:])
+            placed = matrices(np.array(stated))
             if self.settings.cell is None or base == "base":
-                return position, turn
+                return placed
             found = self.static(base, "base")
             if found is None:
                 self.warnings.append(f"{where}. It is assumed to be the robot's base as the "
                                      "pendant shows it. ROS' base_link is rotated by 180 degrees "
                                      "relative to that base.")
-                return position, turn
-            return position + turn.apply(found[0]), turn * found[1]
-        if base == BRANCH_FRAME:
-            return np.zeros(3), Rotation.identity()
+            return placed if found is None else placed @ found
         found = self.static(base, BRANCH_FRAME)
         if found is None:
             self.warnings.append(Text(f"{where}, which is assumed to be the branch's frame. If it "
                                       "is not, give ", Option("frame_pose"), "."))
-            return np.zeros(3), Rotation.identity()
-        return found
+        return np.eye(4) if found is None else found
 
-    def static(self, frame: str, within: str) -> _Placement | None:
-        """A static frame in another, if the bag connects them."""
+    def static(self, frame: str, within: str) -> np.ndarray | None:
+        """A static frame in another, shape [4, 4], if the bag connects them."""
         found = self.frames.between(frame, within, np.zeros(1))
-        return None if found is None else (found[0][0], found[1][0])
+        return None if found is None else found[0]
 
-    def frame_of(self, topic: Topic) -> _Placement:
-        """A static topic's frame in the branch's."""
+    def frame_of(self, topic: Topic) -> np.ndarray:
+        """A static topic's frame in the branch's, shape [4, 4]."""
         own = topic.frame.lstrip("/")
         if own == BRANCH_FRAME:
-            return np.zeros(3), Rotation.identity()
-        found = None if own == self.base else self.static(own, self.base)
+            return np.eye(4)
+        found = self.static(own, self.base)
         if found is None:
-            if own != self.base:
-                self.warnings.append(f"{topic.name} is in frame {own or '(none)'}, whose position "
-                                     "is not known. It is assumed to be the frame of the poses.")
-            return self.placed
-        return self.placed[0] + self.placed[1].apply(found[0]), self.placed[1] * found[1]
+            self.warnings.append(f"{topic.name} is in frame {own or '(none)'}, whose position is "
+                                 "not known. It is assumed to be the frame of the poses.")
+        return self.placed if found is None else self.placed @ found
 
     def observed(self) -> tuple[str, Observations | None]:
         """Observations of the branch: markers as values; images and clouds become files."""
@@ -254,10 +244,9 @@ class _BagReading:
         if not points:
             return "none", None
         topic, times = points[0], self.times(points[0]) - self.begin
-        position, turn = self.frame_of(topic)
+        placed = self.frame_of(topic)
         if topic.counts is None and topic.values.shape[1] <= MOST_MARKERS:
-            moved = (position + turn.apply(topic.values.reshape(-1, 3))).reshape(
-                topic.values.shape)
+            moved = topic.values @ placed[:3, :3].T + placed[:3, 3]
             order = np.unique(times, return_index=True)[1]
             return "markers", self.request.tracks(times[order], moved[order])
         ends = np.cumsum([len(points) for points in topic.values] if topic.counts is None
@@ -266,7 +255,8 @@ class _BagReading:
         with tempfile.TemporaryDirectory(prefix="limber-bag-") as scratch:
             for time, part in zip(times, parts, strict=True):
                 write_frame(Path(scratch, f"{time:.6f}.ply"),
-                            position + turn.apply(part[np.isfinite(part).all(axis=1)]))
+                            part[np.isfinite(part).all(axis=1)] @ placed[:3, :3].T
+                            + placed[:3, 3])
             copy_clouds(Path(scratch), self.request.folder,
                         self.settings.model_copy(update={"unit": "m"}), self.request.progress)
         return "clouds", None
@@ -286,9 +276,9 @@ class _BagReading:
                              "focal length and principal point.",
                              "Record the camera_info topic too.")
         _, _, fx, fy, cx, cy = (beside or infos)[0].values[0]
-        position, turn = self.frame_of(topic)
+        pose = pose_vectors(self.frame_of(topic)).tolist()
         camera = Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, depth_scale=1000.0,
-                        pose=(*map(float, position), *map(float, turn.as_rotvec())))
+                        pose=tuple(pose))
         with tempfile.TemporaryDirectory(prefix="limber-bag-") as scratch:
             Path(scratch, "depth").mkdir()
             write_camera(Path(scratch, "camera.toml"), camera)
@@ -309,10 +299,6 @@ def _root(bag: Bag, frame: str) -> str:
         frame = above[frame]
         seen.add(frame)
     return frame
-
-
-def _six(positions: np.ndarray, turns: Rotation) -> np.ndarray:
-    return np.hstack([positions, turns.as_rotvec()])
 
 
 # A pull as an MCAP file of ROS 2 messages, which Foxglove, PlotJuggler and ROS open.
@@ -451,12 +437,15 @@ def _of_frames(messages: _Messages, folder: Path, pull: Pull) -> Iterator[_Messa
     camera = read_camera(folder / "camera.toml") if (folder / "camera.toml").is_file() else None
     for time, file in _frames(folder):
         if file.suffix == ".ply":
-            yield time + offset, "/cloud", (
-                lambda seconds, file=file: messages.cloud(read_points(file).points, seconds))
+            yield time + offset, "/cloud", partial(_cloud, messages, file)
         elif camera is not None:
             yield time + offset, "/camera/depth", partial(_image, messages, camera, file)
             yield time + offset, "/camera/camera_info", partial(_camera_info, messages, camera)
             yield time + offset, "/tf", partial(messages.transform, _CAMERA, np.array(camera.pose))
+
+
+def _cloud(messages: _Messages, file: Path, seconds: float) -> Any:
+    return messages.cloud(read_points(file).points, seconds)
 
 
 def _image(messages: _Messages, camera: Camera, file: Path, seconds: float) -> Any:

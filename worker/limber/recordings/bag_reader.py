@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError, Option
+from limber.core.numerics.rigid import inverted, matrices, poses_at
 from limber.core.optional import require_extra
 from limber.geometry.io.isolated_readers import read_apart
 
@@ -294,12 +295,10 @@ _MOST_LINKS = 32
 
 @dataclass(frozen=True)
 class Motion:
-    """A frame in another over time [s], increasing, or a static one: positions [m], shape [n, 3],
-    and rotations [n]."""
+    """A frame in another over time [s], increasing, or a static one: poses [m, rad], [n, 6]."""
 
     times: np.ndarray
-    positions: np.ndarray
-    turns: Rotation
+    poses: np.ndarray
 
     @classmethod
     def of(cls, times: np.ndarray, values: np.ndarray) -> "Motion":
@@ -308,17 +307,15 @@ class Motion:
                 & (np.linalg.norm(np.nan_to_num(values[:, 3:]), axis=1) > 1e-6))
         times, first = np.unique(times[good], return_index=True)
         values = values[good][first]
-        return cls(times, values[:, :3], Rotation.from_quat(values[:, 3:]))
+        return cls(times, np.hstack([values[:, :3],
+                                     Rotation.from_quat(values[:, 3:]).as_rotvec()]))
 
-    def at(self, times: np.ndarray) -> tuple[np.ndarray, Rotation]:
-        """Return position [n, 3] and rotation at ``times``; outside their range the nearest known.
-        """
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """Return its frames [n, 4, 4] at ``times``; outside their range the nearest known."""
         if len(self.times) == 1:
-            return np.repeat(self.positions, len(times), axis=0), self.turns[[0] * len(times)]
-        inside = np.clip(times, self.times[0], self.times[-1])
-        position = np.column_stack([np.interp(inside, self.times, column)
-                                    for column in self.positions.T])
-        return position, Slerp(self.times, self.turns)(inside)
+            return matrices(self.poses[[0] * len(times)])
+        return matrices(poses_at(self.times, self.poses,
+                                 np.clip(times, self.times[0], self.times[-1])))
 
 
 class Frames:
@@ -339,20 +336,15 @@ class Frames:
         """Every frame."""
         return sorted(self._links)
 
-    def between(self, frame: str, within: str, times: np.ndarray,
-                ) -> tuple[np.ndarray, Rotation] | None:
-        """Return position [n, 3] and rotation of ``frame`` in ``within``; None if unknown."""
+    def between(self, frame: str, within: str, times: np.ndarray) -> np.ndarray | None:
+        """Return ``frame`` in ``within`` at ``times``, shape [n, 4, 4]; None if unknown."""
         chain = self._transform_chain(within.lstrip("/"), frame.lstrip("/"))
         if chain is None:
             return None
-        position, turn = np.zeros((len(times), 3)), Rotation.identity(len(times))
+        found = np.tile(np.eye(4), (len(times), 1, 1))
         for motion, is_inverse in chain:
-            step, turned = motion.at(times)
-            if is_inverse:
-                turned = turned.inv()
-                step = -turned.apply(step)
-            position, turn = position + turn.apply(step), turn * turned
-        return position, turn
+            found = found @ (inverted(motion.at(times)) if is_inverse else motion.at(times))
+        return found
 
     def _transform_chain(self, start: str, end: str) -> list[tuple[Motion, bool]] | None:
         if start == end:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from limber.core.constants import UNIT_METRES
@@ -25,15 +26,16 @@ CAMERA_MOVES_M, CAMERA_TURNS_RAD = 3e-3, 0.005
 """Largest motion or rotation of a camera during a pull at which it still counts as fixed."""
 
 
-def moved_into(frame_pose: tuple[float, ...], poses: np.ndarray, wrenches: np.ndarray,
+def moved_into(frame_pose: ArrayLike, poses: np.ndarray, wrenches: np.ndarray,
                ) -> tuple[np.ndarray, np.ndarray]:
     """Return poses [n, 6] and wrenches about them [n, 6] in the parent frame of ``frame_pose`` [m,
     rad], shape [6], in which they are given."""
+    origin, turn = np.split(np.asarray(frame_pose, float), 2)
     known = np.isfinite(poses[:, 3:]).all(axis=1)
     turned = np.full((len(poses), 3), np.nan)
-    turned[known] = composed(np.array(frame_pose[3:]), poses[known, 3:])
-    matrix = rotation_matrix(np.array(frame_pose[3:])).T
-    return (np.hstack([np.array(frame_pose[:3]) + poses[:, :3] @ matrix, turned]),
+    turned[known] = composed(turn, poses[known, 3:])
+    matrix = rotation_matrix(turn).T
+    return (np.hstack([origin + poses[:, :3] @ matrix, turned]),
             np.hstack([wrenches[:, :3] @ matrix, wrenches[:, 3:] @ matrix]))
 
 

@@ -5,7 +5,7 @@ No repair is silent: each adds a sentence to ``warnings``.
 
 import datetime
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -35,33 +35,24 @@ class Stream:
         return len(self.times)
 
 
-@dataclass
-class _Rows:
-    header: list[str]
-    numbers: list[list[float]] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-
-
 def read_stream(path: str | Path) -> Stream:
     """Read a CSV file with a header and a column ``t_s`` [s]. An unfinished last line is dropped,
     rows are sorted, of rows with one stamp the first is kept, each with a warning; empty and
     ``nan`` mean "not measured". InputError without file, times or two rows, for a field that is no
     number, or if a tenth of the rows are out of order (the clock is then unusable)."""
     path = Path(path)
-    rows = _read_rows(path)
-    if "t_s" not in rows.header:
-        raise InputError(f"{path} has the columns {', '.join(rows.header)}.",
+    warnings: list[str] = []
+    header, table = _read_rows(path, warnings)
+    if "t_s" not in header:
+        raise InputError(f"{path} has the columns {', '.join(header)}.",
                          "A column t_s with time stamps in seconds was expected.",
                          "Rename the column, or import the file with ", Command("import-pull"), ".")
-    table = np.array(rows.numbers, float).reshape(-1, len(rows.header))
-    at = rows.header.index("t_s")
-    times, values = table[:, at], np.delete(table, at, axis=1)
-    columns = tuple(name for name in rows.header if name != "t_s")
-    times, values = in_order(path, times, values, rows.warnings)
+    at = header.index("t_s")
+    times, values = in_order(path, table[:, at], np.delete(table, at, axis=1), warnings)
     if len(times) < 2:
         raise InputError(f"{path} has {len(times)} complete rows.",
                          "A pull needs at least two samples.", "Record it again.")
-    return Stream(times, values, columns, tuple(rows.warnings))
+    return Stream(times, values, tuple(name for name in header if name != "t_s"), tuple(warnings))
 
 
 def write_stream(path: str | Path, stream: Stream) -> None:
@@ -132,35 +123,32 @@ def _long_runs(flags: np.ndarray, run_length: int) -> np.ndarray:
     return kept
 
 
-def _read_rows(path: Path) -> _Rows:
+def _read_rows(path: Path, warnings: list[str]) -> tuple[list[str], np.ndarray]:
+    """The titles and numbers of a CSV file, shape [n, columns]."""
     text = read_text(path, "a CSV file of a recording")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     if not lines:
         raise InputError(f"{path} is empty.", "A header and rows of numbers were expected.",
                          "Record it again.")
-    complete = text.endswith(("\n", "\r"))
-    rows = _Rows([name.strip() for name in lines[0].split(",")])
+    header = [name.strip() for name in lines[0].split(",")]
+    rows: list[list[float]] = []
     for number, line in enumerate(lines[1:], start=2):
-        fields = line.split(",")
-        is_last = number == len(lines)
         try:
-            numbers = [float(part) if part.strip() else np.nan for part in fields]
-            if np.isinf(numbers).any():
-                raise ValueError("a number that is not finite")
+            numbers = [float(part) if part.strip() else np.nan for part in line.split(",")]
         except ValueError:
             numbers = []
+        is_last = number == len(lines)
         # Without an end of line even a last line of full length may have lost digits.
-        unfinished = is_last and not complete
-        if len(numbers) != len(rows.header) or unfinished:
-            if is_last:
-                rows.warnings.append(f"{path.name}: the last line is incomplete and was "
-                                     "discarded.")
-                continue
+        if (len(numbers) == len(header) and not np.isinf(numbers).any()
+                and (not is_last or text.endswith(("\n", "\r")))):
+            rows.append(numbers)
+        elif is_last:
+            warnings.append(f"{path.name}: the last line is incomplete and was discarded.")
+        else:
             raise InputError(f"{path}, line {number} is {line[:60]!r}.",
-                             f"{len(rows.header)} numbers were expected.",
+                             f"{len(header)} numbers were expected.",
                              "Correct or delete the line.")
-        rows.numbers.append(numbers)
-    return rows
+    return header, np.array(rows, float).reshape(-1, len(header))
 
 
 def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[str], *,
