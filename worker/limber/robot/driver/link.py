@@ -44,18 +44,17 @@ six are the covariance of the expected force."""
 
 class RobotLink:
     """A robot in a driver process; a context manager. ``on_samples`` is called with each batch,
-    shape [n, 37] as in :data:`COLUMNS`, from its own thread; ``python``: an interpreter that has
-    ur-rtde. LimberError with the driver's reason if no robot answers, or it cannot be moved now."""
+    shape [n, 37] as in :data:`COLUMNS`, from its own thread. LimberError with the driver's reason
+    if no robot answers, or it cannot be moved now."""
 
-    def __init__(self, cell: Cell, on_samples: Callable[[np.ndarray], None] | None = None,
-                 python: str | None = None):
+    def __init__(self, cell: Cell, on_samples: Callable[[np.ndarray], None] | None = None):
         self._on_samples = on_samples
         self._fresh: np.ndarray | None = None
         self.warnings: list[str] = []
         self._has_started = False
         self._cell = cell
         self._closing = threading.Event()
-        command = [python or sys.executable, "-m", "limber.robot.driver.driver"]
+        command = [sys.executable, "-m", "limber.robot.driver.driver"]
         self._child = Child(command, self._hear, self._ended, stderr=subprocess.DEVNULL)
         self.process = self._child.process
         self._write(cell.model_dump_json())

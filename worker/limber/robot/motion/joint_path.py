@@ -187,8 +187,8 @@ class _Tree:
         return path[::-1]
 
 
-def joint_space_path(start: np.ndarray, goal: np.ndarray, limits: np.ndarray, free: Free, *,
-                     seed: int = 0) -> np.ndarray:
+def joint_space_path(start: np.ndarray, goal: np.ndarray, limits: np.ndarray, free: Free,
+                     ) -> np.ndarray:
     """Return joint angles [rad] on a free path from ``start`` to ``goal`` within limits [n, 2],
     shape [k, n], neighbours at most :data:`STEP_RAD` apart. NoPathError if start or goal is not
     free, or no path was found."""
@@ -199,7 +199,7 @@ def joint_space_path(start: np.ndarray, goal: np.ndarray, limits: np.ndarray, fr
                               "Move the arm by hand, or correct the cell's obstacles.")
     if free(straight(start, goal)).all():
         return straight(start, goal)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     low = np.maximum(limits[:, 0], np.minimum(start, goal) - np.pi)
     high = np.minimum(limits[:, 1], np.maximum(start, goal) + np.pi)
     trees = [_Tree([start]), _Tree([goal])]

@@ -255,9 +255,9 @@ class Trajectory:
 
 
 def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: float = 0.5,
-          pause: float = 0.0) -> np.ndarray:
-    """Return times [s] at which ``poses`` [n, 6] are passed, from rest to rest after ``pause`` [s],
-    within limits of speed [m/s], acceleration [m/s^2] and turn [rad/s]."""
+          ) -> np.ndarray:
+    """Return times [s] at which ``poses`` [n, 6] are passed, from rest to rest, within limits of
+    speed [m/s], acceleration [m/s^2] and turn [rad/s]."""
     turns = matrices(poses)[:, :3, :3]
     angles = np.arccos(np.clip((np.einsum("nij,nij->n", turns[1:], turns[:-1]) - 1) / 2, -1, 1))
     steps = np.maximum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1),
@@ -270,7 +270,7 @@ def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: f
         durations = np.maximum(2 * np.sqrt(steps / acceleration), 2 * steps / speed)
     else:
         durations = 2 * steps / np.maximum(bound[1:] + bound[:-1], 1e-6)
-    return pause + np.r_[0.0, np.cumsum(durations)]
+    return np.r_[0.0, np.cumsum(durations)]
 
 
 def along_bounded(steps: np.ndarray, speeds: np.ndarray, acceleration: float) -> np.ndarray:
