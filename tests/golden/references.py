@@ -147,7 +147,8 @@ def python_reference() -> dict[str, dict]:
 def _workplace():
     """A folder to work in with the example and other inputs."""
     at = Path.cwd()
-    with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, LIMBER_CORES="1"):
+    with (tempfile.TemporaryDirectory() as folder, _small(),
+          patch.dict(os.environ, LIMBER_CORES="1")):
         os.chdir(folder)
         try:
             shutil.copytree(EXAMPLE, "a.branch")
@@ -173,6 +174,26 @@ def _workplace():
             yield
         finally:
             os.chdir(at)
+
+
+@contextlib.contextmanager
+def _small():
+    """Every part of a stage, of few frames, shapes, grasps and cells; pictures without pixels."""
+    from matplotlib import pyplot
+
+    from limber.estimation.settings import FitSpec
+
+    usual = FitSpec.of.__func__
+
+    def of(cls, settings):
+        found = usual(cls, settings)
+        return found if found.quick else found.model_copy(update={"key_frames": 5, "shapes": 8})
+
+    with (patch.object(FitSpec, "of", classmethod(of)),
+          patch("limber.stages.pulls.suggest_pull.CANDIDATES", (0.8,)),
+          patch("limber.planning.certificate.lower_bound._MOST_CELLS", 60_000),
+          patch("limber.results.report.section._png", lambda figure: pyplot.close(figure) or b"")):
+        yield
 
 
 def _run(command: str, *more: str) -> tuple[int, list[str], list[str]]:
