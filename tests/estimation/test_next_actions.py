@@ -1,6 +1,5 @@
 """What to do next: the interval that an action promises is the one that it then gives."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 from tests.estimation.test_nuisances import TRUTH, objective_of
 
 from benchmarks.paper_branches import Bench, PaperBranch, exact_pull, measured
-from limber.cli.main import call
 from limber.estimation.control_point_count import equal_fractions, is_open, supported
 from limber.estimation.estimated_branch import subject_of
 from limber.estimation.fit import fit_branch
@@ -169,19 +167,6 @@ def test_a_modulus_that_goes_up_and_down_needs_more_than_four():
     found = support((20e6, 60e6, 10e6, 40e6, 8e6, 20e6))
     assert found.fractions == equal_fractions(6)
     assert found.evidence[6] > found.evidence[4] + 3
-
-
-@pytest.mark.slow
-def test_an_estimate_chooses_them_if_none_are_given(branch_folder, capsys):
-    """The truth has four, at the paper's positions."""
-    assert call(["estimate", str(branch_folder), "--json", "--progress", "none",
-                 "--quick"]) == 0
-    line = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
-    evidence = {int(count): value for count, value in line["control_point_evidence"].items()}
-    assert evidence[len(line["fractions"])] > max(evidence.values()) - 3
-    assert len(line["young_pa"]) == len(line["fractions"])
-    known = json.loads((branch_folder / "estimate.json").read_text())
-    assert known["fractions"] == pytest.approx(line["fractions"], abs=0.02)
 
 
 def test_given_control_points_stay_and_other_methods_have_four():

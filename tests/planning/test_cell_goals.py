@@ -49,6 +49,7 @@ def side_goal(field, small_model, blocked=left_half):
     return CellGoal(place.region, advice=place.advice, cell_place=place, grasp_model=small_model)
 
 
+@pytest.mark.slow
 def test_a_region_of_which_half_does_has_its_border_there(field, small_model):
     """Nearly all poses on the right side count, nearly none on the wrong one; then nothing is
     proven; a place that does nowhere is refused with its reason."""

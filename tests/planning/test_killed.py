@@ -103,6 +103,7 @@ def assert_same(now: np.ndarray, then: np.ndarray, name: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse_bound")
 @pytest.mark.parametrize("kind", [
     signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.campaign)])
 def test_a_killed_plan_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
