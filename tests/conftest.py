@@ -100,7 +100,7 @@ def plain_pull() -> Pull:
 def branch_template(tmp_path_factory, small, small_bench):
     """A branch folder as reconstruct leaves it, with one virtual pull of 12 frames."""
     from limber.estimation.settings import VirtualPullSettings
-    from limber.stages.pulls.virtual_pull import virtual_pull
+    from limber.stages.pulls.virtual_pull import VirtualPull
     from limber.store import Branch
 
     folder = tmp_path_factory.mktemp("branches") / "small.branch"
@@ -112,7 +112,7 @@ def branch_template(tmp_path_factory, small, small_bench):
             "young": np.full(count, 1e8), "poisson": np.full(count, 0.36),
             "density": np.full(count, 900.0)}).write(stage.path("mesh.vtu"))
     settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=12, seed=4, phase=0.5)
-    virtual_pull(folder, "pull-1", settings)
+    VirtualPull.of(settings, branch_folder=folder, name="pull-1").run()
     return folder
 
 

@@ -17,7 +17,7 @@ from limber.batch.job_file import read_jobs
 from limber.batch.stage_task import run_task
 from limber.core.progress import SILENT
 from limber.recordings.recording import read_pull
-from limber.stages.pulls.export_pull import export_pull
+from limber.stages.pulls.export_pull import ExportPull
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = ROOT / "scripts" / "examples"
@@ -130,7 +130,7 @@ def test_the_python_of_readme_and_guide(tmp_path):
 def test_headless_estimation(branch_folder, tmp_path):
     """A recording becomes a pull, and the estimate's JSON stands beside the folder."""
     recording = tmp_path / "pull-2.mcap"
-    export_pull(branch_folder, "pull-1", recording)
+    ExportPull(branch_folder=branch_folder, name="pull-1", mcap=recording).run()
     run("bash", SCRIPTS / "estimate.sh", branch_folder, recording, ESTIMATE=(
         "--pull pull-2 --fractions 0.5 --quick"))
     told = json.loads((tmp_path / "small-estimate.json").read_text())
@@ -174,7 +174,7 @@ def test_the_job_file(tmp_path):
     apple, _ = read_jobs(tmp_path / "night.toml").branches
     assert [task.label for task in apple.tasks] == [
         "reconstruct", "import-pull:one", "import-pull:two", "estimate", "report", "scene"]
-    assert apple.tasks[-1].inputs.render == tmp_path / "results" / "apple.png"
+    assert apple.tasks[-1].render == tmp_path / "results" / "apple.png"
     shutil.copytree(ROOT / "blend_files" / "mature", apple.folder)
     for task in apple.tasks[1:3]:
         outcome = run_task(task, apple.folder, SILENT)

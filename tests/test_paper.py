@@ -62,21 +62,20 @@ TOGETHER = [("algorithm 1: delta", "estimate", {"method": "nelder-mead", "delta_
 @pytest.mark.parametrize(("what", "stage", "values"), [
     *((what, stage, {name: value}) for what, stage, name, value in PAPER), *TOGETHER])
 def test_it_has_an_option_and_a_row_in_the_guide(what, stage, values):
-    from limber.stages.registry import stage_description
+    from limber.stages.registry import stage_class
 
-    described = stage_description(stage)
-    kinds = (described.inputs, described.settings, described.options)
+    described = stage_class(stage)
     command = main.get_command(click.Context(main), stage)
     page = GUIDE.read_text(encoding="utf-8").split("## Equations and options")[1]
     for name in values:
-        kind = next(kind for kind in kinds if name in kind.model_fields)
-        assert name in stage_schema(stage)[
-            ("inputs", "settings", "options")[kinds.index(kind)]]["properties"]
+        part = next(part for part, names in described.parts().items() if name in names)
+        assert name in stage_schema(stage)[part]["properties"]
         flag = f"--{name.replace('_', '-')}"
         assert flag in options_of(command), what
         row = next((line for line in page.splitlines() if f"`{stage}`" in line and flag in line),
                    None)
         assert row is not None, f"{what}: no row of {stage} {flag}"
-    if kinds[1].model_fields.keys() >= values.keys():
-        made = kinds[1](**values)
-        assert {name: getattr(made, name) for name in values} == values
+    needed = {name: "some" for name, field in described.model_fields.items()
+              if field.is_required()}
+    made = described.checked(needed | values)
+    assert {name: getattr(made, name) for name in values} == values

@@ -69,12 +69,11 @@ def test_files_of_noise(damaged, name):
     (["poisson"], 3), (["groups", 0], 99), (["causes"], [1])])
 def test_an_estimate_that_does_not_fit_itself(damaged, path, value):
     """`limber predict` and the report refuse it, and say where."""
-    from limber.estimation.settings import PredictSettings
-    from limber.stages.moduli.predict import predict
+    from limber.stages.moduli.predict import Predict
 
     branch = damaged("estimate.json", _changed("estimate.json", *path, value=value))
     with pytest.raises(InputError, match=r"estimate\.json"):
-        predict(branch.folder, PredictSettings(weight=1.0))
+        Predict(branch_folder=branch.folder, weight=1.0).run()
 
 
 @pytest.mark.parametrize("content", [

@@ -5,15 +5,17 @@ import importlib
 import pytest
 
 from limber.recordings.sensor_checks import SENSORS
-from limber.stages.registry import stage_description
+from limber.stages.registry import stage_class
 
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_each_is_valid_for_its_stage(name):
     """Of settings that the stage has, other than its defaults, and with a source."""
     preset = SENSORS[name]
-    settings = stage_description(preset.stage).settings(**preset.settings)
-    assert {key: getattr(settings, key) for key in preset.settings}.keys() == preset.settings.keys()
+    stage = stage_class(preset.stage)
+    assert preset.settings.keys() <= {*stage.parts()["settings"]}
+    needed = {name: "some" for name, field in stage.model_fields.items() if field.is_required()}
+    assert stage.checked(needed | preset.settings)
     assert len(preset.source) > 20
 
 

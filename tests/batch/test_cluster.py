@@ -12,11 +12,12 @@ import psutil
 import pytest
 
 from limber.batch.batch_progress import Records
-from limber.batch.job_file import StageTask, read_jobs
-from limber.batch.scheduler_scripts import line_of_task, task_of_line
+from limber.batch.job_file import read_jobs
 from limber.cli import main
 from limber.core.errors import InputError
-from limber.stages.registry import stage_description
+from limber.stages.command_line import command_line
+from limber.stages.pulls.virtual_pull import VirtualPull
+from limber.stages.shape.reconstruct import Reconstruct
 
 JOBS = """
 out = "results"
@@ -65,9 +66,8 @@ def test_two_workers_on_loopback_one_killed(tmp_path, branch_template, monkeypat
     records = Records(jobs)
     assert [records.of(b, t).status for b in jobs.branches for t in b.tasks] == ["done", "done"]
     task = jobs.branches[0].tasks[0]
-    line = line_of_task(StageTask(task.stage, task.inputs.model_copy(
-        update={"branch_folder": alone}), task.settings, task.options))
-    assert main.call(line) == 0
+    line = command_line(task.model_copy(update={"branch_folder": alone}))
+    assert main.call([task.about.name, *line]) == 0
     expected = _digests(alone)
     assert _digests(tmp_path / "one.branch") == _digests(tmp_path / "two.branch") == expected
 
@@ -78,17 +78,14 @@ def _digests(folder: Path) -> dict[str, str]:
     return {name: entry["sha256"] for name, entry in files.items()}
 
 
-def test_a_task_is_the_same_after_its_command_line():
+def test_a_task_is_the_same_after_its_json():
     """Numbers to the last digit, vectors, switches, lists, paths that look like options."""
-    stage = stage_description("virtual-pull")
-    task = StageTask("virtual-pull", stage.inputs(branch_folder=Path("-odd name.branch")),
-                     stage.settings(reach=0.1 + 0.2, young=(4e7, 1 / 3e-7, 1e7, 3e6), frames=4),
-                     stage.options())
-    assert task_of_line(line_of_task(task)) == task
-    stage = stage_description("reconstruct")
-    task = StageTask("reconstruct", stage.inputs(cloud=Path("a b.xyz"), output=Path("a.branch")),
-                     stage.settings(unit="mm", up=(0.0, 1.0, 1e-17)), stage.options())
-    assert task_of_line(line_of_task(task)) == task
+    for task in (VirtualPull(branch_folder=Path("-odd name.branch"), reach=0.1 + 0.2,
+                             young=(4e7, 1 / 3e-7, 1e7, 3e6), frames=4),
+                 Reconstruct(cloud=Path("a b.xyz"), output=Path("a.branch"), unit="mm",
+                             up=(0.0, 1.0, 1e-17))):
+        again = type(task).checked(json.loads(json.dumps(task.stated())))
+        assert again == task and again.model_fields_set == task.model_fields_set
 
 
 @pytest.mark.parametrize(("words", "told"), [

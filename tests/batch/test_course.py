@@ -18,7 +18,7 @@ from limber.batch.job_file import read_jobs
 from limber.batch.run import run_jobs
 from limber.cli import main
 from limber.core.errors import BranchFolderError
-from limber.stages.shape.target import TargetSettings, set_target
+from limber.stages.shape.target import SetTarget
 from limber.store import Branch
 
 JOBS = """
@@ -131,7 +131,8 @@ def test_what_is_written_beside_the_branch_is_not_written_again(orchard, here, c
             if change == "file":
                 next(orchard.rglob("one.swc")).unlink()
             elif change == "branch":
-                set_target(orchard / "two.branch", "leaf", TargetSettings(at=(0.0, 0.0, 0.1)))
+                SetTarget(branch_folder=orchard / "two.branch", name="leaf",
+                          at=(0.0, 0.0, 0.1)).run()
             ran.clear()
             assert call(capsys, "batch", jobs)[0] == 0
             assert [one.split()[0] for one in ran if "export" in one] == exported, change

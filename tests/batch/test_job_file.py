@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from limber.batch.job_file import read_jobs, toml_lines, why_not_in_batches
+from limber.batch.job_file import fingerprint, read_jobs, toml_lines, why_not_in_batches
 from limber.batch.scheduler_scripts import commands, write_script
 from limber.core.errors import InputError
 from limber.core.units import in_unit
-from limber.stages.registry import stage_description, stage_summaries
+from limber.stages.registry import stage_class, stage_summaries
 from limber.store import Branch
 
 
@@ -68,12 +68,12 @@ fractions = [0.3, 0.7]
     assert [task.label for task in pear.tasks] == ["reconstruct", "import-pull:one", "estimate"]
     assert apple.folder == tmp_path / "results" / "apple.branch"
     first, pull = apple.tasks[:2]
-    assert first.inputs.cloud == tmp_path / "scans/apple.ply"
-    assert first.inputs.output == apple.folder
-    assert first.settings.density == pytest.approx(800.0) and first.settings.up == (0, -1, 0)
-    assert pull.settings.grasp_radius == pytest.approx(0.008)
-    assert pull.inputs.branch_folder == apple.folder
-    assert apple.tasks[-1].settings.fractions == (0.3, 0.7)
+    assert first.cloud == tmp_path / "scans/apple.ply"
+    assert first.output == apple.folder
+    assert first.density == pytest.approx(800.0) and first.up == (0, -1, 0)
+    assert pull.grasp_radius == pytest.approx(0.008)
+    assert pull.branch_folder == apple.folder
+    assert apple.tasks[-1].fractions == (0.3, 0.7)
 
 
 def test_files_named_in_settings_lie_beside_the_job_file(write, tmp_path):
@@ -88,7 +88,7 @@ source = "pulls/{{scan}}/one.csv"
 name = "one"
 {stated}
 """))
-    settings = jobs.branches[0].tasks[1].settings
+    settings = jobs.branches[0].tasks[1]
     assert {key: getattr(settings, key) for key in files} == {
         key: tmp_path / "apple" / name for key, name in files.items()}
 
@@ -104,8 +104,8 @@ def test_a_sweep_is_every_combination(write):
         "apple-mesh_spacing-2-leaves-cut", "apple-mesh_spacing-2-leaves-keep",
         "apple-mesh_spacing-3.5-leaves-cut", "apple-mesh_spacing-3.5-leaves-keep"]
     assert len(jobs.branches) == 8
-    assert jobs.branches[3].tasks[0].settings.mesh_spacing == 3.5
-    assert len({branch.tasks[0].fingerprint for branch in jobs.branches}) == 8
+    assert jobs.branches[3].tasks[0].mesh_spacing == 3.5
+    assert len({fingerprint(branch.tasks[0]) for branch in jobs.branches}) == 8
 
 
 @pytest.mark.parametrize(("text", "line", "said"), [
@@ -223,13 +223,12 @@ def test_every_stage_may_stand_in_a_job_file(write, tmp_path):
     fit = [name for name in stage_summaries() if not why_not_in_batches(name)]
     assert set(stage_summaries()) - {*fit} == {"generate", "record", "execute"}
     for name in fit:
-        stage = stage_description(name)
         own = {"branch_folder", "cloud", "surface"} | (set() if name == "export" else {"output"})
-        needed = "".join(f'{key} = "x"\n' for key, about in stage.inputs.model_fields.items()
+        needed = "".join(f'{key} = "x"\n' for key, about in stage_class(name).model_fields.items()
                          if about.is_required() and key not in own)
         jobs = read_jobs(write(f'[[job]]\nscans = ["scans/apple.ply"]\n[[job.stage]]\n'
                                f'run = "{name}"\n{needed}'))
-        assert [task.stage for task in jobs.branches[0].tasks] == [name]
+        assert [task.about.name for task in jobs.branches[0].tasks] == [name]
 
 
 def test_lines_of_nested_tables():

@@ -31,7 +31,7 @@ from limber.core.errors import Cancelled, ConvergenceError, InputError, SafetySt
 from limber.core.files import caches
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.command_line import command_line, settings_options
-from limber.stages.registry import stage_description, stage_summaries
+from limber.stages.registry import stage_class, stage_summaries
 
 
 class Settings(BaseModel):
@@ -189,9 +189,7 @@ def test_values_are_shown_in_full_on_demand(capfd):
 
 
 REQUIRED = [(name, model, field) for name in stage_summaries()
-            for model in (stage_description(name).inputs, stage_description(name).settings,
-                          stage_description(name).options)
-            for field, about in model.model_fields.items()
+            for model in (stage_class(name),) for field, about in model.model_fields.items()
             if about.is_required() and not (about.json_schema_extra or {}).get("argument")]
 
 
@@ -338,7 +336,7 @@ def test_the_end_says_what_where_and_what_next():
 @pytest.mark.parametrize("name", list(stage_summaries()))
 def test_every_stage_says_what_it_found_and_proposes_commands_that_exist(name):
     """Its lines are written in known units; the command after it is one of ours."""
-    stage = stage_description(name)
+    stage = stage_class(name).about
     assert stage.found
     for line in (line for line in stage.found if isinstance(line, str)):
         for _text, field, spec, _conversion in string.Formatter().parse(line):

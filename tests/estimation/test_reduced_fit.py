@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.stages.specified import Fit
 
 from benchmarks.paper_branches import Bench, measured
 from limber.core.errors import InputError
@@ -13,7 +14,6 @@ from limber.estimation.fitting import reduced_fit
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.fitting.reduced_fit import CorrectedForward, Reduction
 from limber.estimation.settings import FitSpec
-from limber.stages.moduli.estimate import estimate
 
 SETTINGS = FitSpec(poisson=0.36, hold_out=False, key_frames=16)
 REDUCED = SETTINGS.model_copy(update={"forward": "reduced"})
@@ -156,7 +156,8 @@ def test_other_control_points_make_another_basis(branch_folder):
     another number of moduli), and the estimate is near the first where both have a point.
     """
     settings = FitSpec(forward="reduced", mesh_check=False, key_frames=8)
-    first = estimate(branch_folder, settings)
-    again = estimate(branch_folder, settings.model_copy(update={"fractions": (0.2, 0.5, 0.8)}))
+    first = Fit.of(settings, branch_folder=branch_folder).run()
+    again = Fit.of(settings.model_copy(update={"fractions": (0.2, 0.5, 0.8)}),
+                   branch_folder=branch_folder).run()
     assert len(again["young_pa"]) == 3
     assert again["young_pa"][0] == pytest.approx(first["young_pa"][0], rel=0.1)

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from tests.stages.specified import Fit
 
 from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError
@@ -13,12 +14,11 @@ from limber.estimation import fit
 from limber.estimation.fitting import reduced_fit
 from limber.estimation.parameters import Values
 from limber.estimation.settings import FitSpec
-from limber.estimation.simulated_pull import PullSpec
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.recordings.recording import read_pull
 from limber.results.report.estimate_figures import report_figures
-from limber.stages.moduli.estimate import EVALUATIONS, estimate, follow
-from limber.stages.pulls.virtual_pull import virtual_pull
+from limber.stages.moduli.estimate import EVALUATIONS, EstimateYoung, follow
+from limber.stages.pulls.virtual_pull import VirtualPull
 from limber.store import Branch
 from limber.store.loading import load_estimated_subject, stiffness_deviation
 
@@ -35,8 +35,8 @@ def test_virtual_pull_is_a_recording_with_its_truth(branch_folder):
     truth = pull.entry.truth
     assert truth["young_pa"] == TRUTH.tolist()
     assert truth["tet_count"] > 1.1 * TetMesh.read(branch_folder / "mesh.vtu").tet_count
-    again = virtual_pull(branch_folder, "again", PullSpec(
-        young=tuple(TRUTH), poisson=0.36, frames=12, seed=4, phase=0.5))
+    again = VirtualPull(branch_folder=branch_folder, name="again", young=tuple(TRUTH), poisson=0.36,
+                        frames=12, seed=4, phase=0.5).run()
     assert again["frame_count"] == 12
     same = read_pull(branch_folder / "pulls" / "again")
     assert np.allclose(same.wrenches[:, :3], pull.wrenches[:, :3], atol=1e-6)
@@ -106,13 +106,13 @@ def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
             raise Cancelled
 
     with pytest.raises(Cancelled, match="resume"):
-        estimate(branch_folder, QUICK, progress=Progress(stop_at_the_fourth))
+        Fit.of(QUICK, branch_folder=branch_folder).run(Progress(stop_at_the_fourth))
     kept = json.loads((branch_folder / "estimate.json").read_text())
     assert kept["stopped"] and not kept["converged"]
     assert np.array_equal(TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"], before)
     warnings: list[str] = []
-    result = estimate(branch_folder, QUICK, resume=True,
-                      progress=Progress(on_warning=warnings.append))
+    result = Fit.of(QUICK, branch_folder=branch_folder,
+                    resume=True).run(Progress(on_warning=warnings.append))
     assert any("Resumed" in warning for warning in warnings)
     assert result["converged"] and not result["stopped"]
 
@@ -130,7 +130,7 @@ def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, m
     clean, early, late = (tmp_path / name for name in ("clean", "early", "late"))
     for folder in (clean, early, late):
         shutil.copytree(branch_folder, folder)
-    expected = estimate(clean, settings)
+    expected = Fit.of(settings, branch_folder=clean).run()
     calls = 0
 
     class Killed(BaseException):
@@ -143,7 +143,7 @@ def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, m
             raise Killed
 
     with pytest.raises(Killed):
-        estimate(early, settings, progress=Progress(kill))
+        Fit.of(settings, branch_folder=early).run(Progress(kill))
     assert (early / EVALUATIONS).exists()
 
     def kill_late(share: float, _message: str, _numbers: dict) -> None:
@@ -151,9 +151,9 @@ def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, m
             raise Killed
 
     with pytest.raises(Killed):
-        estimate(late, settings, progress=Progress(kill_late))
+        Fit.of(settings, branch_folder=late).run(Progress(kill_late))
     for folder in (early, late):
-        found = estimate(folder, settings)
+        found = Fit.of(settings, branch_folder=folder).run()
         for name in ("young_pa", "young_interval_pa", "loss_m2"):
             assert np.array_equal(found[name], expected[name]), (folder, name)
 
@@ -161,13 +161,13 @@ def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, m
 def test_pulls_that_are_not_there(branch_folder):
     """A name that does not exist is answered with those that do."""
     with pytest.raises(InputError, match="pull-1"):
-        estimate(branch_folder, FitSpec(pull=("pull-9",)))
+        EstimateYoung(branch_folder=branch_folder, pull=("pull-9",)).run()
 
 
 def test_without_force_the_estimate_refuses(branch_folder):
     """Through the whole stage: positions alone are refused, and nothing is written."""
-    virtual_pull(branch_folder, "blind", PullSpec(
-        young=tuple(TRUTH), frames=5, seed=1, phase=0.5))
+    VirtualPull(branch_folder=branch_folder, name="blind", young=tuple(TRUTH), frames=5, seed=1,
+                phase=0.5).run()
     robot = branch_folder / "pulls" / "blind" / "robot.csv"
     lines = [",".join(line.split(",")[:7]) for line in robot.read_text().splitlines()]
     target = branch_folder.parent / "blind"
@@ -178,15 +178,15 @@ def test_without_force_the_estimate_refuses(branch_folder):
     assert call(["import-pull", str(branch_folder), str(target), "--name", "deaf",
                  "--progress", "none"]) == 0
     with pytest.raises(InputError, match="soft or stiff"):
-        estimate(branch_folder, FitSpec(pull=("deaf",)))
+        EstimateYoung(branch_folder=branch_folder, pull=("deaf",)).run()
     assert not (branch_folder / "estimate.json").exists()
 
 
 @pytest.mark.slow
 def test_following_a_pull(branch_folder):
     """Frame by frame the intervals narrow; it ends at what all frames together give."""
-    virtual_pull(branch_folder, "long", PullSpec(
-        young=tuple(TRUTH), poisson=0.36, frames=24, seed=6, phase=0.5, position_noise=5e-4))
+    VirtualPull(branch_folder=branch_folder, name="long", young=tuple(TRUTH), poisson=0.36,
+                frames=24, seed=6, phase=0.5, position_noise=5e-4).run()
     # What follows frame by frame knows one form of the field.
     settings = FitSpec(pull=("long",), key_frames=6, field="inverse_distance")
     result = follow(branch_folder, settings, pace=0, training_count=12)
@@ -196,7 +196,7 @@ def test_following_a_pull(branch_folder):
               for state in stored["history"]]
     assert np.all(widths[-1] < 0.3 * widths[5])
     half = np.log(np.array(result["young_interval_pa"])) @ [-0.5, 0.5]
-    batch = np.array(estimate(branch_folder, settings)["young_pa"])
+    batch = np.array(Fit.of(settings, branch_folder=branch_folder).run()["young_pa"])
     assert np.all(np.abs(np.log(np.array(result["young_pa"]) / batch)) < half)
     assert np.all(np.abs(np.log(np.array(result["young_pa"]) / TRUTH)) < 2 * half + 0.03)
 
@@ -205,9 +205,10 @@ def test_following_a_pull(branch_folder):
 def test_a_hollow_branch_has_stiffer_wood_and_the_same_bending_stiffness(branch_folder):
     """The mesh gets the modulus of solid sections; what is computed on it stays the same."""
     quick = QUICK.model_copy(update={"mesh_check": False, "shapes": 0})
-    solid = estimate(branch_folder, quick)
+    solid = Fit.of(quick, branch_folder=branch_folder).run()
     mesh = TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"]
-    hollow = estimate(branch_folder, quick.model_copy(update={"pith_radius": 6e-3}))
+    hollow = Fit.of(quick.model_copy(update={"pith_radius": 6e-3}),
+                    branch_folder=branch_folder).run()
     wood = np.array(hollow["young_pa"]) / np.array(solid["young_pa"])
     # The radius falls from 10 to 8 mm.
     assert np.all(wood > 1 / (1 - 0.6**4) - 0.02) and np.all(wood < 1 / (1 - 0.75**4) + 0.02)

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from tests.stages.specified import SpecifiedPull
 
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import rotated
@@ -17,7 +18,7 @@ from limber.recordings.recording import (
     PullEntry,
     read_pull,
 )
-from limber.stages.pulls.virtual_pull import virtual_pull
+from limber.stages.pulls.virtual_pull import VirtualPull
 
 POINT = (0.0, 0.0, 0.3)
 
@@ -74,7 +75,7 @@ def test_errors_scatter_as_the_calibration_states():
 def test_a_virtual_pull_states_what_was_drawn(branch_folder):
     """The calibration goes into the fit's prior, the drawn errors into the truth alone."""
     settings = PullSpec(frames=4, cell_errors="realistic", force_bias_sigma=0.0, seed=2)
-    virtual_pull(branch_folder, "real", settings)
+    SpecifiedPull.of(settings, branch_folder=branch_folder, name="real").run()
     entry = read_pull(branch_folder / "pulls" / "real").entry
     assert entry.calibration == CalibrationEntry().model_copy(update={"force_bias_sigma_n": 0.0})
     known = entry.truth["cell_errors"]
@@ -85,8 +86,8 @@ def test_a_virtual_pull_states_what_was_drawn(branch_folder):
 
 def test_depth_images_have_no_such_errors(branch_folder):
     with pytest.raises(InputError, match="--camera cannot be combined"):
-        virtual_pull(branch_folder, "seen", PullSpec(
-            frames=4, camera=True, cell_errors="realistic"))
+        VirtualPull(branch_folder=branch_folder, name="seen", frames=4, camera=True,
+                    cell_errors="realistic").run()
 
 
 def test_errors_can_be_stated_in_a_file(branch_folder, tmp_path):
@@ -94,12 +95,12 @@ def test_errors_can_be_stated_in_a_file(branch_folder, tmp_path):
     file = tmp_path / "sensor.toml"
     file.write_text("[calibration]\nforce_bias_sigma_n = 0.01\n")
     settings = VirtualPullSettings(frames=4, cell_errors=str(file))
-    virtual_pull(branch_folder, "small", settings)
+    SpecifiedPull.of(settings, branch_folder=branch_folder, name="small").run()
     path = branch_folder / "pulls" / "small"
     assert read_pull(path).entry.calibration == CalibrationEntry(force_bias_sigma_n=0.01)
     file.write_text("[calibration]\nforce_bias_sigma_n = 0.02\n")
-    virtual_pull(branch_folder, "small", settings)
+    SpecifiedPull.of(settings, branch_folder=branch_folder, name="small").run()
     assert read_pull(path).entry.calibration == CalibrationEntry(force_bias_sigma_n=0.02)
     file.write_text("[calibration]\nbias = 0.02\n")
     with pytest.raises(InputError, match="bias"):
-        virtual_pull(branch_folder, "small", settings)
+        SpecifiedPull.of(settings, branch_folder=branch_folder, name="small").run()

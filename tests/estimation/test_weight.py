@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.stages.specified import SpecifiedPull
 
 from limber.core.progress import Progress
 from limber.estimation.estimated_branch import forwards_of, subject_of
@@ -18,8 +19,7 @@ from limber.geometry.tets.tet_mesh import mark
 from limber.geometry.tets.tree_sweep import curved_beam
 from limber.mechanics.added_masses import PointMass
 from limber.recordings.recording import CalibrationEntry
-from limber.stages.pulls.virtual_pull import virtual_pull
-from limber.stages.shape.mesh import mesh_surface
+from limber.stages.shape.mesh import Mesh
 from limber.store import Branch
 
 GRAVITY = (9.0, 0.0, -3.9)
@@ -132,15 +132,14 @@ def test_virtual_pull_takes_the_body_that_was_meshed(tmp_path):
     from trimesh.creation import box
 
     box(extents=(0.3, 0.012, 0.006)).export(tmp_path / "slat.stl")
-    from limber.geometry.settings import MeshSurfaceSettings
 
     folder = tmp_path / "slat.branch"
-    mesh_surface(tmp_path / "slat.stl", folder,
-                 MeshSurfaceSettings(up=(0.0, 0.0, 1.0), unit="m", root=(-0.15, 0.0, 0.0)))
+    Mesh(surface=tmp_path / "slat.stl", output=folder, up=(0.0, 0.0, 1.0), unit="m",
+         root=(-0.15, 0.0, 0.0)).run()
     gravity = np.array(Branch.open(folder).gravity)
     assert abs(gravity[2]) < 1e-6 * np.linalg.norm(gravity), "the slat lay level"
     settings = PullSpec(young=(3e9,) * 4, weight=0.5, frames=2, position_noise=0.0)
-    virtual_pull(folder, "hung", settings)
+    SpecifiedPull.of(settings, branch_folder=folder, name="hung").run()
     from limber.recordings.recording import read_pull
 
     hung = read_pull(folder / "pulls" / "hung")

@@ -9,7 +9,6 @@ from scipy.integrate import cumulative_trapezoid, trapezoid
 from limber.cli.main import call
 from limber.core.constants import STANDARD_GRAVITY
 from limber.core.errors import InputError
-from limber.estimation.settings import FitSpec
 from limber.geometry.bodies import body_format, mesh_model, mesh_sections, read_sections
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton
 from limber.geometry.settings import MeshSurfaceSettings
@@ -17,12 +16,11 @@ from limber.mechanics.added_masses import PointMass
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
-from limber.recordings.settings import ImportSettings
 from limber.recordings.time_series import Stream, write_stream
-from limber.stages.moduli.estimate import estimate
-from limber.stages.pulls.import_pull import import_pull
-from limber.stages.results.export import ExportSettings, export
-from limber.stages.shape.mesh import mesh_surface
+from limber.stages.moduli.estimate import EstimateYoung
+from limber.stages.pulls.import_pull import ImportPull
+from limber.stages.results.export import Export
+from limber.stages.shape.mesh import Mesh
 from limber.store import Branch
 from limber.store.loading import load_branch, load_mesh, load_point_masses, load_skeleton
 
@@ -76,7 +74,7 @@ def test_own_sag_gives_the_modulus(tmp_path):
     """Held up first, then sagging under its own weight and the 30 g: E within 2 %, covered."""
     path = table(tmp_path / "beam.csv")
     branch = tmp_path / "beam.branch"
-    mesh_surface(path, branch, SETTINGS)
+    Mesh.of(SETTINGS, surface=path, output=branch).run()
     assert sum(mass.mass for mass in load_point_masses(Branch.open(branch))) == HUNG
     fine, masses = mesh_sections(read_sections(path, "m"),
                                  SETTINGS, elements_across=4.5)
@@ -92,8 +90,9 @@ def test_own_sag_gives_the_modulus(tmp_path):
         (200, *moved.shape))
     write_stream(tmp_path / "sag.csv", Stream(times, seen.reshape(200, -1), tuple(
         f"m{k}_{axis}_m" for k in range(len(places)) for axis in "xyz")))
-    import_pull(branch, tmp_path / "sag.csv", "sag", ImportSettings(weight=0, own_weight=True))
-    found = estimate(branch, FitSpec(fractions=(0.5,), density_sigma=0.01))
+    ImportPull(branch_folder=branch, source=tmp_path / "sag.csv", name="sag", weight=0,
+               own_weight=True).run()
+    found = EstimateYoung(branch_folder=branch, fractions=(0.5,), density_sigma=0.01).run()
     low, high = found["young_interval_pa"][0]
     assert found["young_pa"][0] == pytest.approx(YOUNG, rel=0.02)
     assert low < YOUNG < high and high / low < 1.2
@@ -118,7 +117,7 @@ EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 
 def test_a_model_of_another_program_becomes_the_branch_again(tmp_path):
     """TreeQSM's .mat: the same axes and wood, closed, and it hangs like any branch."""
-    export(EXAMPLE, tmp_path / "tree.mat", ExportSettings())
+    Export(branch_folder=EXAMPLE, output=tmp_path / "tree.mat").run()
     folder = tmp_path / "a.branch"
     assert call(["mesh", str(tmp_path / "tree.mat"), "-o", str(folder), "--no-upright",
                  "--young", "2e8", "--json"]) == 0
@@ -158,7 +157,7 @@ def is_model(path):
 
 def test_what_is_a_model_and_what_is_refused(tmp_path):
     for name, columns in (("rtwig.csv", "rtwig"), ("simple.csv", "simpleforest")):
-        export(EXAMPLE, tmp_path / name, ExportSettings(columns=columns))
+        Export(branch_folder=EXAMPLE, output=tmp_path / name, columns=columns).run()
         assert is_model(tmp_path / name) and read_skeleton(tmp_path / name).length > 0.1
     (tmp_path / "sections.csv").write_text("# drawn\nx,y,z,width,height\n0,0,0,1,1\n0,0,9,1,1\n")
     assert not is_model(tmp_path / "sections.csv") and not is_model(tmp_path / "a.stl")
@@ -168,5 +167,5 @@ def test_what_is_a_model_and_what_is_refused(tmp_path):
             ("thin.swc", MeshSurfaceSettings(), "radius 0"),
             ("rtwig.csv", MeshSurfaceSettings(root=(0.0, 0.0, 0.0)), "defines its own root")):
         with pytest.raises(InputError, match=told):
-            mesh_surface(tmp_path / path, tmp_path / "b.branch", settings)
+            Mesh.of(settings, surface=tmp_path / path, output=tmp_path / "b.branch").run()
     assert not (tmp_path / "b.branch").exists()

@@ -11,7 +11,6 @@ from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError, PartlyFailedError
 from limber.core.progress import Progress
 from limber.geometry import reconstruction
-from limber.geometry.bodies import MeshSurfaceSettings
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_points
@@ -20,15 +19,14 @@ from limber.geometry.reconstruction import ReconstructSettings, reconstruct_clou
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import solve_static
 from limber.mechanics.pull_simulation import SimulateSettings
-from limber.stages.motion.simulate import simulate
+from limber.stages.motion.simulate import Simulate
 from limber.stages.shape.generate import write_generated
-from limber.stages.shape.mesh import mesh_surface
+from limber.stages.shape.mesh import Mesh
 from limber.stages.shape.reconstruct import (
     CLASSES_COMMENT,
+    Reconstruct,
     _place_of_classes,
     _without,
-    reconstruct,
-    reconstruct_folder,
 )
 from limber.store import Branch
 from limber.store.loading import load_model
@@ -44,7 +42,7 @@ def generated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("generated")
     branch = generate_branch(5, fork_count=2, length=0.5, point_spacing=0.004)
     write_generated(branch, folder)
-    result = reconstruct(folder / "cloud.ply", folder / "g.branch")
+    result = Reconstruct(cloud=folder / "cloud.ply", output=folder / "g.branch").run()
     return folder, branch, result
 
 
@@ -124,7 +122,7 @@ def test_second_run_computes_nothing(generated, monkeypatch):
     folder, _, result = generated
     monkeypatch.setattr(reconstruction, "reconstruct_cloud",
                         lambda *_, **__: pytest.fail("it ran again"))
-    assert reconstruct(folder / "cloud.ply", folder / "g.branch") == result
+    assert Reconstruct(cloud=folder / "cloud.ply", output=folder / "g.branch").run() == result
 
 
 def test_gravity_turns_with_the_branch(generated):
@@ -136,7 +134,7 @@ def test_gravity_turns_with_the_branch(generated):
 @pytest.mark.slow
 def test_coffeetree(coffeetree, tmp_path):
     """The real branch: forks found, valid surface, a mesh of the surface's volume."""
-    result = reconstruct(coffeetree, tmp_path / "c.branch")
+    result = Reconstruct(cloud=coffeetree, output=tmp_path / "c.branch").run()
     assert 7 <= result["branch_count"] <= 14
     assert 4.5 < result["length_m"] < 5.6
     assert result["radius_max_m"] < 0.03
@@ -148,8 +146,8 @@ def test_coffeetree(coffeetree, tmp_path):
 def test_own_skeleton_skips_ours(generated, tmp_path):
     """A given skeleton is used as it is."""
     folder, branch, _ = generated
-    result = reconstruct(folder / "cloud.ply", tmp_path / "o.branch",
-                         skeleton_path=folder / "truth_skeleton.swc")
+    result = Reconstruct(cloud=folder / "cloud.ply", output=tmp_path / "o.branch",
+                         skeleton=folder / "truth_skeleton.swc").run()
     assert result["contraction_status"] == "skeleton given"
     assert result["length_m"] == pytest.approx(branch.skeleton.length, rel=1e-4)
 
@@ -161,14 +159,14 @@ def test_left_out_twigs_become_masses(generated, tmp_path):
     """
     folder, _, full = generated
     place = tmp_path / "t.branch"
-    result = reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_radius=0.0055))
+    result = Reconstruct(cloud=folder / "cloud.ply", output=place, twig_radius=0.0055).run()
     masses = json.loads((place / "point_masses.json").read_text())
     assert len(masses) == result["left_out_twigs"] == 2
     whole = 900 * full["mesh_volume_m3"]
     rest = 900 * result["mesh_volume_m3"] + result["left_out_mass_kg"]
     assert rest == pytest.approx(whole, rel=0.04)
     assert Branch.open(place).has("point_masses.json")
-    reconstruct(folder / "cloud.ply", place)
+    Reconstruct(cloud=folder / "cloud.ply", output=place).run()
     assert not Branch.open(place).has("point_masses.json")
     assert not load_model(Branch.open(place)).point_masses
 
@@ -178,18 +176,18 @@ def test_left_out_twigs_weigh_in_a_simulation(generated, tmp_path):
     """Their weight hangs on the base, and on the gripper that holds the branch where it is."""
     folder, _, full = generated
     place = tmp_path / "w.branch"
-    result = reconstruct(folder / "cloud.ply", place,
-                         ReconstructSettings(twig_radius=0.1, upright=True))
+    result = Reconstruct(cloud=folder / "cloud.ply", output=place, twig_radius=0.1,
+                         upright=True).run()
     assert result["left_out_twigs"] == 2 and result["branch_count"] == full["branch_count"]
     model = load_model(Branch.open(place))
     weight = np.linalg.norm(solve_static(model).require().base_force)
     mass = 900 * result["mesh_volume_m3"] + result["left_out_mass_kg"]
     assert weight == pytest.approx(9.80665 * mass, rel=0.01)
     settings = SimulateSettings(kind="static", move=(0.0, 0.0, 1e-5), rest_shape=False)
-    held = np.array(simulate(place, settings)["grasp_force_n"])
+    held = np.array(Simulate.of(settings, branch_folder=place).run()["grasp_force_n"])
     with Branch.open(place).stage("reconstruct") as stage:
         stage.path("point_masses.json").write_text("[]")
-    bare = np.array(simulate(place, settings, force=True)["grasp_force_n"])
+    bare = np.array(Simulate.of(settings, branch_folder=place, force=True).run()["grasp_force_n"])
     assert 0.02 < np.linalg.norm(held - bare) / (9.80665 * result["left_out_mass_kg"]) < 2.0
 
 
@@ -201,7 +199,7 @@ def test_failed_run_leaves_the_folder_as_it_was(generated, tmp_path):
     normal = np.random.default_rng(0).normal(size=(2000, 3))
     np.savetxt(bad, normal / np.linalg.norm(normal, axis=1)[:, None])
     with pytest.raises(InputError, match="shape of a branch"):
-        reconstruct(bad, folder / "g.branch")
+        Reconstruct(cloud=bad, output=folder / "g.branch").run()
     assert (folder / "g.branch" / "branch.json").read_bytes() == before
     Branch.open(folder / "g.branch")
 
@@ -233,7 +231,7 @@ def test_no_two_scans_of_a_folder_have_one_branch(tmp_path, names):
     if len([*tmp_path.iterdir()]) < 3:
         pytest.skip("this file system does not distinguish the names")
     with pytest.raises(InputError) as refused:
-        reconstruct_folder(tmp_path, tmp_path / "out")
+        Reconstruct(cloud=tmp_path, output=tmp_path / "out").run()
     assert all(name in str(refused.value) for name in names)
     assert not (tmp_path / "out").exists()
 
@@ -248,7 +246,7 @@ def test_a_folder_of_scans_replaces_no_other_scans_branch(generated, tmp_path):
         scans.mkdir()
         (scans / name).write_text("1 2 3\n")
         with pytest.raises(PartlyFailedError, match=rf"{seen}.*limber reconstruct .*{name}"):
-            reconstruct_folder(scans, tmp_path / "out")
+            Reconstruct(cloud=scans, output=tmp_path / "out").run()
     assert (kept / "branch.json").read_bytes() == before
 
 
@@ -256,7 +254,7 @@ def test_points_by_class_are_no_scan_and_replace_none(tmp_path):
     """The second run of one command finds its own pictures of refused scans beside the scans."""
     Cloud(np.zeros((1, 3))).write_ply(tmp_path / "a_points.ply", CLASSES_COMMENT)
     with pytest.raises(InputError, match="no point clouds"):
-        reconstruct_folder(tmp_path, tmp_path)
+        Reconstruct(cloud=tmp_path, output=tmp_path).run()
     Cloud(np.zeros((1, 3))).write_ply(tmp_path / "b 1.5_points.ply")
     assert _place_of_classes(tmp_path / "a.branch").name == "a_points.ply"
     assert _place_of_classes(tmp_path / "b 1.5").name == "b 1.5-2_points.ply"
@@ -284,8 +282,7 @@ def test_mesh_a_box_in_millimetres(tmp_path):
 
     box = trimesh.creation.box((30, 30, 100))
     box.export(tmp_path / "beam.stl")
-    result = mesh_surface(tmp_path / "beam.stl", tmp_path / "b.branch",
-                          MeshSurfaceSettings(unit="mm"))
+    result = Mesh(surface=tmp_path / "beam.stl", output=tmp_path / "b.branch", unit="mm").run()
     assert result["mesh_volume_m3"] == pytest.approx(9e-5, rel=0.02)
     assert result["length_m"] == pytest.approx(0.1, rel=0.02)
     mesh = TetMesh.read(tmp_path / "b.branch" / "mesh.vtu")
@@ -302,7 +299,7 @@ def test_points_to_leave_out_must_be_the_scans(tmp_path):
                         (points.astype(np.float32).astype(float), "All 60")):
         Cloud(given).write_ply(others)
         with pytest.raises(InputError, match=told):
-            reconstruct(scan, tmp_path / "b.branch", without_path=others)
+            Reconstruct(cloud=scan, output=tmp_path / "b.branch", without=others).run()
     assert not (tmp_path / "b.branch").exists()
 
 
@@ -334,7 +331,7 @@ def test_cancel_in_each_step_leaves_nothing(generated, tmp_path, step):
     progress = Progress(sink)
     target = tmp_path / "cancelled.branch"
     with pytest.raises(Cancelled):
-        reconstruct(folder / "cloud.ply", target, progress=progress)
+        Reconstruct(cloud=folder / "cloud.ply", output=target).run(progress)
         progress(1.0, "the last report has nothing after it that could stop")
     assert any(message.startswith(step) for message in seen)
     if step != "reconstructed":
@@ -361,7 +358,7 @@ def test_columns_of_any_name_come_through(tmp_path):
     table = np.column_stack([np.arange(len(points)), points, np.tile([1, 2, 3], (len(points), 1))])
     np.savetxt(tmp_path / "a.csv", table, delimiter=",", comments="", encoding="utf-8",
                header='"",x,y,z,Intensität [%],leaf,normal')
-    reconstruct(tmp_path / "a.csv", tmp_path / "a.branch")
+    Reconstruct(cloud=tmp_path / "a.csv", output=tmp_path / "a.branch").run()
     cloud = read_points(Branch.open(tmp_path / "a.branch").path("cloud.ply"))
     assert len(cloud) > 0.9 * len(points)
     assert cloud.attributes.keys() == {"unnamed", "intensitat", "leaf_2", "normal_2",

@@ -16,7 +16,7 @@ from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import solve_static
 from limber.mechanics.pull_simulation import SimulateSettings
 from limber.results.motion_files import read_pc2
-from limber.stages.motion.simulate import simulate
+from limber.stages.motion.simulate import Simulate
 from limber.store import Branch
 from limber.store.loading import load_model
 
@@ -43,7 +43,7 @@ def test_motion_writes_what_the_design_says(folder):
     """A pull in time: keys, PC2 of the surface, first frame the scan, skipped when current."""
     settings = SimulateSettings(move=(0.02, 0, -0.001), duration=0.2, hold=0.1,
                                 grasp_mode="point")
-    result = simulate(folder, settings)
+    result = Simulate.of(settings, branch_folder=folder).run()
     assert result.keys() >= KEYS
     assert result["converged"]
     positions, _, _ = read_pc2(folder / "frames" / "simulate.pc2")
@@ -54,7 +54,7 @@ def test_motion_writes_what_the_design_says(folder):
     frames = json.loads((folder / "frames" / "simulate.json").read_text())
     assert len(frames["energies_j"]) == frames["frame_count"] == result["frame_count"]
     changed = (folder / "branch.json").stat().st_mtime_ns
-    assert simulate(folder, settings) == result
+    assert Simulate.of(settings, branch_folder=folder).run() == result
     assert (folder / "branch.json").stat().st_mtime_ns == changed
 
 
@@ -62,7 +62,7 @@ def test_static_force_and_vtu_series(folder):
     """A force in balance: energy grows, the series has each frame with strain and stress."""
     settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), duration=4 / 60, vtu=True,
                                 gravity=False, name="pull")
-    result = simulate(folder, settings)
+    result = Simulate.of(settings, branch_folder=folder).run()
     frames = json.loads((folder / "frames" / "pull.json").read_text())
     assert np.all(np.diff(frames["energies_j"]) > 0)
     assert result["grasp_force_n"] == pytest.approx([1, 0, 0])
@@ -78,7 +78,7 @@ def test_torn_branch_exits_with_3_and_keeps_good_frames(folder):
     """A pose that tears the branch: exit code 3, place and reason, frames up to there."""
     settings = SimulateSettings(kind="static", move=(3.0, 0, 0), duration=5 / 60, gravity=False)
     with pytest.raises(ConvergenceError, match=r"at \("):
-        simulate(folder, settings)
+        Simulate.of(settings, branch_folder=folder).run()
     branch = Branch.open(folder)
     stored = branch.manifest.stages["simulate"].result
     assert not stored["converged"]
@@ -91,7 +91,7 @@ def test_torn_branch_exits_with_3_and_keeps_good_frames(folder):
 def test_motion_and_force_at_once_are_refused(folder):
     """Both a motion and a force: exit code 2, nothing written."""
     with pytest.raises(InputError, match="force"):
-        simulate(folder, SimulateSettings(move=(0.1, 0, 0), grasp_force=(1.0, 0, 0)))
+        Simulate(branch_folder=folder, move=(0.1, 0, 0), grasp_force=(1.0, 0, 0)).run()
     assert not (folder / "frames").exists()
 
 
@@ -183,7 +183,7 @@ def test_load_in_wrong_units_warns(folder):
     said = []
     settings = SimulateSettings(kind="static", grasp_force=(20000.0, 0, 90000.0), duration=2 / 60,
                                 gravity=False)
-    simulate(folder, settings, progress=Progress(on_warning=said.append))
+    Simulate.of(settings, branch_folder=folder).run(Progress(on_warning=said.append))
     assert any("units" in message and "at (" in message for message in said), said
 
 
@@ -191,7 +191,7 @@ def test_frames_say_strain_and_stress_of_each(folder):
     """Largest principal strain and stress per frame, growing with a pull that grows."""
     settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), duration=4 / 60,
                                 gravity=False)
-    result = simulate(folder, settings)
+    result = Simulate.of(settings, branch_folder=folder).run()
     frames = json.loads((folder / "frames" / "simulate.json").read_text())
     strain = frames["largest_principal_strains"]
     stress = frames["largest_principal_stresses_pa"]
@@ -205,7 +205,7 @@ def test_series_reads_back_elsewhere(folder):
     meshio = pytest.importorskip("meshio")
     settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), duration=2 / 60, vtu=True,
                                 gravity=False)
-    simulate(folder, settings)
+    Simulate.of(settings, branch_folder=folder).run()
     files = sorted((folder / "frames" / "simulate").glob("*.vtu"))
     own = TetMesh.read(folder / "mesh.vtu")
     assert len(files) == 3
@@ -222,9 +222,8 @@ def _frames(folder, name="simulate"):
 
 def test_a_second_gripper_props_the_branch(folder):
     """A load at half the length, the tip held: the prop carries 5/16 of it (beam theory)."""
-    simulate(folder, SimulateSettings(
-        kind="static", gravity=False, duration=1 / 60, grasp_mode="point",
-        load_at=((0, 0, 0.15, 0.1, 0, 0),), hold_at=((0, 0, 0.3),)))
+    Simulate(branch_folder=folder, kind="static", gravity=False, duration=1 / 60,
+             grasp_mode="point", load_at=((0, 0, 0.15, 0.1, 0, 0),), hold_at=((0, 0, 0.3),)).run()
     held = np.array(_frames(folder)["hold_forces_n"])
     assert held.shape == (2, 1, 3)
     assert held[0] == pytest.approx(np.zeros((1, 3)), abs=1e-9)
@@ -233,9 +232,9 @@ def test_a_second_gripper_props_the_branch(folder):
 
 def test_pose_and_hold_together_in_motion(folder):
     """One gripper moves, another holds: forces of both are given, the held place stays."""
-    simulate(folder, SimulateSettings(
-        move=(0.003, 0, 0), hold_at=((0, 0, 0.3),), grasp_point=(0, 0, 0.15), duration=0.1,
-        hold=0.05, grasp_mode="point", gravity=False))
+    Simulate(branch_folder=folder, move=(0.003, 0, 0), hold_at=((0, 0, 0.3),),
+             grasp_point=(0, 0, 0.15), duration=0.1, hold=0.05, grasp_mode="point",
+             gravity=False).run()
     frames = _frames(folder)
     assert np.shape(frames["hold_forces_n"]) == (frames["frame_count"], 1, 3)
     assert frames["grasp_forces_n"][-1][0] > 0 > frames["hold_forces_n"][-1][0][0]
@@ -250,8 +249,8 @@ def test_a_load_grows_as_a_grasp_force_does(folder):
     """The same force by --load-at and by --grasp-force: the same motion."""
     place = {"grasp_point": (0, 0, 0.2), "duration": 0.1, "hold": 0.1, "gravity": False,
              "grasp_mode": "point"}
-    simulate(folder, SimulateSettings(grasp_force=(0.5, 0, 0), name="force", **place))
-    simulate(folder, SimulateSettings(load_at=((0, 0, 0.2, 0.5, 0, 0),), name="load", **place))
+    Simulate(branch_folder=folder, grasp_force=(0.5, 0, 0), name="force", **place).run()
+    Simulate(branch_folder=folder, load_at=((0, 0, 0.2, 0.5, 0, 0),), name="load", **place).run()
     assert _frames(folder, "load")["energies_j"] == pytest.approx(
         _frames(folder, "force")["energies_j"], rel=1e-6)
     assert _frames(folder, "load")["energies_j"][-1] > 0

@@ -12,13 +12,12 @@ from limber.geometry.tets.tree_sweep import curved_beam
 from limber.mechanics import BranchModel
 from limber.mechanics.loads.loaded_branch import hang
 from limber.planning import make_plan
-from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.certificate import lower_bound
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_model import grasp_model_of
 from limber.planning.field.stored_states import GraspSamples
-from limber.stages.paths.energy import EnergySettings, sample_energy_field
-from limber.stages.paths.plan import plan as plan_paths
+from limber.stages.paths.energy import SampleEnergy
+from limber.stages.paths.plan import PlanPaths
 from limber.store import Branch
 
 STIFFNESS = np.array([8.0, 8.0, 30.0])  # [N/m] soft to the sides, stiff along the branch
@@ -119,8 +118,8 @@ def planned_branch(tmp_path_factory, small_mesh, small_skeleton):
     with branch.stage("mesh") as stage:
         small_mesh.write(stage.path("mesh.vtu"))
         small_skeleton.write_swc(stage.path("skeleton.swc"))
-    sample_energy_field(folder, EnergySettings(samples=60), workers=1)
-    plan_paths(folder, PlanSettings(iterations=800, start_seed=3), name="there", workers=1)
+    SampleEnergy(branch_folder=folder, samples=60, workers=1).run()
+    PlanPaths(branch_folder=folder, iterations=800, start_seed=3, name="there", workers=1).run()
     return folder
 
 

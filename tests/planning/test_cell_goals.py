@@ -17,7 +17,7 @@ from limber.planning.goals.goal import Ball, CellPlace, GoalRequest, goal_points
 from limber.planning.goals.goal_kinds import CellGoal, TargetGoal, goal_of
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.plan_file import read_plan
-from limber.stages.paths.plan import plan as plan_paths
+from limber.stages.paths.plan import PlanPaths
 from limber.stages.paths.plan_cell import cell_positions, hiding
 from limber.store import Branch
 
@@ -247,8 +247,8 @@ def test_a_target_is_brought_where_it_can_be_taken_or_seen(planned_branch, tmp_p
     place = cell_positions(cell)[kind]
     path = tmp_path / "cell.toml"
     write_cell(path, cell.model_copy(update={"branch": Branch.open(folder).uuid}))
-    plan_paths(folder, SETTINGS.model_copy(update={kind: True}), name="brought", cell_file=path,
-               workers=1)
+    PlanPaths.of(SETTINGS.model_copy(update={kind: True}), branch_folder=folder, name="brought",
+                 cell=path, workers=1).run()
     plan = read_plan(folder / "plans/brought.json")
     end = np.array(plan.summary["target_end_m"])
     place.require("the tip", end, None)

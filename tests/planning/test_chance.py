@@ -10,8 +10,7 @@ from limber.core.errors import InputError
 from limber.planning.constraints.chance import Exposure, Surface, YoungUncertainty, _chosen, _design
 from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import resolve_path
-from limber.planning.settings import PlanSettings
-from limber.stages.paths.plan import plan as plan_paths
+from limber.stages.paths.plan import PlanPaths
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +109,7 @@ def test_poses_are_asked_where_a_limit_may_break(bent):
 ])
 def test_a_confidence_needs_a_limit_and_an_estimate(planned_branch, settings, words):
     with pytest.raises(InputError, match=words):
-        plan_paths(planned_branch, PlanSettings(**settings), name="sure")
+        PlanPaths(branch_folder=planned_branch, **settings, name="sure").run()
 
 
 def test_poses_that_break_under_other_moduli_share_the_chance():

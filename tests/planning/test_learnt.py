@@ -18,7 +18,7 @@ from limber.reduced import model_cache
 from limber.reduced.model_cache import ReducedCache
 from limber.reduced.reduced_model import ReducedSettings
 from limber.reduced.training import TrainingSettings
-from limber.stages.paths.energy import EnergySettings, sample_energy_field
+from limber.stages.paths.energy import EnergySettings, SampleEnergy
 from limber.store import Branch
 
 FEW = ReducedSettings(size=40, field_count=70, training=TrainingSettings(
@@ -107,7 +107,7 @@ def test_a_field_says_which_model_it_came_from(small_model, small_mesh, small_sk
         small_mesh.write(stage.path("mesh.vtu"))
         small_skeleton.write_swc(stage.path("skeleton.swc"))
     asked = EnergySettings(samples=45, forward="reduced", gravity=False)
-    result = sample_energy_field(branch.folder, asked, workers=1)
+    result = SampleEnergy.of(asked, branch_folder=branch.folder, workers=1).run()
     field = EnergyField.read(branch.path("energy.npz"))
     samples = field.samples
     assert result["forward"] == "reduced" and len(list((tmp_path / "kept").glob("*.npz"))) == 1

@@ -19,7 +19,7 @@ from limber.planning.path_on_full_model import resolve_path
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSettings
 from limber.planning.timing import Pace, poses_at, time_law
-from limber.stages.paths.plan import plan as plan_paths
+from limber.stages.paths.plan import PlanPaths
 
 BRISK = Pace(0.25, 2.0)
 
@@ -109,9 +109,9 @@ def test_a_plan_that_inertia_breaks_is_refused(planned_branch, tmp_path, monkeyp
         Pace(0.001, 0.001), [words], {"force": 99.0}, {"force": 10.0}, 4, {"force": 1.65}, 9, 0.1))
     monkeypatch.setattr(plan_module, "_REPLANS", 0)
     with pytest.raises(NoPathError, match="force in motion") as refused:
-        plan_paths(folder, PlanSettings(
-            max_force=most, iterations=100, start=tuple(there.poses[0, :3]),
-            goal=tuple(there.poses[-1, :3])), name="shaken", workers=1)
+        PlanPaths(branch_folder=folder, max_force=most, iterations=100,
+                  start=tuple(there.poses[0, :3]), goal=tuple(there.poses[-1, :3]), name="shaken",
+                  workers=1).run()
     assert refused.value.exit_code == 3 and not (folder / "plans/shaken.json").exists()
 
 

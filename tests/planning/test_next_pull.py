@@ -22,7 +22,7 @@ from limber.estimation.settings import FitSpec
 from limber.planning.constraints.chance import Exposure, Surface
 from limber.recordings.recording import EXACT, SensorEntry
 from limber.stages.pulls import suggest_pull as stage
-from limber.stages.pulls.suggest_pull import SuggestPullSettings, suggest_pull, verdict
+from limber.stages.pulls.suggest_pull import SuggestPull, verdict
 from limber.store import Branch
 from limber.store.loading import load_subject
 
@@ -167,8 +167,8 @@ def test_the_stage_writes_the_best_pull_and_answers_for_a_plan(planned_branch, t
     """Best first; a plan without limits needs no other pull."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
     monkeypatch.setattr(stage, "CANDIDATES", (0.8,))
-    settings = SuggestPullSettings(max_strain=0.05)
-    result = suggest_pull(folder, settings, plan="there", workers=1)
+    settings = {"max_strain": 0.05}
+    result = SuggestPull(branch_folder=folder, **settings, plan="there", workers=1).run()
     written = json.loads((folder / "suggested_pull.json").read_text())
     shares = [pull["bits_per_percent_strain"] for pull in [written["best"], *written["others"]]]
     assert shares == sorted(shares, reverse=True) and len(shares) > 4

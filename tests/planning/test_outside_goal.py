@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -15,15 +15,14 @@ from limber.core.settings import Groups
 from limber.planning.goals.goal import GoalKind
 from limber.planning.goals.goal_kinds import KINDS
 from limber.planning.plan_file import read_plan
-from limber.planning.settings import PlanSettings
 from limber.results.scene.animation import _goal as drawn
 from limber.stages.paths import plan as plan_stage
-from limber.stages.paths.plan import plan as plan_paths
+from limber.stages.paths.plan import PlanPaths
 
 pytestmark = pytest.mark.usefixtures("rough_plan")
 
 
-class SideSettings(PlanSettings):
+class SidePaths(PlanPaths):
     """Those of a plan, and how far to the side."""
 
     groups: ClassVar[Groups] = {"start and goal": ("goal_side",)}
@@ -88,25 +87,27 @@ def test_a_goal_from_outside_is_planned_to(planned_branch, tmp_path):
     says, and file and picture show it."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
     rest = read_plan(folder / "plans/there.json").motion.poses[0]
-    settings = SideSettings(goal_side=rest[0] + 0.08, iterations=100)
-    done = plan_paths(folder, settings, name="side", workers=1)
+    asked = SidePaths(goal_side=rest[0] + 0.08, iterations=100, branch_folder=folder, name="side",
+                      workers=1)
+    done = asked.run()
     told = json.loads((folder / "plans/side.json").read_text())
-    assert told["goal"] == {"kind": "side", "x_m": settings.goal_side, "chosen": False,
-                            "position_m": [settings.goal_side, 0.0, 0.4], "tolerance_m": 0.01}
-    assert abs(told["plan"]["poses"][-1][0] - settings.goal_side) <= 0.01 * 1.001
+    assert told["goal"] == {"kind": "side", "x_m": asked.goal_side, "chosen": False,
+                            "position_m": [asked.goal_side, 0.0, 0.4], "tolerance_m": 0.01}
+    assert abs(told["plan"]["poses"][-1][0] - asked.goal_side) <= 0.01 * 1.001
     assert told["side_end_m"] == told["plan"]["poses"][-1][0]
     bound = done["certificate"]
     assert 0.0 < bound["lower_bound"] <= bound["upper_bound"]
     assert bound["full_model"]["lower_bound"] <= bound["full_model"]["cost"]
     assert read_plan(folder / "plans/side.json").summary["goal"]["kind"] == "side"
     assert drawn(told, None)["kind"] == "side"
-    assert plan_paths(folder, settings, name="side") == done
+    assert asked.run() == done
 
 
 def test_a_goal_from_outside_has_its_option(monkeypatch):
     """The command with those settings takes it."""
-    monkeypatch.setattr(plan_stage, "STAGE", replace(plan_stage.STAGE, settings=SideSettings))
-    assert parsed("plan", ["a.branch", "--goal-side", "0.3"])[1] == SideSettings(goal_side=0.3)
+    monkeypatch.setattr(plan_stage, "PlanPaths", SidePaths)
+    assert parsed("plan", ["a.branch", "--goal-side", "0.3"]) == SidePaths(
+        branch_folder="a.branch", goal_side=0.3)
 
 
 @pytest.mark.usefixtures("side")
@@ -115,4 +116,4 @@ def test_it_is_refused_beside_another_goal(planned_branch):
     for more, words in (({"goal": (0, 0, 1)}, "--goal and --goal-side"),
                         ({"target": "flower"}, "without a goal for it")):
         with pytest.raises(InputError, match=words):
-            plan_paths(planned_branch, SideSettings(goal_side=0.1, **more), name="bad")
+            SidePaths(goal_side=0.1, **more, branch_folder=planned_branch, name="bad").run()

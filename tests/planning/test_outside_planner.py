@@ -8,13 +8,12 @@ import pytest
 
 from limber.planning.planners.rrt_star import Searched
 from limber.planning.planners.trees import PLANNERS, chosen_engine
-from limber.planning.settings import PlanSettings
-from limber.stages.paths.plan import plan as plan_paths
+from limber.stages.paths.plan import PlanPaths
 
 pytestmark = pytest.mark.usefixtures("rough_plan")
 
 
-class LineSettings(PlanSettings):
+class LinePaths(PlanPaths):
     """Those of a plan, with one more planner."""
 
     engine: Literal["auto", "ompl", "own", "line"] = "line"
@@ -46,7 +45,7 @@ def line():
 def test_a_planner_from_outside_finds_the_baseline(planned_branch, tmp_path, line):
     """Asked for the shortest and the gentle path, its line is the baseline, named as its own."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
-    done = plan_paths(folder, LineSettings(), name="line", workers=1)
+    done = LinePaths(branch_folder=folder, name="line", workers=1).run()
     shortest, gentle = line.searched
     assert shortest.weights.energy == 0.0 < gentle.weights.energy
     assert done["engine"] == "line"

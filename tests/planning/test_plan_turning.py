@@ -9,10 +9,9 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, NoPathError
 from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import resolve_path
-from limber.planning.settings import PlanSettings
 from limber.robot.motion.execution import Turned
 from limber.stages.paths import plan_turning
-from limber.stages.paths.plan import plan
+from limber.stages.paths.plan import PlanPaths
 from limber.stages.paths.plan_turning import Clamped, turned_by
 
 
@@ -61,4 +60,4 @@ def test_an_offset_never_needs_the_torque_at_which_the_guard_stops(clamped, monk
 
 def test_a_slack_without_an_arm_is_refused(planned_branch):
     with pytest.raises(InputError, match="--turn-slack is given without --cell"):
-        plan(planned_branch, PlanSettings(turn_slack=0.2), name="turned")
+        PlanPaths(branch_folder=planned_branch, turn_slack=0.2, name="turned").run()

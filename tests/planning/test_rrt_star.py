@@ -20,8 +20,8 @@ from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.rrt_star import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, OmplRrtStar, plan_path
 from limber.planning.settings import PlanSettings
-from limber.stages.paths.compare import CompareSettings, compare
-from limber.stages.registry import stage_description
+from limber.stages.paths.compare import ComparePlanners
+from limber.stages.registry import stage_class
 
 START = np.array([-0.13, 0.0, 0.0])
 GOAL = GraspGoal((0.13, 0.0, 0.0), 0.01)
@@ -240,16 +240,17 @@ def test_the_table_has_means_deviations_and_changes(trials):
 @pytest.mark.slow  # a plan on a branch's field
 def test_the_command_writes_table_and_figure(planned_branch, tmp_path, monkeypatch):
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
-    settings = CompareSettings(trials=1, seed=3)
-    result = compare(folder, settings, workers=1, progress=Progress(on_warning=pytest.fail))
+    settings = {"trials": 1, "seed": 3}
+    result = ComparePlanners(branch_folder=folder, **settings,
+                             workers=1).run(Progress(on_warning=pytest.fail))
     with (folder / "comparisons/planners.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["planner"] for row in rows] == list(COMPARED.values())
     assert (folder / "comparisons/planners.png").stat().st_size > 10_000
-    (title, table), = stage_description("compare").result.of(result).tables()
+    (title, table), = stage_class("compare").about.result.of(result).tables()
     assert "1 random starts" in title and len(table) == 1 + len(COMPARED)
     assert table[1][0] == "copy" and table[1][3] == "" and float(table[5][5]) != 0.0
     monkeypatch.setattr("limber.planning.compared_planners.run_trials", pytest.fail)
-    assert compare(folder, settings) == result, "it is current"
+    assert ComparePlanners(branch_folder=folder, **settings).run() == result, "it is current"
     with pytest.raises(InputError, match="cannot name"):
-        compare(folder, settings, name="../there")
+        ComparePlanners(branch_folder=folder, **settings, name="../there").run()

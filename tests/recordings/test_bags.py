@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
-from limber.core.progress import SILENT
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.geometry.io.depth_images import depth_metres
 from limber.perception.observe import write_depth
@@ -18,8 +17,8 @@ from limber.recordings.bag_reader import Bag, Topic, read_bag, stamped
 from limber.recordings.import_request import ImportRequest
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.settings import ImportSettings
-from limber.stages.pulls.export_pull import export_pull
-from limber.stages.pulls.import_pull import import_pull
+from limber.stages.pulls.export_pull import ExportPull
+from limber.stages.pulls.import_pull import ImportPull
 
 pytest.importorskip("rosbags")
 
@@ -107,7 +106,7 @@ def pulled(bag: Written, *, wrench="/wrench", pose="/pose", shift=0.0):
 @pytest.mark.usefixtures("apart")
 def test_a_pull_comes_back_as_it_was(mcap, bare_folder, plain_pull):
     """Poses, wrenches and markers through MCAP; frames need no option."""
-    result = import_pull(bare_folder, mcap, "again", ImportSettings())
+    result = ImportPull(branch_folder=bare_folder, source=mcap, name="again").run()
     assert result["kind"] == "bag" and result["point_count"] == 2
     pull = read_pull(bare_folder / "pulls" / "again")
     assert np.allclose(pull.times, plain_pull.times, atol=1e-6)
@@ -115,7 +114,7 @@ def test_a_pull_comes_back_as_it_was(mcap, bare_folder, plain_pull):
     assert np.allclose(pull.wrenches, plain_pull.wrenches, atol=1e-7)
     assert np.allclose(pull.observations.positions, plain_pull.observations.positions, atol=1e-8)
     assert np.allclose(pull.observations.times, plain_pull.observations.times, atol=1e-6)
-    export_pull(bare_folder, "again", bare_folder.parent / "out.mcap")
+    ExportPull(branch_folder=bare_folder, name="again", mcap=bare_folder.parent / "out.mcap").run()
     assert read_bag(bare_folder.parent / "out.mcap").of("wrench")[0].values.shape == (201, 6)
 
 
@@ -130,7 +129,7 @@ def test_a_rosbag2_folder_is_read_as_well(mcap, tmp_path, bare_folder, plain_pul
                  for c in reader.connections}
         for connection, logged, raw in reader.messages():
             writer.write(known[connection.topic], logged, raw)
-    import_pull(bare_folder, tmp_path / "bag2", "again", ImportSettings())
+    ImportPull(branch_folder=bare_folder, source=tmp_path / "bag2", name="again").run()
     pull = read_pull(bare_folder / "pulls" / "again")
     assert np.allclose(pull.wrenches, plain_pull.wrenches, atol=1e-7)
 
@@ -150,7 +149,7 @@ def test_depth_images_come_with_their_camera(tmp_path, bare_folder, plain_pull):
     for time, depth in zip((0.5, 1.5, 2.5), depths, strict=True):
         write_depth(folder / "depth" / f"{time:.6f}.png", depth, camera)
     write_mcap(tmp_path / "run.mcap", folder, pull)
-    import_pull(bare_folder, tmp_path / "run.mcap", "seen", ImportSettings())
+    ImportPull(branch_folder=bare_folder, source=tmp_path / "run.mcap", name="seen").run()
     target = bare_folder / "pulls" / "seen"
     found = read_camera(target / "camera.toml")
     assert found.pose == pytest.approx(camera.pose) and found.fy == 31.0
@@ -170,7 +169,7 @@ def test_a_sensors_own_frame_is_turned_by_tf(tmp_path, bare_folder):
             bag.transform(time, "tool0", [way, 0, 0.5, 0, 0, 0])
             # 50 way N along the branch's y is along the sensor's x.
             bag.wrench("/wrench", time, [50.0 * way, 0.0, 0.0], frame="sensor")
-    import_pull(bare_folder, tmp_path / "tf.mcap", "tf", ImportSettings())
+    ImportPull(branch_folder=bare_folder, source=tmp_path / "tf.mcap", name="tf").run()
     pull = read_pull(bare_folder / "pulls" / "tf")
     way = pull.poses[:, 0]
     assert np.allclose(pull.poses[:, 2], 0.5) and way[-1] == pytest.approx(0.1)
@@ -194,11 +193,11 @@ def test_joint_angles_need_the_cell(tmp_path, bare_folder):
             bag.joints(time, names, [1.4, -1.5, 0.1 * time, -1.2, -1.5, 0.2])
             bag.wrench("/wrench", time, [time - 1, 0, 0])
     with pytest.raises(InputError, match="--cell"):
-        import_pull(bare_folder, tmp_path / "joints.mcap", "j", ImportSettings())
+        ImportPull(branch_folder=bare_folder, source=tmp_path / "joints.mcap", name="j").run()
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.4, 0.2, 0.0, 0, 0, 0)})
     write_cell(tmp_path / "cell.toml", cell)
-    import_pull(bare_folder, tmp_path / "joints.mcap", "j",
-                ImportSettings(cell=str(tmp_path / "cell.toml")))
+    ImportPull(branch_folder=bare_folder, source=tmp_path / "joints.mcap", name="j",
+               cell=str(tmp_path / "cell.toml")).run()
     pull = read_pull(bare_folder / "pulls" / "j")
     expected = pose_vectors(cell.arm.forward(np.array([0.1, -1.5, 1.4, -1.2, -1.5, 0.2])))
     assert np.allclose(pull.poses[0, :3], expected[:3] + [0.4, 0.2, 0.0])
@@ -225,13 +224,15 @@ def test_joints_are_called_as_the_cells_arm_calls_them(tmp_path, bare_folder, re
                 bag.wrench("/wrench", time, [time - 1, 0, 0])
         settings = ImportSettings(cell=str(path))
         if called is names:
-            import_pull(bare_folder, tmp_path / "joints.mcap", "j", settings)
+            ImportPull.of(settings, branch_folder=bare_folder, source=tmp_path / "joints.mcap",
+                          name="j").run()
             pull = read_pull(bare_folder / "pulls" / "j")
             place = read_cell(path).arm.forward(np.array([0.1, -1.5, 1.4, -1.2, -1.5, 0.2]))
             assert np.allclose(pull.poses[0, :3], pose_vectors(place)[:3])
         else:
             with pytest.raises(InputError, match=r"joints are named.*waist, shoulder_lift_joint"):
-                import_pull(bare_folder, tmp_path / "joints.mcap", "k", settings)
+                ImportPull.of(settings, branch_folder=bare_folder, source=tmp_path / "joints.mcap",
+                              name="k").run()
 
 
 @pytest.mark.parametrize("made, told", [
@@ -246,7 +247,7 @@ def test_what_a_bag_lacks_is_said(tmp_path, bare_folder, made, told):
     with Written(tmp_path / "bad.mcap") as bag:
         made(bag)
     with pytest.raises(InputError, match=f"(?s){told}"):
-        import_pull(bare_folder, tmp_path / "bad.mcap", "bad", ImportSettings())
+        ImportPull(branch_folder=bare_folder, source=tmp_path / "bad.mcap", name="bad").run()
     assert not (bare_folder / "pulls" / "bad" / "pull.toml").exists()
 
 
@@ -255,8 +256,8 @@ def test_what_was_asked_can_be_answered(tmp_path, bare_folder):
     with Written(tmp_path / "two.mcap") as bag:
         pulled(bag, shift=3600.0)
         pulled(bag, wrench="/other", pose="/left")
-    import_pull(bare_folder, tmp_path / "two.mcap", "two", ImportSettings(
-        wrench_topic="/wrench", pose_topic="/left", bag_clock="log"))
+    ImportPull(branch_folder=bare_folder, source=tmp_path / "two.mcap", name="two",
+               wrench_topic="/wrench", pose_topic="/left", bag_clock="log").run()
     pull = read_pull(bare_folder / "pulls" / "two")
     assert np.allclose(pull.wrenches[:, 0], 50 * pull.poses[:, 0], atol=1e-6)
 
@@ -294,8 +295,8 @@ def test_a_robots_log_alone_is_a_pull(tmp_path, bare_folder):
     header = ",".join(["timestamp", *(f"actual_TCP_pose_{k}" for k in range(6)),
                        *(f"actual_TCP_force_{k}" for k in range(6))])
     np.savetxt(tmp_path / "rtde.csv", rows, "%.9g", ",", header=header, comments="")
-    result = import_pull(bare_folder, tmp_path / "rtde.csv", "log", ImportSettings(
-        frame_pose=(0.1, 0, 0, 0, 0, np.pi / 2)))
+    result = ImportPull(branch_folder=bare_folder, source=tmp_path / "rtde.csv", name="log",
+                        frame_pose=(0.1, 0, 0, 0, 0, np.pi / 2)).run()
     assert result["kind"] == "robot"
     pull = read_pull(bare_folder / "pulls" / "log")
     assert np.allclose(pull.poses[-1, :3], [0.1, 0.1, 0.5])
@@ -305,15 +306,12 @@ def test_a_robots_log_alone_is_a_pull(tmp_path, bare_folder):
 
 def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
     """One command imports the bag under a name of its own, and estimates from it."""
-    from limber.estimation.settings import FitSpec
-    from limber.stages.inputs import BranchInputs
     from limber.stages.moduli import estimate as stage
 
     pull = read_pull(branch_folder / "pulls" / "pull-1")
     write_mcap(tmp_path / "run 7.mcap", branch_folder / "pulls" / "pull-1", pull)
-    monkeypatch.setattr(stage, "estimate", lambda folder, settings, **_: {"used": settings.pull})
-    told = stage.run(BranchInputs(branch_folder=branch_folder), FitSpec(),
-                     stage.EstimateOptions(bag=tmp_path / "run 7.mcap"), SILENT)
+    monkeypatch.setattr(stage, "_estimate", lambda _branch, asked, _: {"used": asked.pull})
+    told = stage.EstimateYoung(branch_folder=branch_folder, bag=tmp_path / "run 7.mcap").run()
     assert told == {"used": ("run-7",)}
     again = read_pull(branch_folder / "pulls" / "run-7")
     assert np.allclose(again.wrenches[:, :3], pull.wrenches[:, :3], atol=1e-6)
@@ -332,8 +330,8 @@ def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, ba
     with Written(tmp_path / "theirs.mcap") as bag:
         pulled(bag)
     said: list[str] = []
-    import_pull(bare_folder, tmp_path / "theirs.mcap", "unknown", ImportSettings(),
-                progress=Progress(on_warning=said.append))
+    ImportPull(branch_folder=bare_folder, source=tmp_path / "theirs.mcap",
+               name="unknown").run(Progress(on_warning=said.append))
     assert any("calibration errors of gripper and force sensor" in line and "--cell" in line
                for line in said)
     assert read_pull(bare_folder / "pulls" / "unknown").entry.calibration is None
@@ -341,8 +339,8 @@ def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, ba
         robot={"model": "ur5e", "pose_sigma_m": 2e-5}, base={
             "pose": (0,) * 6, "position_sigma_m": 4e-4, "rotation_sigma_rad": 3e-3},
         sensor={"force_sigma_n": 0.3, "drift_n_per_minute": 6.0}))
-    import_pull(bare_folder, tmp_path / "theirs.mcap", "known", ImportSettings(
-        cell=str(tmp_path / "cell.toml")))
+    ImportPull(branch_folder=bare_folder, source=tmp_path / "theirs.mcap", name="known",
+               cell=str(tmp_path / "cell.toml")).run()
     entry = read_pull(bare_folder / "pulls" / "known").entry
     assert entry.sensor.force_sigma_n == 0.3
     assert entry.calibration.force_drift_sigma_n == pytest.approx(0.2, rel=1e-3)
@@ -360,8 +358,8 @@ def test_a_broken_description_in_a_bag_costs_only_itself(mcap, tmp_path, bare_fo
     monkeypatch.setattr(bag_pull, "entry_text", lambda entry: "grasp = {radius_m = -1}")
     write_mcap(tmp_path / "odd.mcap", tmp_path / "spring", plain_pull)
     said: list[str] = []
-    import_pull(bare_folder, tmp_path / "odd.mcap", "odd", ImportSettings(),
-                progress=Progress(on_warning=said.append))
+    ImportPull(branch_folder=bare_folder, source=tmp_path / "odd.mcap",
+               name="odd").run(Progress(on_warning=said.append))
     assert any("odd.mcap, metadata limber" in line for line in said)
     assert len(read_pull(bare_folder / "pulls" / "odd").times) == len(plain_pull.times)
 

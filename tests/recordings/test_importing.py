@@ -23,7 +23,7 @@ from limber.recordings.recording import (
 from limber.recordings.recording_formats import RECORDINGS
 from limber.recordings.settings import ImportSettings
 from limber.recordings.time_series import Stream, read_stream, write_stream
-from limber.stages.pulls.import_pull import import_pull
+from limber.stages.pulls.import_pull import ImportPull
 from limber.store import Branch
 from limber.store.loading import load_mesh
 
@@ -44,9 +44,9 @@ def source(tmp_path, plain_pull):
 
 def test_markers_in_millimetres_and_gram_force(bare_folder, source, plain_pull):
     """Units are converted at the door; the pull in the folder is in metres and newtons."""
-    result = import_pull(bare_folder, source / "markers.csv", "m", ImportSettings(
-        robot=str(source / "robot.csv"), unit="mm", force_unit="gf", time_offset=0.05,
-        torque_sigma=0.002))
+    result = ImportPull(branch_folder=bare_folder, source=source / "markers.csv", name="m",
+                        robot=str(source / "robot.csv"), unit="mm", force_unit="gf",
+                        time_offset=0.05, torque_sigma=0.002).run()
     assert result["frame_count"] == 60 and result["point_count"] == 2
     pull = read_pull(bare_folder / "pulls" / "m")
     assert np.allclose(pull.observations.positions, plain_pull.observations.positions, atol=1e-6)
@@ -62,18 +62,20 @@ def test_entries_of_the_users_file_replace_the_imports(bare_folder, source, tmp_
     stated.write_text("[calibration]\ncamera_sigma_m = 0.004\n[sensor]\ntared = false\n")
     settings = ImportSettings(robot=str(source / "robot.csv"), unit="mm", force_unit="gf",
                               time_offset=0.05, pull_toml=str(stated))
-    import_pull(bare_folder, source / "markers.csv", "m", settings)
+    ImportPull.of(settings, branch_folder=bare_folder, source=source / "markers.csv",
+                  name="m").run()
     entry = read_pull(bare_folder / "pulls" / "m").entry
     assert entry.calibration.camera_sigma_m == 0.004
     assert not entry.sensor.tared and entry.sensor.position_sigma_m == 1e-3
     stated.write_text("[calibration]\ncamera_sigma_m = 0.005\n")
-    import_pull(bare_folder, bare_folder / "pulls" / "m", "whole", ImportSettings(
-        pull_toml=str(stated)))
+    ImportPull(branch_folder=bare_folder, source=bare_folder / "pulls" / "m", name="whole",
+               pull_toml=str(stated)).run()
     whole = read_pull(bare_folder / "pulls" / "whole").entry
     assert whole.calibration.camera_sigma_m == 0.005 and whole.sensor == entry.sensor
     stated.write_text("[calibration]\ncamera_sigma = 0.005\n")
     with pytest.raises(InputError, match=r"mine.toml: calibration.camera_sigma: "):
-        import_pull(bare_folder, source / "markers.csv", "m", settings)
+        ImportPull.of(settings, branch_folder=bare_folder, source=source / "markers.csv",
+                      name="m").run()
 
 
 def test_tables_with_the_same_stamps_have_one_clock(bare_folder, source, plain_pull):
@@ -84,8 +86,8 @@ def test_tables_with_the_same_stamps_have_one_clock(bare_folder, source, plain_p
                    for column in seen.positions.reshape(60, -1).T], axis=1)
     write_stream(source / "same.csv", Stream(times, at, tuple(
         f"tip{k}_{axis}_m" for k in range(2) for axis in "xyz")))
-    result = import_pull(bare_folder, source / "same.csv", "s", ImportSettings(
-        robot=str(source / "robot.csv"), force_unit="gf"))
+    result = ImportPull(branch_folder=bare_folder, source=source / "same.csv", name="s",
+                        robot=str(source / "robot.csv"), force_unit="gf").run()
     assert result["time_offset_s"] == 0.0
 
 
@@ -98,19 +100,20 @@ def test_markers_in_another_frame_are_refused(branch_folder, source, small):
     write_stream(source / "far.csv", Stream(np.array([0.0, 4.0]), seen,
                                             ("tip_x_m", "tip_y_m", "tip_z_m")))
     with pytest.raises(InputError, match="--nominal"):
-        import_pull(branch_folder, source / "far.csv", "m", ImportSettings(
-            robot=str(source / "robot.csv")))
+        ImportPull(branch_folder=branch_folder, source=source / "far.csv", name="m",
+                   robot=str(source / "robot.csv")).run()
 
 
 def test_a_robot_table_is_needed_and_its_columns_are_named(bare_folder, source):
     """What is missing is said, with the columns that are expected."""
     with pytest.raises(InputError, match="--robot"):
-        import_pull(bare_folder, source / "markers.csv", "m", ImportSettings(unit="mm"))
+        ImportPull(branch_folder=bare_folder, source=source / "markers.csv", name="m",
+                   unit="mm").run()
     with pytest.raises(InputError, match="x_m"):
-        import_pull(bare_folder, source / "markers.csv", "m", ImportSettings(
-            unit="mm", robot=str(source / "markers.csv")))
+        ImportPull(branch_folder=bare_folder, source=source / "markers.csv", name="m", unit="mm",
+                   robot=str(source / "markers.csv")).run()
     with pytest.raises(InputError, match="no "):
-        import_pull(bare_folder, source / "nothing.csv", "m", ImportSettings())
+        ImportPull(branch_folder=bare_folder, source=source / "nothing.csv", name="m").run()
     assert "m" not in json.loads((bare_folder / "branch.json").read_text())["files"]
 
 
@@ -130,7 +133,8 @@ def test_rgbd_folder_in_the_layout_of_tum(bare_folder, source):
         lines.append(f"{10.0 + 0.5 * k:.6f} depth/f{k}.png")
     (folder / "depth.txt").write_text("\n".join(lines) + "\n")
     (folder / "groundtruth.txt").write_text("10.0 1 2 3 0 0 0.70710678 0.70710678\n")
-    import_pull(bare_folder, folder, "rgbd", ImportSettings(robot=str(source / "robot.csv")))
+    ImportPull(branch_folder=bare_folder, source=folder, name="rgbd",
+               robot=str(source / "robot.csv")).run()
     target = bare_folder / "pulls" / "rgbd"
     frames = list_frames(target, "depth")
     assert [time for time, _ in frames] == [10.0, 10.5, 11.0]
@@ -150,8 +154,9 @@ def test_folder_of_clouds(bare_folder, source):
         Cloud(np.full((20, 3), 100.0 * k)).write_ply(folder / f"cloud_{k}.ply")
     robot = str(source / "robot.csv")
     with pytest.raises(InputError, match="--rate-hz"):
-        import_pull(bare_folder, folder, "c", ImportSettings(robot=robot, unit="mm"))
-    import_pull(bare_folder, folder, "c", ImportSettings(robot=robot, unit="mm", rate_hz=10))
+        ImportPull(branch_folder=bare_folder, source=folder, name="c", robot=robot, unit="mm").run()
+    ImportPull(branch_folder=bare_folder, source=folder, name="c", robot=robot, unit="mm",
+               rate_hz=10).run()
     assert [t for t, _ in list_frames(bare_folder / "pulls" / "c", "clouds")] == [0.0, 0.1, 0.2]
 
 
@@ -239,8 +244,8 @@ def test_a_swing_by_its_own_weight_needs_no_grasp_point(branch_folder, tmp_path)
     seen[-1, 1] = np.nan
     write_stream(tmp_path / "swing.csv", Stream(times, seen.reshape(400, -1), tuple(
         f"m{k}_{axis}_m" for k in range(2) for axis in "xyz")))
-    import_pull(branch_folder, tmp_path / "swing.csv", "swing", ImportSettings(
-        weight=0, own_weight=True, motion="swing"))
+    ImportPull(branch_folder=branch_folder, source=tmp_path / "swing.csv", name="swing", weight=0,
+               own_weight=True, motion="swing").run()
     entry = read_pull(branch_folder / "pulls" / "swing").entry
     assert np.allclose(entry.grasp.point_m, places[1], atol=1e-3)
     assert entry.swing.load_mass_kg == 0

@@ -9,7 +9,7 @@ from limber.cli.main import call
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.recording_formats import RECORDINGS, RecordingFormat
 from limber.recordings.time_series import Stream
-from limber.stages.registry import stage_description
+from limber.stages.registry import stage_class
 
 
 class Tracks:
@@ -32,7 +32,7 @@ class Tracks:
 @pytest.fixture
 def tracks(tmp_path, plain_pull):
     # A stage's help lists the formats that there are when it is loaded: other tests' as well.
-    stage_description("import-pull")
+    stage_class("import-pull")
     RECORDINGS.register(RecordingFormat("tracks", (".foo",), Tracks.read, holds="markers"))
     Tracks.write(plain_pull.observations, tmp_path / "a.foo")
     write_pull(tmp_path / "made", plain_pull)

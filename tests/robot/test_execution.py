@@ -26,13 +26,7 @@ from limber.robot.motion.execution import across, followed, robot_motion
 from limber.robot.motion.trajectory import Predicted
 from limber.robot.recorder import NUDGE_M
 from limber.stages.paths import execute_path
-from limber.stages.paths.execute import (
-    ExecuteOptions,
-    ExecuteSettings,
-    _as_planned,
-    _as_slow_as_checked,
-    execute,
-)
+from limber.stages.paths.execute import ExecutePlan, _as_planned, _as_slow_as_checked
 from limber.stages.paths.execute_path import planned_poses
 from limber.stages.pulls.record_prediction import PullModel
 from limber.store import Branch
@@ -161,8 +155,8 @@ def test_what_was_followed_is_measured():
 def test_a_dry_run_moves_nothing_and_says_what_it_would_do(planned_folder, tmp_path):
     """Nobody listens at the address: a dry run needs no robot."""
     cell = standing_at(Branch.open(planned_folder), "127.0.0.97", fraction=FRACTION)
-    result = execute(planned_folder, "path", cell_file(cell, tmp_path), ExecuteSettings(),
-                     ExecuteOptions())
+    result = ExecutePlan(branch_folder=planned_folder, name="path",
+                         cell=cell_file(cell, tmp_path)).run()
     assert result["armed"] is False and result["reached"] is None
     assert result["predicted_peak_force_n"] > 0.1
     assert result["singularity_distance"] >= cell.limits.singularity
@@ -185,17 +179,21 @@ def test_the_plans_own_approach_is_taken(planned_folder):
     np.testing.assert_allclose(found[:, 0], [0.0, 0.03, 0.02, 0.01])
 
 
+def _asked(**settings):
+    return ExecutePlan(branch_folder="a.branch", cell="cell.toml", **settings)
+
+
 def test_a_plan_that_was_checked_in_motion_is_followed_no_faster():
     """Its pace where that is slower, with a warning; the cell's and the settings' where not."""
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.6, 0, 0, 0, 0, 0)})
     told = []
     settings, slow = _as_slow_as_checked({"speed_m_s": 0.01, "acceleration_m_s2": 0.02},
-                                         ExecuteSettings(speed=0.03), cell,
+                                         _asked(speed=0.03), cell,
                                          Progress(on_warning=told.append))
     assert settings.speed == 0.01 and "10.0 mm/s" in told[0]
     assert slow.limits.acceleration_m_s2 == pytest.approx(0.02 * np.sqrt(0.5))
     settings, same = _as_slow_as_checked({"speed_m_s": 0.2, "acceleration_m_s2": 2.0},
-                                         ExecuteSettings(speed=0.03), cell, Progress())
+                                         _asked(speed=0.03), cell, Progress())
     assert settings.speed == 0.03 and same.limits == cell.limits and len(told) == 1
 
 
@@ -204,11 +202,11 @@ def test_a_plan_is_executed_at_its_own_speed_and_held_as_long_as_it_says():
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.6, 0, 0, 0, 0, 0)})
     plan = {"timing": {"speed_m_s": 0.02}, "legs": [
         {"name": "path", "duration_s": 5.0}, {"name": "hold", "duration_s": 7.0}]}
-    own = _as_planned(plan, ExecuteSettings(), cell)
+    own = _as_planned(plan, _asked(), cell)
     assert (own.speed, own.hold) == (0.02, 7.0)
-    fast = _as_planned({"timing": {"speed_m_s": 0.2}}, ExecuteSettings(hold=0.0), cell)
+    fast = _as_planned({"timing": {"speed_m_s": 0.2}}, _asked(hold=0.0), cell)
     assert (fast.speed, fast.hold) == (cell.limits.speed_m_s, 0.0)
-    assert _as_planned({}, ExecuteSettings(), cell).speed == 0.03
+    assert _as_planned({}, _asked(), cell).speed == 0.03
 
 
 def test_a_base_out_of_reach_is_refused_before_any_force_is_solved(planned_folder, tmp_path,
@@ -221,8 +219,7 @@ def test_a_base_out_of_reach_is_refused_before_any_force_is_solved(planned_folde
     base = (cell.base.pose[0] + 3.0, *cell.base.pose[1:])
     away = cell.model_copy(update={"base": cell.base.model_copy(update={"pose": base})})
     with pytest.raises(NoPathError, match="out of the arm's reach"):
-        execute(planned_folder, "path", cell_file(away, tmp_path), ExecuteSettings(),
-                ExecuteOptions())
+        ExecutePlan(branch_folder=planned_folder, name="path", cell=cell_file(away, tmp_path)).run()
 
 
 def test_a_gripper_that_would_meet_an_obstacle_is_refused_at_once(planned_folder, tmp_path,
@@ -239,8 +236,8 @@ def test_a_gripper_that_would_meet_an_obstacle_is_refused_at_once(planned_folder
     blocked = Cell.model_validate(cell.model_dump() | {
         "tool": cell.tool.model_dump() | {"parts": [finger]}, "obstacles": [box]})
     with pytest.raises(NoPathError, match="inside shelf"):
-        execute(planned_folder, "path", cell_file(blocked, tmp_path), ExecuteSettings(),
-                ExecuteOptions())
+        ExecutePlan(branch_folder=planned_folder, name="path",
+                    cell=cell_file(blocked, tmp_path)).run()
 
 
 def test_the_planned_clearance_is_kept_when_executed(planned_folder, tmp_path, monkeypatch):
@@ -261,10 +258,10 @@ def test_the_planned_clearance_is_kept_when_executed(planned_folder, tmp_path, m
     stated = {"clearance_m": 0.2}
     monkeypatch.setattr(stage, "_stated_by_plan", lambda *_: stated)
     with pytest.raises(NoPathError, match=r"from shelf, nearer than the clearance of 200.0 mm"):
-        execute(planned_folder, "path", near, ExecuteSettings(), ExecuteOptions())
+        ExecutePlan(branch_folder=planned_folder, name="path", cell=near).run()
     stated["clearance_m"] = 0.0
     with pytest.raises(pytest.fail.Exception, match="forces were solved"):
-        execute(planned_folder, "path", near, ExecuteSettings(), ExecuteOptions())
+        ExecutePlan(branch_folder=planned_folder, name="path", cell=near).run()
 
 
 @pytest.mark.slow
@@ -276,14 +273,14 @@ def test_what_does_not_belong_together_is_refused(planned_folder, tmp_path):
                            "soft limit")):
         path = cell_file(cell.model_copy(update=changes), tmp_path)
         with pytest.raises(InputError, match=told):
-            execute(planned_folder, "path", path, ExecuteSettings(), ExecuteOptions())
+            ExecutePlan(branch_folder=planned_folder, name="path", cell=path).run()
     unweighed = cell.model_copy(update={"tool": cell.tool.model_copy(update={"mass_kg": None})})
     with pytest.raises(InputError, match="payload is not set"):
-        execute(planned_folder, "path", cell_file(unweighed, tmp_path), ExecuteSettings(),
-                ExecuteOptions(arm=True, confirm="path"))
+        ExecutePlan(branch_folder=planned_folder, name="path", cell=cell_file(unweighed, tmp_path),
+                    arm=True, confirm="path").run()
     path = cell_file(cell, tmp_path)
     with pytest.raises(InputError, match="Nobody confirmed"):
-        execute(planned_folder, "path", path, ExecuteSettings(), ExecuteOptions(arm=True))
+        ExecutePlan(branch_folder=planned_folder, name="path", cell=path, arm=True).run()
 
 
 @pytest.mark.parametrize("changes, told", [
@@ -314,15 +311,15 @@ def cell_before(folder, address, **limits) -> Cell:
 def motion_settings(planned_template):
     skeleton = load_skeleton(Branch.open(planned_template))
     axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
-    return ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), speed=0.05,
-                           hold=0.2)
+    return {"gripper_rotation": tuple(map(float, across(axis)[0])), "speed": 0.05, "hold": 0.2}
 
 
 @pytest.fixture(scope="module")
 def start_joints(planned_template, motion_settings, own_address, tmp_path_factory):
     """Where a dry run says that the arm has to stand [rad, 6]."""
     path = cell_file(cell_before(planned_template, own_address), tmp_path_factory.mktemp("dry"))
-    dry = execute(planned_template, "path", path, motion_settings, ExecuteOptions())
+    dry = ExecutePlan(branch_folder=planned_template, name="path", cell=path,
+                      **motion_settings).run()
     return np.array(dry["start_joints_rad"])
 
 
@@ -357,8 +354,8 @@ def armed_on(planned_folder, tmp_path, motion_settings, start_joints, monkeypatc
         robot.ask("stand", joints=list(map(float, joints)))
         # As it is set on the pendant: it is put back afterwards, and the pose is that tool's.
         robot.ask("tool", offset=list(GRASP_POSE))
-        return execute(planned_folder, "path", path, motion_settings,
-                       ExecuteOptions(arm=True, confirm="path"))
+        return ExecutePlan(branch_folder=planned_folder, name="path", cell=path, **motion_settings,
+                           arm=True, confirm="path").run()
     return run
 
 

@@ -23,7 +23,7 @@ from limber.robot.driver.controls import control_of, register_control
 from limber.robot.motion.joint_path import follow
 from limber.robot.motion.trajectory import densely
 from limber.robot.virtual.controller import Controller
-from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute
+from limber.stages.paths.execute import ExecutePlan
 from limber.store import Branch
 
 UPPER, FORE, FOOT, FLANGE = 0.45, 0.42, 0.35, 0.09
@@ -192,8 +192,8 @@ def test_a_plan_is_checked_for_it_and_its_dry_run_written(planned_folder, tmp_pa
     cell = standing_at(Branch.open(planned_folder), "127.0.0.97", model="pieper-6")
     far = {"kind": "box", "name": "wall", "size_m": (0.1, 0.1, 0.1), "pose": (5, 5, 0, 0, 0, 0)}
     cell = Cell.model_validate(cell.model_dump() | {"obstacles": [far]})
-    result = execute(planned_folder, "path", cell_file(cell, tmp_path), ExecuteSettings(),
-                     ExecuteOptions())
+    result = ExecutePlan(branch_folder=planned_folder, name="path",
+                         cell=cell_file(cell, tmp_path)).run()
     assert result["robot"] == "pieper-6" and result["armed"] is False
     assert result["singularity_distance"] >= cell.limits.singularity
     table = np.genfromtxt(planned_folder / "executions" / "path-preview.csv", delimiter=",",

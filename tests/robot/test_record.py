@@ -33,15 +33,9 @@ from limber.perception.observe import observe
 from limber.recordings.recording import read_pull
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
 from limber.robot.virtual.launch import VirtualCamera
-from limber.stages.pulls.record import (
-    RecordOptions,
-    RecordSettings,
-    _remove_empty,
-    record,
-)
+from limber.stages.pulls.record import RecordPull, _remove_empty
 from limber.stages.pulls.record_path import arc_path, suggested_pull, there_and_back, waypoint_path
 from limber.stages.pulls.record_prediction import PullModel
-from limber.stages.registry import stage_description
 from limber.store import Branch
 from limber.store.loading import load_skeleton
 
@@ -50,10 +44,10 @@ pytest.importorskip("rtde_control")
 MARKERS = 63400
 
 
-def sideways_pull(branch_folder, **changes) -> RecordSettings:
+def sideways_pull(branch_folder, **changes) -> dict:
     direction = tuple(map(float, sideways(Branch.open(branch_folder))))
-    return RecordSettings(**{"direction": direction, "distance": 0.012, "speed": 0.01,
-                             "pause": 0.2, "shape": "straight", **changes})
+    return {"direction": direction, "distance": 0.012, "speed": 0.01, "pause": 0.2,
+            "shape": "straight", **changes}
 
 
 def cell_at(branch_folder, address, **limits) -> Cell:
@@ -99,8 +93,9 @@ def stepped(shared_stepped, _soon):
 def test_a_recorded_pull_is_what_the_branch_did(branch_folder, tmp_path, robot):
     """No sample lost; the piece goes out and back; force rises and falls; markers beside it."""
     path = cell_file(cell_at(branch_folder, robot.address), tmp_path)
-    result = record(branch_folder, path, "robot-1", sideways_pull(branch_folder, speed=0.02),
-                    RecordOptions(confirm="robot-1", markers=MARKERS))
+    result = RecordPull(branch_folder=branch_folder, cell=path, name="robot-1",
+                        **sideways_pull(branch_folder, speed=0.02), confirm="robot-1",
+                        markers=MARKERS).run()
     assert result["ended"] == "reached" and result["marker_frames"] > 5
     pull = read_pull(branch_folder / "pulls" / "robot-1")
     assert np.diff(pull.times) == pytest.approx(np.full(len(pull.times) - 1, 0.002), abs=1e-5)
@@ -122,7 +117,7 @@ def test_nothing_moves_without_a_typed_name(branch_folder, tmp_path):
     path = cell_file(standing_at(Branch.open(branch_folder), "127.0.0.98"), tmp_path)
     for confirm in (None, "something"):
         with pytest.raises(InputError, match="Nobody confirmed"):
-            record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm=confirm))
+            RecordPull(branch_folder=branch_folder, cell=path, name="r", confirm=confirm).run()
 
 
 @pytest.mark.slow
@@ -131,7 +126,7 @@ def test_a_recording_that_never_began_leaves_nothing(branch_folder, tmp_path):
     path = cell_file(standing_at(Branch.open(branch_folder), "127.0.0.98"), tmp_path)
     for _ in range(2):
         with pytest.raises(WorkError, match="No robot answers"):
-            record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm="r"))
+            RecordPull(branch_folder=branch_folder, cell=path, name="r", confirm="r").run()
     assert Branch.open(branch_folder).streams() == []
 
 
@@ -139,7 +134,7 @@ def test_a_cell_of_another_branch_is_refused(branch_folder, tmp_path):
     cell = standing_at(Branch.open(branch_folder), "127.0.0.98")
     path = cell_file(cell.model_copy(update={"branch": "another"}), tmp_path)
     with pytest.raises(InputError, match="calibrated for branch another"):
-        record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm="r"))
+        RecordPull(branch_folder=branch_folder, cell=path, name="r", confirm="r").run()
 
 
 @pytest.mark.slow
@@ -147,8 +142,8 @@ def test_a_stop_keeps_what_was_recorded(branch_folder, tmp_path, stepped):
     """A force limit that the pull breaks: exit 4, a recording that says where it ended."""
     cell = cell_at(branch_folder, stepped.address, soft_force_n=1.2, hard_force_n=1.4)
     with pytest.raises(SafetyStop, match=r"force limit.*samples are in"):
-        record(branch_folder, cell_file(cell, tmp_path), "stopped", sideways_pull(branch_folder),
-               RecordOptions(confirm="stopped"))
+        RecordPull(branch_folder=branch_folder, cell=cell_file(cell, tmp_path), name="stopped",
+                   **sideways_pull(branch_folder), confirm="stopped").run()
     assert np.linalg.norm(stepped.state["tool_speed"]) < 1e-3
     found = Branch.open(branch_folder).manifest.stages["record:stopped"].result
     assert "force limit" in found["ended"] and found["sample_count"] > 100
@@ -188,8 +183,8 @@ def test_a_sensor_that_a_nudge_finds_wrong_stops_before_the_pull(branch_folder, 
     begin = flange_of(stepped)
     path = cell_file(cell_at(branch_folder, stepped.address), tmp_path)
     with pytest.raises(SafetyStop, match="implausible: the force points against") as stop:
-        record(branch_folder, path, "turned", sideways_pull(branch_folder),
-               RecordOptions(confirm="turned"))
+        RecordPull(branch_folder=branch_folder, cell=path, name="turned",
+                   **sideways_pull(branch_folder), confirm="turned").run()
     assert stop.value.result["sample_count"] == 0
     assert np.linalg.norm(flange_of(stepped) - begin) < 0.005
     assert np.linalg.norm(stepped.state["tool_speed"]) < 1e-3
@@ -209,8 +204,8 @@ def test_what_goes_wrong_during_a_pull_is_noticed_within_ten_millimetres(
     path = cell_file(cell_at(branch_folder, stepped.address), tmp_path)
     begin = flange_of(stepped)
     with after_a_way(stepped, 0.006, action, **values), pytest.raises(SafetyStop, match=told):
-        record(branch_folder, path, "wrong", sideways_pull(branch_folder, distance=0.03),
-               RecordOptions(confirm="wrong"))
+        RecordPull(branch_folder=branch_folder, cell=path, name="wrong",
+                   **sideways_pull(branch_folder, distance=0.03), confirm="wrong").run()
     assert 0.006 < np.linalg.norm(flange_of(stepped) - begin) < 0.016
     assert np.linalg.norm(stepped.state["tool_speed"]) < 1e-3
 
@@ -223,7 +218,7 @@ def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folde
     axis = skeleton.point_at(0.92) - skeleton.point_at(0.87)
     path = cell_file(cell_at(branch_folder, stepped.address), tmp_path)
     with pytest.raises(SystemExit) as stop:
-        command_of(stage_description("record"), "").main(
+        command_of(RecordPull).main(
             [str(branch_folder), "--cell", str(path), "--name", "stiff", "--confirm", "stiff",
              "--after-stop", "retreat", "--shape", "straight", "--direction", *map(str, axis),
              "--distance", "0.03", "--speed", "0.007", "--json"], standalone_mode=False)
@@ -261,7 +256,7 @@ def test_a_killed_recording_is_taken_over(branch_folder, tmp_path, robot):
     assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
     branch = Branch.open(branch_folder)
     assert "pulls/cut/robot.csv" in branch.streams()
-    result = record(branch_folder, path, "cut", RecordSettings(), RecordOptions(recover=True))
+    result = RecordPull(branch_folder=branch_folder, cell=path, name="cut", recover=True).run()
     assert result["seconds"] > killed - begin - 1.0
     pull = read_pull(branch_folder / "pulls" / "cut")
     assert np.all(np.diff(pull.times) > 0) and np.isfinite(pull.poses).all()
@@ -274,10 +269,10 @@ def test_a_recording_killed_before_its_pull_leaves_its_name_free(branch_folder, 
     with branch.stream("pulls/cut/robot.csv") as lines:
         lines.append("t_s,x_m")
     with pytest.raises(InputError, match="before its pull began"):
-        record(branch_folder, path, "cut", RecordSettings(), RecordOptions(recover=True))
+        RecordPull(branch_folder=branch_folder, cell=path, name="cut", recover=True).run()
     # No robot answers there: it got as far as that.
     with pytest.raises(WorkError, match="No robot answers"):
-        record(branch_folder, path, "cut", RecordSettings(), RecordOptions(confirm="cut"))
+        RecordPull(branch_folder=branch_folder, cell=path, name="cut", confirm="cut").run()
     _remove_empty(branch, "cut")
     assert branch.streams() == []
 
@@ -518,8 +513,9 @@ def test_a_realsense_records_what_the_tracker_follows(branch_folder, tmp_path, r
     path = cell_file(cell, tmp_path)
     camera = VirtualRealSense(robot.address, placed.pose)
     monkeypatch.setitem(sys.modules, "pyrealsense2", camera)
-    result = record(branch_folder, path, "seen", sideways_pull(branch_folder, distance=0.03),
-                    RecordOptions(confirm="seen", realsense=True))
+    result = RecordPull(branch_folder=branch_folder, cell=path, name="seen",
+                        **sideways_pull(branch_folder, distance=0.03), confirm="seen",
+                        realsense=True).run()
     assert result["ended"] == "reached" and result["depth_images"] > 5
     folder = branch_folder / "pulls" / "seen"
     pull = read_pull(folder)
@@ -547,9 +543,10 @@ def test_a_camera_on_the_flange_cannot_watch_a_pull(branch_folder, tmp_path, rob
     monkeypatch.setitem(sys.modules, "pyrealsense2", VirtualRealSense(
         robot.address, np.zeros(6)))
     with pytest.raises(InputError, match="mount = \"branch\""):
-        record(branch_folder, cell_file(cell, tmp_path), "seen", sideways_pull(branch_folder),
-               RecordOptions(confirm="seen", realsense=True))
+        RecordPull(branch_folder=branch_folder, cell=cell_file(cell, tmp_path), name="seen",
+                   **sideways_pull(branch_folder), confirm="seen", realsense=True).run()
     with pytest.raises(InputError, match="Both --markers and --realsense"):
-        record(branch_folder, cell_file(cell, tmp_path), "seen", sideways_pull(branch_folder),
-               RecordOptions(confirm="seen", realsense=True, markers=MARKERS))
+        RecordPull(branch_folder=branch_folder, cell=cell_file(cell, tmp_path), name="seen",
+                   **sideways_pull(branch_folder), confirm="seen", realsense=True,
+                   markers=MARKERS).run()
     assert Branch.open(branch_folder).streams() == []

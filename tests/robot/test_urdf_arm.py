@@ -19,7 +19,7 @@ from limber.robot.driver.link import RobotLink
 from limber.robot.motion.joint_path import follow, joint_path
 from limber.robot.motion.trajectory import densely
 from limber.robot.virtual.controller import Controller
-from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute
+from limber.stages.paths.execute import ExecutePlan
 from limber.store import Branch
 
 UR5 = ARMS["ur5"]
@@ -242,8 +242,8 @@ def test_a_missing_file_is_said(tmp_path):
 @pytest.mark.slow
 def test_a_plan_is_checked_for_it_and_its_dry_run_written(planned_folder, tmp_path, arm):
     cell = standing_at(Branch.open(planned_folder), "127.0.0.97", model=arm.name)
-    result = execute(planned_folder, "path", cell_file(cell, tmp_path), ExecuteSettings(),
-                     ExecuteOptions())
+    result = ExecutePlan(branch_folder=planned_folder, name="path",
+                         cell=cell_file(cell, tmp_path)).run()
     assert result["armed"] is False and result["predicted_peak_force_n"] > 0.1
     table = np.genfromtxt(planned_folder / "executions" / "path-preview.csv", delimiter=",",
                           names=True)

@@ -19,7 +19,7 @@ from limber.session import protocol
 from limber.session.outdoor_effects import EffectsTeller, effects_of, gusts_of
 from limber.session.protocol import SessionSettings
 from limber.session.session_branch import HeldBranch, load_held
-from limber.stages.motion.load import LoadSettings, load
+from limber.stages.motion.load import ApplyLoads
 from limber.store import Branch
 from limber.store.loading import load_branch, load_skeleton
 
@@ -99,7 +99,7 @@ def test_gusts_in_a_session(with_axes):
     question = protocol.parse_command(b'{"command": "effects", "gust": 0.3}')
     told = effects_of(with_axes, SessionSettings(), held.young, loads, gusts_of(question),
                       question, SILENT)
-    as_load = load(with_axes, LoadSettings(wind=(6.0, 0.0, 0.0), gust=0.3))
+    as_load = ApplyLoads(branch_folder=with_axes, wind=(6.0, 0.0, 0.0), gust=0.3).run()
     assert told["gusts"]["factor"] == pytest.approx(as_load["gusts"]["factor"], rel=1e-6)
     assert told["greatest_strain"] == pytest.approx(as_load["greatest_strain"], rel=1e-6)
     teller = EffectsTeller(with_axes, SessionSettings(), Said())

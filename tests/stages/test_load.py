@@ -10,7 +10,7 @@ from limber.core.json_values import plain
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.loads.load_effects import load_effects
 from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
-from limber.stages.motion.load import Load, LoadSettings, _inputs, load
+from limber.stages.motion.load import ApplyLoads, Load, _inputs
 from limber.stages.results.report import page_of
 from limber.store import Branch
 from limber.store.loading import load_branch, load_skeleton
@@ -28,7 +28,7 @@ def tip():
 def test_a_fruit_with_interval_and_limit(tip, monkeypatch):
     """It sags within the interval of the estimate, and bears the load so many times."""
     monkeypatch.setattr("limber.stages.motion.load._MOST_MULTIPLE", 100.0)
-    result = load(EXAMPLE, LoadSettings(fruit=((*tip, 0.005),), limit_load=True))
+    result = ApplyLoads(branch_folder=EXAMPLE, fruit=((*tip, 0.005),), limit_load=True).run()
     low, high = result["sag_interval_m"]
     assert 0 < low < result["sag_m"] < high
     slow, fast = result["first_frequency_interval_hz"]
@@ -59,18 +59,18 @@ def test_the_limit_is_where_the_strain_is(tip):
 
 def test_a_load_is_needed_and_lies_on_the_branch(tip):
     """No load, one without mass, one somewhere else: told what is wrong."""
-    for settings, words in ((LoadSettings(), "No load"),
-                            (LoadSettings(fruit=((*tip, 0.0),)), "without mass"),
-                            (LoadSettings(fruit=((9.0, 0.0, 0.0, 1.0),)), "away from the branch")):
+    for settings, words in (({}, "No load"),
+                            ({"fruit": ((*tip, 0.0),)}, "without mass"),
+                            ({"fruit": ((9.0, 0.0, 0.0, 1.0),)}, "away from the branch")):
         with pytest.raises(InputError, match=words):
-            load(EXAMPLE, settings)
+            ApplyLoads(branch_folder=EXAMPLE, **settings).run()
 
 
 @pytest.mark.slow
 def test_gusts_bend_it_further_than_an_even_wind(tmp_path):
     """Their peak is the rest under so many times the mean load; a record of even wind adds none."""
-    even = load(EXAMPLE, LoadSettings(wind=(6.0, 0.0, 0.0)))
-    found = load(EXAMPLE, LoadSettings(wind=(6.0, 0.0, 0.0), gust=0.3))
+    even = ApplyLoads(branch_folder=EXAMPLE, wind=(6.0, 0.0, 0.0)).run()
+    found = ApplyLoads(branch_folder=EXAMPLE, wind=(6.0, 0.0, 0.0), gust=0.3).run()
     gusts = found["gusts"]
     assert even["gusts"] is None and gusts["factor"] > 1 + 3 * 2 * 0.3
     assert gusts["mean_tip_displacement_m"] == pytest.approx(even["tip_displacement_m"])
@@ -78,7 +78,7 @@ def test_gusts_bend_it_further_than_an_even_wind(tmp_path):
     assert found["greatest_strain"] > even["greatest_strain"] and 0 < gusts["damping"] < 1
     record = tmp_path / "wind.csv"
     record.write_text("time_s,speed_m_s\n" + "".join(f"{k / 10},6\n" for k in range(100)))
-    still = load(EXAMPLE, LoadSettings(wind=(1.0, 0.0, 0.0), gust_record=record))
+    still = ApplyLoads(branch_folder=EXAMPLE, wind=(1.0, 0.0, 0.0), gust_record=record).run()
     assert still["gusts"]["factor"] == pytest.approx(1.0)
     assert still["tip_displacement_m"] == pytest.approx(even["tip_displacement_m"])
 
@@ -99,7 +99,8 @@ def test_gusts_that_make_no_sense(tmp_path, content, settings, told):
     record = tmp_path / "wind.csv"
     record.write_text(content)
     with pytest.raises(InputError, match=told):
-        load(EXAMPLE, LoadSettings(**settings, **({"gust_record": record} if content else {})))
+        ApplyLoads(branch_folder=EXAMPLE, **settings,
+                   **{"gust_record": record} if content else {}).run()
 
 
 @pytest.mark.slow
@@ -109,7 +110,8 @@ def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     from limber.results.scene.contents import scene_data
 
     folder = Path(shutil.copytree(EXAMPLE, tmp_path / "a.branch"))
-    result = load(folder, LoadSettings(wind=(6.0, 0.0, 0.0), gust=0.2, name="gale"))
+    gale = ApplyLoads(branch_folder=folder, wind=(6.0, 0.0, 0.0), gust=0.2, name="gale")
+    result = gale.run()
     branch = Branch.open(folder, verify=True)
     assert branch.manifest.stages["load:gale"].result["sag_m"] == result["sag_m"]
     section = next(one for one in page_of(branch)[1] if one.title == "Load: gale")
@@ -120,16 +122,15 @@ def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     assert data.info["frames"]["name"] == "load-gale" and "frame_scalar:strain" in data.arrays
     assert len(data.arrays["frame_strain"]) == 2
     # The same again is not worked out again; of other moduli it is.
-    again = load(folder, LoadSettings(wind=(6.0, 0.0, 0.0), gust=0.2, name="gale"))
-    assert again == plain(result)
+    assert gale.run() == plain(result)
     assert Branch.open(folder).manifest.stages["load:gale"] == branch.manifest.stages["load:gale"]
     assert branch.is_current("load:gale", branch.manifest.stages["load:gale"].settings,
-                             **_inputs(branch, LoadSettings()))
+                             **_inputs(branch, gale))
     branch.manifest.stages["swing"] = branch.manifest.stages["load:gale"]
     assert not branch.is_current("load:gale", branch.manifest.stages["load:gale"].settings,
-                                 **_inputs(branch, LoadSettings()))
+                                 **_inputs(branch, gale))
     (folder / "loads" / "gale.json").write_text('{"sag_m": 1e999}')
     with pytest.raises(LimberError, match=r"gale\.json"):
         Load.content(branch, "load:gale", {})
     with pytest.raises(ValueError, match="pattern"):
-        LoadSettings(name="../out")
+        ApplyLoads(branch_folder=folder, name="../out")

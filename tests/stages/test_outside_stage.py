@@ -6,53 +6,48 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import pytest
 from tests.stages.test_registry import parsed, sample
 
 from limber.batch.job_file import read_jobs
-from limber.batch.scheduler_scripts import line_of_task, task_of_line
+from limber.batch.scheduler_scripts import commands
 from limber.cli import main
 from limber.core.errors import InputError
 from limber.stages import registry
+from limber.stages.stage import About, Stage
 from limber.store import Branch
 
 ROOT = Path(__file__).parents[2]
-STAGE = '''"""Count the nodes of the skeleton.
-
-Of every axis.
-"""
-
-from typing import ClassVar
+STAGE = '''from typing import Any, ClassVar
 
 from pydantic import Field
 
-from limber.core.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, RunOptions
-from limber.stages.registry import StageDescription
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups
+from limber.stages.stage import About, BranchStage, Repeatable
 from limber.store import Branch
 
 
-class CountSettings(Settings):
-    """What is counted."""
+class Count(Repeatable, BranchStage):
+    """Count the nodes of the skeleton.
 
+    Of every axis.
+    """
+
+    about = About("count", 27, key="count", reads=("skeleton.swc",), writes=("count.txt",),
+                  step="skeleton", label="Count the Nodes")
     groups: ClassVar[Groups] = {"counting": ("least_radius",)}
 
     least_radius: float = Field(0.0, ge=0, description="Of the thicker ones alone [m].")
 
-
-def run(inputs, settings, options, progress):
-    branch = Branch.open(inputs.branch_folder)
-    with branch.stage("count", settings) as stage:
-        (stage.path("count.txt")).write_text("3")
-        stage.result = {"node_count": 3, "least_radius_m": settings.least_radius}
-    return branch.manifest.stages["count"].result
-
-
-STAGE = StageDescription("count", 27, run, BranchInputs, CountSettings, RunOptions, key="count",
-                         reads=("skeleton.swc",), writes=("count.txt",), step="skeleton",
-                         label="Count the Nodes")
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        branch = Branch.open(self.branch_folder)
+        with branch.stage("count", self) as stage:
+            (stage.path("count.txt")).write_text("3")
+            stage.result = {"node_count": 3, "least_radius_m": self.least_radius}
+        return branch.manifest.stages["count"].result
 '''
 
 
@@ -66,7 +61,7 @@ def package(tmp_path, monkeypatch):
     (folder / "counting-1.0.dist-info").mkdir()
     (folder / "counting-1.0.dist-info" / "METADATA").write_text("Name: counting\nVersion: 1.0\n")
     (folder / "counting-1.0.dist-info" / "entry_points.txt").write_text(
-        "[limber.stages]\ncount = counting.count\n")
+        "[limber.stages]\ncount = counting.count:Count\n")
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), str(ROOT / "worker")]))
     registry._stages.cache_clear()
@@ -86,8 +81,8 @@ def test_its_command_runs_and_makes_its_entry(package, tmp_path, capsys):
     entry = Branch.open(tmp_path / "a.branch").manifest.stages["count"]
     assert entry.settings == {"least_radius": 0.004}
     assert (tmp_path / "a.branch" / "count.txt").read_text() == "3"
-    models = sample("count")
-    assert parsed("count", [str(models[0].branch_folder), "--force"]) == list(models)
+    stage = sample("count")
+    assert parsed("count", [str(stage.branch_folder), "--force"]) == stage
 
 
 def test_it_is_in_the_help_before_anything_is_imported(package):
@@ -112,14 +107,16 @@ def test_its_schema_and_its_line_in_the_table(package):
 
 
 def test_its_line_in_a_job_file(package, tmp_path):
-    """It is checked, and becomes the command line that a cluster gets."""
+    """It is checked, and becomes a command line and what a cluster gets."""
     Branch.create(tmp_path / "a.branch")
     jobs = tmp_path / "jobs.toml"
     jobs.write_text('[[job]]\nfolders = ["*.branch"]\n[[job.stage]]\nrun = "count"\n'
                     'least_radius = "4 mm"\n')
-    (task,) = read_jobs(jobs).branches[0].tasks
-    assert task.label == "count" and task.settings.least_radius == 0.004
-    assert line_of_task(task)[0] == "count" and task_of_line(line_of_task(task)) == task
+    (branch,) = read_jobs(jobs).branches
+    (task,) = branch.tasks
+    assert task.label == "count" and task.least_radius == 0.004
+    assert commands(branch)[0].startswith("limber count --least-radius 0.004 ")
+    assert type(task).checked(task.stated()) == task
     jobs.write_text(jobs.read_text().replace("4 mm", "4 kg"))
     with pytest.raises(InputError, match=r"line 5: least_radius: .*It must be in m"):
         read_jobs(jobs)
@@ -144,15 +141,22 @@ def test_its_place_in_the_add_on(package, tmp_path, monkeypatch):
         "count", "--least-radius", "0.004", "--", "a.branch"]
 
 
-def test_a_module_that_is_registered(monkeypatch):
+def test_a_class_that_is_registered(monkeypatch):
     """Without a package: in this process, and only once under one name."""
-    module = SimpleNamespace(__name__="tests.here", __doc__="Nothing.\n\nMore.",
-                             STAGE=SimpleNamespace(name="nothing", position=3))
+    class Nothing(Stage):
+        """Nothing.
+
+        More.
+        """
+
+        about = About("nothing", 3)
+
     monkeypatch.setattr(registry, "_registered", [])
     try:
-        registry.register(module)
+        registry.register(Nothing)
         assert next(iter(registry.stage_summaries().items())) == ("nothing", "Nothing.")
-        module.STAGE.name = "mesh"
+        assert registry.stage_class("nothing") is Nothing
+        Nothing.about = About("mesh", 3)
         registry._stages.cache_clear()
         with pytest.raises(InputError, match="Two modules make a stage mesh"):
             registry.stage_summaries()

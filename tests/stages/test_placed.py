@@ -11,14 +11,12 @@ from limber.cli.main import call
 from limber.core.alignment import Alignment
 from limber.core.errors import InputError
 from limber.core.progress import Progress
-from limber.core.settings import checked_settings
 from limber.geometry.tets.tree_sweep import straight_beam
 from limber.recordings.recording import read_pull
-from limber.recordings.settings import ImportSettings
 from limber.recordings.time_series import Stream, read_stream, write_stream
-from limber.stages.pulls.import_pull import import_pull
-from limber.stages.registry import stage_description
-from limber.stages.shape.target import TargetSettings, set_target
+from limber.stages.pulls.import_pull import ImportPull
+from limber.stages.registry import stage_class
+from limber.stages.shape.target import SetTarget
 from limber.store import Branch
 from limber.store.loading import load_branch, load_targets
 
@@ -38,11 +36,10 @@ def _aligned(folder: Path) -> Path:
 def test_a_target_is_where_the_scan_shows_it(tmp_path):
     """At the same point of the branch as by the branch's own coordinates."""
     folder = _aligned(shutil.copytree(EXAMPLE, tmp_path / "a.branch"))
-    stage = stage_description("target")
     at = read_pull(folder / "pulls" / "pull-1").entry.grasp.point_m
     in_scan = ALIGNMENT.undo(np.array([at]))[0] * ALIGNMENT.scale
-    found = [stage.run(*stage.models({"branch_folder": folder, "name": name, "at": tuple(place),
-                                      "coordinates": frame}), None)["position_m"]
+    found = [SetTarget(branch_folder=folder, name=name, at=tuple(place),
+                       coordinates=frame).run()["position_m"]
              for name, place, frame in (("a", at, "branch"), ("b", in_scan, "scan"))]
     np.testing.assert_allclose(found[1], found[0], atol=1e-12)
 
@@ -51,22 +48,23 @@ def test_a_target_is_where_the_scan_shows_it(tmp_path):
 def test_all_positions_are_moved_and_boxes_refused(tmp_path, name):
     """No position of these stages stays behind."""
     folder = _aligned(shutil.copytree(EXAMPLE, tmp_path / "a.branch"))
-    stage = stage_description(name)
+    stage = stage_class(name)
+    fields = {field: stage.model_fields[field] for field in stage.parts()["settings"]}
     kinds = {field: (about.json_schema_extra or {}).get("frame")
-             for field, about in stage.settings.model_fields.items()}
-    listed = {field for field, about in stage.settings.model_fields.items()
+             for field, about in fields.items()}
+    listed = {field for field, about in fields.items()
               if "position" in (about.description or "").lower()
               and "tuple" in str(about.annotation)}
     assert listed == {field for field, kind in kinds.items() if kind == "branch"}
-    inputs, settings, _ = stage.models(
+    asked = stage.checked(
         {"branch_folder": folder, "coordinates": "scan"}
         | ({"name": "a"} if name == "target" else {}) | dict.fromkeys(listed, (5.1, -2.0, 1.0)))
-    moved = inputs.in_branch(settings)
+    moved = asked.in_branch()
     for field in listed:
         np.testing.assert_allclose(getattr(moved, field), (0, -0.1, 0), atol=1e-12)
     for field in (field for field, kind in kinds.items() if kind == "branch axes"):
         with pytest.raises(InputError, match=field.replace("_", "-")):
-            inputs.in_branch(settings.model_copy(update={field: (0.0, 0.0, 0.0)}))
+            asked.model_copy(update={field: (0.0, 0.0, 0.0)}).in_branch()
 
 
 @pytest.mark.slow
@@ -95,10 +93,10 @@ def test_tables_in_frames_of_their_own(tmp_path):
     write_stream(tmp_path / "markers.csv", Stream(
         seen.times, in_frame(seen.positions, (0.5, 0.2, 0.0)).reshape(len(seen.times), -1),
         tuple(f"m{k}_{axis}_m" for k in range(count) for axis in "xyz")))
-    import_pull(folder, tmp_path / "markers.csv", "own", ImportSettings(
-        robot=str(tmp_path / "robot.csv"), coordinates="scan", time_offset=0.0,
-        marker_frame=(0.5, 0.2, 0.0, 0.0, 0.0, np.pi / 2),
-        frame_pose=(1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2)))
+    ImportPull(branch_folder=folder, source=tmp_path / "markers.csv", name="own",
+               robot=str(tmp_path / "robot.csv"), coordinates="scan", time_offset=0.0,
+               marker_frame=(0.5, 0.2, 0.0, 0.0, 0.0, np.pi / 2),
+               frame_pose=(1.0, 0.0, 0.0, 0.0, 0.0, np.pi / 2)).run()
     found = read_pull(folder / "pulls" / "own")
     np.testing.assert_allclose(found.observations.positions, seen.positions, atol=1e-6)
     # They need not be the control points: they rest where the first frame shows them.
@@ -130,15 +128,15 @@ def test_targets_are_set_replaced_and_removed(folder, capsys):
     # The beam is 5.3 mm thick there, with six sides.
     assert 0.0062 < said["distance_m"] < 0.0077
     np.testing.assert_allclose(said["branch_point_m"][2], 0.2, atol=2e-3)
-    set_target(folder, "leaf", TargetSettings(at=(0.0, 0.0, 0.1)))
-    set_target(folder, "flower", TargetSettings(at=(0.0, 0.0, 0.25), mass=0.02))
+    SetTarget(branch_folder=folder, name="leaf", at=(0.0, 0.0, 0.1)).run()
+    SetTarget(branch_folder=folder, name="flower", at=(0.0, 0.0, 0.25), mass=0.02).run()
     targets = load_targets(Branch.open(folder))
     assert [(t.name, t.position, t.mass) for t in targets] == [
         ("flower", (0.0, 0.0, 0.25), 0.02), ("leaf", (0.0, 0.0, 0.1), 0.0)]
     loaded = load_branch(Branch.open(folder), gravity=True,
                          progress=Progress(on_warning=pytest.fail))
     assert [m.mass for m in loaded.model.point_masses] == [0.02]
-    result = set_target(folder, "flower", TargetSettings(remove=True))
+    result = SetTarget(branch_folder=folder, name="flower", remove=True).run()
     assert result["targets"] == ["leaf"]
     assert [t.name for t in load_targets(Branch.open(folder))] == ["leaf"]
 
@@ -147,18 +145,18 @@ def test_one_that_is_there_is_left_as_it_is(folder):
     """Unless it was moved, taken out or asked for again; so is one that is not there."""
     def finished(name="flower"):
         return Branch.open(folder).manifest.stages[f"target:{name}"]
-    wish = TargetSettings(at=(0.0, 0.0, 0.2))
-    first = set_target(folder, "flower", wish)
+    wish = {"at": (0.0, 0.0, 0.2)}
+    first = SetTarget(branch_folder=folder, name="flower", **wish).run()
     before = finished()
-    set_target(folder, "leaf", TargetSettings(at=(0.0, 0.0, 0.1)))
-    again = set_target(folder, "flower", wish)
+    SetTarget(branch_folder=folder, name="leaf", at=(0.0, 0.0, 0.1)).run()
+    again = SetTarget(branch_folder=folder, name="flower", **wish).run()
     assert finished() == before and again["targets"] == ["flower", "leaf"]
     assert again["position_m"] == list(first["position_m"])
-    set_target(folder, "flower", wish, force=True)
+    SetTarget(branch_folder=folder, name="flower", **wish, force=True).run()
     assert finished() != before
-    set_target(folder, "flower", TargetSettings(remove=True))
-    assert set_target(folder, "flower", TargetSettings(remove=True))["targets"] == ["leaf"]
-    set_target(folder, "flower", wish)
+    SetTarget(branch_folder=folder, name="flower", remove=True).run()
+    assert SetTarget(branch_folder=folder, name="flower", remove=True).run()["targets"] == ["leaf"]
+    SetTarget(branch_folder=folder, name="flower", **wish).run()
     assert {one.name for one in load_targets(Branch.open(folder))} == {"flower", "leaf"}
 
 
@@ -173,9 +171,9 @@ def test_one_that_is_there_is_left_as_it_is(folder):
 ])
 def test_what_is_refused(folder, name, settings, words):
     """With its reason; targets from before stay."""
-    set_target(folder, "leaf", TargetSettings(at=(0.0, 0.0, 0.1)))
+    SetTarget(branch_folder=folder, name="leaf", at=(0.0, 0.0, 0.1)).run()
     with pytest.raises(InputError) as caught:
-        set_target(folder, name, checked_settings(TargetSettings, settings))
+        SetTarget.checked({"branch_folder": folder, "name": name, **settings}).run()
     assert words in str(caught.value)
     assert [t.name for t in load_targets(Branch.open(folder))] == ["leaf"]
 

@@ -1,121 +1,95 @@
 """The registry: every stage described whole, its schema and command line round trips."""
 
-import inspect
 import json
+from dataclasses import replace
 
 import click
 import pytest
 
 from limber.cli import main
 from limber.stages.command_line import command_line
-from limber.stages.inputs import PlacedInputs
-from limber.stages.registry import (
-    all_schemas,
-    stage_description,
-    stage_module,
-    stage_schema,
-    stage_summaries,
-)
+from limber.stages.registry import all_schemas, stage_class, stage_schema, stage_summaries
 
 NAMES = list(stage_summaries())
 
 # Values other than the defaults, of every kind of field.
 OTHERS = {
-    "reconstruct": ({"cloud": "scan.ply", "output": "a.branch", "mask": "m.png"},
-                    {"up": (0.0, -1.0, 0.0), "upright": False, "unit": "mm", "young": 2.5e8,
-                     "plants": "largest", "gap_factor": 4.0}),
-    "simulate": ({"branch_folder": "a.branch"},
-                 {"move": (-0.1, 0.0, 1e-3), "gravity": False, "kind": "static",
-                  "load_at": ((0.0, 0.0, 0.1, 1.0, -2.0, 0.5), (0.0, 0.0, 0.2, 0.0, 0.0, -1.0))}),
-    "estimate": ({"branch_folder": "-odd.branch"},
-                 {"pull": ("one", "two"), "fractions": (0.25, 0.75), "quick": True}),
+    "reconstruct": {"cloud": "scan.ply", "output": "a.branch", "mask": "m.png",
+                    "up": (0.0, -1.0, 0.0), "upright": False, "unit": "mm", "young": 2.5e8,
+                    "plants": "largest", "gap_factor": 4.0},
+    "simulate": {"branch_folder": "a.branch", "move": (-0.1, 0.0, 1e-3), "gravity": False,
+                 "kind": "static", "load_at": ((0.0, 0.0, 0.1, 1.0, -2.0, 0.5),
+                                               (0.0, 0.0, 0.2, 0.0, 0.0, -1.0))},
+    "estimate": {"branch_folder": "-odd.branch", "pull": ("one", "two"),
+                 "fractions": (0.25, 0.75), "quick": True},
 }
 
 
 def parsed(name, arguments):
-    """Return the inputs, settings and options that a command line gives a stage."""
+    """Return the stage that a command line makes."""
     seen = []
 
-    def run(*given):
-        seen.extend(given[:3])
-        return {}
-    stage = stage_description(name)
-    caught = type(stage)(**{**vars(stage), "run": run, "result": None, "found": ()})
-    command = main.command_of(caught, stage_module(name).__doc__)
+    class Caught(stage_class(name)):
+        about = replace(stage_class(name).about, result=None, found=())
+
+        def run(self, progress=None):
+            seen.append(type(self).__base__(**{field: getattr(self, field)
+                                               for field in self.model_fields_set}))
+            return {}
     with pytest.raises(SystemExit) as stop:
-        command.main(arguments, standalone_mode=False)
+        main.command_of(Caught).main(arguments, standalone_mode=False)
     assert stop.value.code == 0
-    return seen
+    return seen[0]
 
 
 def sample(name):
-    """Return inputs, settings and options of a stage with values that are no defaults."""
-    stage = stage_description(name)
-    given, settings = OTHERS.get(name, ({}, {}))
-    required = {field: f"some-{field}" for field, about in stage.inputs.model_fields.items()
+    """Return a stage with values that are no defaults."""
+    stage = stage_class(name)
+    required = {field: f"some-{field}" for field, about in stage.model_fields.items()
                 if about.is_required()}
-    return (stage.inputs(**(required | given)), stage.settings(**settings),
-            stage.options(**({"force": True} if "force" in stage.options.model_fields else {})))
+    return stage(**(required | OTHERS.get(name, {})
+                    | ({"force": True} if "force" in stage.model_fields else {})))
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_command_line_round_trip(name):
-    """Inputs, settings and options become a command line that gives them back."""
-    models = sample(name)
-    assert parsed(name, command_line(*models)) == list(models)
+def test_command_line_and_json_round_trip(name):
+    """A stage becomes a command line, or JSON, that gives it back."""
+    stage = sample(name)
+    assert parsed(name, command_line(stage)) == stage
+    again = stage_class(name).checked(json.loads(json.dumps(stage.stated())))
+    assert again == stage and again.model_fields_set == stage.model_fields_set
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_schema_round_trip(name):
-    """The schema is plain JSON, its defaults give the defaults, and dumped settings come back."""
+    """The schema is plain JSON, its defaults give the defaults, and the manifest has the settings.
+    """
     schema = json.loads(json.dumps(stage_schema(name), allow_nan=False))
-    stage = stage_description(name)
-    for part, model in zip(("settings", "options"), sample(name)[1:], strict=True):
-        kind = type(model)
-        defaults = {field: about["default"]
-                    for field, about in schema[part]["properties"].items()}
-        assert kind.model_validate(defaults) == kind()
-        assert kind.model_validate_json(model.model_dump_json()) == model
-    assert set(schema["inputs"]["properties"]) == set(stage.inputs.model_fields)
+    stage = sample(name)
+    defaults = {field: about["default"] for part in ("inputs", "settings", "options")
+                for field, about in schema[part]["properties"].items() if "default" in about}
+    needed = {field: "some" for field, about in type(stage).model_fields.items()
+              if about.is_required()}
+    assert type(stage).model_validate(needed | defaults) == type(stage)(**needed)
+    assert list(stage.model_dump()) == list(schema["settings"]["properties"])
+    assert {part: list(schema[part]["properties"]) for part in stage.parts()} == stage.parts()
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_description_is_whole(name):
     """A stage's name is its file's; all that is grouped exists, and all is grouped and told."""
-    stage = stage_description(name)
-    assert stage.name == name
+    stage = stage_class(name)
+    assert stage.about.name == name
     assert stage_summaries()[name].endswith(".")
-    fields: set[str] = set()
-    for model in (stage.inputs, stage.settings, stage.options):
-        for base in model.__mro__:
-            named = {field for names in vars(base).get("groups", {}).values() for field in names}
-            assert named | set(vars(base).get("common", ())) <= set(
-                getattr(base, "model_fields", {}))
-        for field, about in model.model_json_schema().get("properties", {}).items():
-            assert about["description"], field
-            assert about["group"] != "options", field
-        assert not fields & set(model.model_fields)
-        fields |= set(model.model_fields)
-    for place in (stage.key, *stage.reads, *stage.writes):
-        assert "{name}" not in place or "name" in fields
-
-
-def test_stages_pass_over_none_of_their_fields():
-    """The functions that are called by name take every input, setting and option."""
-    by_name = {}
-    for name in NAMES:
-        stage = stage_description(name)
-        taken = inspect.getclosurevars(stage.run).nonlocals.get("taken")
-        if taken is None:
-            continue
-        by_name[name] = {*taken.values()}
-        lacking = {field for part in ("inputs", "settings", "options")
-                   if part not in by_name[name]
-                   for field in getattr(stage, part).model_fields} - by_name[name]
-        # by_name itself moves the positions.
-        lacking -= {*PlacedInputs.model_fields} if issubclass(stage.inputs, PlacedInputs) else {*()}
-        assert not lacking, name
-    assert len(by_name) > 10
+    for base in stage.__mro__:
+        named = {field for names in vars(base).get("groups", {}).values() for field in names}
+        assert named | set(vars(base).get("common", ())) <= set(
+            getattr(base, "model_fields", {}))
+    for field, about in stage.model_json_schema()["properties"].items():
+        assert about["description"], field
+        assert about["group"] != "options", field
+    for place in (stage.about.key, *stage.about.reads, *stage.about.writes):
+        assert "{name}" not in place or "name" in stage.model_fields
 
 
 def test_units_and_experts_are_in_the_schema():
@@ -157,8 +131,8 @@ def test_a_file_is_a_stage(tmp_path, monkeypatch):
     from limber.stages import registry
 
     (tmp_path / "probe.py").write_text(
-        '"""Looks at something.\n\nMore."""\n'
-        'STAGE = StageDescription("probe", 5, run, Inputs, Settings, Options)\n')
+        'class Probe(Stage):\n    """Looks at something.\n\n    More."""\n'
+        '    about = About("probe", 5)\n')
     monkeypatch.setattr(registry, "__file__", str(tmp_path / "registry.py"))
     registry._stages.cache_clear()
     try:

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 
 from limber.cli.main import call, main
 from limber.core.errors import Command, InputError, Option, Text
-from limber.stages.registry import stage_description, stage_summaries
+from limber.stages.registry import stage_class, stage_summaries
 
 ROOT = Path(__file__).parents[2]
 TYPED = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]+|`limber ")
@@ -58,9 +58,8 @@ def _values(node: ast.Call) -> list:
 
 def _is_taken(option: Option) -> bool:
     """Whether a command has the option; with a value, whether a stage's field of it takes that."""
-    fields = [model.model_fields[option.name] for stage in map(stage_description, stage_summaries())
-              for model in (stage.inputs, stage.settings, stage.options)
-              if option.name in model.model_fields]
+    fields = [stage.model_fields[option.name] for stage in map(stage_class, stage_summaries())
+              if option.name in stage.model_fields]
 
     def takes(field) -> bool:
         kept = [name for part in field.metadata for name in getattr(part, "kept", ())]

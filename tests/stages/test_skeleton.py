@@ -26,8 +26,8 @@ from limber.geometry.skeleton.search_result import FoundSkeleton, result_of_skel
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.results.scene.contents import scene_data
 from limber.results.scene.still_objects import EDITED
-from limber.stages.shape.edit_skeleton import review_skeleton
-from limber.stages.shape.reconstruct import load_search, reconstruct
+from limber.stages.shape.edit_skeleton import ReviewSkeleton
+from limber.stages.shape.reconstruct import Reconstruct, load_search
 from limber.store import Branch
 
 # Map coordinates in millimetres, its z along the file's y.
@@ -41,7 +41,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scan")
     points = 1e3 * generate_branch(5, fork_count=1, length=0.4, point_spacing=0.0025).cloud.points
     Cloud(points[:, [1, 2, 0]] + OFFSET).write_ply(folder / "cloud.ply")
-    result = reconstruct(folder / "cloud.ply", folder / "a.branch", SETTINGS)
+    result = Reconstruct.of(SETTINGS, cloud=folder / "cloud.ply", output=folder / "a.branch").run()
     return folder, result
 
 
@@ -50,8 +50,8 @@ def test_a_kept_skeleton_given_back_is_used_as_it_is(made, tmp_path) -> None:
     folder, result = made
     kept = read_swc(folder / "a.branch" / "scan_skeleton.swc", scale=1.0)
     assert np.abs(kept.nodes - OFFSET).max() < 1000 and kept.radius.max() > 3
-    again = reconstruct(folder / "cloud.ply", tmp_path / "b.branch", SETTINGS,
-                        skeleton_path=folder / "a.branch" / "scan_skeleton.csv")
+    again = Reconstruct.of(SETTINGS, cloud=folder / "cloud.ply", output=tmp_path / "b.branch",
+                           skeleton=folder / "a.branch" / "scan_skeleton.csv").run()
     one, other = (read_skeleton(place / "skeleton.csv")
                   for place in (folder / "a.branch", tmp_path / "b.branch"))
     np.testing.assert_allclose(other.nodes, one.nodes, atol=2e-8)
@@ -68,14 +68,14 @@ def test_an_alternative_is_applied_by_its_number(made, tmp_path) -> None:
     """
     folder, result = made
     target = shutil.copytree(folder / "a.branch", tmp_path / "n.branch")
-    listed = review_skeleton(target)["alternatives"]
+    listed = ReviewSkeleton(branch_folder=target).run()["alternatives"]
     assert listed == result["alternatives"] and listed[0]["edits"] == []
     assert [edit["do"] for edit in listed[1]["edits"]] == ["delete"]
     with pytest.raises(InputError, match=f"has {len(listed) - 1} alternatives"):
-        review_skeleton(target, alternative=9)
+        ReviewSkeleton(branch_folder=target, alternative=9).run()
     other = limber.open(target).alternatives[1]
     assert (other.length, other.edits[0].do) == (listed[1]["length_m"], "delete")
-    chosen = review_skeleton(target, alternative=2)
+    chosen = ReviewSkeleton(branch_folder=target, alternative=2).run()
     assert chosen["branch_count"] == result["branch_count"] - 1
     assert chosen["length_m"] == pytest.approx(listed[1]["length_m"], rel=1e-6)
     low, high = result["length_interval_m"]
@@ -87,13 +87,13 @@ def test_edits_outlive_a_new_reconstruct(made, tmp_path) -> None:
     """The mesh follows an edit; the folder keeps it; a misfit is told; an empty list undoes it."""
     folder, result = made
     scan, target = folder / "cloud.ply", tmp_path / "e.branch"
-    reconstruct(scan, target, SETTINGS)
+    Reconstruct.of(SETTINGS, cloud=scan, output=target).run()
     alignment = Branch.open(target).manifest.alignment
     before = read_skeleton(target / "skeleton.csv")
     tip = alignment.undo(before.nodes[before.branch == 1][-3:-2])[0].tolist()
     edits = tmp_path / "edits.json"
     edits.write_text(json.dumps([{"do": "delete", "at": tip}]))
-    told = review_skeleton(target, edits_path=edits, output=tmp_path / "out.swc")
+    told = ReviewSkeleton(branch_folder=target, edits=edits, output=tmp_path / "out.swc").run()
     assert told["length_m"] < result["length_m"] and told["mesh"] == "current"
     assert told["edit_effects"][0]["length_change_m"] == pytest.approx(
         told["length_m"] - result["length_m"])
@@ -102,22 +102,24 @@ def test_edits_outlive_a_new_reconstruct(made, tmp_path) -> None:
     written = read_swc(tmp_path / "out.swc")
     assert written.length == pytest.approx(told["length_m"], rel=1e-4)
     # The same reconstruct is current with its edits; one with other settings applies them anew.
-    assert reconstruct(scan, target, SETTINGS)["length_m"] == pytest.approx(told["length_m"])
-    other = reconstruct(scan, target, SETTINGS.model_copy(update={"young": 2e8}))
+    assert Reconstruct.of(SETTINGS, cloud=scan,
+                          output=target).run()["length_m"] == pytest.approx(told["length_m"])
+    other = Reconstruct.of(SETTINGS.model_copy(update={"young": 2e8}), cloud=scan,
+                           output=target).run()
     assert other["length_m"] == pytest.approx(told["length_m"], rel=1e-6)
     far = (OFFSET + 2000).tolist()
     edits.write_text(json.dumps([{"do": "delete", "at": far}]))
     with pytest.raises(InputError, match=r"Edit 1 .*not belong to any branch"):
-        review_skeleton(target, edits_path=edits)
-    assert len(review_skeleton(target)["edits"]) == 1
+        ReviewSkeleton(branch_folder=target, edits=edits).run()
+    assert len(ReviewSkeleton(branch_folder=target).run()["edits"]) == 1
     warned: list[str] = []
-    undone = reconstruct(scan, target, SETTINGS, edits_path=edits,
-                         progress=Progress(on_warning=warned.append))
+    undone = Reconstruct.of(SETTINGS, cloud=scan, output=target,
+                            edits=edits).run(Progress(on_warning=warned.append))
     assert undone["length_m"] == pytest.approx(result["length_m"])
     assert any("Edit 1 (delete)" in text and "skipped" in text for text in warned)
-    assert review_skeleton(target)["edit_effects"] == []
+    assert ReviewSkeleton(branch_folder=target).run()["edit_effects"] == []
     edits.write_text("[]")
-    assert review_skeleton(target, edits_path=edits)["edits"] == []
+    assert ReviewSkeleton(branch_folder=target, edits=edits).run()["edits"] == []
     assert not (target / "edits.json").exists()
 
 
@@ -132,7 +134,7 @@ def test_edits_in_the_branchs_frame_come_after_those_before(made, tmp_path) -> N
     for edit in ({"do": "move", "at": before.nodes[node].tolist(), "to": onto.tolist()},
                  {"do": "radius", "at": onto.tolist(), "radius": 1.1 * before.radius[node]}):
         edits.write_text(json.dumps([edit]))
-        told = review_skeleton(target, edits_path=edits, frame="branch", append=True)
+        told = ReviewSkeleton(branch_folder=target, edits=edits, frame="branch", append=True).run()
     assert [edit["do"] for edit in told["edits"]] == ["move", "radius"]
     after = read_skeleton(target / "skeleton.csv")
     moved = np.linalg.norm(after.nodes - onto, axis=1).argmin()
@@ -151,7 +153,7 @@ import os, sys
 from pathlib import Path
 from limber.geometry import reconstruction
 from limber.geometry.settings import ReconstructSettings
-from limber.stages.shape.reconstruct import reconstruct
+from limber.stages.shape.reconstruct import Reconstruct
 reconstruction.mesh_skeleton = lambda *given: os._exit(9)
 scan, target = map(Path, sys.argv[1:3])
 reconstruct(scan, target, ReconstructSettings.model_validate_json(sys.argv[3]))
@@ -192,8 +194,8 @@ def test_one_killed_after_its_skeleton_goes_on_from_there(made, tmp_path, monkey
     with monkeypatch.context() as other:
         other.setattr(reconstruction, "skeletonise", search_again)
         with pytest.raises(AssertionError):
-            reconstruct(scan, target, SETTINGS, force=True)
-        again = reconstruct(scan, target, SETTINGS)
+            Reconstruct.of(SETTINGS, cloud=scan, output=target, force=True).run()
+        again = Reconstruct.of(SETTINGS, cloud=scan, output=target).run()
     after, undisturbed = (Branch.open(place, verify=True).manifest
                           for place in (target, folder / "a.branch"))
     assert after.stages["skeleton"] == before.stages["skeleton"]
@@ -251,8 +253,8 @@ def test_a_failed_mesh_leaves_the_skeleton(made, tmp_path, monkeypatch, capsys) 
     monkeypatch.setattr(reconstruction, "mesh_skeleton", fail)
     warned: list[str] = []
     with pytest.raises(MeshingError, match=r"^No mesh\.$"):
-        reconstruct(folder / "cloud.ply", target, SETTINGS,
-                    progress=Progress(on_warning=warned.append))
+        Reconstruct.of(SETTINGS, cloud=folder / "cloud.ply",
+                       output=target).run(Progress(on_warning=warned.append))
     assert any("scan_skeleton.swc" in text for text in warned)
     assert call(["skeleton", str(target), "--json"]) == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
@@ -261,9 +263,9 @@ def test_a_failed_mesh_leaves_the_skeleton(made, tmp_path, monkeypatch, capsys) 
     edits = tmp_path / "edits.json"
     edits.write_text("[]")
     with pytest.raises(InputError, match="scan is needed again"):
-        review_skeleton(target, edits_path=edits)
+        ReviewSkeleton(branch_folder=target, edits=edits).run()
     monkeypatch.undo()
-    again = reconstruct(folder / "cloud.ply", target, SETTINGS,
-                        skeleton_path=target / "scan_skeleton.csv")
+    again = Reconstruct.of(SETTINGS, cloud=folder / "cloud.ply", output=target,
+                           skeleton=target / "scan_skeleton.csv").run()
     assert again["tet_count"] == result["tet_count"]
-    assert review_skeleton(target)["mesh"] == "current"
+    assert ReviewSkeleton(branch_folder=target).run()["mesh"] == "current"

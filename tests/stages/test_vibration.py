@@ -10,7 +10,7 @@ import pytest
 from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.mechanics.dynamics.modes import lowest_modes
-from limber.stages.moduli.vibration import VibrationSettings, vibration
+from limber.stages.moduli.vibration import FitVibration
 from limber.stages.registry import result_of
 from limber.store import Branch
 from limber.store.loading import load_branch, load_mesh
@@ -40,7 +40,7 @@ def test_a_stiffer_branch_rings_faster(branch, tmp_path):
     before = float(load_mesh(branch).cell_data["young"].mean())
     wanted = float(lowest_modes(model.with_young(1.5 * model.young), 1).frequencies[0])
     record = written(tmp_path / "ring.csv", wanted)
-    told = vibration(branch.folder, record, VibrationSettings())
+    told = FitVibration(branch_folder=branch.folder, record=record).run()
     assert told["young_factor"] == pytest.approx(1.5, rel=0.01)
     low, high = told["young_interval_pa"]
     assert low < told["young_pa"] < high
@@ -48,7 +48,7 @@ def test_a_stiffer_branch_rings_faster(branch, tmp_path):
     assert told["damping_ratios"][0] == pytest.approx(0.03, rel=0.05)
     now = Branch.open(branch.folder, verify=True)
     assert load_mesh(now).cell_data["young"].mean() == pytest.approx(told["young_pa"])
-    assert vibration(branch.folder, record, VibrationSettings()) == told, "kept"
+    assert FitVibration(branch_folder=branch.folder, record=record).run() == told, "kept"
     section = result_of(now, "vibration", told).section(now, "vibration")
     (_, modulus), (_, vibrations) = section.tables
     assert modulus[1][1] == f"{told['young_pa'] / 1e6:.4g}" and len(vibrations) == 1 + len(
@@ -61,7 +61,7 @@ def test_a_stiffer_branch_rings_faster(branch, tmp_path):
 def test_import_pull_takes_a_record_of_a_swing(branch, tmp_path, capsys):
     """Other names and units of time, a counter and a gap beside the readings: the same modulus."""
     record = written(tmp_path / "ring.csv", 2.5)
-    plain = vibration(branch.folder, record, VibrationSettings())
+    plain = FitVibration(branch_folder=branch.folder, record=record).run()
     rows = [line.split(",") for line in record.read_text().splitlines()[1:]]
     (tmp_path / "strain.csv").write_text("Frame;Time (ms);strain (um/m);tip_x_m\n" + "".join(
         f"{number};{1e3 * float(time):.3f};{reading};{'' if number == 7 else reading}\n"
@@ -79,8 +79,9 @@ def test_a_heavy_sensor_is_reckoned_with(branch, tmp_path):
     """The same record with a mass at the tip means stiffer wood."""
     tip = load_mesh(branch).nodes[load_mesh(branch).nodes[:, 2].argmax()]
     record = written(tmp_path / "ring.csv", 2.5)
-    plain = vibration(branch.folder, record, VibrationSettings())["young_pa"]
-    heavy = vibration(branch.folder, record, VibrationSettings(sensor=(*tip, 0.005)))["young_pa"]
+    plain = FitVibration(branch_folder=branch.folder, record=record).run()["young_pa"]
+    heavy = FitVibration(branch_folder=branch.folder, record=record,
+                         sensor=(*tip, 0.005)).run()["young_pa"]
     assert heavy > 1.1 * plain
 
 
@@ -102,5 +103,5 @@ def test_a_record_that_cannot_be_used(branch, tmp_path, content, told):
     path.write_text(content)
     before = (branch.folder / "branch.json").read_bytes()
     with pytest.raises(InputError, match=told):
-        vibration(branch.folder, path, VibrationSettings())
+        FitVibration(branch_folder=branch.folder, record=path).run()
     assert (branch.folder / "branch.json").read_bytes() == before

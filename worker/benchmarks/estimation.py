@@ -36,7 +36,7 @@ from limber.mechanics.dynamics.modes import Modes, lowest_modes
 from limber.mechanics.model import BranchModel
 from limber.recordings.recording import Pull
 from limber.recordings.synchronisation import frames_of
-from limber.stages.moduli.vibration import VibrationSettings, young_of
+from limber.stages.moduli.vibration import FitVibration, young_of
 
 SETTINGS = FitSpec(hold_out=False)
 PULL_COUNTS, DRIVES = (1, 3), ("pose", "force")
@@ -318,7 +318,8 @@ def ringing_row(setting: Setting) -> list[Row]:
 
 def _ringing(seed: int) -> dict[str, list[float]]:
     """Several trials on one generated geometry."""
-    rng, settings = np.random.default_rng([seed, 77]), VibrationSettings()
+    rng = np.random.default_rng([seed, 77])
+    settings = FitVibration(branch_folder=Path(), record=Path())
     skeleton = generate_branch(int(rng.integers(1, 10**6))).skeleton
     assumed = _model(skeleton, 1.0, _YOUNG, _DENSITY)
     found: dict[str, list[float]] = {"covered": [], "errors": [], "frequencies": []}

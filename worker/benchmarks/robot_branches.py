@@ -39,8 +39,8 @@ from limber.mechanics.materials.materials import young_weights
 from limber.recordings.time_series import read_stream
 from limber.robot.motion.execution import across
 from limber.robot.virtual.launch import VirtualRobot
-from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute
-from limber.stages.pulls.record import RecordOptions, RecordSettings, record
+from limber.stages.paths.execute import ExecutePlan
+from limber.stages.pulls.record import RecordPull
 from limber.stages.pulls.virtual_pull import load_truth
 from limber.store import Branch
 from limber.store.loading import load_grasp_model, load_skeleton
@@ -174,9 +174,9 @@ def _executed_in(folder: Path, seed: int, address: str,
                        grip_seconds=4.0)
     skeleton = load_skeleton(branch)
     axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
-    settings = ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), hold=0.5)
+    settings = {"gripper_rotation": tuple(map(float, across(axis)[0])), "hold": 0.5}
     path = cell_file(cell, folder)
-    dry = execute(branch.folder, "path", path, settings, ExecuteOptions())
+    dry = ExecutePlan(branch_folder=branch.folder, name="path", cell=path, **settings).run()
     with robot_holding(branch, cell, folder, seed=seed, young=young) as robot:
         robot.ask("stand", joints=list(map(float, dry["start_joints_rad"])))
         largest = [0.0]
@@ -184,8 +184,8 @@ def _executed_in(folder: Path, seed: int, address: str,
         watcher = threading.Thread(target=_watch, args=(robot, largest, ended, fault))
         watcher.start()
         try:
-            result = execute(branch.folder, "path", path, settings,
-                             ExecuteOptions(arm=True, confirm="path", after_stop="hold"))
+            result = ExecutePlan(branch_folder=branch.folder, name="path", cell=path, **settings,
+                                 arm=True, confirm="path", after_stop="hold").run()
         finally:
             ended.set()
             watcher.join()
@@ -292,7 +292,7 @@ def recorded_stream(setting: Setting, address: str) -> list[Row]:
                 process.wait()
             lost_by_robot = robot.state["lost_seconds"]
         if killed is not None:
-            record(branch.folder, path, "stream", RecordSettings(), RecordOptions(recover=True))
+            RecordPull(branch_folder=branch.folder, cell=path, name="stream", recover=True).run()
         kept = Branch.open(branch.folder)
         rows = read_stream(kept.path("pulls/stream/robot.csv"))
         ended = kept.manifest.stages["record:stream"].result["ended"]

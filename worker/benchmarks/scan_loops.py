@@ -31,10 +31,9 @@ from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
 from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, control_points
 from limber.recordings.recording import CalibrationEntry, Pull, write_pull
-from limber.recordings.settings import ImportSettings
-from limber.stages.moduli.estimate import estimate
-from limber.stages.pulls.import_pull import import_pull
-from limber.stages.shape.reconstruct import reconstruct
+from limber.stages.moduli.estimate import EstimateYoung
+from limber.stages.pulls.import_pull import ImportPull
+from limber.stages.shape.reconstruct import Reconstruct
 from limber.store import Branch
 from limber.store.loading import hung_masses, load_skeleton
 
@@ -53,6 +52,10 @@ is chosen for the branch.
 LACKS = ("scan", "cloud", "point")
 """A helpful refusal names one of these."""
 SETTINGS = FitSpec(hold_out=False)
+
+
+class _Fit(FitSpec, EstimateYoung):
+    """An estimate with what only Python sets."""
 
 
 PARTS = ("sensor", "geometry", "mesh")
@@ -227,7 +230,7 @@ def _looped(folder: Path, case: ScanCase, rng: np.random.Generator) -> _Loop:
                    + rng.uniform(-0.5, 0.5, len(FRACTIONS)))
     folder_of_branch = folder / "drawn.branch"
     reconstructing = ReconstructSettings(**{"root": "auto"} | case.settings)
-    reconstruct(case.write(folder), folder_of_branch, reconstructing)
+    Reconstruct.of(reconstructing, cloud=case.write(folder), output=folder_of_branch).run()
     branch = Branch.open(folder_of_branch)
     axes = case.truth.moved(branch.manifest.alignment.apply(case.truth.nodes))
     meshed = mesh_skeleton(axes, reconstructing)
@@ -240,7 +243,7 @@ def _looped(folder: Path, case: ScanCase, rng: np.random.Generator) -> _Loop:
     cell = CalibrationEntry(force_bias_sigma_n=zero, force_drift_sigma_n=zero)
     pull = recorded(exact, CellErrors.drawn(cell, rng), rng)
     _imported(folder / "recorded", pull, folder_of_branch)
-    estimate(folder_of_branch, SETTINGS)
+    _Fit.of(SETTINGS, branch_folder=folder_of_branch).run()
     done = Branch.open(folder_of_branch)
     written = json.loads(done.path("estimate.json").read_text(encoding="utf-8"))
     young = truth.young_at(np.array(written["control_points_m"]))
@@ -255,11 +258,11 @@ def _imported(folder: Path, pull: Pull, branch: Path) -> None:
     sensor.write_text("[calibration]\n" + "".join(
         f"{name} = {getattr(entry.calibration, name)!r}\n"
         for name in ("force_bias_sigma_n", "force_drift_sigma_n")), encoding="utf-8")
-    import_pull(branch, folder / "markers.csv", "pull-1", ImportSettings(
-        robot=str(folder / "robot.csv"), time_offset=0.0, grasp_point=entry.grasp.point_m,
-        grasp_radius=entry.grasp.radius_m, grasp_mode="point",
-        position_sigma=entry.sensor.position_sigma_m, force_sigma=entry.sensor.force_sigma_n,
-        pull_toml=str(sensor)))
+    ImportPull(branch_folder=branch, source=folder / "markers.csv", name="pull-1",
+               robot=str(folder / "robot.csv"), time_offset=0.0, grasp_point=entry.grasp.point_m,
+               grasp_radius=entry.grasp.radius_m, grasp_mode="point",
+               position_sigma=entry.sensor.position_sigma_m, force_sigma=entry.sensor.force_sigma_n,
+               pull_toml=str(sensor)).run()
 
 
 def _true_bending(branch: Branch, true: Skeleton, young: np.ndarray, written: dict) -> np.ndarray:

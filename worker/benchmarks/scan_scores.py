@@ -23,13 +23,12 @@ from benchmarks.worlds.sources import WORLDS
 from limber.core.alignment import Alignment
 from limber.geometry.io.clouds import read_points
 from limber.geometry.io.skeletons import read_cylinders
-from limber.geometry.reconstruction import ReconstructSettings
 from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.radii.nearest_points import nearest_point_radii
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.stages.shape.reconstruct import reconstruct
+from limber.stages.shape.reconstruct import Reconstruct
 
 _STEP = 0.001  # [m] between the places on the axes that are compared
 _DETOUR, _AROUND = 1.5, 3.0  # longest true path of a true bridge, in its lengths plus these radii
@@ -121,7 +120,7 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
         LimberError: it could not be reconstructed.
     """
     path, branch = case.write(folder), folder / f"{case.name}.branch"
-    result = reconstruct(path, branch, ReconstructSettings(**{"root": "auto"} | case.settings))
+    result = Reconstruct(cloud=path, output=branch, **{"root": "auto"} | case.settings).run()
     manifest = json.loads((branch / "branch.json").read_text())
     aligned = read_cylinders(branch / "skeleton.csv")
     alignment = Alignment.model_validate(manifest["alignment"])

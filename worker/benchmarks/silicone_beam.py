@@ -16,21 +16,18 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.trials import column
-from limber.estimation.settings import FitSpec, PredictSettings, SwingSettings
-from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh, mark
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
-from limber.recordings.settings import ImportSettings
 from limber.recordings.time_series import Stream, write_stream
-from limber.stages.moduli.estimate import estimate
-from limber.stages.moduli.predict import predict
-from limber.stages.moduli.swing import swing
-from limber.stages.pulls.import_pull import import_pull
-from limber.stages.shape.mesh import mesh_surface
+from limber.stages.moduli.estimate import EstimateYoung
+from limber.stages.moduli.predict import Predict
+from limber.stages.moduli.swing import FitSwing
+from limber.stages.pulls.import_pull import ImportPull
+from limber.stages.shape.mesh import Mesh
 from limber.store import Branch
 
 FOLDER = Path(__file__).parents[3] / "shared/data/silicone_beam"
@@ -97,9 +94,8 @@ def in_scan(points: np.ndarray) -> np.ndarray:
 def made_branch(folder: Path) -> Path:
     """The branch folder of ``beam.stl``, clamped at its far face, with the marker table."""
     branch = folder / "beam.branch"
-    mesh_surface(FOLDER / "beam.stl", branch, MeshSurfaceSettings(
-        unit="mm", up=(0.0, 1.0, 0.0), root=(15.0, 15.0, 0.0), poisson=POISSON,
-        density=DENSITY))
+    Mesh(surface=FOLDER / "beam.stl", output=branch, unit="mm", up=(0.0, 1.0, 0.0),
+         root=(15.0, 15.0, 0.0), poisson=POISSON, density=DENSITY).run()
     _write_places(folder / "nominal.csv", in_scan(NOMINAL_M))
     return branch
 
@@ -113,11 +109,12 @@ def _write_places(path: Path, places: np.ndarray) -> None:
 def estimate_beam(branch: Path, recording: Path, load: float, name: str) -> BeamResult:
     """Import a recording and estimate one modulus from it."""
     x, y, z = in_scan(LOAD_POINT_M)
-    pull = import_pull(branch, recording, name, ImportSettings(
-        nominal=str(branch.parent / "nominal.csv"), coordinates="scan", weight=load,
-        own_weight=True, grasp_point=(float(x), float(y), float(z)), grasp_radius=0.012))
-    found = estimate(branch, FitSpec(pull=(name,), fractions=(0.5,), density_sigma=0.02),
-                     force=True)
+    pull = ImportPull(branch_folder=branch, source=recording, name=name,
+                      nominal=str(branch.parent / "nominal.csv"), coordinates="scan", weight=load,
+                      own_weight=True, grasp_point=(float(x), float(y), float(z)),
+                      grasp_radius=0.012).run()
+    found = EstimateYoung(branch_folder=branch, pull=(name,), fractions=(0.5,), density_sigma=0.02,
+                          force=True).run()
     down = -np.array(pull["load_n"]) / load
     measured = -np.mean(np.array(pull["displacement_m"])[TIPS] @ down)
     deviation = found["young_deviation"]
@@ -144,7 +141,7 @@ def predicted_drop(branch: Path, name: str, load: float) -> float:
 
 def _predicted(branch: Path, name: str, load: float) -> tuple[float, tuple[float, float]]:
     """That drop, and the interval of the points that move most: the tips."""
-    found = predict(branch, PredictSettings(pull=name, weight=load))
+    found = Predict(branch_folder=branch, pull=name, weight=load).run()
     return float(np.mean(np.array(found["drops_m"])[TIPS])), found["drop_interval_m"]
 
 
@@ -248,8 +245,8 @@ def beam_rows(setting: Setting) -> list[Row]:
             branch = _bricks(folder / f"beam-{cells[0]}", cells)
             _imported(branch, folder / "hung.csv", "hung")
             # Poisson's ratio is given: near one half it would take up a coarse mesh's stiffness.
-            found.append(estimate(branch.folder, FitSpec(
-                fractions=(0.5,), density_sigma=0.02, poisson_sigma=0.0))["young_pa"][0])
+            found.append(EstimateYoung(branch_folder=branch.folder, fractions=(0.5,),
+                                       density_sigma=0.02, poisson_sigma=0.0).run()["young_pa"][0])
     young = np.array(found)
     spread = float(np.ptp(young) / young.mean())
     return [Row(*BEAM_ROWS[0], f"{100 * spread:.2f} % ("
@@ -313,9 +310,9 @@ def _imported(branch: Branch, recording: Path, name: str,
     """Import a recording of the hung beam."""
     places = branch.folder.parent / "places.csv"
     _write_places(places, NOMINAL_M)
-    import_pull(branch.folder, recording, name, ImportSettings(
-        nominal=str(places), weight=LOAD_N, own_weight=True, motion=motion,
-        grasp_point=tuple(LOAD_POINT_M.tolist()), grasp_radius=0.012))
+    ImportPull(branch_folder=branch.folder, source=recording, name=name, nominal=str(places),
+               weight=LOAD_N, own_weight=True, motion=motion,
+               grasp_point=tuple(LOAD_POINT_M.tolist()), grasp_radius=0.012).run()
 
 
 def real_row(_setting: Setting) -> list[Row]:
@@ -331,7 +328,7 @@ def real_row(_setting: Setting) -> list[Row]:
         folder = Path(temporary)
         bricks = _bricks(folder / "swing", _SWING_MESH)
         _imported(bricks, RECORDING, "swing", "swing")
-        swung = swing(bricks.folder, SwingSettings(density_sigma=0.02))
+        swung = FitSwing(branch_folder=bricks.folder, density_sigma=0.02).run()
         found = estimate_beam(made_branch(folder), RECORDING, LOAD_N, "csv")
     (low, high), (soft, stiff) = found.interval, swung["young_interval_pa"]
     least, most = swung["damping_ratio_interval"]

@@ -20,12 +20,10 @@ import psutil
 
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.worker_branch_files import TEMPLATE
-from limber.batch.job_file import StageTask
 from limber.batch.stage_task import run_task
 from limber.core.processes import Pool
-from limber.core.progress import SILENT
-from limber.stages.registry import stage_description
-from limber.stages.shape.generate import GenerateInputs, GenerateSettings
+from limber.stages.motion.load import ApplyLoads
+from limber.stages.shape.generate import Generate
 
 RECONSTRUCT = '[[job.stage]]\nrun = "reconstruct"\n'
 _ESTIMATE = ('[[job.stage]]\nrun = "virtual-pull"\nname = "pull-1"\n'
@@ -103,12 +101,10 @@ def memory(setting: Setting) -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place, \
             Pool(1, name="a job of the bench") as pool:
         folder = Path(shutil.copytree(TEMPLATE, Path(place, "a.branch")))
-        stage = stage_description("load")
         used = []
         for number in setting.budget.seeds(0, jobs, at_least=20):
             setting.progress(number / jobs, f"job {number + 1}")
-            task = StageTask("load", stage.inputs(branch_folder=folder), stage.settings(
-                wind=(3.0 + 0.01 * number, 0.0, 0.0)), stage.options())
+            task = ApplyLoads(branch_folder=folder, wind=(3.0 + 0.01 * number, 0.0, 0.0))
             outcome = pool.submit(run_task, task, folder).result()
             if outcome["error"]:
                 return [Row(*MEMORY_ROW, outcome["error"], False, number)]
@@ -122,8 +118,7 @@ def make_scans(folder: Path, count: int, seed: int) -> None:
     """Write ``scan-0.ply`` and so on, generated branches, into a folder."""
     for number in range(count):
         made = folder / f"made-{number}"
-        settings = GenerateSettings(seed=seed % 10_000 + number)
-        stage_description("generate").run(GenerateInputs(folder=made), settings, None, SILENT)
+        Generate(folder=made, seed=seed % 10_000 + number).run()
         (made / "cloud.ply").rename(folder / f"scan-{number}.ply")
 
 

@@ -232,10 +232,10 @@ def _branch_file(name: str, kind: str, act: Callable[[Branch], Any], make: Any =
 
 
 def _mcap(template: Path, folder: Path) -> list[Path]:
-    from limber.stages.pulls.export_pull import export_pull
+    from limber.stages.pulls.export_pull import ExportPull
 
     path = folder / "pull.mcap"
-    export_pull(template, "pull-1", path)
+    ExportPull(branch_folder=template, name="pull-1", mcap=path).run()
     return [path]
 
 

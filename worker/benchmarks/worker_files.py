@@ -293,10 +293,10 @@ def _read_commands(_template: Path, path: Path) -> Any:
 
 
 def _cylinder_models(suffix: str, template: Path, folder: Path) -> list[Path]:
-    from limber.stages.results.export import ExportSettings, export
+    from limber.stages.results.export import Export
 
     files = [folder / f"tree{suffix}"]
-    export(template, files[0], ExportSettings())
+    Export(branch_folder=template, output=files[0]).run()
     return files
 
 

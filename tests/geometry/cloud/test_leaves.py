@@ -31,8 +31,8 @@ from limber.geometry.reconstruction import (
 )
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeletonise import skeletonise
-from limber.stages.shape.edit_skeleton import review_skeleton
-from limber.stages.shape.reconstruct import reconstruct
+from limber.stages.shape.edit_skeleton import ReviewSkeleton
+from limber.stages.shape.reconstruct import Reconstruct
 from limber.store import Branch
 from limber.store.loading import load_point_masses
 
@@ -106,7 +106,7 @@ def test_a_leafy_plant_is_its_stems_with_the_leaves_mass(seedling, tmp_path) -> 
     branch, points, on_leaf, area = seedling
     scan, folder = tmp_path / "scan.ply", tmp_path / "a.branch"
     Cloud(points).write_ply(scan)
-    result = reconstruct(scan, folder, ReconstructSettings(leave_out=True, leaves="cut"))
+    result = Reconstruct(cloud=scan, output=folder, leave_out=True, leaves="cut").run()
     assert result["length_m"] == pytest.approx(branch.skeleton.length, rel=0.15)
     assert any("leaves" in text and "detected and removed" in text for text in result["warnings"])
     assert result["leaf_mass_kg"] == pytest.approx(0.2 * area, rel=0.3)
@@ -118,7 +118,7 @@ def test_a_leafy_plant_is_its_stems_with_the_leaves_mass(seedling, tmp_path) -> 
     assert hung == pytest.approx(result["leaf_mass_kg"] + result["left_out_mass_kg"])
     edits = tmp_path / "edits.json"
     edits.write_text("[]")
-    review_skeleton(folder, edits_path=edits)
+    ReviewSkeleton(branch_folder=folder, edits=edits).run()
     again = json.loads((folder / "point_masses.json").read_text())
     assert sum(mass["mass_kg"] for mass in again if mass.get("kind") == "leaf") == (
         pytest.approx(result["leaf_mass_kg"]))
@@ -132,7 +132,7 @@ def test_leaves_are_not_cut_off_unasked(seedling, tmp_path) -> None:
     moved = 1000 * points + [700.0, -300.0, 2000.0]
     Cloud(moved).write_ply(scan)
     with pytest.raises(InputError, match=r"--leaves cut.*--leaves keep") as refused:
-        reconstruct(scan, tmp_path / "a.branch", ReconstructSettings(unit="mm"))
+        Reconstruct(cloud=scan, output=tmp_path / "a.branch", unit="mm").run()
     share, *place = re.search(
         r"^(\d+) % of the points.*? at \((.*?), (.*?), (.*?)\)", str(refused.value)).groups()
     assert float(share) == pytest.approx(100 * on_leaf.mean(), abs=10)
@@ -181,8 +181,8 @@ def test_a_refusal_shows_its_points_by_class(tmp_path, monkeypatch) -> None:
     cloud.write_ply(tmp_path / "scan.ply")
     told: list[str] = []
     with pytest.raises(InputError, match="leaves"):
-        reconstruct(tmp_path / "scan.ply", tmp_path / "a.branch", progress=Progress(
-            on_warning=told.append))
+        Reconstruct(cloud=tmp_path / "scan.ply",
+                    output=tmp_path / "a.branch").run(Progress(on_warning=told.append))
     assert any(str(tmp_path / "a_points.ply") in text for text in told)
     shown = read_cloud(tmp_path / "a_points.ply")
     assert not seen and np.allclose(shown.points, prepared.cloud.points + prepared.origin)

@@ -15,8 +15,8 @@ from limber.geometry.io.clouds import CLOUDS, read_points
 from limber.geometry.io.formats import Format, starts_with
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.stages.registry import stage_description
-from limber.stages.results.export import ExportSettings, export
+from limber.stages.registry import stage_class
+from limber.stages.results.export import Export
 from limber.store import Branch
 from limber.store.loading import load_skeleton
 
@@ -39,7 +39,7 @@ class Dots:
 @pytest.fixture(params=[False, True], ids=["here", "isolated"])
 def dots(request):
     # A stage's help lists the formats that there are when it is loaded: other tests' as well.
-    stage_description("reconstruct")
+    stage_class("reconstruct")
     CLOUDS.register(Format("dots", (".foo",), Dots.read, recognises=starts_with(b"dots"),
                            isolated=request.param))
     yield
@@ -123,7 +123,7 @@ def rows():
 
 def test_it_comes_back_as_it_went_out(rows, tmp_path):
     """By `limber export`; `limber mesh` takes it for the cylinder model that it is."""
-    told = export(EXAMPLE, tmp_path / "a.foo", ExportSettings())
+    told = Export(branch_folder=EXAMPLE, output=tmp_path / "a.foo").run()
     before, after = load_skeleton(Branch.open(EXAMPLE)), read_skeleton(tmp_path / "a.foo")
     assert told["format"] == ".foo" and told["cylinder_count"] == before.node_count - 1
     np.testing.assert_array_equal(after.nodes, before.nodes)
@@ -137,7 +137,7 @@ def test_its_suffix_is_listed(rows, tmp_path):
     (tmp_path / "a.docx").write_bytes(b"nonsense")
     for refused in (lambda: read_skeleton(tmp_path / "a.docx"),
                     lambda: body_format(tmp_path / "a.docx"),
-                    lambda: export(EXAMPLE, tmp_path / "a.docx", ExportSettings())):
+                    lambda: Export(branch_folder=EXAMPLE, output=tmp_path / "a.docx").run()):
         with pytest.raises(InputError, match=r"\.foo .*\.swc"):
             refused()
 

@@ -150,7 +150,7 @@ def test_points_of_colmap_as_it_keeps_them(tmp_path, cut):
 
 def test_the_unit_of_the_file_is_that_of_the_branch(tmp_path, monkeypatch):
     """Skeleton, surface and manifest have it, not the default."""
-    from limber.stages.shape.reconstruct import reconstruct
+    from limber.stages.shape.reconstruct import Reconstruct
 
     used = []
 
@@ -162,5 +162,5 @@ def test_the_unit_of_the_file_is_that_of_the_branch(tmp_path, monkeypatch):
     (tmp_path / "a.csv").write_text(table("x_mm,y_mm,z_mm"))
     for settings in (None, ReconstructSettings(), ReconstructSettings(unit="cm")):
         with pytest.raises(InputError, match="enough"):
-            reconstruct(tmp_path / "a.csv", tmp_path / "a.branch", settings)
+            Reconstruct.of(settings, cloud=tmp_path / "a.csv", output=tmp_path / "a.branch").run()
     assert used == ["mm", "mm", "cm"]

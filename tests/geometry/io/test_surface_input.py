@@ -8,11 +8,10 @@ import trimesh
 
 from limber.cli.main import call
 from limber.core.errors import InputError
-from limber.geometry.bodies import MeshSurfaceSettings
 from limber.geometry.cloud.preparation import size_doubts
 from limber.geometry.io.surfaces import usable_surface
 from limber.geometry.surface.surface import Surface
-from limber.stages.shape.mesh import mesh_surface
+from limber.stages.shape.mesh import Mesh
 
 FILE = Path("bar.stl")
 
@@ -143,9 +142,9 @@ def test_refused_surfaces_leave_no_folder(tmp_path, capsys):
     assert not (tmp_path / "b.branch").exists()
     (tmp_path / "text.stl").write_text("solid nothing\nendsolid nothing\n")
     with pytest.raises(InputError):
-        mesh_surface(tmp_path / "text.stl", tmp_path / "b.branch")
+        Mesh(surface=tmp_path / "text.stl", output=tmp_path / "b.branch").run()
     with pytest.raises(InputError, match="no file"):
-        mesh_surface(tmp_path / "none.stl", tmp_path / "b.branch", MeshSurfaceSettings())
+        Mesh(surface=tmp_path / "none.stl", output=tmp_path / "b.branch").run()
 
 
 REPORTED = Path(__file__).parents[4] / "shared" / "data" / "reports"

@@ -23,7 +23,7 @@ from limber.geometry.skeleton.radii.visible_sides import fit_seen_side, side_unc
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.perception.simulated_camera import render_depth
-from limber.stages.shape.reconstruct import reconstruct
+from limber.stages.shape.reconstruct import Reconstruct
 
 _RADIUS, _LENGTH = 0.006, 0.5  # [m]
 _EYE = np.array([2.0, 0.4, 0.9])  # [m]
@@ -182,7 +182,8 @@ def test_a_skeleton_without_thickness_or_of_another_unit_is_refused(tmp_path):
         Skeleton.from_edges(scale * truth.nodes, truth.parent,
                             scale * thick * truth.radius).write_swc(path)
         with pytest.raises(InputError, match=complaint):
-            reconstruct(tmp_path / "cloud.ply", tmp_path / "a.branch", skeleton_path=path)
+            Reconstruct(cloud=tmp_path / "cloud.ply", output=tmp_path / "a.branch",
+                        skeleton=path).run()
 
 
 # From where one side was seen, and how far around: told by the points' angles.

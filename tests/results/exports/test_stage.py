@@ -7,7 +7,7 @@ import pytest
 
 from limber.core.errors import InputError
 from limber.geometry.io.skeletons import read_skeleton
-from limber.stages.results.export import ExportSettings, export
+from limber.stages.results.export import Export
 from limber.store import Branch
 from limber.store.loading import load_skeleton
 
@@ -20,7 +20,7 @@ EXAMPLE = Path(__file__).parents[3] / "blend_files" / "bending_branch"
     ("a.mtg", "rtwig")])
 def test_cylinder_models_come_back(tmp_path, name, columns):
     """TreeQSM, rTwig, SimpleForest, SWC and MTG: the same tree, places and radii."""
-    told = export(EXAMPLE, tmp_path / name, ExportSettings(columns=columns))
+    told = Export(branch_folder=EXAMPLE, output=tmp_path / name, columns=columns).run()
     before, after = load_skeleton(Branch.open(EXAMPLE)), read_skeleton(tmp_path / name)
     assert after.node_count == before.node_count == told.get("cylinder_count") + 1
     np.testing.assert_allclose(after.nodes, before.nodes, atol=1e-6)
@@ -34,13 +34,13 @@ def test_simulators_files_are_written(tmp_path):
 
     links = {}
     for name in ("a.xml", "a.urdf"):
-        told = export(EXAMPLE, tmp_path / name, ExportSettings(links=8))
+        told = Export(branch_folder=EXAMPLE, output=tmp_path / name, links=8).run()
         assert 0.7 < told["stiffness_factor"] < 1.3 and told["mass_kg"] > 0
         links[name] = told["link_count"]
     bodies = ElementTree.parse(tmp_path / "a.xml").getroot().findall(".//body")
     assert len(bodies) == links["a.xml"] == links["a.urdf"]
     assert ElementTree.parse(tmp_path / "a.xml").find(".//site[@name='tip']") is not None
-    told = export(EXAMPLE, tmp_path / "a.inp", ExportSettings(load=(0.1, 0.0, 0.0)))
+    told = Export(branch_folder=EXAMPLE, output=tmp_path / "a.inp", load=(0.1, 0.0, 0.0)).run()
     text = (tmp_path / "a.inp").read_text()
     assert "*CLOAD" in text and text.count("*ELEMENT") == 1
     assert f"*NSET, NSET=TIP\n{told['tip_node']}\n" in text
@@ -48,7 +48,7 @@ def test_simulators_files_are_written(tmp_path):
 
 def test_an_mtg_has_a_line_for_each_node(tmp_path):
     """Axes follow with <, side axes with +; places and radii stand in their columns."""
-    export(EXAMPLE, tmp_path / "a.mtg", ExportSettings())
+    Export(branch_folder=EXAMPLE, output=tmp_path / "a.mtg").run()
     skeleton = load_skeleton(Branch.open(EXAMPLE))
     lines = (tmp_path / "a.mtg").read_text().splitlines()
     nodes = [line for line in lines if line.strip().startswith(("^/N", "^<N", "+N"))]
@@ -62,7 +62,7 @@ def test_an_mtg_has_a_line_for_each_node(tmp_path):
 def test_what_cannot_be_written_is_told(tmp_path):
     """Unknown suffixes list the known ones."""
     with pytest.raises(InputError, match=r"\.urdf"):
-        export(EXAMPLE, tmp_path / "a.sdf", ExportSettings())
+        Export(branch_folder=EXAMPLE, output=tmp_path / "a.sdf").run()
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from limber.results.report.report_tables import (
 )
 from limber.results.scene.graphs import young_graph
 from limber.stages.registry import result_of
-from limber.stages.results.report import page_of, write_report
+from limber.stages.results.report import WriteReport, page_of
 from limber.store import Branch
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -41,7 +41,7 @@ def meshed(tmp_path) -> Branch:
 
 def test_unfinished_folder_says_what_is_missing(meshed: Branch):
     """Each part that has not been done names the command that does it; the name is escaped."""
-    result = write_report(meshed.folder)
+    result = WriteReport(branch_folder=meshed.folder).run()
     html = (meshed.folder / "report.html").read_text(encoding="utf-8")
     assert result["sections"] == ["What was found", "Summary", "Mesh", "How it was made"]
     assert "Young&#39;s modulus has not been estimated" in html
@@ -53,18 +53,18 @@ def test_unfinished_folder_says_what_is_missing(meshed: Branch):
 
 def test_a_page_of_an_unchanged_folder_is_left_as_it_is(meshed: Branch):
     """Drawn again when something has been added, or when it is asked for."""
-    first = write_report(meshed.folder)
+    first = WriteReport(branch_folder=meshed.folder).run()
     entry = Branch.open(meshed.folder).manifest.stages["report"]
-    assert write_report(meshed.folder) == first
+    assert WriteReport(branch_folder=meshed.folder).run() == first
     assert Branch.open(meshed.folder).manifest.stages["report"] == entry
     page = meshed.folder / "report.html"
     drawn = page.stat().st_ino
-    write_report(meshed.folder, force=True)
+    WriteReport(branch_folder=meshed.folder, force=True).run()
     assert page.stat().st_ino != drawn  # clocks are too coarse: it is drawn within milliseconds
     with meshed.stage("note") as stage:
         stage.result["said"] = "something"
     entry = Branch.open(meshed.folder).manifest.stages["report"]
-    write_report(meshed.folder)
+    WriteReport(branch_folder=meshed.folder).run()
     assert Branch.open(meshed.folder).manifest.stages["report"] != entry
 
 
@@ -75,13 +75,13 @@ def test_a_picture_comes_into_a_page_that_is_drawn(meshed: Branch, tmp_path, mon
     picture = tmp_path / "scene.png"
     picture.write_bytes(b"\x89PNG made")
     page = meshed.folder / "report.html"
-    new = write_report(meshed.folder, picture=picture)
+    new = WriteReport(branch_folder=meshed.folder, picture=picture).run()
     html = page.read_text()
     assert html.index("Rendered scene.") < html.index('<section id="part2">')
-    plain, without = write_report(meshed.folder), page.read_text()
+    plain, without = WriteReport(branch_folder=meshed.folder).run(), page.read_text()
     assert plain["figure_count"] == new["figure_count"] - 1
     monkeypatch.setattr(page_module, "draw_page", None)
-    assert write_report(meshed.folder, picture=picture) == new
+    assert WriteReport(branch_folder=meshed.folder, picture=picture).run() == new
     lines = page.read_text().splitlines()
     assert [line for line in lines if "Rendered scene." not in line] == without.splitlines()
 
@@ -117,7 +117,7 @@ def test_picture_must_be_a_png(meshed: Branch, tmp_path):
     (tmp_path / "x.png").write_bytes(b"JFIF")
     for picture in (tmp_path / "x.png", tmp_path / "none.png"):
         with pytest.raises(InputError, match=picture.name):
-            write_report(meshed.folder, picture=picture)
+            WriteReport(branch_folder=meshed.folder, picture=picture).run()
     assert not (meshed.folder / "report.html").exists()
 
 
@@ -126,7 +126,7 @@ def test_damaged_mesh_is_named(meshed: Branch):
     with open(meshed.folder / "mesh.vtu", "a", encoding="utf-8") as stream:
         stream.write(" ")
     with pytest.raises(BranchFolderError, match=r"mesh\.vtu"):
-        write_report(meshed.folder)
+        WriteReport(branch_folder=meshed.folder).run()
 
 
 def test_tables_without_truth_or_numbers():
@@ -216,7 +216,7 @@ def test_what_holds_an_estimate_back_is_read_first(meshed: Branch):
         "control_points_m": [[0.0, 0.0, 0.2]]}
     with meshed.stage("estimate") as stage:
         stage.path("estimate.json").write_text(json.dumps(full), encoding="utf-8")
-    result = write_report(meshed.folder)
+    result = WriteReport(branch_folder=meshed.folder).run()
     assert result["sections"][:3] == ["What was found", "What limits the estimate", "Summary"]
     html = (meshed.folder / "report.html").read_text(encoding="utf-8")
     assert html.index("from base to tip: 1,000 (800 to 1,200) MPa") < html.index("calibrate it")
@@ -229,14 +229,14 @@ def test_named_targets_stand_in_figure_and_table(tmp_path):
     import shutil
     from pathlib import Path
 
-    from limber.stages.shape.target import TargetSettings, set_target
+    from limber.stages.shape.target import SetTarget
 
     example = Path(__file__).parents[3] / "blend_files" / "bending_branch"
     folder = shutil.copytree(example, tmp_path / "example.branch")
     branch = Branch.open(folder)
     tip = np.loadtxt(branch.path("skeleton.swc"))[-1, 2:5]
-    set_target(folder, "flower", TargetSettings(at=tuple(tip), mass=0.02))
-    write_report(folder)
+    SetTarget(branch_folder=folder, name="flower", at=tuple(tip), mass=0.02).run()
+    WriteReport(branch_folder=folder).run()
     html = (folder / "report.html").read_text(encoding="utf-8")
     assert "Named targets" in html and ">flower<" in html and f"{tip[2]:.3f}" in html
 
@@ -257,7 +257,7 @@ def test_cylinder_model_stands_beside_calipers(tmp_path):
         stage.result["length_shares"] = {"measured": 0.74, "unresolved": 0.26}
     path = tmp_path / "calipers.csv"
     path.write_text("along_m,diameter_mm\n0.2,21.0\n")
-    result = write_report(branch.folder, caliper_path=path)
+    result = WriteReport(branch_folder=branch.folder, caliper=path).run()
     assert "Cylinder model" in result["sections"]
     (row,) = result["calipers"]
     assert row["difference"] == pytest.approx(20 / 21 - 1)
@@ -270,7 +270,7 @@ def test_cylinder_model_stands_beside_calipers(tmp_path):
                           ("along_m,diameter_mm\n0.1,-3\n", "line 2: -3 mm"), ("", "no values")):
         path.write_text(content)
         with pytest.raises(InputError, match=told):
-            write_report(branch.folder, caliper_path=path)
+            WriteReport(branch_folder=branch.folder, caliper=path).run()
 
 
 def test_a_swing_has_a_section(meshed):

@@ -434,15 +434,14 @@ def test_the_map_offset_is_kept_in_double_precision(tmp_path, mesh):
 
 def test_the_stage_shows_the_folders_targets(tmp_path, mesh):
     """What `limber target` wrote is in the file that the add-on opens."""
-    from limber.stages.results.scene import SceneInputs, SceneSettings, scene
+    from limber.stages.results.scene import MakeScene
 
     targets = {"format_version": 1, "targets": [
         {"name": "flower", "position_m": [0.0, 0.0, 0.4], "mass_kg": 0.01}]}
     _branch(tmp_path / "a.branch", mesh.with_data(
         cell_data={"young": np.full(mesh.tet_count, 1e8)}),
             target={"targets.json": json.dumps(targets)})
-    scene(SceneInputs(branch_folder=tmp_path / "a.branch", data=tmp_path / "data.npz"),
-          SceneSettings())
+    MakeScene(branch_folder=tmp_path / "a.branch", data=tmp_path / "data.npz").run()
     with np.load(tmp_path / "data.npz", allow_pickle=False) as content:
         assert json.loads(str(content["info"]))["targets"] == ["flower"]
         np.testing.assert_allclose(content["targets"], [[0.0, 0.0, 0.4]])

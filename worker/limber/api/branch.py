@@ -11,7 +11,7 @@ from limber.api.running import in_python_words, run_stage, stage_of
 from limber.api.settings_table import known_stage
 from limber.core.errors import InputError
 from limber.core.settings import checked_settings, nearest
-from limber.stages.registry import result_of, stage_description
+from limber.stages.registry import result_of, stage_class
 from limber.stages.result import Result, Written, drawn
 from limber.store import Branch as Folder
 
@@ -413,5 +413,5 @@ class Branch:
         if replayed := settings.get("pull") if name == "simulate" else None:
             key = f"replay:{replayed}"
         if settings.get("follow") or not key:
-            return (stage_description(name).result or Result).read(None, name, values)
+            return (stage_class(name).about.result or Result).read(None, name, values)
         return result_of(self._read(), key, values)

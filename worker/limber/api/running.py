@@ -13,8 +13,8 @@ import numpy as np
 from limber.core.errors import Command, InputError, LimberError, Option, Text
 from limber.core.json_values import plain
 from limber.core.progress import BarSink, LineSink, Progress, Sink
-from limber.core.settings import Settings
-from limber.stages.registry import StageDescription, stage_description
+from limber.stages.registry import stage_class
+from limber.stages.stage import Stage
 
 _STAGES = {"add_pull": "import-pull", "energy_field": "energy"}
 _lock = threading.Lock()
@@ -44,25 +44,23 @@ def run_stage(name: str, arguments: Mapping[str, Any], *, quiet: bool) -> tuple[
         InputError: a name is not known, or a value is refused. LimberError: as for the stage.
     """
     caught: list[Text] = []
-    stage = stage_description(name)
     try:
         with in_python_words(), script_run_once(), _sink(name, quiet) as sink:
-            inputs, settings, options = _models(stage, arguments)
-            result = stage.run(inputs, settings, options, Progress(sink, caught.append))
+            stage = _checked(name, arguments)
+            result = stage.run(Progress(sink, caught.append))
     finally:
         for text in caught:
             warnings.warn(text.shown(_in_python), stacklevel=_users_level())
-    return stage.entry(inputs, settings), {"warnings": caught} | plain(result)
+    return stage.entry, {"warnings": caught} | plain(result)
 
 
-def _models(stage: StageDescription, arguments: Mapping[str, Any],
-            ) -> tuple[Settings, Settings, Settings]:
+def _checked(name: str, arguments: Mapping[str, Any]) -> Stage:
     try:
-        return stage.models(
+        return stage_class(name).checked(
             {key: plain(value) if isinstance(value, np.ndarray | np.generic | list | tuple)
              else value for key, value in arguments.items()})
     except InputError as error:
-        error.fix = Text(f"limber.settings({stage.name!r}) lists what it takes.")
+        error.fix = Text(f"limber.settings({name!r}) lists what it takes.")
         raise
 
 

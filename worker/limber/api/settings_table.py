@@ -20,14 +20,14 @@ def settings(verb: str) -> "SettingsTable":
     >>> limber.settings("plan")["max_force"]
     Setting(meaning='Largest force of the gripper at any pose [N].', default=None)
     """
-    from limber.stages.registry import stage_description
+    from limber.stages.registry import stage_class
 
-    stage = stage_description(known_stage(verb))
+    stage = stage_class(known_stage(verb))
     return SettingsTable(verb, {
-        field: Setting(about.description or "",
-                       "required" if about.is_required() else about.default)
-        for kind in (stage.inputs, stage.settings, stage.options)
-        for field, about in kind.model_fields.items() if field != "branch_folder"})
+        name: Setting(field.description or "",
+                      "required" if field.is_required() else field.default)
+        for name in stage.names() if name != "branch_folder"
+        for field in [stage.model_fields[name]]})
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from urllib.parse import quote
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.batch.job_file import BranchJob, JobFile, StageTask
+from limber.batch.job_file import BranchJob, JobFile, fingerprint
 from limber.core.errors import LimberError
 from limber.core.files.atomic import is_alive, write_atomically
 from limber.core.files.tables import table_text
@@ -24,6 +24,7 @@ from limber.geometry.io.skeletons import read_swc
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.results.scene.colours import colour_scale, css_colours
+from limber.stages.stage import Stage
 from limber.store.journal import Stream, stream_lines
 from limber.version import VERSION
 
@@ -62,9 +63,9 @@ class Records:
         for line in stream_lines(self.path) if self.path.is_file() else ():
             self._take(line)
 
-    def of(self, branch: BranchJob, task: StageTask) -> Record:
+    def of(self, branch: BranchJob, task: Stage) -> Record:
         """Return the state of a task; one that ran when its batch was killed is waiting."""
-        return self._found.get((branch.name, task.fingerprint), Record())
+        return self._found.get((branch.name, fingerprint(task)), Record())
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -73,18 +74,18 @@ class Records:
             yield
         self._stream = None
 
-    def begin(self, branch: BranchJob, task: StageTask) -> None:
+    def begin(self, branch: BranchJob, task: Stage) -> None:
         import psutil
 
         self._append(branch, task, {"status": RUNNING, "process": [
             os.getpid(), round(psutil.Process().create_time())]})
 
-    def end(self, branch: BranchJob, task: StageTask, record: Record) -> None:
+    def end(self, branch: BranchJob, task: Stage, record: Record) -> None:
         self._append(branch, task, {**vars(record)})
 
-    def _append(self, branch: BranchJob, task: StageTask, record: dict[str, Any]) -> None:
+    def _append(self, branch: BranchJob, task: Stage, record: dict[str, Any]) -> None:
         line = json.dumps({"branch": branch.name, "stage": task.label,
-                           "task": task.fingerprint, **record})
+                           "task": fingerprint(task), **record})
         present(self._stream, "right to append to the records").append(line)
         self._take(line)
 
@@ -356,7 +357,7 @@ def _title(branch: BranchJob, page: Path) -> str:
 
 def _rendered(branch: BranchJob, page: Path) -> str:
     """The branch's pictures that `limber scene` has rendered."""
-    images = (getattr(task.inputs, kind, None) for task in branch.tasks
+    images = (getattr(task, kind, None) for task in branch.tasks
               for kind in ("render", "turntable"))
     links = [link for path in images if path and (link := _relative_link(path, page))]
     return "".join(f"<a href='{link}'><img src='{link}' alt='rendered' loading=lazy></a>"

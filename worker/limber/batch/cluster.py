@@ -1,6 +1,6 @@
 """Machines beyond this process, by Dask: a cluster started here, by a queue, or already running.
 
-Command lines are sent out, outcomes are returned; branch folders are where all machines see them.
+Stages are sent out as JSON, outcomes are returned; branch folders are where all machines see them.
 Messages are encrypted and both ends are authenticated (TLS); only a scheduler that another user has
 started on this computer may do without.
 """
@@ -13,15 +13,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from limber.batch.job_file import JobFile, StageTask
-from limber.batch.scheduler_scripts import line_of_task
-from limber.batch.stage_task import run_line, stop_lines, unfit
+from limber.batch.job_file import JobFile
+from limber.batch.stage_task import run_remotely, stop_stages, unfit
 from limber.core.errors import Cancelled, InputError, Option, WorkError
 from limber.core.not_none import present
 from limber.core.optional import require_extra
 from limber.core.processes import worker_count
 from limber.core.processes.process_limits import CORES, core_budget
 from limber.core.progress import Progress
+from limber.stages.stage import Stage
 from limber.version import VERSION
 
 _QUEUES = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "lsf": "LSFCluster", "sge": "SGECluster",
@@ -82,7 +82,7 @@ class Cluster:
         """Number of tasks to run at a time."""
         return self._requested or max(sum(self._client.nthreads().values()), 1)
 
-    def submit(self, task: StageTask, folder: Path) -> Future:
+    def submit(self, task: Stage, folder: Path) -> Future:
         """Submit a task; its future holds the result of :func:`~limber.batch.stage_task.run_task`.
 
         If a worker is lost, only this stage is lost: another worker runs it again.
@@ -92,8 +92,9 @@ class Cluster:
         future: Future = Future()
         future.set_running_or_notify_cancel()
         try:
-            remote = self._client.submit(run_line, line_of_task(task), self._directory, str(folder),
-                                         self._limits, VERSION, pure=False)
+            remote = self._client.submit(
+                run_remotely, task.about.name, task.stated(), self._directory, str(folder),
+                self._limits, VERSION, pure=False)
         except (OSError, NoAnswer) as error:
             raise _lost(error) from error
         remote.add_done_callback(partial(self._pass_on, future))
@@ -103,7 +104,7 @@ class Cluster:
         """Stop all tasks and their child processes."""
         self._is_cancelled = True
         self._client.cancel(list(self._client.futures.values()), force=True)
-        self._client.run(stop_lines, on_error="ignore")
+        self._client.run(stop_stages, on_error="ignore")
 
     def __enter__(self) -> "Cluster":
         return self

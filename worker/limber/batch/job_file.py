@@ -26,39 +26,20 @@ from limber.core.files.reading import read_text, read_toml
 from limber.core.files.safe_names import same_named
 from limber.core.json_values import plain
 from limber.core.processes import Limits
-from limber.core.settings import Settings, nearest
+from limber.core.settings import nearest
 from limber.core.units import in_unit
-from limber.stages.registry import (
-    StageDescription,
-    stage_description,
-    stage_schema,
-    stage_summaries,
-)
+from limber.stages.registry import stage_class, stage_schema, stage_summaries
+from limber.stages.stage import Stage
 from limber.store.manifest import MANIFEST, read_manifest
 
 # The content of a job file: branches, and the stages to run on each.
 
 
-@dataclass(frozen=True)
-class StageTask:
-    """A stage to run on a branch, with checked inputs, settings and options."""
-
-    stage: str
-    inputs: Settings
-    settings: Settings
-    options: Settings
-
-    @property
-    def label(self) -> str:
-        """The stage's name, with the name of its result if there may be several."""
-        name = getattr(self.inputs, "name", None) or getattr(self.settings, "name", None)
-        return f"{self.stage}:{name}" if name else self.stage
-
-    @property
-    def fingerprint(self) -> str:
-        """The task without its options: the same text for the same task."""
-        content = json.dumps([self.stage, plain(self.inputs), plain(self.settings)], sort_keys=True)
-        return hashlib.sha256(content.encode("utf-8")).hexdigest()[:16]
+def fingerprint(task: Stage) -> str:
+    """Return the same text for the same task; options do not count."""
+    inputs = {name: plain(getattr(task, name)) for name in task.parts()["inputs"]}
+    content = json.dumps([task.about.name, inputs, plain(task)], sort_keys=True)
+    return hashlib.sha256(content.encode("utf-8")).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -71,7 +52,7 @@ class BranchJob:
 
     name: str
     folder: Path
-    tasks: tuple[StageTask, ...]
+    tasks: tuple[Stage, ...]
     sweep: dict[str, Any] = field(default_factory=dict)
     fetched: tuple[tuple[str, Path], ...] = ()
     home: str = ""
@@ -307,10 +288,10 @@ def why_not_in_batches(name: str) -> str:
     Raises:
         KeyError: there is no such stage.
     """
-    stage = stage_description(name)
-    if stage.moves_robot:
-        return _ROBOTS[stage.moves_robot]
-    if not stage.inputs.model_fields.keys() & {"branch_folder", "output"}:
+    stage = stage_class(name)
+    if stage.about.moves_robot:
+        return _ROBOTS[stage.about.moves_robot]
+    if not {*stage.parts()["inputs"]} & {"branch_folder", "output"}:
         return "It makes a scan, not a branch. Run it first, and list its cloud under scans."
     return ""
 
@@ -337,12 +318,12 @@ class StageTables:
     folder: Path
     sweep: dict[str, Any]
 
-    def tasks(self, tables: list[dict[str, Any]], key_path: KeyPath) -> list[StageTask]:
+    def tasks(self, tables: list[dict[str, Any]], key_path: KeyPath) -> list[Stage]:
         """Return the tasks of all stages of a job."""
         return [task for number, table in enumerate(tables)
                 for task in self._tasks_of(table, (*key_path, "stage", number))]
 
-    def _tasks_of(self, table: dict[str, Any], key_path: KeyPath) -> list[StageTask]:
+    def _tasks_of(self, table: dict[str, Any], key_path: KeyPath) -> list[Stage]:
         name = str(table.get("run"))
         if trouble := _trouble(name):
             self.problems.add((*key_path, "run"), f"run = {table.get('run')!r}: {trouble}")
@@ -352,24 +333,25 @@ class StageTables:
             stage, _, key = swept.partition(".")
             if stage == name:
                 entries[key] = value, (*key_path[:2], "sweep", swept)
-        return _StageValues(self, stage_description(name), entries, key_path).tasks()
+        return _StageValues(self, stage_class(name), entries, key_path).tasks()
 
 
 class _StageValues:
     """The values of one stage on one branch, each with its position in the file."""
 
-    def __init__(self, of: StageTables, stage: StageDescription,
+    def __init__(self, of: StageTables, stage: type[Stage],
                  entries: dict[str, tuple[Any, KeyPath]], key_path: KeyPath):
         self._of, self._problems, self._stage, self._key_path = of, of.problems, stage, key_path
         self._key_paths = {key: where for key, (_, where) in entries.items()}
         self._values = {key: value for key, (value, _) in entries.items()}
-        schema = stage_schema(stage.name)
+        self._name = stage.about.name
+        schema = stage_schema(self._name)
         self._fields = {key: about for part in ("inputs", "settings", "options")
                         for key, about in schema[part].get("properties", {}).items()}
         self._refused: set[str] = set()
         """Fields whose value was refused before reaching the stage's settings."""
 
-    def tasks(self) -> list[StageTask]:
+    def tasks(self) -> list[Stage]:
         own = self._own_inputs()
         values: dict[str, Any] = {}
         for key, value in self._values.items():
@@ -377,7 +359,7 @@ class _StageValues:
                 self._problems.add(self._key_paths[key],
                                    f"The batch sets {key!r} itself. Remove it.")
             elif key not in self._fields:
-                self._problems.add(self._key_paths[key], f"{self._stage.name} has no {key!r}. "
+                self._problems.add(self._key_paths[key], f"{self._name} has no {key!r}. "
                                    f"{nearest(key, list(self._fields))}")
             else:
                 values[key] = self._value(key, value)
@@ -386,22 +368,19 @@ class _StageValues:
         self._check_results(tasks)
         return tasks
 
-    def _check_results(self, tasks: list[StageTask]) -> None:
+    def _check_results(self, tasks: list[Stage]) -> None:
         """Report runs of this table that would replace each other's result."""
-        for group in same_named([self._stage.entry(task.inputs, task.settings) or " ".join(
-                map(str, written_by(task))) or task.fingerprint for task in tasks]):
-            files = [", ".join(path.name for key, path in vars(tasks[index].inputs).items()
-                               if isinstance(path, Path) and key in self._values)
-                     for index in group]
-            same = self._stage.entry(tasks[group[0]].inputs, tasks[group[0]].settings)
+        for group in same_named([task.entry or " ".join(map(str, task.outputs()))
+                                 or fingerprint(task) for task in tasks]):
+            files = [", ".join(path.name for key in self._stage.parts()["inputs"]
+                               if isinstance(path := getattr(tasks[index], key), Path)
+                               and key in self._values) for index in group]
+            same = tasks[group[0]].entry
             self._problems.add(self._key_path, (
-                f"{len(group)} runs of {self._stage.name} on {self._of.source.name} would have one "
+                f"{len(group)} runs of {self._name} on {self._of.source.name} would have one "
                 f"result{f', {same}' if same else ''}: {'; '.join(files[:5])}. Each would replace "
                 "the one before. Put {file} into the name, and give files that differ in their "
                 "suffix only other names."))
-
-    def _models(self) -> tuple[type[Settings], ...]:
-        return self._stage.inputs, self._stage.settings, self._stage.options
 
     def _own_inputs(self) -> dict[str, Any]:
         """Return the inputs that follow from the branch."""
@@ -409,7 +388,7 @@ class _StageValues:
             return {"branch_folder": self._of.folder}
         source = next(key for key, about in self._fields.items() if about.get("argument"))
         if not self._of.source.is_scan:
-            self._problems.add((), f"{self._stage.name} makes a branch from a scan, but this job "
+            self._problems.add((), f"{self._name} makes a branch from a scan, but this job "
                                "has branch folders.")
         return {source: self._of.source.path, "output": self._of.folder}
 
@@ -467,16 +446,13 @@ class _StageValues:
             self._problems.add(key_path, f"{key}: no file matches {pattern!r}.")
         return list(matches or ())
 
-    def _checked(self, values: dict[str, Any]) -> StageTask | None:
-        made = []
-        for model in self._models():
-            own = {key: value for key, value in values.items() if key in model.model_fields}
-            try:
-                made.append(model(**own))
-            except ValidationError as error:
-                for one in error.errors():
-                    self._report_refusal(one)
-        return StageTask(self._stage.name, *made) if len(made) == 3 else None
+    def _checked(self, values: dict[str, Any]) -> Stage | None:
+        try:
+            return self._stage(**values)
+        except ValidationError as error:
+            for one in error.errors():
+                self._report_refusal(one)
+            return None
 
     def _report_refusal(self, refusal: Any) -> None:
         """Report why the stage's settings refuse a value."""
@@ -486,15 +462,8 @@ class _StageValues:
         unit = self._fields.get(key, {}).get("unit")
         seen = "" if refusal["type"] == "missing" else f", not {refusal['input']!r}"
         self._problems.add(self._key_paths.get(key, (*self._key_path, key)),
-                           f"{self._stage.name} {key}: {refusal['msg']}{seen}"
+                           f"{self._name} {key}: {refusal['msg']}{seen}"
                            + (f" [{unit}]." if unit else "."))
-
-
-def written_by(task: StageTask) -> list[Path]:
-    """Return the files and folders that a task writes and its inputs name."""
-    model = type(task.inputs)
-    return [value for key, value in vars(task.inputs).items()
-            if isinstance(value, Path) and model.group_of(key) == "output"]
 
 
 def _trouble(name: str) -> str:
@@ -666,7 +635,7 @@ class _Reader:
                               "lower case, or use two job files with different `out`.")
         outputs = [(branch.name, str(path)) for branch in branches
                    for path in {path for task in branch.tasks
-                                for path in written_by(task) if path != branch.folder}]
+                                for path in task.outputs() if path != branch.folder}]
         for group in same_named([path for _, path in outputs]):
             self.problems.add((), f"{len(group)} branches would write {outputs[group[0]][1]}: "
                               f"{', '.join(outputs[index][0] for index in group[:5])}. Put "
@@ -681,9 +650,8 @@ def _scan_of(folder: Path) -> str:
         return ""
 
 
-def _paths_in(tasks: list[StageTask]) -> list[Path]:
-    return [value for task in tasks for part in (task.inputs, task.settings, task.options)
-            for value in vars(part).values() if isinstance(value, Path)]
+def _paths_in(tasks: list[Stage]) -> list[Path]:
+    return [value for task in tasks for value in vars(task).values() if isinstance(value, Path)]
 
 
 def _plain_name(value: Any) -> str:

@@ -18,12 +18,13 @@ from limber.batch.batch_progress import (
     numbers_of,
 )
 from limber.batch.cluster import Cluster, ClusterLostError
-from limber.batch.job_file import BranchJob, JobFile, StageTask
+from limber.batch.job_file import BranchJob, JobFile
 from limber.batch.stage_task import is_shown, run_task
 from limber.batch.staging import AT_ONCE, Staging
 from limber.core.errors import Cancelled, Command, LimberError, WorkError
 from limber.core.processes import Pool, worker_count
 from limber.core.progress import SILENT, Progress
+from limber.stages.stage import Stage
 from limber.version import VERSION
 
 _TICK_SECONDS = 0.2
@@ -72,7 +73,7 @@ class Machines(Protocol):
     @property
     def count(self) -> int: ...
 
-    def submit(self, task: StageTask, folder: Path) -> Future: ...
+    def submit(self, task: Stage, folder: Path) -> Future: ...
 
     def cancel(self) -> None: ...
 
@@ -86,7 +87,7 @@ class _ThisProcess:
         self._limits = jobs.limits
         self._pool = Pool(self.count, name="a stage of the batch")
 
-    def submit(self, task: StageTask, folder: Path) -> Future:
+    def submit(self, task: Stage, folder: Path) -> Future:
         return self._pool.submit(run_task, task, folder, limits=self._limits)
 
     def cancel(self) -> None:
@@ -271,7 +272,7 @@ def _step(branch: BranchJob, number: int) -> str:
 
 
 def plan_of(jobs: JobFile, records: Records, *, retry_failed: bool = False,
-            ) -> list[tuple[BranchJob, StageTask, str]]:
+            ) -> list[tuple[BranchJob, Stage, str]]:
     """Return what a run would do: each branch's tasks, in order, and their status."""
     found = []
     for branch in jobs.branches:

@@ -8,40 +8,11 @@ import math
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import click
-
-from limber.batch.job_file import BranchJob, JobFile, StageTask
+from limber.batch.job_file import BranchJob, JobFile
 from limber.core.errors import InputError, Option
 from limber.core.files.atomic import write_atomically
-from limber.stages.command_line import command_line, given, stage_options
-from limber.stages.registry import stage_description
-
-# A stage's task as the command line that runs it, and back.
-
-
-def line_of_task(task: StageTask) -> list[str]:
-    """Return the arguments after ``limber`` that run the task."""
-    return [task.stage, *command_line(task.inputs, task.settings, task.options)]
-
-
-def task_of_line(line: list[str]) -> StageTask:
-    """Return the task that a command line runs.
-
-    Raises:
-        InputError: a value is refused.
-        click.UsageError: it is not the command line of a stage.
-    """
-    stage = stage_description(line[0])
-
-    @click.command(stage.name)
-    @stage_options(stage)
-    def command(**options: Any) -> StageTask:
-        return StageTask(stage.name, *stage.models(given(options)))
-
-    return command.main(line[1:], prog_name=f"limber {stage.name}", standalone_mode=False)
-
+from limber.stages.command_line import command_line
 
 KINDS = ("slurm", "snakemake")
 _HOURS = 24.0
@@ -71,11 +42,7 @@ def write_script(jobs: JobFile, kind: str) -> Path:
 
 def commands(branch: BranchJob) -> list[str]:
     """Return a branch's stages as they are typed, quoted for a shell."""
-    return [_command(task) for task in branch.tasks]
-
-
-def _command(task: StageTask) -> str:
-    return shlex.join(["limber", *line_of_task(task)])
+    return [shlex.join(["limber", task.about.name, *command_line(task)]) for task in branch.tasks]
 
 
 def _minutes(jobs: JobFile, branch_tasks: int) -> int:

@@ -7,22 +7,21 @@ from multiprocessing import current_process
 from pathlib import Path
 from typing import Any
 
-from limber.batch.job_file import StageTask
-from limber.batch.scheduler_scripts import task_of_line
 from limber.core.errors import BranchBusyError, Cancelled, LimberError
 from limber.core.json_values import plain
 from limber.core.machine_errors import machine_error
 from limber.core.processes import Limits, Pool
 from limber.core.processes.process_limits import memory_mb
 from limber.core.progress import Progress
-from limber.stages.registry import stage_description
+from limber.stages.registry import stage_class
+from limber.stages.stage import Stage
 from limber.store.manifest import read_manifest
 from limber.version import VERSION
 
 _SAMPLE_SECONDS = 0.2
 
 
-def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any]:
+def run_task(task: Stage, folder: Path, progress: Progress) -> dict[str, Any]:
     """Run a stage; return its outcome, also if it failed.
 
     Returns:
@@ -41,8 +40,7 @@ def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any
     outcome: dict[str, Any] = {"error": "", "result": {}}
     with _Memory() as memory:
         try:
-            outcome["result"] = plain(stage_description(task.stage).run(
-                task.inputs, task.settings, task.options, progress.keeping(warnings)))
+            outcome["result"] = plain(task.run(progress.keeping(warnings)))
         except (BranchBusyError, Cancelled):
             raise
         except LimberError as error:
@@ -59,7 +57,7 @@ def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any
         "memory_mb": round(memory.most_mb, 1), "is_kept": before is not None and before == after}
 
 
-def is_shown(task: StageTask, folder: Path, content: str) -> bool:
+def is_shown(task: Stage, folder: Path, content: str) -> bool:
     """Whether a stage that stores no results in the branch, such as a scene, is up to date.
 
     Args:
@@ -70,9 +68,9 @@ def is_shown(task: StageTask, folder: Path, content: str) -> bool:
         path.exists() for path in outputs)
 
 
-def _content(task: StageTask, folder: Path) -> str:
+def _content(task: Stage, folder: Path) -> str:
     """Digest of branch and Limber version for a stage that stores no results; else empty."""
-    if stage_description(task.stage).key or not _outputs(task):
+    if task.about.key or not _outputs(task):
         return ""
     try:
         return f"{VERSION} {read_manifest(folder).content_digest()}"
@@ -80,22 +78,20 @@ def _content(task: StageTask, folder: Path) -> str:
         return ""
 
 
-def _outputs(task: StageTask) -> list[Path]:
+def _outputs(task: Stage) -> list[Path]:
     """The files that a stage writes beside the branch; none if it reads any beside it."""
-    kind = type(task.inputs)
-    paths = {name: value for name, value in task.inputs if isinstance(value, Path)
-             and name != "branch_folder"}
-    outputs = [value for name, value in paths.items() if kind.group_of(name) == "output"]
+    paths = [name for name in task.parts()["inputs"] if isinstance(getattr(task, name), Path)
+             and name != "branch_folder"]
+    outputs = task.outputs()
     return outputs if len(outputs) == len(paths) else []
 
 
-def _finished(task: StageTask, folder: Path) -> str | None:
+def _finished(task: Stage, folder: Path) -> str | None:
     """Return when the branch's entry of the task was made; None if there is none."""
-    key = stage_description(task.stage).entry(task.inputs, task.settings)
-    if not key or not folder.is_dir():
+    if not task.entry or not folder.is_dir():
         return None
     try:
-        entry = read_manifest(folder).stages.get(key)
+        entry = read_manifest(folder).stages.get(task.entry)
     except (LimberError, OSError):
         # The stage reports what is wrong.
         return None
@@ -125,7 +121,7 @@ class _Memory:
                 return
 
 
-# The work of a Dask worker for a batch: it runs command lines in processes of its own pool.
+# The work of a Dask worker for a batch: it runs stages in processes of its own pool.
 #
 # Crash, memory and time are then confined to the stage, and imported modules remain for the next
 # one. A lost worker takes its processes with it.
@@ -149,13 +145,14 @@ def unfit(version: str) -> str:
     return ""
 
 
-def run_line(line: list[str], directory: str, folder: str, limits: Limits, version: str,
-             ) -> dict[str, Any]:
-    """Run a stage's command line in a process of this worker's pool; return its outcome.
+def run_remotely(name: str, stated: dict[str, Any], directory: str, folder: str, limits: Limits,
+                 version: str) -> dict[str, Any]:
+    """Run a stage in a process of this worker's pool; return its outcome.
 
     Args:
-        line: The stage and its arguments, as typed after ``limber``.
-        directory: The folder to which the paths in it are relative.
+        name: The stage.
+        stated: Its values, as of :meth:`limber.stages.stage.Stage.stated`.
+        directory: The folder to which its paths are relative.
         folder: The branch folder.
         limits: Its limits on time and memory.
         version: Version of the batch.
@@ -171,14 +168,15 @@ def run_line(line: list[str], directory: str, folder: str, limits: Limits, versi
         return _failed(f"The worker {os.getpid()} cannot run this stage: {reason}.", 0.0)
     started = time.perf_counter()
     try:
-        return _workers_pool().submit(_run, line, directory, folder, limits=limits).result()
+        return _workers_pool().submit(
+            _run, name, stated, directory, folder, limits=limits).result()
     except Cancelled:
         raise
     except LimberError as error:
         return _failed(str(error), time.perf_counter() - started)
 
 
-def stop_lines() -> None:
+def stop_stages() -> None:
     """End the running stages of this worker; the folders stay as they were before them."""
     global _pool
     with _guard:
@@ -200,10 +198,11 @@ def _workers_pool() -> Pool:
         return _pool
 
 
-def _run(line: list[str], directory: str, folder: str, progress: Progress) -> dict[str, Any]:
-    # Paths of the command line are relative to the start folder of the batch, on every machine.
+def _run(name: str, stated: dict[str, Any], directory: str, folder: str, progress: Progress,
+         ) -> dict[str, Any]:
+    # Paths are relative to the start folder of the batch, on every machine.
     os.chdir(directory)
-    task = task_of_line(line)
+    task = stage_class(name).checked(stated)
     end = time.monotonic() + _BUSY_SECONDS
     while True:
         try:

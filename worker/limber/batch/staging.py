@@ -182,7 +182,7 @@ def _beside(jobs: JobFile, branch: BranchJob) -> Iterator[Path]:
     out, own = jobs.out.resolve(), branch.folder.resolve()
     fetched = {path.resolve() for _, path in branch.fetched}
     for task in branch.tasks:
-        for value in vars(task.inputs).values():
+        for value in (getattr(task, name) for name in task.parts()["inputs"]):
             path = value.resolve() if isinstance(value, Path) else None
             if path is None or path in fetched or not path.is_relative_to(out) or (
                     path.is_relative_to(own)):

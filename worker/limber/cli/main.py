@@ -11,6 +11,7 @@ import contextlib
 import difflib
 import functools
 import importlib
+import inspect
 import json
 import os
 import re
@@ -35,11 +36,11 @@ from limber.core.errors import LimberError, PartlyFailedError, SafetyStop, Text,
 from limber.core.machine_errors import machine_error
 from limber.core.processes.heartbeat import Heartbeat
 from limber.core.progress import BarSink, JsonSink, LogSink, Progress, Sink, report_damage_to
-from limber.stages.registry import stage_description, stage_module, stage_schema, stage_summaries
+from limber.stages.registry import stage_class, stage_schema, stage_summaries
 from limber.version import VERSION
 
 if TYPE_CHECKING:
-    from limber.stages.registry import StageDescription
+    from limber.stages.stage import Stage
 
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
@@ -77,7 +78,7 @@ class _Commands(click.Group):
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         if name in stage_summaries():
-            return command_of(stage_description(name), stage_module(name).__doc__)
+            return command_of(stage_class(name))
         if name not in command_summaries():
             return None
         return importlib.import_module(f"limber.cli.commands.{name.replace('-', '_')}").command
@@ -160,47 +161,38 @@ def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.
     return wrap
 
 
-def command_of(stage: "StageDescription", help_text: str) -> click.Command:
-    """Make the command of a stage: its inputs, settings and options become options."""
+def command_of(stage: "type[Stage]") -> click.Command:
+    """Make the command of a stage: its fields become options."""
     from limber.stages.command_line import GroupedOption, given, stage_options
 
-    @stage_command(stage.name)
+    about = stage.about
+
+    @stage_command(about.name)
     @click.option("--schema", cls=GroupedOption, expert=True, is_flag=True, is_eager=True,
-                  expose_value=False, callback=functools.partial(_show_schema, stage.name),
+                  expose_value=False, callback=functools.partial(_show_schema, about.name),
                   help="Print the stage's inputs, settings and options as a JSON schema, and "
                        "exit.")
     @stage_options(stage)
     def command(run: Run, **options: Any) -> dict[str, Any]:
-        models = stage.models(given(options))
-        result = stage.run(*models, run.progress)
-        for title, rows in stage.result.of(_plain(result)).tables() if stage.result else ():
+        made = stage.checked(given(options))
+        result = made.run(run.progress)
+        for title, rows in about.result.of(_plain(result)).tables() if about.result else ():
             run.show(title, rows)
-        known = {name: value for model in models for name, value in dict(model).items()}
-        _close_stage(run, stage, known | _plain(result))
+        values = dict(made) | _plain(result)
+        if found := list(found_lines(about.found, values)):
+            run.close(*found, where=_result_folder(about.writes, values),
+                      then=command_to_type(about.then, values))
         return result
-    command.help = help_text
+    command.help = inspect.getdoc(stage)
     return command
 
 
-def _close_stage(run: Run, stage: "StageDescription", values: dict[str, Any]) -> None:
-    """Print what a stage found, in which file, and which command follows.
-
-    Args:
-        values: Inputs, settings and result by name.
-    """
-    found = list(found_lines(stage.found, values))
-    if found:
-        run.close(*found, where=_result_folder(stage, values),
-                  then=command_to_type(stage.then, values))
-
-
-def _result_folder(stage: "StageDescription", values: dict[str, Any]) -> object:
+def _result_folder(writes: tuple[str, ...], values: dict[str, Any]) -> object:
     """The first file or folder that a stage wrote, if any."""
     folder = values.get("branch_folder")
     if folder is None or "output" in values:
         return values.get("output") or values.get("data") or values.get("folder") or folder or ""
-    written = Path(folder, stage.writes[0].replace("{name}", str(values.get("name")))
-                   if stage.writes else "")
+    written = Path(folder, writes[0].replace("{name}", str(values.get("name"))) if writes else "")
     return written if written.exists() else folder
 
 

@@ -134,14 +134,17 @@ class Settings(BaseModel):
     results_version: ClassVar[int] = 1
 
     @classmethod
-    def of(cls, settings: "Settings") -> Self:
-        """Return these settings with the further ones that only Python sets, at their defaults."""
-        return settings if isinstance(settings, cls) else cls(**{
-            name: getattr(settings, name) for name in settings.model_fields_set})
+    def of(cls, settings: "Settings", **more: Any) -> Self:
+        """Return these settings as another model that knows them, with further values."""
+        return settings if isinstance(settings, cls) and not more else cls(**{
+            name: getattr(settings, name) for name in settings.model_fields_set
+            if name in cls.model_fields} | more)
 
     @classmethod
     def group_of(cls, name: str) -> str:
         """Return the title that a field belongs to."""
+        if group := _extra(cls, name).get("group"):
+            return group
         for base in cls.__mro__:
             for title, names in vars(base).get("groups", {}).items():
                 if name in names:
@@ -151,8 +154,8 @@ class Settings(BaseModel):
     @classmethod
     def is_expert(cls, name: str) -> bool:
         """Whether a field is shown on demand only."""
-        return not cls.model_fields[name].is_required() and not any(
-            name in vars(base).get("common", ()) for base in cls.__mro__)
+        return not (cls.model_fields[name].is_required() or _extra(cls, name).get("common") or any(
+            name in vars(base).get("common", ()) for base in cls.__mro__))
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
@@ -164,6 +167,11 @@ class Settings(BaseModel):
             if unit := _UNIT.search(content.get("description", "")):
                 content["unit"] = unit.group(1)
         return schema
+
+
+def _extra(model: type[BaseModel], name: str) -> dict[str, Any]:
+    extra = model.model_fields[name].json_schema_extra if name in model.model_fields else None
+    return extra if isinstance(extra, dict) else {}
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
@@ -202,9 +210,7 @@ def _missing(model: type[BaseModel], values: dict[str, Any], names: list[str]) -
                 "NAME")
     seen, meant, proposed = [], [], []
     for name in names:
-        field = model.model_fields[name]
-        declared = field.json_schema_extra
-        extra = declared if isinstance(declared, dict) else {}
+        field, extra = model.model_fields[name], _extra(model, name)
         short = str(extra["short"]) if "short" in extra else Option(name)
         seen.append(Text(short, " (", Option(name), ")") if "short" in extra else short)
         meant.append(Text(short, f": {field.description}") if len(names) > 1

@@ -1,7 +1,7 @@
 """Settings of estimates, virtual pulls and predictions, without heavy imports."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -139,8 +139,8 @@ class FitSpec(EstimateSettings):
         "intervals. 0: only the uncertainty of the radii.")
 
     @classmethod
-    def of(cls, settings: Settings) -> Self:
-        found = super().of(settings)
+    def of(cls, settings: Settings, **more: Any) -> Self:
+        found = super().of(settings, **more)
         return found.model_copy(update=_QUICK) if found.quick else found
 
 

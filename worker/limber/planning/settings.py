@@ -46,7 +46,7 @@ class PlanSettings(Settings):
         "timing": ("speed", "hold", "inertia"),
         "solver": ("planner", "iterations", "engine", "seed"),
     }
-    common = ("goal", "tip_goal", "target", "max_force", "max_strain")
+    common: ClassVar[tuple[str, ...]] = ("goal", "tip_goal", "target", "max_force", "max_strain")
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the grasp, in the branch's frame [m]. Without any goal, a distant pose "

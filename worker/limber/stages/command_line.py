@@ -19,7 +19,7 @@ from pydantic import BaseModel
 
 from limber.core.errors import Command, Option, Text
 from limber.core.settings import OneOf, Settings, checked_settings
-from limber.stages.registry import StageDescription
+from limber.stages.stage import Stage
 
 
 class GroupedOption(click.Option):
@@ -164,11 +164,9 @@ def settings_options(model: type[BaseModel], name: str = "settings", *,
     return wrap
 
 
-def stage_options(stage: StageDescription) -> Callable[[Callable], Callable]:
-    """Add one option for each input, setting and option of a stage; :func:`given` takes them."""
-    fields = {field: model for model in (stage.inputs, stage.settings, stage.options)
-              for field in model.model_fields}
-    return lambda function: _with_options(function, fields, "stage")
+def stage_options(stage: type[Stage]) -> Callable[[Callable], Callable]:
+    """Add one option for each field of a stage; :func:`given` takes them."""
+    return lambda function: _with_options(function, dict.fromkeys(stage.names(), stage), "stage")
 
 
 def _with_options(function: Callable, fields: Mapping[str, type[BaseModel]],
@@ -186,21 +184,22 @@ def given(options: dict[str, Any], prefix: str = "stage") -> dict[str, Any]:
             if value is not None}
 
 
-def command_line(*models: Settings) -> list[str]:
+def command_line(model: Settings) -> list[str]:
     """Return the arguments that give a command these values; defaults are omitted."""
     arguments: list[str] = []
     options: list[str] = []
-    for model in models:
-        for name, field in type(model).model_fields.items():
-            value = getattr(model, name)
-            # A stated value counts even if it is the default: the unit would be asked for.
-            if not field.is_required() and name not in model.model_fields_set and (
-                    value == field.get_default(call_default_factory=True)):
-                continue
-            if (field.json_schema_extra or {}).get("argument"):
-                arguments.append(str(value))
-            else:
-                options += _typed(name, field, value)
+    kind = type(model)
+    for name in kind.names() if issubclass(kind, Stage) else kind.model_fields:
+        field, value = kind.model_fields[name], getattr(model, name)
+        # A stated value counts even if it is the default: the unit would be asked for.
+        if not field.is_required() and name not in model.model_fields_set and (
+                value == field.get_default(call_default_factory=True)):
+            continue
+        extra: Any = field.json_schema_extra or {}
+        if extra.get("argument"):
+            arguments.append(str(value))
+        else:
+            options += _typed(name, field, value)
     return [*options, "--", *arguments] if arguments else options
 
 

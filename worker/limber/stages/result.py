@@ -14,7 +14,7 @@ users they are typed attributes; terminal, notebook and report show the labelled
 :func:`shown` has a label, :func:`kept` none, :func:`of_files` is no value but an array or object
 that :meth:`Result.of_folder` reads from the stage's files. In JSON the name of a value ends with
 its unit, here ``radius_m``. One that may be missing is declared with ``| None``. Values that no
-field declares are kept too. A stage names the model as ``StageDescription(..., result=Count)``.
+field declares are kept too. A stage names the model as ``About(..., result=Count)``.
 """
 
 import functools

@@ -62,7 +62,7 @@ from limber.store.manifest import (
 _STREAMS = ".streams"
 
 
-class Stage:
+class OpenStage:
     """A stage in progress. ``path`` gives the path to write to; ``result`` goes to the manifest."""
 
     def __init__(self, folder: Path, manifest: Manifest, streams: Path):
@@ -290,7 +290,7 @@ class Branch:
     def stream(self, name: str) -> Stream:
         """Open the stream ``name``, new or left by a program that ended; see :class:`Stream`.
 
-        It stays beside the branch's files until a stage takes it over (:meth:`Stage.adopt`).
+        It stays beside the branch's files until a stage takes it over (:meth:`OpenStage.adopt`).
         """
         return Stream(self.folder / _STREAMS / checked_name(name))
 
@@ -326,7 +326,7 @@ class Branch:
     @contextmanager
     def stage(self, key: str, settings: BaseModel | Mapping[str, Any] | None = None, *,
               reads: Iterable[str] = (), digests: Mapping[str, str] | None = None,
-              ) -> Iterator[Stage]:
+              ) -> Iterator[OpenStage]:
         """Run stage ``key``; see the module's docstring.
 
         Args:
@@ -342,7 +342,7 @@ class Branch:
             work = self.folder / owned_name(f"stage-{_short(key)}")
             work.mkdir()
             try:
-                stage = Stage(work, self.manifest.model_copy(deep=True), self.folder / _STREAMS)
+                stage = OpenStage(work, self.manifest.model_copy(deep=True), self.folder / _STREAMS)
                 yield stage
                 entry = StageEntry(
                     settings=plain(settings or {}), reads=read, writes=stage.written(),
@@ -356,7 +356,7 @@ class Branch:
             for path in stage.adopted:
                 path.unlink(missing_ok=True)
 
-    def _commit(self, key: str, entry: StageEntry, stage: Stage, work: Path) -> None:
+    def _commit(self, key: str, entry: StageEntry, stage: OpenStage, work: Path) -> None:
         written = {name: FileEntry(sha256=file_digest(work / name),
                                    bytes=(work / name).stat().st_size, stage=key)
                    for name in entry.writes}

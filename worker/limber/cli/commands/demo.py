@@ -33,7 +33,7 @@ from limber.stages.command_line import (
     settings_options,
     without_foreign_options,
 )
-from limber.stages.registry import stage_description
+from limber.stages.registry import stage_class
 from limber.store import Branch
 from limber.store.manifest import MANIFEST, Manifest
 from limber.version import VERSION
@@ -82,7 +82,7 @@ class _Demo:
         self.done = _ENDS[name]
         self.seconds[name] = round(time.perf_counter() - started, 1)
         self.results[name] = result
-        if before and before == self._entries() and stage_description(name).key:
+        if before and before == self._entries() and stage_class(name).about.key:
             self.kept.add(name)
         self._tell(title, name)
         for warning in result.get("warnings", []):

@@ -163,14 +163,14 @@ def follow(run: Run, cell_file: Path, branch_folder: Path, name: str, leg: str, 
     from limber.robot.robot_state import require_weighed
     from limber.robot.ros.bridge import SECONDS
     from limber.robot.ros.messages import wrench_topic
-    from limber.stages.paths.execute import ExecuteSettings, planned_motion
+    from limber.stages.paths.execute import ExecutePlan, planned_motion
 
     wrench_topic(read_cell(cell_file))
     if armed:
         require_weighed(read_cell(cell_file))
     planned = planned_motion(
-        branch_folder, name, cell_file, ExecuteSettings(speed=speed), progress=run.progress,
-        is_to_move=armed, is_unwatched=unwatched)
+        ExecutePlan(branch_folder=branch_folder, name=name, cell=cell_file, speed=speed,
+                    unwatched=unwatched), run.progress, is_to_move=armed)
     cell, motion, result = planned.cell, planned.motion, planned.result
     trajectory = {"approach": motion.approach, "path": motion.path, "return": motion.return_path,
                   "leaving": motion.leaving}[leg]

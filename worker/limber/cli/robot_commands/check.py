@@ -58,7 +58,7 @@ def _from_files(run: Run, cell: Cell, cell_file: Path, folder: Path | None, plan
     """Check a cell, its calibration and a plan without a robot."""
     from limber.cell.cell_file import check_branch
     from limber.cell.obstacles import cell_obstacles
-    from limber.stages.paths.execute import ExecuteSettings, planned_motion
+    from limber.stages.paths.execute import ExecutePlan, planned_motion
     from limber.store import Branch
 
     obstacles = cell_obstacles(cell, cell_file.parent)
@@ -73,8 +73,9 @@ def _from_files(run: Run, cell: Cell, cell_file: Path, folder: Path | None, plan
             warning := check_branch(cell, Branch.read(folder).uuid, folder)):
         run.progress.warn(warning)
     if plan is not None and folder is not None:
-        planned = planned_motion(folder, plan, cell_file, ExecuteSettings(),
-                                 progress=run.progress, is_to_move=True, is_unwatched=True)
+        planned = planned_motion(
+            ExecutePlan(branch_folder=folder, name=plan, cell=cell_file, unwatched=True),
+            run.progress, is_to_move=True)
         result |= {"plan": plan, "motion": planned.result}
     run.close(f"{cell_file} describes a {cell.arm.name}; its base is known to "
               f"{1000 * cell.base.position_sigma_m:.1f} mm"

@@ -65,11 +65,11 @@ def goto_start(run: Run, cell_file: Path, confirm: str | None, armed: bool, bran
     The plan is checked by a dry run of `limber execute` first, which states that start.
     """
     from limber.cell.cell_file import read_cell
-    from limber.stages.paths.execute import ExecuteOptions, ExecuteSettings, execute
+    from limber.stages.paths.execute import ExecutePlan
 
     cell = read_cell(cell_file)
-    dry_run = execute(branch_folder, name, cell_file, ExecuteSettings(speed=speed),
-                      ExecuteOptions(unwatched=True), progress=run.progress)
+    dry_run = ExecutePlan(branch_folder=branch_folder, name=name, cell=cell_file, speed=speed,
+                          unwatched=True).run(run.progress)
     goal = np.array(dry_run["start_joints_rad"], float)
     return _to(run, cell_file, cell, branch_folder, goal, "goto-start", armed, confirm)
 

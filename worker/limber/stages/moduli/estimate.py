@@ -1,4 +1,4 @@
-"""Estimate Young's modulus along the branch from pulls."""
+"""Stage ``estimate``."""
 
 from __future__ import annotations
 
@@ -6,20 +6,17 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field
 
 from limber.core.errors import Cancelled, InputError, LimberError, Option, Text, WorkError
 from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups
 from limber.estimation.settings import EstimateSettings, FitSpec
-from limber.stages.inputs import BranchInputs, RunOptions
-from limber.stages.registry import StageDescription
 from limber.stages.result import Numbers, Picture, Result, Table, filled, frozen, of_files, shown
+from limber.stages.stage import About, BranchStage, Repeatable, option
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -34,26 +31,6 @@ EVALUATIONS = ".estimate-evaluations.jsonl"
 """File in the branch folder that grows while an estimate runs, and lets a stopped one resume."""
 _BASES = ".reduced-*.npz"
 """Bases of reduced models in the same folder, from which the next estimate starts."""
-
-
-class EstimateOptions(RunOptions):
-    """Options of an estimate's run."""
-
-    groups: ClassVar[Groups] = {"input": ("bag", "cell"), "running": ("resume", "follow", "pace")}
-    common = ("bag",)
-
-    bag: Path | None = Field(
-        None, description="Import this recording first (MCAP, rosbag2, RTDE log) as a pull with "
-        "the file's name, and estimate from it. `limber import-pull` has more options.")
-    cell: Path | None = Field(
-        None, description="With --bag: the robot's cell file, which states its base and how well "
-        "gripper and force sensor are known.")
-    resume: bool = Field(False, json_schema_extra={"switch": True}, description=(
-        "Start from the best result of a stopped run. Otherwise that result is ignored."))
-    follow: bool = Field(
-        False, description="Estimate frame by frame while a pull is recorded, or replay one.",
-        json_schema_extra={"switch": True})
-    pace: float = Field(1.0, ge=0, description="Speed of a replay; 0: as fast as possible.")
 
 
 class Estimate(Result):
@@ -146,39 +123,81 @@ class Estimate(Result):
         return section
 
 
-def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = False,
-             resume: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Estimate Young's modulus from the pulls of a branch folder.
+def _moduli_line(values: Mapping[str, Any]) -> str:
+    from limber.results.findings import ASSUMED_PULL, modulus_sentence, simulated_pull
 
-    Writes ``estimate.json`` and the modulus into ``mesh.vtu``. If stopped by Ctrl-C it keeps the
-    best result so far in ``estimate.json`` (``converged`` is then false).
-
-    Args:
-        branch_folder: Folder of the branch.
-        settings: Settings that determine the result.
-        force: Estimate again even if nothing has changed.
-        resume: Start from the best result of a stopped run of the same estimate. It ends at the
-            same moduli to the fit's tolerance, not to the last digit. Without it nothing from a
-            stopped or killed run is used.
-        progress: Called during the work.
-
-    Returns:
-        DESIGN's keys and ``warnings``.
-
-    Raises:
-        InputError: there are no pulls, or pulls that cannot determine Young's modulus.
-        WorkError: the simulation finds no equilibrium, or the fit has no result (it did not
-            converge, ended at a bound, or the data do not determine the moduli); nothing is
-            written.
-        Cancelled: the best result so far was kept.
-    """
-    branch = Branch.open(branch_folder)
-    with branch.writing("limber estimate"):
-        return _estimate(branch, settings, force=force, resume=resume, progress=progress)
+    pull = simulated_pull(Branch.read(values["branch_folder"]))
+    return modulus_sentence(values, ASSUMED_PULL if pull and pull["young_assumed"] else "")
 
 
-def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume: bool,
-              progress: Progress) -> dict[str, Any]:
+class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
+    """Estimate Young's modulus along the branch from pulls."""
+
+    about = About(
+        "estimate", 70, Estimate, key="estimate", reads=("mesh.vtu", "skeleton.swc", "pulls/"),
+        writes=("estimate.json", "mesh.vtu"),
+        found=(_moduli_line, "Main cause of the uncertainty: {causes[0][cause]} "
+               "({causes[0][share]:share} of the variance). Remedy: {causes[0][advice]}.",
+               "Next: {next_actions[0][action]}, {next_actions[0][how]}."),
+        then="limber energy {branch_folder}", step="estimate", label="Estimate")
+
+    bag: Path | None = option(
+        "Import this recording first (MCAP, rosbag2, RTDE log) as a pull with the file's name, and "
+        "estimate from it. `limber import-pull` has more options.", group="input", common=True)
+    cell: Path | None = option(
+        "With --bag: the robot's cell file, which states its base and how well gripper and force "
+        "sensor are known.", group="input")
+    resume: bool = option(
+        "Start from the best result of a stopped run. Otherwise that result is ignored.", False,
+        switch=True)
+    follow: bool = option(
+        "Estimate frame by frame while a pull is recorded, or replay one.", False, switch=True)
+    pace: float = option("Speed of a replay; 0: as fast as possible.", 1.0, limits={"ge": 0})
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Estimate Young's modulus from the pulls of a branch folder.
+
+        Writes ``estimate.json`` and the modulus into ``mesh.vtu``. If stopped by Ctrl-C it keeps
+        the best result so far in ``estimate.json`` (``converged`` is then false). With ``resume``
+        it starts from there, and ends at the same moduli to the fit's tolerance, not to the last
+        digit; without it nothing from a stopped or killed run is used.
+
+        Returns:
+            DESIGN's keys and ``warnings``.
+
+        Raises:
+            InputError: there are no pulls, or pulls that cannot determine Young's modulus.
+            WorkError: the simulation finds no equilibrium, or the fit has no result (it did not
+                converge, ended at a bound, or the data do not determine the moduli); nothing is
+                written.
+            Cancelled: the best result so far was kept.
+        """
+        if self.bag is not None:
+            return self._with_bag(self.bag, progress).run(progress)
+        if self.cell is not None:
+            raise InputError(Text(Option("cell"), " was given without ", Option("bag"), "."),
+                             "A pull in the branch folder already states how well its robot is "
+                             "known.", "Omit ", Option("cell"), ".")
+        if self.follow:
+            return follow(self, progress)
+        branch = Branch.open(self.branch_folder)
+        with branch.writing("limber estimate"):
+            return _estimate(branch, self, progress)
+
+    def _with_bag(self, bag: Path, progress: Progress) -> Self:
+        """Import a recording; the estimate's pulls are the requested ones and this one."""
+        import re
+
+        from limber.stages.pulls.import_pull import ImportPull
+
+        name = re.sub(r"[^A-Za-z0-9_.-]+", "-", bag.stem).strip("-.") or "bag"
+        ImportPull(branch_folder=self.branch_folder, source=bag, name=name,
+                   cell=self.cell).run(progress.part(0.0, 0.05))
+        return self.model_copy(update={
+            "pull": tuple(dict.fromkeys((*self.pull, name))), "bag": None, "cell": None})
+
+
+def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[str, Any]:
     from limber.estimation.control_point_count import is_open
     from limber.estimation.estimate_file import details, summary
     from limber.estimation.estimated_branch import tell_doubts
@@ -188,25 +207,24 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
     from limber.stages.moduli.other_skeletons import add_other_skeletons
     from limber.store.loading import load_pulls, load_subject, pull_names, pulls_digest
 
-    names = pull_names(branch, settings)
-    subject = load_subject(branch, settings)
+    names = pull_names(branch, asked)
+    subject = load_subject(branch, asked)
     digests = {"mesh geometry": subject.mesh.geometry_digest(),
                "pulls": pulls_digest(branch, names)}
-    if not force and branch.is_current("estimate", settings, digests=digests):
+    if asked.is_kept(branch, digests=digests):
         stored = branch.manifest.stages["estimate"].result
         if not stored.get("stopped"):
             return stored
     warnings: list[str] = []
     heard = progress.keeping(warnings)
-    pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
+    pulls = load_pulls(branch, names, subject, asked, heard.part(0.0, 0.2))
     tell_doubts(pulls, subject, heard)
     log_path = branch.folder / EVALUATIONS
-    if force or not resume:
+    if asked.force or not asked.resume:
         log_path.unlink(missing_ok=True)
     bases = _finished_bases(branch)
-    log = EvaluationLog(log_path, json.dumps([plain(settings), digests], sort_keys=True))
-    asked, initial, evidence = settings, subject, None
-    settings = FitSpec.of(settings)
+    log = EvaluationLog(log_path, json.dumps([plain(asked), digests], sort_keys=True))
+    settings, initial, evidence = FitSpec.of(asked), subject, None
     if is_open(settings):
         pulls = _placed(pulls, initial)
         found, settings, subject, evidence = _with_supported_points(
@@ -316,8 +334,7 @@ def _finished_bases(branch: Branch) -> dict[str, str]:
     return kept
 
 
-def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0,
-           training_count: int = 60, progress: Progress = SILENT) -> dict[str, Any]:
+def follow(asked: EstimateYoung, progress: Progress, training_count: int = 60) -> dict[str, Any]:
     """Estimate frame by frame from the first named pull (or the only one).
 
     A pull that is still being recorded is read as it arrives. A finished one is replayed at
@@ -330,14 +347,14 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
     from limber.estimation.online.follow import follow as follow_pull
     from limber.store.loading import load_subject
 
-    branch = Branch.open(branch_folder)
-    name, where = _followed(branch, settings)
-    subject = load_subject(branch, settings)
+    branch = Branch.open(asked.branch_folder)
+    name, where = _followed(branch, asked)
+    subject = load_subject(branch, asked)
     result, history = follow_pull(
-        where, name, subject, FitSpec.of(settings), pace=pace,
+        where, name, subject, FitSpec.of(asked), pace=asked.pace,
         training_count=training_count, progress=progress,
         axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None)
-    with branch.stage("estimate-online", settings, digests={"pull": name}) as stage:
+    with branch.stage("estimate-online", asked, digests={"pull": name}) as stage:
         stage.path("estimate-online.json").write_text(
             json.dumps(plain(result | {"history": history}), indent=1), encoding="utf-8")
         stage.result.update(result)
@@ -386,50 +403,3 @@ def _score_unused_pulls(branch: Branch, names: list[str], subject: Subject,
         except LimberError as error:
             progress.warn(
                 f"The pull {name}, which the estimate did not use, could not be scored: {error}")
-
-
-def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    if options.bag is not None:
-        settings = _with_bag(inputs.branch_folder, options.bag, options.cell, settings, progress)
-    elif options.cell is not None:
-        raise InputError(Text(Option("cell"), " was given without ", Option("bag"), "."),
-                         "A pull in the branch folder already states how well its robot is known.",
-                         "Omit ", Option("cell"), ".")
-    if options.follow:
-        return follow(inputs.branch_folder, settings, pace=options.pace, progress=progress)
-    return estimate(inputs.branch_folder, settings, force=options.force, resume=options.resume,
-                    progress=progress)
-
-
-def _with_bag(branch_folder: Path, bag: Path, cell: Path | None, settings: EstimateSettings,
-              progress: Progress) -> EstimateSettings:
-    """Import a recording; the estimate's pulls are the requested ones and this one."""
-    import re
-
-    from limber.recordings.settings import ImportSettings
-    from limber.stages.pulls.import_pull import import_pull
-
-    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", bag.stem).strip("-.") or "bag"
-    import_pull(branch_folder, bag, name, ImportSettings(cell=None if cell is None else str(cell)),
-                progress=progress.part(0.0, 0.05))
-    return settings.model_copy(update={"pull": tuple(dict.fromkeys((*settings.pull, name)))})
-
-
-def _moduli_line(values: Mapping[str, Any]) -> str:
-    from limber.results.findings import ASSUMED_PULL, modulus_sentence, simulated_pull
-
-    pull = simulated_pull(Branch.read(values["branch_folder"]))
-    return modulus_sentence(values, ASSUMED_PULL if pull and pull["young_assumed"] else "")
-
-
-STAGE = StageDescription(
-    "estimate", 70, run, BranchInputs, EstimateSettings, EstimateOptions, key="estimate",
-    result=Estimate,
-    reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("estimate.json", "mesh.vtu"),
-    found=(
-        _moduli_line, "Main cause of the uncertainty: {causes[0][cause]} "
-        "({causes[0][share]:share} of the variance). Remedy: {causes[0][advice]}.",
-        "Next: {next_actions[0][action]}, {next_actions[0][how]}."),
-    then="limber energy {branch_folder}", step="estimate", label="Estimate")

@@ -1,9 +1,8 @@
-"""Estimate Young's modulus and damping from a free swing, without a robot."""
+"""Stage ``swing``."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,9 +13,8 @@ from limber.core.json_values import number_array, plain
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings, SwingSettings
-from limber.stages.inputs import BranchInputs, RunOptions, by_name
-from limber.stages.registry import StageDescription
 from limber.stages.result import Interval, Picture, Result, frozen, kept, of_files, shown
+from limber.stages.stage import About, BranchStage, Repeatable
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -70,60 +68,70 @@ class Swing(Result):
 _DAMAGED = "The result of a swing was expected.", Text("The file is damaged. Run ",
                                                        Command("swing"), " again.")
 
-def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
-          progress: Progress = SILENT) -> dict[str, Any]:
-    """Estimate one level of Young's modulus, and damping, from a released branch.
 
-    The modulus keeps its pattern along the branch. Writes ``swing.json``, and the modulus into
-    ``mesh.vtu``.
+class FitSwing(SwingSettings, Repeatable, BranchStage):
+    """Estimate Young's modulus and damping from a free swing, without a robot."""
 
-    Raises:
-        InputError: there is no such swing, or nothing swings in it. WorkError: the fit does not
-        converge.
-    """
-    from limber.estimation.forward.forward_model import under_its_weight
-    from limber.estimation.vibration.free_swing import SwingSeen, fit_swing
-    from limber.recordings.recording import grasp_on
-    from limber.store.loading import load_subject, pulls_digest
+    about = About(
+        "swing", 75, Swing, key="swing", reads=("mesh.vtu", "skeleton.swc", "pulls/"),
+        writes=("swing.json", "mesh.vtu"),
+        found=("Young's modulus, mean of the branch: {young_pa:Pa} ({young_interval_pa[0]:Pa} to "
+               "{young_interval_pa[1]:Pa}); damping ratio {damping_ratio:.3g}.",),
+        then="limber energy {branch_folder}", step="estimate", label="Fit a Free Swing")
 
-    branch = Branch.open(branch_folder)
-    with branch.writing("limber swing"):
-        pull = _pull(branch, settings.pull)
-        subject = load_subject(branch, EstimateSettings())
-        digests = {"mesh geometry": subject.mesh.geometry_digest(),
-                   "pulls": pulls_digest(branch, [pull.name])}
-        if not force and branch.is_current("swing", settings, digests=digests):
-            return branch.manifest.stages["swing"].result
-        about = present(pull.entry.swing, "record of the branch's release")
-        seen = present(pull.observations, "observation of the swing")
-        rest = np.array(pull.entry.rest_points_m)
-        warnings: list[str] = []
-        model = under_its_weight(subject.model, pull.entry).with_young(
-            subject.mesh.cell_data["young"])
-        found = fit_swing(
-            model, grasp_on(subject.mesh, pull.entry.grasp),
-            SwingSeen(seen.times, seen.positions - rest, rest,
-                      about.start, pull.wrenches[0, :3], about.load_mass_kg, about.noise_m,
-                      about.registration_m),
-            density_sigma=settings.density_sigma,
-            progress=progress.keeping(warnings).part(0.0, 0.95))
-        if not found.converged:
-            raise WorkError("The fit of the swing did not converge.",
-                            f"The residual is {100 * found.relative_residual:.0f} % of the "
-                            "largest displacement.",
-                            "Check load, mass and density.")
-        young = found.factor * model.young
-        result = _summary(found, young, pull, warnings)
-        with branch.stage("swing", settings, digests=digests) as stage:
-            figure = {"times_s": found.times, "seen_m": found.seen,
-                      "simulated_m": found.simulated}
-            stage.path("swing.json").write_text(json.dumps(
-                plain(result | figure), allow_nan=False) + "\n", encoding="utf-8")
-            subject.mesh.with_data(cell_data={
-                "young": young, "poisson": model.poisson, "density": model.density,
-            }).write(stage.path("mesh.vtu"))
-            stage.result.update(result)
-        return stage.result
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Estimate one level of Young's modulus, and damping, from a released branch.
+
+        The modulus keeps its pattern along the branch. Writes ``swing.json``, and the modulus into
+        ``mesh.vtu``.
+
+        Raises:
+            InputError: there is no such swing, or nothing swings in it.
+            WorkError: the fit does not converge.
+        """
+        from limber.estimation.forward.forward_model import under_its_weight
+        from limber.estimation.vibration.free_swing import SwingSeen, fit_swing
+        from limber.recordings.recording import grasp_on
+        from limber.store.loading import load_subject, pulls_digest
+
+        branch = Branch.open(self.branch_folder)
+        with branch.writing("limber swing"):
+            pull = _pull(branch, self.pull)
+            subject = load_subject(branch, EstimateSettings())
+            digests = {"mesh geometry": subject.mesh.geometry_digest(),
+                       "pulls": pulls_digest(branch, [pull.name])}
+            if self.is_kept(branch, digests=digests):
+                return branch.manifest.stages["swing"].result
+            about = present(pull.entry.swing, "record of the branch's release")
+            seen = present(pull.observations, "observation of the swing")
+            rest = np.array(pull.entry.rest_points_m)
+            warnings: list[str] = []
+            model = under_its_weight(subject.model, pull.entry).with_young(
+                subject.mesh.cell_data["young"])
+            found = fit_swing(
+                model, grasp_on(subject.mesh, pull.entry.grasp),
+                SwingSeen(seen.times, seen.positions - rest, rest,
+                          about.start, pull.wrenches[0, :3], about.load_mass_kg, about.noise_m,
+                          about.registration_m),
+                density_sigma=self.density_sigma,
+                progress=progress.keeping(warnings).part(0.0, 0.95))
+            if not found.converged:
+                raise WorkError("The fit of the swing did not converge.",
+                                f"The residual is {100 * found.relative_residual:.0f} % of the "
+                                "largest displacement.",
+                                "Check load, mass and density.")
+            young = found.factor * model.young
+            result = _summary(found, young, pull, warnings)
+            with branch.stage("swing", self, digests=digests) as stage:
+                figure = {"times_s": found.times, "seen_m": found.seen,
+                          "simulated_m": found.simulated}
+                stage.path("swing.json").write_text(json.dumps(
+                    plain(result | figure), allow_nan=False) + "\n", encoding="utf-8")
+                subject.mesh.with_data(cell_data={
+                    "young": young, "poisson": model.poisson, "density": model.density,
+                }).write(stage.path("mesh.vtu"))
+                stage.result.update(result)
+            return stage.result
 
 
 def _pull(branch: Branch, name: str | None) -> Pull:
@@ -164,12 +172,3 @@ def _summary(found: SwingFit, young: np.ndarray, pull: Pull, warnings: list[str]
         "relative_residual": found.relative_residual, "independent_readings": found.readings,
         "forward_count": found.forward_count, "window_s": list(found.window),
         "converged": found.converged, "creep": found.creep, "warnings": warnings}
-
-
-STAGE = StageDescription(
-    "swing", 75, by_name(swing), BranchInputs, SwingSettings, RunOptions, key="swing",
-    result=Swing,
-    reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("swing.json", "mesh.vtu"),
-    found=("Young's modulus, mean of the branch: {young_pa:Pa} ({young_interval_pa[0]:Pa} to "
-           "{young_interval_pa[1]:Pa}); damping ratio {damping_ratio:.3g}.",),
-    then="limber energy {branch_folder}", step="estimate", label="Fit a Free Swing")

@@ -1,10 +1,4 @@
-"""Estimate Young's modulus and damping from ringing (accelerometer, strain gauge, video).
-
-RECORD is a table of times and one or more columns of accelerations, strains or displacements in any
-unit, or a C3D file of markers. The branch is plucked and left to vibrate. Its frequencies determine
-one level of Young's modulus, as accurately as its density and radii are known; the pattern along
-the branch is kept.
-"""
+"""Stage ``vibration``."""
 
 from __future__ import annotations
 
@@ -20,10 +14,9 @@ from limber.core.errors import InputError, Option, WorkError
 from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, RunOptions, argument, by_name
-from limber.stages.registry import StageDescription
+from limber.core.settings import Groups
 from limber.stages.result import Interval, Numbers, Result, kept, shown
+from limber.stages.stage import About, BranchStage, Repeatable, argument
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -38,34 +31,6 @@ _CLOSE = 1.15
 _ROUNDS = 8
 _SLOWEST_HZ, _FASTEST_HZ = 0.05, 1000.0
 """Range of a plant branch's frequencies; outside it the record's times are in another unit."""
-
-
-class VibrationInputs(BranchInputs):
-    """A branch folder, and the record."""
-
-    groups: ClassVar[Groups] = {"input": ("record",)}
-
-    record: Path = argument("Table of times and readings (CSV), or C3D.")
-
-
-class VibrationSettings(Settings):
-    """Settings of the record."""
-
-    groups: ClassVar[Groups] = {"record": ("start", "sensor", "rate_hz"),
-                                "known": ("density_sigma", "radius_sigma")}
-    common = ("sensor",)
-
-    start: float | None = Field(None, description="Time at which the branch is released, on the "
-                                "record's clock [s]. Default: where it moves most.")
-    sensor: tuple[float, float, float, float] | None = Field(
-        None, description="Position [m] and mass [kg] of a sensor that swings with the branch.",
-        json_schema_extra={"metavar": "X Y Z KG"})
-    rate_hz: float | None = Field(
-        None, gt=0, description="Readings per second of the sensor. Default: by RECORD's times.")
-    density_sigma: float = Field(0.1, ge=0, le=1, description="Relative standard deviation of the "
-                                 "wood's density.")
-    radius_sigma: float = Field(0.02, ge=0, le=1, description="Relative standard deviation of the "
-                                "scan's radii as a whole.")
 
 
 class Vibration(Result):
@@ -92,62 +57,93 @@ class Vibration(Result):
         section.tables.append(("Vibrations in the recording", rows))
 
 
-def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
-              force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Estimate one level of Young's modulus, and damping, from a record of free vibration.
+class FitVibration(Repeatable, BranchStage):
+    """Estimate Young's modulus and damping from ringing (accelerometer, strain gauge, video).
 
-    Writes ``vibration.json``, and the modulus into ``mesh.vtu``.
-
-    Returns:
-        ``young_pa`` (mean of the branch) with ``young_interval_pa`` (95 %) and ``young_factor``;
-        ``frequencies_hz``, ``frequency_deviations_hz``, ``damping_ratios`` and
-        ``damping_ratio_deviations`` of the record, ``damping_ratio_intervals`` (95 %);
-        ``model_frequencies_hz`` with that modulus;
-        ``left_over``; ``damping_mass_per_s`` (0) and ``damping_stiffness_s``, which give the first
-        vibration its damping.
-
-    Raises:
-        InputError: the record cannot be read, or shows no vibration. WorkError: no modulus has such
-            a frequency.
+    RECORD is a table of times and one or more columns of accelerations, strains or displacements in
+    any unit, or a C3D file of markers. The branch is plucked and left to vibrate. Its frequencies
+    determine one level of Young's modulus, as accurately as its density and radii are known; the
+    pattern along the branch is kept.
     """
-    from limber.estimation.vibration.ringing import identify, read_record
-    from limber.store.loading import load_branch, load_mesh
 
-    if not Path(record).is_file():
-        raise InputError(f"There is no file {record}.", "A record of the branch's vibration was "
-                         "expected.", "Check the path.")
-    rung = read_record(Path(record), settings.rate_hz)
-    for text in rung.warnings:
-        progress.warn(text)
-    branch = Branch.open(branch_folder)
-    with branch.writing("limber vibration"):
-        mesh = load_mesh(branch)
-        digests = {"record": file_digest(record), "mesh geometry": mesh.geometry_digest()}
-        if not force and branch.is_current("vibration", settings, digests=digests):
-            return branch.manifest.stages["vibration"].result
-        seen = identify(rung.times, rung.values, settings.start,
-                        rate_deviation=rung.rate_deviation)
-        for text in seen.warnings:
+    about = About(
+        "vibration", 76, Vibration, key="vibration", reads=("mesh.vtu",),
+        writes=("vibration.json", "mesh.vtu"),
+        found=("Young's modulus, mean of the branch: {young_pa:Pa} ({young_interval_pa[0]:Pa} to "
+               "{young_interval_pa[1]:Pa}), from a ringing at {frequencies_hz[0]:Hz}.",),
+        then="limber energy {branch_folder}", step="estimate", label="Fit Natural Frequencies")
+    groups: ClassVar[Groups] = {"record": ("start", "sensor", "rate_hz"),
+                                "known": ("density_sigma", "radius_sigma")}
+    common = ("sensor",)
+
+    record: Path = argument("Table of times and readings (CSV), or C3D.")
+    start: float | None = Field(None, description="Time at which the branch is released, on the "
+                                "record's clock [s]. Default: where it moves most.")
+    sensor: tuple[float, float, float, float] | None = Field(
+        None, description="Position [m] and mass [kg] of a sensor that swings with the branch.",
+        json_schema_extra={"metavar": "X Y Z KG"})
+    rate_hz: float | None = Field(
+        None, gt=0, description="Readings per second of the sensor. Default: by RECORD's times.")
+    density_sigma: float = Field(0.1, ge=0, le=1, description="Relative standard deviation of the "
+                                 "wood's density.")
+    radius_sigma: float = Field(0.02, ge=0, le=1, description="Relative standard deviation of the "
+                                "scan's radii as a whole.")
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Estimate one level of Young's modulus, and damping, from a record of free vibration.
+
+        Writes ``vibration.json``, and the modulus into ``mesh.vtu``.
+
+        Returns:
+            ``young_pa`` (mean of the branch) with ``young_interval_pa`` (95 %) and
+            ``young_factor``; ``frequencies_hz``, ``frequency_deviations_hz``, ``damping_ratios``
+            and ``damping_ratio_deviations`` of the record, ``damping_ratio_intervals`` (95 %);
+            ``model_frequencies_hz`` with that modulus; ``left_over``; ``damping_mass_per_s`` (0)
+            and ``damping_stiffness_s``, which give the first vibration its damping.
+
+        Raises:
+            InputError: the record cannot be read, or shows no vibration.
+            WorkError: no modulus has such a frequency.
+        """
+        from limber.estimation.vibration.ringing import identify, read_record
+        from limber.store.loading import load_branch, load_mesh
+
+        if not self.record.is_file():
+            raise InputError(f"There is no file {self.record}.",
+                             "A record of the branch's vibration was expected.", "Check the path.")
+        rung = read_record(self.record, self.rate_hz)
+        for text in rung.warnings:
             progress.warn(text)
-        if not _SLOWEST_HZ < seen.frequencies[0] < _FASTEST_HZ:
-            raise InputError(f"{record} has a first frequency of {seen.frequencies[0]:.3g} Hz.",
-                             "No branch swings like that. Its times are in another unit.",
-                             "Name the unit in the title of the times: t_s, t_ms or t_us.")
-        progress(0.3, "modulus of that frequency")
-        model = load_branch(branch, progress=progress).model
-        fitted = young_of(_with_sensor(model, settings), seen, settings)
-        young = fitted["young_factor"] * model.young
-        result = _summary(seen, fitted, float(young.mean()))
-        with branch.stage("vibration", settings, digests=digests) as stage:
-            stage.path("vibration.json").write_text(
-                json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-            mesh.with_data(cell_data={"young": young, "poisson": model.poisson,
-                                      "density": model.density}).write(stage.path("mesh.vtu"))
-            stage.result.update(result)
-        return stage.result
+        branch = Branch.open(self.branch_folder)
+        with branch.writing("limber vibration"):
+            mesh = load_mesh(branch)
+            digests = {"record": file_digest(self.record), "mesh geometry": mesh.geometry_digest()}
+            if self.is_kept(branch, digests=digests):
+                return branch.manifest.stages["vibration"].result
+            seen = identify(rung.times, rung.values, self.start,
+                            rate_deviation=rung.rate_deviation)
+            for text in seen.warnings:
+                progress.warn(text)
+            if not _SLOWEST_HZ < seen.frequencies[0] < _FASTEST_HZ:
+                raise InputError(f"{self.record} has a first frequency of "
+                                 f"{seen.frequencies[0]:.3g} Hz.",
+                                 "No branch swings like that. Its times are in another unit.",
+                                 "Name the unit in the title of the times: t_s, t_ms or t_us.")
+            progress(0.3, "modulus of that frequency")
+            model = load_branch(branch, progress=progress).model
+            fitted = young_of(_with_sensor(model, self), seen, self)
+            young = fitted["young_factor"] * model.young
+            result = _summary(seen, fitted, float(young.mean()))
+            with branch.stage("vibration", self, digests=digests) as stage:
+                stage.path("vibration.json").write_text(
+                    json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+                mesh.with_data(cell_data={"young": young, "poisson": model.poisson,
+                                          "density": model.density}).write(stage.path("mesh.vtu"))
+                stage.result.update(result)
+            return stage.result
 
 
-def young_of(model: BranchModel, seen: Ringing, settings: VibrationSettings) -> dict[str, Any]:
+def young_of(model: BranchModel, seen: Ringing, settings: FitVibration) -> dict[str, Any]:
     """Return the factor on the modulus for which a model has the record's first frequency.
 
     Returns:
@@ -184,7 +180,7 @@ def young_of(model: BranchModel, seen: Ringing, settings: VibrationSettings) -> 
     return {"young_factor": factor, "deviation": float(deviation), "model_frequencies_hz": found}
 
 
-def _with_sensor(model: BranchModel, settings: VibrationSettings) -> BranchModel:
+def _with_sensor(model: BranchModel, settings: FitVibration) -> BranchModel:
     from limber.mechanics.added_masses import PointMass
 
     if settings.sensor is None:
@@ -210,11 +206,3 @@ def _summary(seen: Ringing, fitted: dict[str, Any], level: float) -> dict[str, A
         "model_frequencies_hz": fitted["model_frequencies_hz"], "left_over": seen.left_over,
         "damping_mass_per_s": 0.0, "damping_stiffness_s": float(2 * seen.damping[0] / omega),
         "start_s": seen.start, "duration_s": seen.duration})
-
-
-STAGE = StageDescription(
-    "vibration", 76, by_name(vibration), VibrationInputs, VibrationSettings, RunOptions,
-    key="vibration", result=Vibration, reads=("mesh.vtu",), writes=("vibration.json", "mesh.vtu"),
-    found=("Young's modulus, mean of the branch: {young_pa:Pa} ({young_interval_pa[0]:Pa} to "
-           "{young_interval_pa[1]:Pa}), from a ringing at {frequencies_hz[0]:Hz}.",),
-    then="limber energy {branch_folder}", step="estimate", label="Fit Natural Frequencies")

@@ -1,4 +1,4 @@
-"""Compute sag, strain and frequencies under wind, gusts, snow, fruit or pruning."""
+"""Stage ``load``: wind, gusts, snow, fruit or pruning."""
 
 from __future__ import annotations
 
@@ -19,9 +19,7 @@ from limber.core.files.reading import read_json
 from limber.core.json_values import number_array
 from limber.core.labels import table_of
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings, possible_force
-from limber.stages.inputs import BranchInputs, RunOptions, by_name
-from limber.stages.registry import StageDescription
+from limber.core.settings import Groups, possible_force
 from limber.stages.result import (
     Interval,
     Numbers,
@@ -33,6 +31,7 @@ from limber.stages.result import (
     kept,
     shown,
 )
+from limber.stages.stage import About, BranchStage, Repeatable
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -46,56 +45,6 @@ _MOST_MULTIPLE = 50.0  # of the loads, up to which a limit load is sought
 _STRAIN_LIMIT = 0.01  # at which the wood is taken to fail
 _Place = tuple[float, float, float]
 _Fruit = tuple[float, float, float, float]
-
-
-class LoadSettings(Settings):
-    """Loads beside the weight that the branch had when it was scanned."""
-
-    groups: ClassVar[Groups] = {
-        "loads": ("wind", "snow", "fruit", "cut"),
-        "gusts": ("gust", "gust_record"),
-        "limits": ("limit_load",),
-        "output": ("name",)}
-    common = ("wind", "snow", "fruit", "cut", "name")
-
-    wind: tuple[float, float, float] | None = Field(
-        None, description="Wind velocity in the branch's frame [m/s].",
-        json_schema_extra={"metavar": "X Y Z"})
-    gust: float | None = Field(
-        None, gt=0, le=1, description="Turbulence intensity of gusts: standard deviation of the "
-        "wind speed over its mean, from 0.1 over water to 0.4 in a crown. Results are then those "
-        "of the peak, by spectrum and peak factor of EN 1991-1-4, annex B.")
-    gust_record: Path | None = Field(
-        None, description="Recorded gusts: a CSV file with time_s and speed_m_s along the "
-        "direction of --wind.")
-    snow: float = Field(0.0, ge=0, le=1000, description="Snow load per area of the branch seen "
-                        "from above [kg/m^2].")
-    fruit: tuple[_Fruit, ...] = Field(
-        (), description="A fruit: position on the branch [m] and mass [kg]. May be given several "
-                        "times.",
-        json_schema_extra={"metavar": "X Y Z KG"})
-    cut: tuple[_Place, ...] = Field(
-        (), description="Position of a pruning cut [m]. May be given several times.",
-        json_schema_extra={"metavar": "X Y Z"})
-    limit_load: bool = Field(
-        False, description="Also find the limit load, as a multiple of these loads.")
-    name: str | None = Field(
-        None, pattern=r"^[\w-]+$", max_length=60, description="Keep the result in the branch "
-        "folder under this name, for report and scene.")
-
-    @field_validator("wind")
-    @classmethod
-    def _possible_wind(cls, value: _Place | None) -> _Place | None:
-        if value is not None and (speed := math.hypot(*value)) > _FASTEST_WIND:
-            raise ValueError(f"no wind has {speed:g} m/s; {speed / 3.6:g} m/s would be {speed:g} "
-                             "km/h")
-        return value
-
-    @field_validator("fruit")
-    @classmethod
-    def _possible_fruit(cls, values: tuple[_Fruit, ...]) -> tuple[_Fruit, ...]:
-        possible_force(tuple(fruit[3] * STANDARD_GRAVITY for fruit in values))
-        return values
 
 
 def _pieces(rows: Any) -> np.ndarray:
@@ -187,66 +136,132 @@ class Load(Result):
                 section.text.append(f"The bent branch cannot be drawn: {error}")
 
 
-def load(folder: Path, settings: LoadSettings, *, force: bool = False,
-         progress: Progress = SILENT) -> dict[str, Any]:
-    """Bring the branch to rest under loads.
+def _failure_line(result: Mapping[str, Any]) -> str:
+    from limber.results.findings import failure_sentence
 
-    With a name it writes ``loads/NAME.json``, and ``frames/load-NAME.pc2``, ``.json`` and ``.npz``:
-    the branch as scanned, and at rest under the loads. Stored results of the same branch and loads
-    are not computed again, unless ``force``. Without a name it writes no file.
-
-    Returns:
-        The output of :func:`~limber.mechanics.loads.load_effects.load_effects` (sag, largest strain
-        and strain along the main path, frequencies; with ``limit_load`` how many times the loads it
-        bears; each with its interval, None if the uncertainty of the moduli is unknown), and
-        ``frequencies_before_hz``. With gusts all values are those of their peak, and ``gusts`` has
-        the output of :func:`~limber.mechanics.loads.load_effects.with_peak`.
-
-    Raises:
-        InputError: there is no load, one off the branch, or gusts without wind. WorkError: there is
-            no equilibrium under it.
-    """
-    from limber.mechanics.added_masses import PointMass
-    from limber.mechanics.dynamics.modes import lowest_modes
-    from limber.mechanics.loads.load_effects import blown, load_effects, with_peak
-    from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
-    from limber.store.loading import known_damping, load_branch, load_skeleton, stiffness_deviation
-
-    gusts = _gusts(settings)
-    wind = blown(settings.wind or (0.0, 0.0, 0.0), gusts)
-    if not (settings.wind or settings.snow or settings.fruit or settings.cut):
-        raise InputError("No load is given.", "The scanned shape already carries the branch's own "
-                         "weight.", "Give ", Option("wind"), ", ", Option("snow"), ", ",
-                         Option("fruit"), " or ", Option("cut"), ".")
-    if any(not one[3] > 0 for one in settings.fruit):
-        raise InputError("A fruit without mass.", "", "Give ", Option("fruit"), " X Y Z KG.")
-    # Without a name nothing is stored.
-    branch = (Branch.read if settings.name is None else Branch.open)(folder)
-    inputs = _inputs(branch, settings)
-    if settings.name is not None and not force and branch.is_current(
-            f"load:{settings.name}", settings, **inputs):
-        return read_json(branch.path(f"loads/{settings.name}.json"), "the effects of loads")
-    skeleton = load_skeleton(branch)
-    model = load_branch(branch, loaded=True, progress=progress).model
-    _require_near(model.mesh.nodes, [one[:3] for one in settings.fruit])
-    loads = Outdoors(wind, snow=settings.snow, cuts=settings.cut, fruit=tuple(
-        PointMass(one[:3], one[3]) for one in settings.fruit))
-    outdoors = LoadedOutdoors(model, skeleton, loads)
-    peak = None
-    if gusts is not None:
-        progress(0.1, "gusts")
-        outdoors, peak = with_peak(outdoors, gusts, known_damping(branch, progress))
-    bent, result = load_effects(
-        outdoors, strain_limit=_STRAIN_LIMIT, deviation=stiffness_deviation(branch),
-        most=_MOST_MULTIPLE if settings.limit_load else None, progress=progress.part(0.2, 1.0))
-    result |= {"frequencies_before_hz": lowest_modes(model, len(bent.frequencies)).frequencies,
-               "gusts": peak}
-    if settings.name is not None:
-        _keep(branch, settings, inputs, model, bent, result)
-    return result
+    return failure_sentence(result.get("strain_over_limit", 0.0))
 
 
-def _inputs(branch: Branch, settings: LoadSettings) -> dict[str, Any]:
+class ApplyLoads(Repeatable, BranchStage):
+    """Compute sag, strain and frequencies under wind, gusts, snow, fruit or pruning."""
+
+    about = About(
+        "load", 45, Load, key="load:{name}", reads=("mesh.vtu", "skeleton.swc"),
+        writes=("loads/{name}.json", "frames/load-{name}.pc2", "frames/load-{name}.json"),
+        found=("Under the loads the tip sags by {sag_m:m}; greatest strain "
+               "{greatest_strain:share}, {strain_over_limit:share} of the limit; first frequency "
+               "{frequencies_hz[0]:Hz}.", _failure_line,
+               "It bears {bears_times:.3g} times these loads; then held by: {held_by}."),
+        then="limber report {branch_folder}", step="material", label="Wind, Snow, Fruit, Cuts")
+    groups: ClassVar[Groups] = {
+        "loads": ("wind", "snow", "fruit", "cut"),
+        "gusts": ("gust", "gust_record"),
+        "limits": ("limit_load",),
+        "output": ("name",)}
+    common = ("wind", "snow", "fruit", "cut", "name")
+
+    wind: tuple[float, float, float] | None = Field(
+        None, description="Wind velocity in the branch's frame [m/s].",
+        json_schema_extra={"metavar": "X Y Z"})
+    gust: float | None = Field(
+        None, gt=0, le=1, description="Turbulence intensity of gusts: standard deviation of the "
+        "wind speed over its mean, from 0.1 over water to 0.4 in a crown. Results are then those "
+        "of the peak, by spectrum and peak factor of EN 1991-1-4, annex B.")
+    gust_record: Path | None = Field(
+        None, description="Recorded gusts: a CSV file with time_s and speed_m_s along the "
+        "direction of --wind.")
+    snow: float = Field(0.0, ge=0, le=1000, description="Snow load per area of the branch seen "
+                        "from above [kg/m^2].")
+    fruit: tuple[_Fruit, ...] = Field(
+        (), description="A fruit: position on the branch [m] and mass [kg]. May be given several "
+                        "times.",
+        json_schema_extra={"metavar": "X Y Z KG"})
+    cut: tuple[_Place, ...] = Field(
+        (), description="Position of a pruning cut [m]. May be given several times.",
+        json_schema_extra={"metavar": "X Y Z"})
+    limit_load: bool = Field(
+        False, description="Also find the limit load, as a multiple of these loads.")
+    name: str | None = Field(
+        None, pattern=r"^[\w-]+$", max_length=60, description="Keep the result in the branch "
+        "folder under this name, for report and scene.")
+
+    @field_validator("wind")
+    @classmethod
+    def _possible_wind(cls, value: _Place | None) -> _Place | None:
+        if value is not None and (speed := math.hypot(*value)) > _FASTEST_WIND:
+            raise ValueError(f"no wind has {speed:g} m/s; {speed / 3.6:g} m/s would be {speed:g} "
+                             "km/h")
+        return value
+
+    @field_validator("fruit")
+    @classmethod
+    def _possible_fruit(cls, values: tuple[_Fruit, ...]) -> tuple[_Fruit, ...]:
+        possible_force(tuple(fruit[3] * STANDARD_GRAVITY for fruit in values))
+        return values
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Bring the branch to rest under loads.
+
+        With a name it writes ``loads/NAME.json``, and ``frames/load-NAME.pc2``, ``.json`` and
+        ``.npz``: the branch as scanned, and at rest under the loads. Without one it writes no file.
+
+        Returns:
+            The output of :func:`~limber.mechanics.loads.load_effects.load_effects` (sag, largest
+            strain and strain along the main path, frequencies; with ``limit_load`` how many times
+            the loads it bears; each with its interval, None if the uncertainty of the moduli is
+            unknown), and ``frequencies_before_hz``. With gusts all values are those of their peak,
+            and ``gusts`` has the output of :func:`~limber.mechanics.loads.load_effects.with_peak`.
+
+        Raises:
+            InputError: there is no load, one off the branch, or gusts without wind.
+            WorkError: there is no equilibrium under it.
+        """
+        from limber.mechanics.added_masses import PointMass
+        from limber.mechanics.dynamics.modes import lowest_modes
+        from limber.mechanics.loads.load_effects import blown, load_effects, with_peak
+        from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
+        from limber.store.loading import (
+            known_damping,
+            load_branch,
+            load_skeleton,
+            stiffness_deviation,
+        )
+
+        gusts = _gusts(self)
+        wind = blown(self.wind or (0.0, 0.0, 0.0), gusts)
+        if not (self.wind or self.snow or self.fruit or self.cut):
+            raise InputError("No load is given.",
+                             "The scanned shape already carries the branch's own weight.",
+                             "Give ", Option("wind"), ", ", Option("snow"), ", ",
+                             Option("fruit"), " or ", Option("cut"), ".")
+        if any(not one[3] > 0 for one in self.fruit):
+            raise InputError("A fruit without mass.", "", "Give ", Option("fruit"), " X Y Z KG.")
+        # Without a name nothing is stored.
+        branch = (Branch.read if self.name is None else Branch.open)(self.branch_folder)
+        inputs = _inputs(branch, self)
+        if self.name is not None and self.is_kept(branch, **inputs):
+            return read_json(branch.path(f"loads/{self.name}.json"), "the effects of loads")
+        skeleton = load_skeleton(branch)
+        model = load_branch(branch, loaded=True, progress=progress).model
+        _require_near(model.mesh.nodes, [one[:3] for one in self.fruit])
+        loads = Outdoors(wind, snow=self.snow, cuts=self.cut, fruit=tuple(
+            PointMass(one[:3], one[3]) for one in self.fruit))
+        outdoors = LoadedOutdoors(model, skeleton, loads)
+        peak = None
+        if gusts is not None:
+            progress(0.1, "gusts")
+            outdoors, peak = with_peak(outdoors, gusts, known_damping(branch, progress))
+        bent, result = load_effects(
+            outdoors, strain_limit=_STRAIN_LIMIT, deviation=stiffness_deviation(branch),
+            most=_MOST_MULTIPLE if self.limit_load else None, progress=progress.part(0.2, 1.0))
+        result |= {"frequencies_before_hz": lowest_modes(model, len(bent.frequencies)).frequencies,
+                   "gusts": peak}
+        if self.name is not None:
+            _keep(branch, self, inputs, model, bent, result)
+        return result
+
+
+def _inputs(branch: Branch, settings: ApplyLoads) -> dict[str, Any]:
     """Further inputs of the result beside the settings, in the form for the store."""
     reads = [file for file in ("mesh.vtu", "skeleton.swc", "skeleton.csv", "point_masses.json",
                                "targets.json", "estimate.json") if branch.has(file)]
@@ -259,7 +274,7 @@ def _inputs(branch: Branch, settings: LoadSettings) -> dict[str, Any]:
         {} if record is None else {"gust_record": file_digest(record)})}
 
 
-def _keep(branch: Branch, settings: LoadSettings, inputs: dict[str, Any], model: BranchModel,
+def _keep(branch: Branch, settings: ApplyLoads, inputs: dict[str, Any], model: BranchModel,
           bent: Bent, result: dict[str, Any]) -> None:
     """Write the result, and the branch before and under the loads as frames."""
     import json
@@ -284,7 +299,7 @@ def _keep(branch: Branch, settings: LoadSettings, inputs: dict[str, Any], model:
                              if key != "along"})
 
 
-def _gusts(settings: LoadSettings) -> Gusts | None:
+def _gusts(settings: ApplyLoads) -> Gusts | None:
     """The requested gusts."""
     from limber.mechanics.loads.load_effects import Turbulence, WindRecord
 
@@ -303,20 +318,3 @@ def _require_near(nodes: np.ndarray, points: list[_Place]) -> None:
         if not distance < 0.1:
             raise InputError(f"A fruit at {point} m is {distance:.3g} m away from the branch.",
                              "A fruit must hang on the branch.", "Check frame and unit.").at(point)
-
-
-def _failure_line(result: Mapping[str, Any]) -> str:
-    from limber.results.findings import failure_sentence
-
-    return failure_sentence(result.get("strain_over_limit", 0.0))
-
-
-STAGE = StageDescription(
-    "load", 45, by_name(load, folder="branch_folder"), BranchInputs, LoadSettings, RunOptions,
-    key="load:{name}", result=Load, reads=("mesh.vtu", "skeleton.swc"),
-    writes=("loads/{name}.json", "frames/load-{name}.pc2", "frames/load-{name}.json"),
-    found=("Under the loads the tip sags by {sag_m:m}; greatest strain {greatest_strain:share}, "
-           "{strain_over_limit:share} of the limit; first frequency {frequencies_hz[0]:Hz}.",
-           _failure_line,
-           "It bears {bears_times:.3g} times these loads; then held by: {held_by}."),
-    then="limber report {branch_folder}", step="material", label="Wind, Snow, Fruit, Cuts")

@@ -1,4 +1,4 @@
-"""Simulate a pull by a pose or a force; writes motion, energy and forces."""
+"""Stage ``simulate``."""
 
 from __future__ import annotations
 
@@ -8,17 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from limber.core.errors import Command, ConvergenceError, InputError, Option, Text
 from limber.core.files.atomic import write_atomically
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups
 from limber.mechanics.settings import FRAME_RATE, GRASP_RADIUS_M, SimulateSettings
-from limber.stages.inputs import BranchInputs, RunOptions
-from limber.stages.registry import StageDescription
 from limber.stages.result import FORCE, Picture, Result, Vector, frozen, of_files, shown
-from limber.store import Branch, Stage
+from limber.stages.stage import About, BranchStage, Repeatable, given
+from limber.store import Branch, OpenStage
 
 if TYPE_CHECKING:
     from limber.mechanics.dynamics.drive import PoseTable
@@ -30,21 +27,6 @@ if TYPE_CHECKING:
 KEY = "simulate"
 _MOST_REPLAYED = 120
 """Frames of a recording that is replayed slowly."""
-
-
-class SimulateInputs(BranchInputs):
-    """A branch folder, and the grasp's path."""
-
-    groups: ClassVar[Groups] = {"motion": ("along", "pull")}
-
-    along: Path | None = Field(
-        None, description="Table of poses that the grasp follows, relative to its position: a "
-        "recording's robot.csv, or a plan's plans/NAME.csv over --duration.",
-        json_schema_extra={"metavar": "FILE"})
-    pull: str | None = Field(
-        None, description="Replay this recording: the grasp, the motion and the result's name are "
-        "those of the recording. The measured motion can then be compared frame by frame.",
-        json_schema_extra={"metavar": "NAME", "panel": False})
 
 
 class Simulation(Result):
@@ -103,27 +85,57 @@ class Simulation(Result):
             "peak_force_n": float(np.linalg.norm(self.forces, axis=1).max())}))
 
 
-def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
-             along: PoseTable | None = None, grasp_radius: float = GRASP_RADIUS_M,
-             frame_rate: float = FRAME_RATE, key: str = KEY, force: bool = False,
-             progress: Progress = SILENT) -> dict[str, Any]:
-    """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
+def _peaks_line(result: Mapping[str, Any]) -> str:
+    from limber.results.findings import peaks_line
 
-    Args:
-        branch_folder: Folder with a mesh.
-        settings: Settings of the pull.
-        along: The grasp's path instead of a motion of the settings.
-        grasp_radius: [m]; frame_rate: [1/s].
-        key: Key of its entry in the manifest.
+    return peaks_line(result)
 
-    Returns:
-        The keys of the design's table: ``converged``, ``frame_count``, ``energy_j``,
-        ``grasp_force_n``, ``tip_displacement_m``, ``min_det_f``.
 
-    Raises:
-        InputError: the options do not fit together. ConvergenceError: the simulation of the branch
-            did not converge; the frames up to there are written.
-    """
+class Simulate(SimulateSettings, Repeatable, BranchStage):
+    """Simulate a pull by a pose or a force; writes motion, energy and forces."""
+
+    about = About(
+        "simulate", 40, Simulation, key=KEY, reads=("mesh.vtu",),
+        writes=("frames/{name}.pc2", "frames/{name}.json"),
+        found=("{frame_count} frames. At the end the tip has moved by {tip_displacement_m:|m}, the "
+               "force on the grasp is {grasp_force_n:|N} and the branch stores {energy_j:J}.",
+               _peaks_line),
+        then="limber scene {branch_folder} -o scene.blend --motion {name}", step="material",
+        label="Simulate a Motion")
+
+    along: Path | None = given(
+        "Table of poses that the grasp follows, relative to its position: a recording's robot.csv, "
+        "or a plan's plans/NAME.csv over --duration.", group="motion", metavar="FILE")
+    pull: str | None = given(
+        "Replay this recording: the grasp, the motion and the result's name are those of the "
+        "recording. The measured motion can then be compared frame by frame.", group="motion",
+        metavar="NAME", panel=False)
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
+
+        Returns:
+            The keys of the design's table: ``converged``, ``frame_count``, ``energy_j``,
+            ``grasp_force_n``, ``tip_displacement_m``, ``min_det_f``.
+
+        Raises:
+            InputError: the options do not fit together, or there is no such recording.
+            ConvergenceError: the simulation of the branch did not converge; the frames up to there
+                are written.
+        """
+        if self.pull is None:
+            along = _poses(self.along, self.duration, progress) if self.along else None
+            return _simulated(self, progress, along)
+        asked, replayed, radius = _replay(self, self.pull)
+        # Each frame at rest is a separate equilibrium, and a recording may last for minutes.
+        rate = FRAME_RATE if asked.kind == "dynamic" else min(
+            FRAME_RATE, _MOST_REPLAYED / replayed.duration)
+        return _simulated(asked, progress, replayed, radius, rate, f"replay:{self.pull}")
+
+
+def _simulated(asked: Simulate, progress: Progress, along: PoseTable | None,
+               grasp_radius: float = GRASP_RADIUS_M, frame_rate: float = FRAME_RATE,
+               key: str = KEY) -> dict[str, Any]:
     from limber.mechanics.materials.laws import law_digest, material_named
     from limber.mechanics.pull_simulation import (
         load_case_of,
@@ -133,35 +145,35 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     )
     from limber.store.loading import load_grasp_point
 
-    branch = Branch.open(branch_folder)
+    branch = Branch.open(asked.branch_folder)
     branch.require("mesh.vtu", "reconstruct")
-    require_one_drive(settings, along)
+    require_one_drive(asked, along)
     digests = {"along": along.digest(), "grasp_radius": str(grasp_radius)} if along else {}
-    law = material_named(settings.material)
+    law = material_named(asked.material)
     if not law.is_compiled:
         digests["material"] = law_digest(law)
     reads = [name for name in ("mesh.vtu", "point_masses.json", "targets.json")
              if branch.has(name)]
     stored = branch.manifest.stages.get(key)
-    if not force and stored and stored.result.get("converged") and branch.is_current(
-            key, settings, reads=reads, digests=digests):
+    if stored and stored.result.get("converged") and asked.is_kept(
+            branch, key, reads=reads, digests=digests):
         return stored.result
     progress(0.0, "preparing")
-    model = with_masses(_model(branch, settings, progress), settings)
-    case = load_case_of(model, settings, along, load_grasp_point(branch), grasp_radius=grasp_radius,
+    model = with_masses(_model(branch, asked, progress), asked)
+    case = load_case_of(model, asked, along, load_grasp_point(branch), grasp_radius=grasp_radius,
                         frame_rate=frame_rate)
-    motion = motion_of(case, settings, progress.part(0.2, 0.9))
+    motion = motion_of(case, asked, progress.part(0.2, 0.9))
     for message in motion.warnings:
         progress.warn(message)
-    with branch.stage(key, settings, reads=reads, digests=digests) as stage:
-        result = _write(stage, case.model, settings, motion, frame_rate)
+    with branch.stage(key, asked, reads=reads, digests=digests) as stage:
+        result = _write(stage, case.model, asked, motion, frame_rate)
         stage.result.update(result)
     progress(1.0, "done")
     if not motion.converged:
         raise ConvergenceError(
             Text("The branch could not follow the motion: ", motion.message),
             f"{result['frame_count']} frames up to the last valid state are in "
-            f"frames/{settings.name}.pc2. The grasp force there is {result['grasp_force_n']} N.",
+            f"frames/{asked.name}.pc2. The grasp force there is {result['grasp_force_n']} N.",
             "Pull less far, or check units and Young's modulus.")
     return result
 
@@ -179,7 +191,7 @@ def _model(branch: Branch, settings: SimulateSettings, progress: Progress) -> Br
     return load_model(branch, gravity=settings.gravity, **values)
 
 
-def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
+def _write(stage: OpenStage, model: BranchModel, settings: SimulateSettings,
            motion: SimulatedMotion, frame_rate: float) -> dict[str, Any]:
     from limber.mechanics.strain import strain_state
     from limber.results.motion_files import (
@@ -224,26 +236,8 @@ def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
         "peak_force_n": float(np.linalg.norm(motion.grasp_force, axis=-1).max(initial=0.0))}
 
 
-def run(inputs: SimulateInputs, settings: SimulateSettings, options: RunOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    if inputs.pull is not None:
-        settings, replayed, grasp_radius = _replay(Branch.open(inputs.branch_folder), inputs,
-                                                   settings)
-        # Each frame at rest is a separate equilibrium, and a recording may last for minutes.
-        rate = FRAME_RATE if settings.kind == "dynamic" else min(
-            FRAME_RATE, _MOST_REPLAYED / replayed.duration)
-        return simulate(inputs.branch_folder, settings, along=replayed, grasp_radius=grasp_radius,
-                        frame_rate=rate, key=f"replay:{inputs.pull}", force=options.force,
-                        progress=progress)
-    along = _poses(inputs.along, settings.duration, progress) if inputs.along else None
-    return simulate(inputs.branch_folder, settings, along=along, force=options.force,
-                    progress=progress)
-
-
-def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
-            ) -> tuple[SimulateSettings, PoseTable, float]:
-    """Return the settings, the gripper's path and the grasp's radius [m] of a recording.
+def _replay(asked: Simulate, name: str) -> tuple[Simulate, PoseTable, float]:
+    """Return the stage, the gripper's path and the grasp's radius [m] of a recording.
 
     Raises:
         InputError: there is no recording of that name, or its gripper does not drive the branch.
@@ -252,21 +246,22 @@ def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
     from limber.recordings.recording import read_pull
     from limber.store.loading import known_pulls
 
-    if inputs.along is not None:
+    if asked.along is not None:
         raise InputError(Text("Both ", Option("along"), " and ", Option("pull"), " were given."),
                          "Each states a path of the gripper.", "Give one of them.")
-    if inputs.pull not in known_pulls(branch):
-        raise InputError(f"There is no pull {inputs.pull!r}.",
+    branch = Branch.open(asked.branch_folder)
+    if name not in known_pulls(branch):
+        raise InputError(f"There is no pull {name!r}.",
                          f"There are: {', '.join(known_pulls(branch)) or 'none'}.",
                          "Import or record it first.")
-    pull = read_pull(branch.path(f"pulls/{inputs.pull}"))
+    pull = read_pull(branch.path(f"pulls/{name}"))
     if pull.entry.motion == "swing":
-        raise InputError(f"{inputs.pull} is a free swing.", "A free swing has no gripper.",
+        raise InputError(f"{name} is a free swing.", "A free swing has no gripper.",
                          Command("swing"), " fits it.")
     grasp, path = pull.entry.grasp, PoseTable(pull.times, pull.poses)
     kind = "static" if pull.entry.motion == "quasi_static" else "dynamic"
-    return settings.model_copy(update={
-        "name": inputs.pull, "kind": kind, "hold": 0.0, "grasp_point": grasp.point_m,
+    return asked.model_copy(update={
+        "name": name, "kind": kind, "hold": 0.0, "grasp_point": grasp.point_m,
         "grasp_mode": grasp.mode, "move": None, "turn": None, "grasp_force": None,
     }), path, grasp.radius_m
 
@@ -287,19 +282,3 @@ def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
         poses[:, 3:] = 0.0  # a table of positions only
     known = np.isfinite(poses).all(axis=1)
     return PoseTable(stream.times[known], poses[known])
-
-
-def _peaks_line(result: Mapping[str, Any]) -> str:
-    from limber.results.findings import peaks_line
-
-    return peaks_line(result)
-
-
-STAGE = StageDescription(
-    "simulate", 40, run, SimulateInputs, SimulateSettings, RunOptions, key=KEY,
-    result=Simulation, reads=("mesh.vtu",), writes=("frames/{name}.pc2", "frames/{name}.json"),
-    found=("{frame_count} frames. At the end the tip has moved by {tip_displacement_m:|m}, the "
-           "force on the grasp is {grasp_force_n:|N} and the branch stores {energy_j:J}.",
-           _peaks_line),
-    then="limber scene {branch_folder} -o scene.blend --motion {name}", step="material",
-    label="Simulate a Motion")

@@ -1,9 +1,8 @@
-"""Compare RRT*, D-RRT* and the gentle path over random starts, as the paper does."""
+"""Stage ``compare``."""
 
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -12,12 +11,11 @@ from pydantic import Field
 from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.core.files.tables import table_text
 from limber.core.labels import table_of
-from limber.core.progress import SILENT, Progress
-from limber.core.settings import POSITION, Groups, Settings
+from limber.core.progress import Progress
+from limber.core.settings import POSITION, Groups
 from limber.planning.settings import PlanSettings
-from limber.stages.inputs import ParallelOptions, PlacedInputs, by_name
-from limber.stages.registry import StageDescription
 from limber.stages.result import Result, Table, shown
+from limber.stages.stage import About, ParallelStage, PlacedStage, given
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -27,32 +25,6 @@ if TYPE_CHECKING:
 
 _COLUMNS = ("trial", "planner", "length_m", "energy_sum_nmm", "energy_integral_jm",
             "peak_energy_j")
-
-
-class CompareInputs(PlacedInputs):
-    """A branch folder, and the comparison's name."""
-
-    groups: ClassVar[Groups] = {"output": ("name",)}
-
-    name: str = Field("planners", description="Name of the comparison's files.")
-
-
-class CompareSettings(Settings):
-    """Trials, their common goal, and the planning."""
-
-    groups: ClassVar[Groups] = {"trials": ("trials", "goal", "seed"),
-                                "solver": ("max_detour",)}
-
-    trials: int = Field(10, ge=1, le=1000, description=(
-        "Number of random deformed start configurations."))
-    goal: tuple[float, float, float] | None = Field(None, description=(
-        "Goal position of the grasp, in the branch's frame [m]. Default: the branch's tip within "
-        "reach of a second arm, as in the paper."),
-                                                    json_schema_extra=POSITION)
-    seed: int = Field(0, ge=0, description="Seed of the starts and the planners.")
-    max_detour: float | None = Field(8.1, ge=0, le=1000, description=(
-        "Largest extra length of the gentle path over that of RRT* [%]. Default: the paper's "
-        "mean."))
 
 
 class Comparison(Result):
@@ -80,53 +52,86 @@ class Comparison(Result):
             ("saved [%]", saved("saved_percent"))))]
 
 
-def compare(folder: Path, settings: CompareSettings, *, name: str = "planners",
-            workers: int | None = None, force: bool = False,
-            progress: Progress = SILENT) -> dict[str, Any]:
-    """Stage ``compare``: plan from random starts with each planner, on the branch's energy field.
+def _saving(values: Mapping[str, Any]) -> str | None:
+    """Say what each planner saves against RRT*."""
+    from limber.planning.compared_planners import BASELINE, COMPARED
 
-    Writes ``comparisons/NAME.csv``, one row per path, and ``comparisons/NAME.png``.
+    return "Energy saved against RRT*: " + ", ".join(
+        f"{COMPARED[path]} {row['saved_percent']:.1f} %"
+        for path, row in values["planners"].items() if path != BASELINE) + "."
 
-    Raises:
-        BranchFolderError: there is no energy field. InputError: the name is invalid.
-        NoPathError: no trial has a path; the message gives the reason.
-    """
-    from limber.planning.compared_planners import run_trials, summarised
-    from limber.planning.field.energy_field import EnergyField
-    from limber.planning.goals.goal_kinds import near, second_arm_goal
-    from limber.results.report.planner_figure import planner_figure
 
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
-        raise InputError(Text(Option("name"), f" {name!r} cannot name a comparison."), "It becomes "
-                         "part of file names.", "Use letters, digits, dash, dot and underscore.")
-    branch = Branch.open(folder)
-    field = EnergyField.read(branch.require("energy.npz", "energy"))
-    key, reads = f"compare:{name}", ["energy.npz"]
-    if not force and branch.is_current(key, settings, reads=reads):
-        return branch.manifest.stages[key].result
-    asked = PlanSettings(seed=settings.seed, max_detour=settings.max_detour)
-    goal = (second_arm_goal(field) if settings.goal is None
-            else near(np.array(settings.goal), asked.goal_tolerance))
-    with branch.stage(key, settings, reads=reads) as stage:
-        trials = run_trials(field, goal, asked, settings.trials, workers=workers,
-                            progress=progress)
-        good = [trial for trial in trials if trial.scores]
-        if not good:
-            raise NoPathError(f"None of {len(trials)} trials has a path.", trials[0].trouble,
-                              "Choose another ", Option("goal"), ", or sample more poses with ",
-                              Command("energy", Option("samples")), ".")
-        for trial in trials:
-            if trial.trouble:
-                progress.warn(f"Trial {trial.number + 1} has no path: {trial.trouble}")
-        gaps = [trial.gap_percent for trial in good if trial.gap_percent is not None]
-        stage.path(f"comparisons/{name}.csv").write_text(_rows(good), encoding="utf-8")
-        planner_figure(field, good).savefig(stage.path(f"comparisons/{name}.png"), dpi=150)
-        stage.result.update({
-            "goal": goal.describe(), "trial_count": len(trials), "planned_count": len(good),
-            "planners": summarised(trials), "gap_percent_median": float(np.median(gaps)),
-            "field_energy_error": field.errors["energy_error"], "branch": folder.stem})
-    progress(1.0, "compared")
-    return branch.manifest.stages[key].result
+class ComparePlanners(ParallelStage, PlacedStage):
+    """Compare RRT*, D-RRT* and the gentle path over random starts, as the paper does."""
+
+    about = About(
+        "compare", 105, Comparison, key="compare:{name}", reads=("energy.npz",),
+        writes=("comparisons/{name}.csv", "comparisons/{name}.png"),
+        found=("{planned_count} of {trial_count} random starts were planned.", _saving),
+        then="limber report {branch_folder}", step="plan", label="Compare Planners")
+    groups: ClassVar[Groups] = {"trials": ("trials", "goal", "seed"),
+                                "solver": ("max_detour",)}
+
+    name: str = given("Name of the comparison's files.", "planners", group="output")
+    trials: int = Field(10, ge=1, le=1000, description=(
+        "Number of random deformed start configurations."))
+    goal: tuple[float, float, float] | None = Field(None, description=(
+        "Goal position of the grasp, in the branch's frame [m]. Default: the branch's tip within "
+        "reach of a second arm, as in the paper."),
+                                                    json_schema_extra=POSITION)
+    seed: int = Field(0, ge=0, description="Seed of the starts and the planners.")
+    max_detour: float | None = Field(8.1, ge=0, le=1000, description=(
+        "Largest extra length of the gentle path over that of RRT* [%]. Default: the paper's "
+        "mean."))
+
+    def run_in_branch(self, progress: Progress) -> dict[str, Any]:
+        """Plan from random starts with each planner, on the branch's energy field.
+
+        Writes ``comparisons/NAME.csv``, one row per path, and ``comparisons/NAME.png``.
+
+        Raises:
+            BranchFolderError: there is no energy field.
+            InputError: the name is invalid.
+            NoPathError: no trial has a path; the message gives the reason.
+        """
+        from limber.planning.compared_planners import run_trials, summarised
+        from limber.planning.field.energy_field import EnergyField
+        from limber.planning.goals.goal_kinds import near, second_arm_goal
+        from limber.results.report.planner_figure import planner_figure
+
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", self.name):
+            raise InputError(Text(Option("name"), f" {self.name!r} cannot name a comparison."),
+                             "It becomes part of file names.",
+                             "Use letters, digits, dash, dot and underscore.")
+        branch = Branch.open(self.branch_folder)
+        field = EnergyField.read(branch.require("energy.npz", "energy"))
+        reads = ["energy.npz"]
+        if self.is_kept(branch, reads=reads):
+            return branch.manifest.stages[self.entry].result
+        asked = PlanSettings(seed=self.seed, max_detour=self.max_detour)
+        goal = (second_arm_goal(field) if self.goal is None
+                else near(np.array(self.goal), asked.goal_tolerance))
+        with branch.stage(self.entry, self, reads=reads) as stage:
+            trials = run_trials(field, goal, asked, self.trials, workers=self.workers,
+                                progress=progress)
+            good = [trial for trial in trials if trial.scores]
+            if not good:
+                raise NoPathError(f"None of {len(trials)} trials has a path.", trials[0].trouble,
+                                  "Choose another ", Option("goal"), ", or sample more poses with ",
+                                  Command("energy", Option("samples")), ".")
+            for trial in trials:
+                if trial.trouble:
+                    progress.warn(f"Trial {trial.number + 1} has no path: {trial.trouble}")
+            gaps = [trial.gap_percent for trial in good if trial.gap_percent is not None]
+            stage.path(f"comparisons/{self.name}.csv").write_text(_rows(good), encoding="utf-8")
+            planner_figure(field, good).savefig(stage.path(f"comparisons/{self.name}.png"), dpi=150)
+            stage.result.update({
+                "goal": goal.describe(), "trial_count": len(trials), "planned_count": len(good),
+                "planners": summarised(trials), "gap_percent_median": float(np.median(gaps)),
+                "field_energy_error": field.errors["energy_error"],
+                "branch": self.branch_folder.stem})
+        progress(1.0, "compared")
+        return branch.manifest.stages[self.entry].result
 
 
 def _rows(trials: Sequence[ComparedTrial]) -> str:
@@ -140,20 +145,3 @@ def _rows(trials: Sequence[ComparedTrial]) -> str:
 def _spread(row: dict[str, Any], key: str, form: str) -> str:
     mean, deviation = row[f"{key}_mean"], row[f"{key}_deviation"]
     return f"{mean:{form}}" if deviation is None else f"{mean:{form}} ± {deviation:{form}}"
-
-
-def _saving(values: Mapping[str, Any]) -> str | None:
-    """Say what each planner saves against RRT*."""
-    from limber.planning.compared_planners import BASELINE, COMPARED
-
-    return "Energy saved against RRT*: " + ", ".join(
-        f"{COMPARED[path]} {row['saved_percent']:.1f} %"
-        for path, row in values["planners"].items() if path != BASELINE) + "."
-
-
-STAGE = StageDescription(
-    "compare", 105, by_name(compare, folder="branch_folder"), CompareInputs, CompareSettings,
-    ParallelOptions, key="compare:{name}", reads=("energy.npz",),
-    writes=("comparisons/{name}.csv", "comparisons/{name}.png"), result=Comparison,
-    found=("{planned_count} of {trial_count} random starts were planned.", _saving),
-    then="limber report {branch_folder}", step="plan", label="Compare Planners")

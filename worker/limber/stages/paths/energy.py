@@ -1,6 +1,5 @@
-"""Sample the deformation energy over grasp poses, and fit a field to it."""
+"""Stage ``energy``."""
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -9,9 +8,8 @@ from limber.core.errors import Option
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.settings import EnergySettings
-from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
-from limber.stages.registry import StageDescription
 from limber.stages.result import FORCE, Picture, Result, frozen, of_files, shown
+from limber.stages.stage import About, BranchStage, ParallelStage
 from limber.store import Branch
 
 _MOST_TIMES = 4  # multiple of the requested samples that --field-error may take
@@ -63,75 +61,77 @@ class EnergyField(Result):
         return self.field.force(np.asarray(points, float))
 
 
-def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int | None = None,
-                        force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Stage ``energy``: sample grasp poses and fit the field; writes ``energy.npz``.
+class SampleEnergy(EnergySettings, ParallelStage, BranchStage):
+    """Sample the deformation energy over grasp poses, and fit a field to it."""
 
-    Raises:
-        BranchFolderError: there is no mesh yet.
-        WorkError: too few poses could be solved.
-    """
-    from limber.planning.field.energy_field import fit_field
-    from limber.planning.field.grasp_model import LearntGraspModel
-    from limber.planning.field.sampling import energy_inputs, refined, sample_field
-    from limber.store.loading import load_grasp_model
+    about = About(
+        "energy", 90, EnergyField, key="energy", reads=("mesh.vtu", "skeleton.swc"),
+        writes=("energy.npz",),
+        found=("{sample_count} poses solved, {rejected_count} rejected.",
+               "Error of the field: energy {energy_error:share}, force {force_error:share}."),
+        then="limber plan {branch_folder}", step="plan", label="Sample the Energy")
 
-    branch = Branch.open(folder)
-    grasp_model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
-    digests = energy_inputs(grasp_model)
-    if not force and branch.is_current("energy", settings, digests=digests):
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Sample grasp poses and fit the field; writes ``energy.npz``.
+
+        Raises:
+            BranchFolderError: there is no mesh yet.
+            WorkError: too few poses could be solved.
+        """
+        from limber.planning.field.energy_field import fit_field
+        from limber.planning.field.grasp_model import LearntGraspModel
+        from limber.planning.field.sampling import energy_inputs, refined, sample_field
+        from limber.store.loading import load_grasp_model
+
+        branch = Branch.open(self.branch_folder)
+        grasp_model = load_grasp_model(branch, gravity=self.gravity, progress=progress)
+        digests = energy_inputs(grasp_model)
+        if self.is_kept(branch, digests=digests):
+            return branch.manifest.stages["energy"].result
+        with branch.stage("energy", self, digests=digests) as stage:
+            if self.forward == "reduced":
+                grasp_model = LearntGraspModel.learnt(grasp_model,
+                                                      progress=progress.part(0.0, 0.02))
+            progress(0.0, "rest state")
+            sampled = sample_field(grasp_model, self, workers=self.workers,
+                                   progress=progress.part(0.02, 0.7))
+            field = fit_field(
+                sampled.samples,
+                sampled.energy_surface.pivot,
+                sampled.energy_surface.radius,
+                progress=progress.part(0.7, 0.8),
+            )
+            if self.field_error is not None:
+                sampled, field = refined(grasp_model, sampled, field, self.field_error / 100.0,
+                                         _MOST_TIMES * self.samples, workers=self.workers,
+                                         progress=progress.part(0.8, 1.0))
+                off = 100.0 * field.errors["energy_error"]
+                if off > self.field_error:
+                    progress.warn(
+                        f"The error of the energy field is {off:.2g} % with "
+                        f"{len(field.samples.poses)} poses, more than the {self.field_error:g} % "
+                        "of ", Option("field_error"), ". Increase ", Option("samples"),
+                        ", or reduce ", Option("deflection"), ".")
+            samples, reasons = sampled.samples, sampled.reasons
+            rejected = len(samples.rejected_poses)
+            if rejected > 0.2 * self.samples:
+                progress.warn(f"{rejected} of {self.samples} poses were rejected ({reasons}). "
+                              "Paths avoid them.")
+            field.write(stage.path("energy.npz"), {
+                "target_names": np.array([t.name for t in grasp_model.branch.targets], "U64"),
+                "rest_pose": samples.poses[0], "chart_base_m": grasp_model.reach.base,
+                "arc_length_m": np.array(grasp_model.reach.arc_length)})
+            stage.result.update(
+                sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
+                taut_count=sampled.taut_count,
+                energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
+                forward=self.forward,
+                reduced_count=int(present(samples.reduced, "mark of reduced samples").sum()),
+                errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
+                chart_stretch=field.chart.stretch,
+                chart_depth_m=field.chart.depth if np.isfinite(field.chart.depth) else None,
+                max_energy_j=float(samples.energies.max()),
+                max_force_n=float(np.linalg.norm(samples.forces, axis=1).max()),
+                rest_position_m=samples.poses[0, :3], arc_length_m=grasp_model.reach.arc_length)
+        progress(1.0, "energy field fitted")
         return branch.manifest.stages["energy"].result
-    with branch.stage("energy", settings, digests=digests) as stage:
-        if settings.forward == "reduced":
-            grasp_model = LearntGraspModel.learnt(grasp_model, progress=progress.part(0.0, 0.02))
-        progress(0.0, "rest state")
-        sampled = sample_field(grasp_model, settings, workers=workers,
-                               progress=progress.part(0.02, 0.7))
-        field = fit_field(
-            sampled.samples,
-            sampled.energy_surface.pivot,
-            sampled.energy_surface.radius,
-            progress=progress.part(0.7, 0.8),
-        )
-        if settings.field_error is not None:
-            sampled, field = refined(grasp_model, sampled, field, settings.field_error / 100.0,
-                                     _MOST_TIMES * settings.samples, workers=workers,
-                                     progress=progress.part(0.8, 1.0))
-            off = 100.0 * field.errors["energy_error"]
-            if off > settings.field_error:
-                progress.warn(
-                    f"The error of the energy field is {off:.2g} % with {len(field.samples.poses)} "
-                    f"poses, more than the {settings.field_error:g} % of ", Option("field_error"),
-                    ". Increase ", Option("samples"), ", or reduce ", Option("deflection"), ".")
-        samples, reasons = sampled.samples, sampled.reasons
-        rejected = len(samples.rejected_poses)
-        if rejected > 0.2 * settings.samples:
-            progress.warn(f"{rejected} of {settings.samples} poses were rejected ({reasons}). "
-                          "Paths avoid them.")
-        field.write(stage.path("energy.npz"), {
-            "target_names": np.array([t.name for t in grasp_model.branch.targets], "U64"),
-            "rest_pose": samples.poses[0], "chart_base_m": grasp_model.reach.base,
-            "arc_length_m": np.array(grasp_model.reach.arc_length)})
-        stage.result.update(
-            sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
-            taut_count=sampled.taut_count,
-            energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
-            forward=settings.forward,
-            reduced_count=int(present(samples.reduced, "mark of reduced samples").sum()),
-            errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
-            chart_stretch=field.chart.stretch,
-            chart_depth_m=field.chart.depth if np.isfinite(field.chart.depth) else None,
-            max_energy_j=float(samples.energies.max()),
-            max_force_n=float(np.linalg.norm(samples.forces, axis=1).max()),
-            rest_position_m=samples.poses[0, :3], arc_length_m=grasp_model.reach.arc_length)
-    progress(1.0, "energy field fitted")
-    return branch.manifest.stages["energy"].result
-
-
-STAGE = StageDescription(
-    "energy", 90, by_name(sample_energy_field, folder="branch_folder"), BranchInputs,
-    EnergySettings, ParallelOptions, key="energy", result=EnergyField,
-    reads=("mesh.vtu", "skeleton.swc"), writes=("energy.npz",),
-    found=("{sample_count} poses solved, {rejected_count} rejected.",
-           "Error of the field: energy {energy_error:share}, force {force_error:share}."),
-    then="limber plan {branch_folder}", step="plan", label="Sample the Energy")

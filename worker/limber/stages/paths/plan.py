@@ -1,8 +1,4 @@
-"""Plan the shortest and the gentlest path to a goal, and compare them.
-
-The field is used for the search only. All reported energies, forces and strains are computed by
-finite elements along the paths found; the error of the field is reported beside them.
-"""
+"""Stage ``plan``."""
 
 from __future__ import annotations
 
@@ -14,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from limber.core.errors import (
     BranchFolderError,
@@ -27,11 +22,8 @@ from limber.core.errors import (
 )
 from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
-from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups
+from limber.core.progress import Progress
 from limber.planning.settings import PlanSettings
-from limber.stages.inputs import ParallelOptions, PlacedInputs, by_name
-from limber.stages.registry import StageDescription
 from limber.stages.result import (
     FORCE,
     POSE,
@@ -44,7 +36,8 @@ from limber.stages.result import (
     of_files,
     shown,
 )
-from limber.store import Branch, Stage
+from limber.stages.stage import About, ParallelStage, PlacedStage, given
+from limber.store import Branch, OpenStage
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,21 +54,6 @@ if TYPE_CHECKING:
 
 
 _FRAME_RATE = 24.0  # frames per second of the played motion; a pose is a frame
-
-
-class PlanInputs(PlacedInputs):
-    """A branch folder, and the plan's name."""
-
-    groups: ClassVar[Groups] = {"input": ("cell", "break_tests"), "output": ("name",)}
-    common = ("cell", "name", "coordinates")
-
-    cell: Path | None = Field(None, description=(
-        "The robot's cell file. Its workspace, force limit and obstacles apply, and its arm must "
-        "reach the whole path."))
-    break_tests: Path | None = Field(None, description=(
-        "CSV of break tests on shoots of the same plant: a column strain_at_break (0.05 is 5 %). "
-        "They state the branch's strength."))
-    name: str = Field("path", description="Name of the plan's files.")
 
 
 class Plan(Result):
@@ -188,149 +166,185 @@ class Plan(Result):
         return section
 
 
-def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
-         cell_file: Path | None = None, break_tests: Path | None = None,
-         workers: int | None = None, force: bool = False,
-         progress: Progress = SILENT) -> dict[str, Any]:
-    """Plan paths on the branch's energy field.
+def _found_lines(values: Mapping[str, Any]) -> str:
+    from limber.results.findings import (
+        beyond_sentence,
+        certificate_sentence,
+        modulus_origin,
+        path_sentence,
+    )
 
-    Writes ``plans/NAME.json``, CSV files of both paths, the whole motion, its poses at the
-    controller's rate and the search trees, and the frames.
+    origin = modulus_origin(Branch.read(values["branch_folder"]))
+    return "\n".join(filter(None, (
+        path_sentence(values), certificate_sentence(values), beyond_sentence(values),
+        "" if origin == "estimated" else f"All this holds for Young's modulus as {origin}.")))
 
-    Raises:
-        BranchFolderError: there is no energy field, or one of another geometry or material.
-        InputError: the name is invalid, the start is not allowed, or there are two goals.
-        NoPathError: there is no path; the message gives the reason.
-        Cancelled: the best result so far was kept, if there was one and no finished plan of that
-        name.
+
+class PlanPaths(PlanSettings, ParallelStage, PlacedStage):
+    """Plan the shortest and the gentlest path to a goal, and compare them.
+
+    The field is used for the search only. All reported energies, forces and strains are computed by
+    finite elements along the paths found; the error of the field is reported beside them.
     """
-    from limber.planning.constraints.damage import DamageAlong, assumed_strain
-    from limber.planning.constraints.limits import Limits
-    from limber.planning.field.energy_field import EnergyField
-    from limber.planning.field.sampling import energy_inputs
-    from limber.planning.make_plan import plan_motion
-    from limber.planning.plan_file import whole_motion
-    from limber.planning.timing import Pace
-    from limber.stages.paths.plan_legs import legs_without_cell
-    from limber.stages.paths.plan_strength import (
-        default_limit,
-        strength_for,
-        strength_of_plan,
-        with_damage,
-    )
-    from limber.stages.paths.plan_tables import SETPOINT_RATE, setpoints
-    from limber.stages.paths.plan_uncertainty import young_uncertainty
-    from limber.store.loading import known_damping, load_grasp_model, load_skeleton
 
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
-            ("-baseline", "-bound", "-damage", "-motion", "-setpoints", "-trees")):
-        raise InputError(Text(Option("name"), f" {name!r} cannot name a plan."), "It becomes part "
-                         "of file names, and -baseline, -bound, -damage, -motion, -setpoints and "
-                         "-trees are reserved.", "Use letters, digits, dash, dot and underscore.")
-    branch = Branch.open(folder)
-    field_path = branch.require("energy.npz", "energy")
-    energy_stage = branch.manifest.stages["energy"]
-    grasp_model = load_grasp_model(branch, gravity=bool(energy_stage.settings["gravity"]),
-                                   progress=progress)
-    field = EnergyField.read(field_path)
-    digests = energy_inputs(grasp_model)
-    if any(energy_stage.reads.get(name) != digest for name, digest in digests.items()):
-        raise BranchFolderError(
-            "The energy field belongs to another mesh, material, weight or set of targets.",
-            Text("The branch was meshed or estimated again, or its targets changed, after ",
-                 Command("energy"), " ran."),
-            "Run ", Command("energy"), " again.")
-    grasp_model = grasp_model.damped(known_damping(branch))
-    digests = digests | {"damping": repr(grasp_model.model.damping)}
-    stiffer = _stiffer(branch) if settings.max_stress else 1.0
-    digests = digests | {"stiffer": f"{stiffer:.6f}"}
-    strength = strength_for(branch, settings, break_tests)
-    if break_tests is not None:
-        digests = digests | {"break tests": file_digest(break_tests)}
-    young = float(np.median(grasp_model.model.young))
-    asked = with_damage(Limits.of(settings, stiffer), settings, strength, young)
-    if np.isfinite(asked.strain):
-        digests = digests | {"strain": f"{asked.strain:.6g}"}
-    uncertainty = (
-        None if settings.confidence is None else young_uncertainty(branch, grasp_model, asked)
-    )
-    if settings.turn_slack is not None and cell_file is None:
-        raise InputError(Text(Option("turn_slack"), " is given without ", Option("cell"), "."),
-                         "It is the arm in the cell that may not let the gripper turn with the "
-                         "branch.",
-                         "Give ", Option("cell"), ", or omit ", Option("turn_slack"), ".")
-    in_cell = None
-    if cell_file is not None:
-        in_cell = _InCell.of(branch, cell_file, asked, progress, settings, grasp_model)
-        digests = digests | {"cell": file_digest(cell_file)}
-    key = f"plan:{name}"
-    reads = ["energy.npz"]
-    earlier = branch.manifest.stages.get(key)
-    finished = earlier is not None and not earlier.result.get("stopped")
-    if not force and earlier is not None and finished and branch.is_current(
-            key, settings, reads=reads, digests=digests):
-        return earlier.result
-    if in_cell is not None:
-        in_cell.check_goal(settings)
-    with branch.stage(key, settings, reads=reads, digests=digests) as stage:
-        limits = asked if in_cell is None else in_cell.limits
-        pace = Pace(settings.speed)
+    about = About(
+        "plan", 100, Plan, key="plan:{name}", reads=("mesh.vtu", "energy.npz"),
+        writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
+                "plans/{name}-motion.csv", "plans/{name}-setpoints.csv", "plans/{name}-trees.csv",
+                "plans/{name}-damage.csv", "plans/{name}-bound.npz", "frames/{name}.pc2",
+                "frames/{name}.json", "frames/{name}.npz"),
+        found=(_found_lines,), then="limber report {branch_folder}", step="plan",
+        label="Plan Path")
+    common: ClassVar[tuple[str, ...]] = ("coordinates",)
+
+    cell: Path | None = given(
+        "The robot's cell file. Its workspace, force limit and obstacles apply, and its arm must "
+        "reach the whole path.", common=True)
+    break_tests: Path | None = given(
+        "CSV of break tests on shoots of the same plant: a column strain_at_break (0.05 is 5 %). "
+        "They state the branch's strength.")
+    name: str = given("Name of the plan's files.", "path", group="output", common=True)
+
+    def run_in_branch(self, progress: Progress) -> dict[str, Any]:
+        """Plan paths on the branch's energy field.
+
+        Writes ``plans/NAME.json``, CSV files of both paths, the whole motion, its poses at the
+        controller's rate and the search trees, and the frames.
+
+        Raises:
+            BranchFolderError: there is no energy field, or one of another geometry or material.
+            InputError: the name is invalid, the start is not allowed, or there are two goals.
+            NoPathError: there is no path; the message gives the reason.
+            Cancelled: the best result so far was kept, if there was one and no finished plan of
+                that name.
+        """
+        from limber.planning.constraints.damage import DamageAlong, assumed_strain
+        from limber.planning.constraints.limits import Limits
+        from limber.planning.field.energy_field import EnergyField
+        from limber.planning.field.sampling import energy_inputs
+        from limber.planning.make_plan import plan_motion
+        from limber.planning.plan_file import whole_motion
+        from limber.planning.timing import Pace
+        from limber.stages.paths.plan_legs import legs_without_cell
+        from limber.stages.paths.plan_strength import (
+            default_limit,
+            strength_for,
+            strength_of_plan,
+            with_damage,
+        )
+        from limber.stages.paths.plan_tables import SETPOINT_RATE, setpoints
+        from limber.stages.paths.plan_uncertainty import young_uncertainty
+        from limber.store.loading import known_damping, load_grasp_model, load_skeleton
+
+        name, key, reads = self.name, self.entry, ["energy.npz"]
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
+                ("-baseline", "-bound", "-damage", "-motion", "-setpoints", "-trees")):
+            raise InputError(Text(Option("name"), f" {name!r} cannot name a plan."),
+                             "It becomes part of file names, and -baseline, -bound, -damage, "
+                             "-motion, -setpoints and -trees are reserved.",
+                             "Use letters, digits, dash, dot and underscore.")
+        branch = Branch.open(self.branch_folder)
+        field_path = branch.require("energy.npz", "energy")
+        energy_stage = branch.manifest.stages["energy"]
+        grasp_model = load_grasp_model(branch, gravity=bool(energy_stage.settings["gravity"]),
+                                       progress=progress)
+        field = EnergyField.read(field_path)
+        digests = energy_inputs(grasp_model)
+        if any(energy_stage.reads.get(name) != digest for name, digest in digests.items()):
+            raise BranchFolderError(
+                "The energy field belongs to another mesh, material, weight or set of targets.",
+                Text("The branch was meshed or estimated again, or its targets changed, after ",
+                     Command("energy"), " ran."),
+                "Run ", Command("energy"), " again.")
+        grasp_model = grasp_model.damped(known_damping(branch))
+        digests = digests | {"damping": repr(grasp_model.model.damping)}
+        stiffer = _stiffer(branch) if self.max_stress else 1.0
+        digests = digests | {"stiffer": f"{stiffer:.6f}"}
+        strength = strength_for(branch, self, self.break_tests)
+        if self.break_tests is not None:
+            digests = digests | {"break tests": file_digest(self.break_tests)}
+        young = float(np.median(grasp_model.model.young))
+        asked = with_damage(Limits.of(self, stiffer), self, strength, young)
+        if np.isfinite(asked.strain):
+            digests = digests | {"strain": f"{asked.strain:.6g}"}
+        uncertainty = (
+            None if self.confidence is None else young_uncertainty(branch, grasp_model, asked)
+        )
+        if self.turn_slack is not None and self.cell is None:
+            raise InputError(Text(Option("turn_slack"), " is given without ", Option("cell"), "."),
+                             "It is the arm in the cell that may not let the gripper turn with the "
+                             "branch.",
+                             "Give ", Option("cell"), ", or omit ", Option("turn_slack"), ".")
+        in_cell = None
+        if self.cell is not None:
+            in_cell = _InCell.of(branch, self.cell, asked, progress, self, grasp_model)
+            digests = digests | {"cell": file_digest(self.cell)}
+        earlier = branch.manifest.stages.get(key)
+        finished = earlier is not None and not earlier.result.get("stopped")
+        if earlier is not None and finished and self.is_kept(branch, reads=reads, digests=digests):
+            return earlier.result
         if in_cell is not None:
-            pace = in_cell.slowed(pace, progress)
-        try:
-            found = plan_motion(
-                field,
-                grasp_model,
-                settings,
-                limits=limits,
-                cell=None if in_cell is None else in_cell.positions,
-                uncertainty=uncertainty,
-                pace=pace,
-                workers=workers,
-                progress=progress,
-            )
-        except NoPathError as error:
-            limited = default_limit(limits, settings, strength)
-            raise type(error)(error.seen, error.why, error.fix,
-                              *([" ", limited] if limited else [])) from error
-        if limited := default_limit(limits, settings, strength):
-            progress.warn(limited)
-        if found.summary["stopped"]:
-            progress = progress.to_the_end()
-        if found.summary["stopped"] and finished:
-            raise Cancelled("The search was stopped.", f"The finished plan {name} is kept.",
-                            "Run it again when there is time for it.")
-        # A user who limits the strain knows the wood: no strength is assumed.
-        if strength is not None or (settings.max_strain is None and assumed_strain(young)):
-            found.summary["strength"] = strength_of_plan(
-                strength, found.plan, found.summary.get("in_motion"), progress)
-        pace = found.pace
-        motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets), pace)
-        if in_cell is None:
-            found.summary["legs"] = legs_without_cell(motion, settings.hold)
-        else:
-            progress(0.95, "inverse kinematics")
-            found.summary.update(in_cell.taken(motion, grasp_model, found, settings, progress))
-        progress(0.95, "writing")
-        rate = SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
-        found.summary["setpoint_rate_hz"] = rate
-        stage.path(f"plans/{name}-setpoints.csv").write_text(setpoints(motion, pace, rate),
-                                                             encoding="utf-8")
-        _write(stage, name, limits, pace, motion, grasp_model, found)
-        with open(stage.path(f"plans/{name}-damage.csv"), "w", encoding="utf-8") as stream:
-            DamageAlong.of(grasp_model, load_skeleton(branch), found.plan.ahead.displacements,
-                           strength).write(stream)
-        stage.result.update(found.summary)
-    result = branch.manifest.stages[key].result
-    if result["stopped"]:
-        gap = result["certificate"]["gap_percent"]
-        near = "gap to the best possible unknown" if gap is None else (
-            f"at most {gap:.2g} % above the best possible")
-        raise Cancelled("The search was stopped.",
-                        f"The best path so far ({near}) was checked on the full model and stored "
-                        f"as plan {name}.", "Run it again to close the bound.")
-    progress(1.0, "planned")
-    return result
+            in_cell.check_goal(self)
+        with branch.stage(key, self, reads=reads, digests=digests) as stage:
+            limits = asked if in_cell is None else in_cell.limits
+            pace = Pace(self.speed)
+            if in_cell is not None:
+                pace = in_cell.slowed(pace, progress)
+            try:
+                found = plan_motion(
+                    field,
+                    grasp_model,
+                    self,
+                    limits=limits,
+                    cell=None if in_cell is None else in_cell.positions,
+                    uncertainty=uncertainty,
+                    pace=pace,
+                    workers=self.workers,
+                    progress=progress,
+                )
+            except NoPathError as error:
+                limited = default_limit(limits, self, strength)
+                raise type(error)(error.seen, error.why, error.fix,
+                                  *([" ", limited] if limited else [])) from error
+            if limited := default_limit(limits, self, strength):
+                progress.warn(limited)
+            if found.summary["stopped"]:
+                progress = progress.to_the_end()
+            if found.summary["stopped"] and finished:
+                raise Cancelled("The search was stopped.", f"The finished plan {name} is kept.",
+                                "Run it again when there is time for it.")
+            # A user who limits the strain knows the wood: no strength is assumed.
+            if strength is not None or (self.max_strain is None and assumed_strain(young)):
+                found.summary["strength"] = strength_of_plan(
+                    strength, found.plan, found.summary.get("in_motion"), progress)
+            pace = found.pace
+            motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets),
+                                  pace)
+            if in_cell is None:
+                found.summary["legs"] = legs_without_cell(motion, self.hold)
+            else:
+                progress(0.95, "inverse kinematics")
+                found.summary.update(in_cell.taken(motion, grasp_model, found, self, progress))
+            progress(0.95, "writing")
+            rate = SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
+            found.summary["setpoint_rate_hz"] = rate
+            stage.path(f"plans/{name}-setpoints.csv").write_text(setpoints(motion, pace, rate),
+                                                                 encoding="utf-8")
+            _write(stage, name, limits, pace, motion, grasp_model, found)
+            with open(stage.path(f"plans/{name}-damage.csv"), "w", encoding="utf-8") as stream:
+                DamageAlong.of(grasp_model, load_skeleton(branch), found.plan.ahead.displacements,
+                               strength).write(stream)
+            stage.result.update(found.summary)
+        result = branch.manifest.stages[key].result
+        if result["stopped"]:
+            gap = result["certificate"]["gap_percent"]
+            near = "gap to the best possible unknown" if gap is None else (
+                f"at most {gap:.2g} % above the best possible")
+            raise Cancelled("The search was stopped.",
+                            f"The best path so far ({near}) was checked on the full model and "
+                            f"stored as plan {name}.", "Run it again to close the bound.")
+        progress(1.0, "planned")
+        return result
 
 
 @dataclass(frozen=True)
@@ -441,7 +455,7 @@ def _stiffer(branch: Branch) -> float:
     return float(np.max(share, initial=1.0))
 
 
-def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: PlanPath,
+def _write(stage: OpenStage, name: str, limits: Limits, pace: Pace, motion: PlanPath,
            grasp_model: GraspModel, found: PlannedMotion) -> None:
     from limber.mechanics.strain import strain_state
     from limber.planning.plan_file import limits_of_motion, path_record, plan_text
@@ -473,27 +487,3 @@ def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: PlanPath
     model, mesh = grasp_model.model, grasp_model.mesh
     states = [strain_state(model, u) for u in displacements]
     np.savez_compressed(stage.path(f"frames/{name}.npz"), **surface_fields(mesh, states))
-
-
-def _found_lines(values: Mapping[str, Any]) -> str:
-    from limber.results.findings import (
-        beyond_sentence,
-        certificate_sentence,
-        modulus_origin,
-        path_sentence,
-    )
-
-    origin = modulus_origin(Branch.read(values["branch_folder"]))
-    return "\n".join(filter(None, (
-        path_sentence(values), certificate_sentence(values), beyond_sentence(values),
-        "" if origin == "estimated" else f"All this holds for Young's modulus as {origin}.")))
-
-
-STAGE = StageDescription(
-    "plan", 100, by_name(plan, folder="branch_folder", cell_file="cell"), PlanInputs, PlanSettings,
-    ParallelOptions, key="plan:{name}", result=Plan, reads=("mesh.vtu", "energy.npz"),
-    writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
-            "plans/{name}-motion.csv", "plans/{name}-setpoints.csv", "plans/{name}-trees.csv",
-            "plans/{name}-damage.csv", "plans/{name}-bound.npz", "frames/{name}.pc2",
-            "frames/{name}.json", "frames/{name}.npz"), found=(_found_lines,),
-    then="limber report {branch_folder}", step="plan", label="Plan Path")

@@ -1,4 +1,4 @@
-"""Import a recording of a pull into the branch folder."""
+"""Stage ``import-pull``, and a pull's result."""
 
 from __future__ import annotations
 
@@ -8,38 +8,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from limber.core.errors import InputError
 from limber.core.files.atomic import file_digest
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups
 from limber.geometry.io.formats import listed
 from limber.recordings.recording_formats import RECORDINGS, recording_format
 from limber.recordings.settings import ImportSettings
-from limber.stages.inputs import BranchInputs, RunOptions, argument, required
-from limber.stages.registry import StageDescription
 from limber.stages.result import FORCE, POSE, Picture, Result, frozen, of_files, shown
+from limber.stages.stage import About, BranchStage, Repeatable, argument, given, required
 from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.recordings.import_request import BranchFrame, RobotKnown
     from limber.results.report.section import Section
-
-
-class ImportInputs(BranchInputs):
-    """A branch folder, a recording, and its new name."""
-
-    groups: ClassVar[Groups] = {"input": ("source",), "output": ("name",),
-                               "simulation": ("swing",)}
-
-    source: Path = argument(f"A recording: {listed(RECORDINGS.readers())}.")
-    name: str = required("Name of the pull.", "pull-1")
-    swing: bool = Field(
-        False, description="The branch is released without a robot. Markers with --weight or "
-        "--load become a pull for `limber swing`. Other records (accelerometer, strain gauge, "
-        "video track, markers of a plucked branch) are evaluated by `limber vibration`.",
-        json_schema_extra={"switch": True})
 
 
 class Pull(Result):
@@ -100,54 +82,92 @@ class Pull(Result):
         super().illustrate(section, branch, key)
 
 
-def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSettings, *,
-                force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Import a recording into ``pulls/NAME`` of a branch folder.
+def _moved(values: Mapping[str, Any]) -> str | None:
+    """Report how far the points of a load's recording moved."""
+    if "displacement_m" not in values:
+        return None
+    farthest = float(np.linalg.norm(values["displacement_m"], axis=-1).max())
+    return f"The points moved by up to {1e3 * farthest:.3g} mm under the load."
 
-    Returns:
-        ``pull``, ``kind`` and the result of :func:`~.importing.pulls.import_recording`.
 
-    Raises:
-        InputError: SOURCE cannot be read as the stated kind.
-    """
+class ImportPull(ImportSettings, Repeatable, BranchStage):
+    """Import a recording of a pull into the branch folder."""
+
+    about = About(
+        "import-pull", 50, Pull, key="pull:{name}", writes=("pulls/{name}/",),
+        found=("Pull {pull} ({kind}): {frame_count} frames of {point_count} points.", _moved,
+               "Force over displacement: {slope_n_per_m:.3g} N/m."),
+        then="limber estimate {branch_folder}", step="pulls", label="Import Pull")
+
+    source: Path = argument(f"A recording: {listed(RECORDINGS.readers())}.")
+    name: str = required("Name of the pull.", "pull-1", group="output")
+    swing: bool = given(
+        "The branch is released without a robot. Markers with --weight or --load become a pull for "
+        "`limber swing`. Other records (accelerometer, strain gauge, video track, markers of a "
+        "plucked branch) are evaluated by `limber vibration`.", False, group="simulation",
+        switch=True)
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Import a recording into ``pulls/NAME`` of a branch folder.
+
+        Returns:
+            ``pull``, ``kind`` and the result of
+            :func:`limber.recordings.importing.import_recording`; of a swing under an unknown load
+            that of :class:`.FitVibration`.
+
+        Raises:
+            InputError: the recording cannot be read as the stated kind.
+        """
+        if not self.swing:
+            return _imported(self, progress)
+        if self.weight is not None or self.load is not None:
+            return _imported(self.model_copy(update={"motion": "swing"}), progress)
+        # The load is unknown: the frequencies determine the modulus, positions do not.
+        from limber.stages.moduli.vibration import FitVibration
+
+        fitted = FitVibration(branch_folder=self.branch_folder, record=self.source,
+                              rate_hz=self.rate_hz, force=self.force)
+        return fitted.run(progress) | {"kind": "ringing"}
+
+
+def _imported(asked: ImportPull, progress: Progress) -> dict[str, Any]:
     from limber.recordings.import_request import BranchFrame, ImportRequest
     from limber.recordings.importing import import_recording
 
-    source = Path(source)
+    source, name = asked.source, asked.name
     if not source.exists():
         raise InputError(f"There is no {source}.", "A recording was expected.", "Check the path.")
-    kind = RECORDINGS.of(source).name if settings.kind == "auto" else settings.kind
+    kind = RECORDINGS.of(source).name if asked.kind == "auto" else asked.kind
     is_force = recording_format(kind).holds == "force"
-    given = settings
-    settings, robot = _of_cell(given)
-    branch = (Branch.create if is_force else Branch.open)(branch_folder)
-    key, digests = f"pull:{name}", {"source": _digest(source)}
+    settings, robot = _of_cell(asked)
+    branch = (Branch.create if is_force else Branch.open)(asked.branch_folder)
+    digests = {"source": _digest(source)}
     for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
                           ("yolo", settings.yolo_weights), ("cell", settings.cell),
                           ("pull_toml", settings.pull_toml)):
         if named and named.is_file():
             digests[key_of] = _digest(named)
-    if not force and branch.is_current(key, settings, digests=digests):
-        return branch.manifest.stages[key].result
-    with branch.stage(key, settings, digests=digests) as stage:
+    if settings.is_kept(branch, digests=digests):
+        return branch.manifest.stages[asked.entry].result
+    with branch.stage(asked.entry, settings, digests=digests) as stage:
         prefix = f"pulls/{name}/"
         for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
             stage.remove(old)
         folder = stage.path(prefix + "pull.toml").parent
         is_bare = is_force and not branch.has("mesh.vtu")
         frame = BranchFrame() if is_bare else _frame(branch, settings)
-        in_branch = settings.model_copy(update=_poses_in_branch(given, branch))
+        in_branch = settings.model_copy(update=_poses_in_branch(asked, branch))
         stage.result.update(import_recording(kind, ImportRequest(
             source, folder, name, in_branch, frame, robot, progress)))
         stage.result |= {"pull": name, "kind": kind}
     return stage.result
 
 
-def _poses_in_branch(given: ImportSettings, branch: Branch) -> dict[str, tuple[float, ...]]:
+def _poses_in_branch(asked: ImportPull, branch: Branch) -> dict[str, tuple[float, ...]]:
     """The poses of frames that the user gave, in the branch's frame."""
     poses = {name: np.array(pose) for name in ("frame_pose", "marker_frame")
-             if (pose := getattr(given, name)) is not None}
-    if given.coordinates == "branch" or not poses:
+             if (pose := getattr(asked, name)) is not None}
+    if asked.coordinates == "branch" or not poses:
         return {}
     from limber.core.numerics.rigid import composed, rotation_vector
 
@@ -157,7 +177,7 @@ def _poses_in_branch(given: ImportSettings, branch: Branch) -> dict[str, tuple[f
                    *composed(turn, pose[3:]).tolist()) for name, pose in poses.items()}
 
 
-def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | None]:
+def _of_cell(settings: ImportPull) -> tuple[ImportPull, RobotKnown | None]:
     """The settings with the cell's base, and the cell's data on its robot."""
     if settings.cell is None:
         return settings, None
@@ -210,38 +230,3 @@ def _digest(path: Path) -> str:
         if file.is_file():
             joined.update(file.relative_to(path).as_posix().encode() + file_digest(file).encode())
     return joined.hexdigest()
-
-
-def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    if inputs.swing and settings.weight is None and settings.load is None:
-        # The load is unknown: the frequencies determine the modulus, positions do not.
-        from limber.stages.moduli.vibration import VibrationSettings, vibration
-
-        vibration_result = vibration(
-            inputs.branch_folder, inputs.source, VibrationSettings(rate_hz=settings.rate_hz),
-            force=options.force, progress=progress)
-        return vibration_result | {"kind": "ringing"}
-    if inputs.swing:
-        settings = settings.model_copy(update={"motion": "swing"})
-    return import_pull(inputs.branch_folder, inputs.source, inputs.name, settings,
-                       force=options.force, progress=progress)
-
-
-def _moved(values: Mapping[str, Any]) -> str | None:
-    """Report how far the points of a load's recording moved."""
-    if "displacement_m" not in values:
-        return None
-    farthest = float(np.linalg.norm(values["displacement_m"], axis=-1).max())
-    return f"The points moved by up to {1e3 * farthest:.3g} mm under the load."
-
-
-STAGE = StageDescription(
-    "import-pull", 50, run, ImportInputs, ImportSettings, RunOptions, key="pull:{name}",
-    result=Pull,
-    writes=("pulls/{name}/",),
-    found=("Pull {pull} ({kind}): {frame_count} frames of {point_count} points.",
-           _moved,
-           "Force over displacement: {slope_n_per_m:.3g} N/m."),
-    then="limber estimate {branch_folder}", step="pulls", label="Import Pull")

@@ -1,4 +1,4 @@
-"""Record a pull with a robot, under the guard."""
+"""Stage ``record``."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from pydantic import Field
 
 from limber.core.errors import InputError, LimberError, Option, SafetyStop, Text, WorkError
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
+from limber.core.settings import Groups
 from limber.robot.operator_decisions import AfterStop, grip, require_confirmation, retreat_if_chosen
-from limber.stages.inputs import NOT_KEPT, BranchInputs, by_name, required
 from limber.stages.pulls.import_pull import Pull
-from limber.stages.registry import StageDescription
+from limber.stages.stage import About, BranchStage, given, option, required
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -35,28 +34,24 @@ _FEWEST_IMAGES = 2  # of a pull that is observed
 _SETTLE_SECONDS = 0.5  # until the branch rests in the closed gripper
 
 
-class RecordInputs(BranchInputs):
-    """A branch folder, the robot's cell and the recording's name."""
+class RecordPull(BranchStage):
+    """Record a pull with a robot, under the guard."""
 
-    groups: ClassVar[Groups] = {"input": ("cell",), "output": ("name",)}
-    common = ("name",)
-
-    cell: Path = required("The robot's cell file.", "cell.toml")
-    name: str = Field("pull-1", description="Name of the recording.")
-
-
-class RecordSettings(Settings):
-    """A predefined pull, out and back.
-
-    A branch pulled far sideways without following its arc is stretched. Its force then rises
-    steeply, and the guard pauses.
-    """
-
+    about = About(
+        "record", 55, Pull, key="record:{name}", reads=("skeleton.swc",),
+        writes=("pulls/{name}/",),
+        found=("Pull {pull}: {sample_count:count} samples in {seconds:s}, {marker_frames} marker "
+               "frames, peak force {peak_force_n:N}; ended: {ended}.",
+               "{depth_images} depth images."),
+        then="limber estimate {branch_folder}", step="pulls", label="Record a Pull",
+        moves_robot="always")
     groups: ClassVar[Groups] = {
         "pull": ("direction", "distance", "shape", "waypoints", "suggested", "speed", "cycles",
                  "pause")}
     common = ("direction", "distance")
 
+    cell: Path = required("The robot's cell file.", "cell.toml")
+    name: str = given("Name of the recording.", "pull-1", group="output", common=True)
     direction: tuple[float, float, float] = Field(
         (1.0, 0.0, 0.0), description="Direction of the pull in the branch's frame; its length is "
                                      "ignored.")
@@ -74,89 +69,83 @@ class RecordSettings(Settings):
     speed: float = Field(0.03, gt=0, le=0.25, description="Speed of the gripper [m/s].")
     cycles: int = Field(1, ge=1, le=20, description="Number of times out and back.")
     pause: float = Field(0.5, ge=0, le=10, description="Time at rest at each end [s].")
+    confirm: str | None = option(
+        "The recording's name, to confirm that the robot may move. Default: ask at the terminal.",
+        common=True, panel=False)
+    markers: int | None = option(
+        "Port at the robot's address where a tracker sends observed points as JSON lines (the "
+        "virtual robot's is 63400).", limits={"ge": 1, "le": 65535})
+    realsense: bool = option(
+        "Record depth images with the connected RealSense camera, which stands still at the pose "
+        "of [camera] in the cell file. `limber estimate` tracks the control points in them.", False,
+        switch=True)
+    after_stop: AfterStop = option(
+        "What to do after a stop. ask: ask at the terminal, or hold without one.", "ask",
+        panel=False)
+    recover: bool = option(
+        "Move nothing, and recover an interrupted recording of this name.", False, switch=True)
 
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Record a predefined pull, out and back.
 
-class RecordOptions(Settings):
-    """Options of a recording's run."""
+        The sensor is tared with the gripper empty. The gripper closes and nudges the branch across
+        the pull, which shows a sensor whose axes are wrong; then it pulls and returns. Every sample
+        of the pull is written to ``robot.csv`` at once; after a kill or a stop at most the last
+        second is missing. A branch pulled far sideways without following its arc is stretched; its
+        force then rises steeply, and the guard pauses.
 
-    groups: ClassVar[Groups] = {"running": (
-        "confirm", "markers", "realsense", "after_stop", "recover")}
-    common = ("confirm",)
+        Returns:
+            ``ended`` (``reached`` or the reason of a stop), ``after_stop`` (after a stop, as
+            :func:`limber.robot.operator_decisions.retreat_if_chosen` returns it),
+            ``sample_count``, ``seconds``, ``peak_force_n``, ``marker_frames``.
 
-    confirm: str | None = Field(
-        None, description="The recording's name, to confirm that the robot may move. Default: ask "
-        "at the terminal.", json_schema_extra=NOT_KEPT)
-    markers: int | None = Field(
-        None, ge=1, le=65535, description="Port at the robot's address where a tracker sends "
-        "observed points as JSON lines (the virtual robot's is 63400).")
-    realsense: bool = Field(
-        False, description="Record depth images with the connected RealSense camera, which stands "
-        "still at the pose of [camera] in the cell file. `limber estimate` tracks the control "
-        "points in them.", json_schema_extra={"switch": True})
-    after_stop: AfterStop = Field(
-        "ask", description="What to do after a stop. ask: ask at the terminal, or hold without "
-                           "one.",
-        json_schema_extra=NOT_KEPT)
-    recover: bool = Field(False, description="Move nothing, and recover an interrupted recording "
-                          "of this name.", json_schema_extra={"switch": True})
+        Raises:
+            InputError: cell and branch do not belong together, or the user did not confirm.
+            SafetyStop: the guard stopped the pull; the recording so far is nevertheless in the
+                folder.
+        """
+        from limber.cell.cell_file import check_branch, read_cell, require_payload
+        from limber.cell.obstacles import cell_obstacles
+        from limber.cell.reach_and_collision import blocked_by
+        from limber.robot.robot_state import require_weighed
 
-
-def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
-           options: RecordOptions, *, progress: Progress = SILENT) -> dict[str, Any]:
-    """Record a pull.
-
-    The sensor is tared with the gripper empty. The gripper closes and nudges the branch across the
-    pull, which shows a sensor whose axes are wrong; then it pulls and returns. Every sample of the
-    pull is written to ``robot.csv`` at once; after a kill or a stop at most the last second is
-    missing.
-
-    Returns:
-        ``ended`` (``reached`` or the reason of a stop), ``after_stop`` (after a stop, as
-        :func:`limber.robot.operator_decisions.retreat_if_chosen` returns it), ``sample_count``,
-        ``seconds``, ``peak_force_n``, ``marker_frames``.
-
-    Raises:
-        InputError: cell and branch do not belong together, or the user did not confirm.
-        SafetyStop: the guard stopped the pull; the recording so far is nevertheless in the folder.
-    """
-    from limber.cell.cell_file import check_branch, read_cell, require_payload
-    from limber.cell.obstacles import cell_obstacles
-    from limber.cell.reach_and_collision import blocked_by
-    from limber.robot.robot_state import require_weighed
-
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
-        raise InputError(Text(Option("name"), f" {name!r} cannot name a recording."),
-                         "The name becomes a folder's name.", "Use letters, digits, dash and dot.")
-    branch, cell = Branch.open(folder), read_cell(cell_file)
-    if warning := check_branch(cell, branch.uuid, folder):
-        progress.warn(warning)
-    if options.recover:
-        if branch.growing(f"pulls/{name}") and not _left_samples(branch, name):
-            raise InputError(f"The recording {name} was interrupted before its pull began.",
-                             "There is nothing to recover.", "Record it again; its name is free.")
-        return _finish(branch, name, settings, {"ended": "recovered after an interruption"})
-    if branch.has(f"pulls/{name}/pull.toml"):
-        raise InputError(f"{folder} already has a recording {name}.",
-                         "A recording is never overwritten.", "Give another ", Option("name"), ".")
-    if _left_samples(branch, name):
-        raise InputError(f"A recording {name} was interrupted.", "It would be lost.",
-                         "Recover it with ", Option("recover", True), ", or give another ",
-                         Option("name"), ".")
-    require_payload(cell)
-    require_weighed(cell)
-    blocked = blocked_by(cell, cell_obstacles(cell, cell_file.parent))
-    require_confirmation(name, options.confirm, cell, progress)
-    with branch.writing(f"the recording {name}"):
-        _remove_empty(branch, name)
-        ended = _recorded(branch, cell, name, settings, options, blocked, progress)
-        # Nothing is recorded of a stop before the pull: the name stays free.
-        result = _finish(branch, name, settings, ended) if ended["sample_count"] else ended
-    if ended["ended"] != "reached":
-        raise SafetyStop(f"The recording was stopped: {ended['ended']}.",
-                         f"{ended['after_stop']['outcome']} {result['sample_count']} samples are "
-                         f"in pulls/{name}.",
-                         "Check the branch and the robot before anything moves.", result=result)
-    return result
+        name = self.name
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
+            raise InputError(Text(Option("name"), f" {name!r} cannot name a recording."),
+                             "The name becomes a folder's name.",
+                             "Use letters, digits, dash and dot.")
+        branch, cell = Branch.open(self.branch_folder), read_cell(self.cell)
+        if warning := check_branch(cell, branch.uuid, self.branch_folder):
+            progress.warn(warning)
+        if self.recover:
+            if branch.growing(f"pulls/{name}") and not _left_samples(branch, name):
+                raise InputError(f"The recording {name} was interrupted before its pull began.",
+                                 "There is nothing to recover.",
+                                 "Record it again; its name is free.")
+            return _finish(branch, self, {"ended": "recovered after an interruption"})
+        if branch.has(f"pulls/{name}/pull.toml"):
+            raise InputError(f"{self.branch_folder} already has a recording {name}.",
+                             "A recording is never overwritten.", "Give another ",
+                             Option("name"), ".")
+        if _left_samples(branch, name):
+            raise InputError(f"A recording {name} was interrupted.", "It would be lost.",
+                             "Recover it with ", Option("recover", True), ", or give another ",
+                             Option("name"), ".")
+        require_payload(cell)
+        require_weighed(cell)
+        blocked = blocked_by(cell, cell_obstacles(cell, self.cell.parent))
+        require_confirmation(name, self.confirm, cell, progress)
+        with branch.writing(f"the recording {name}"):
+            _remove_empty(branch, name)
+            ended = _recorded(branch, cell, self, blocked, progress)
+            # Nothing is recorded of a stop before the pull: the name stays free.
+            result = _finish(branch, self, ended) if ended["sample_count"] else ended
+        if ended["ended"] != "reached":
+            raise SafetyStop(f"The recording was stopped: {ended['ended']}.",
+                             f"{ended['after_stop']['outcome']} {result['sample_count']} samples "
+                             f"are in pulls/{name}.",
+                             "Check the branch and the robot before anything moves.", result=result)
+        return result
 
 
 def _left_samples(branch: Branch, name: str) -> bool:
@@ -174,18 +163,19 @@ def _remove_empty(branch: Branch, name: str) -> None:
             file.unlink()
 
 
-def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
-              options: RecordOptions, blocked: Blocked, progress: Progress) -> dict[str, Any]:
+def _recorded(branch: Branch, cell: Cell, asked: RecordPull, blocked: Blocked,
+              progress: Progress) -> dict[str, Any]:
     from limber.robot.driver.link import LiveForce, RobotLink
     from limber.robot.recorder import PullRecorder, off_axis
     from limber.stages.pulls.record_nudge import nudge_and_checks, nudged
     from limber.stages.pulls.record_observers import Observers
     from limber.stages.pulls.record_path import grasp_point
 
+    name = asked.name
     stream = branch.stream(f"pulls/{name}/robot.csv")
     entry_lines = branch.stream(f"pulls/{name}/pull.toml")
-    observers = Observers(branch, cell, name, stream.path.parent, options.markers,
-                          options.realsense)
+    observers = Observers(branch, cell, name, stream.path.parent, asked.markers,
+                          asked.realsense)
     recorders: list[PullRecorder] = []
     try:
         progress(0.02, "connecting")
@@ -207,7 +197,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             recorder = PullRecorder(stream, point, cell.tool.compliance_m_per_n)
             recorders.append(recorder)
             # Before the tare: during long work the sensor would drift.
-            trajectory = _pull(branch, cell, point, sample, settings, blocked,
+            trajectory = _pull(branch, cell, point, sample, asked, blocked,
                                progress.part(0.02, 0.1))
             across, predicted = nudge_and_checks(branch, cell, point, sample, trajectory, blocked,
                                                  progress.part(0.08, 0.1))
@@ -221,7 +211,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                 event = nudged(link, live, across, doubts)
                 if event["event"] != "reached":
                     return {"ended": event["reason"], "after_stop": retreat_if_chosen(
-                        cell, link, options.after_stop, progress), "peak_force_n": 0.0,
+                        cell, link, asked.after_stop, progress), "peak_force_n": 0.0,
                         "sample_count": 0, "warnings": list(link.warnings)}
             _write_entry(entry_lines, cell, point, tared, trajectory.duration, observers)
             recorder.close_gripper()
@@ -238,7 +228,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                 grip(cell, link, close=False, progress=progress)
             else:
                 observers.end(recorder, progress)
-                ended["after_stop"] = retreat_if_chosen(cell, link, options.after_stop, progress)
+                ended["after_stop"] = retreat_if_chosen(cell, link, asked.after_stop, progress)
         return ended | {"peak_force_n": recorder.peak_force, "sample_count": recorder.count,
                         "warnings": list(link.warnings)}
     finally:
@@ -291,7 +281,7 @@ def _watched(link: RobotLink, observers: Observers, recorder: PullRecorder,
 
 
 def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
-          settings: RecordSettings, blocked: Blocked, progress: Progress) -> Trajectory:
+          asked: RecordPull, blocked: Blocked, progress: Progress) -> Trajectory:
     """The motion of the gripper from its position in a sample of the robot."""
     from limber.core.numerics.rigid import matrices
     from limber.robot.motion.trajectory import speed_within
@@ -302,30 +292,30 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
         waypoint_path,
     )
 
-    direction, distance = np.array(settings.direction, float), settings.distance
-    if settings.suggested:
+    direction, distance = np.array(asked.direction, float), asked.distance
+    if asked.suggested:
         direction, distance = suggested_pull(branch, point)
     length = np.linalg.norm(direction)
-    if length < 1e-9 and settings.waypoints is None:
+    if length < 1e-9 and asked.waypoints is None:
         raise InputError(Text(Option("direction"), " is 0 0 0."), "It has no direction.",
                          "Give a direction.")
-    if settings.speed > cell.limits.speed_m_s:
-        raise InputError(Text(Option("speed"), f" {settings.speed:g} exceeds the cell's "
+    if asked.speed > cell.limits.speed_m_s:
+        raise InputError(Text(Option("speed"), f" {asked.speed:g} exceeds the cell's "
                               f"{cell.limits.speed_m_s:g} m/s."), "The guard would slow it down.",
                          "Reduce ", Option("speed"), ", or raise limits.speed_m_s in the cell "
                          "file.")
-    speed = speed_within(cell, settings.speed, progress.warn)
+    speed = speed_within(cell, asked.speed, progress.warn)
     gripper, joints = sample[1:7], sample[19:25]
     here = matrices(gripper)
-    if settings.waypoints is not None:
-        frames = waypoint_path(Path(settings.waypoints), gripper)
-    elif settings.shape == "arc":
+    if asked.waypoints is not None:
+        frames = waypoint_path(Path(asked.waypoints), gripper)
+    elif asked.shape == "arc":
         frames = arc_path(branch, point, direction, distance, progress) @ here
     else:
         frames = np.array([here, here])
         frames[1, :3, 3] += distance * direction / length
-    return there_and_back(cell, frames, speed=speed, cycles=settings.cycles,
-                          pause=settings.pause, start=joints, blocked=blocked)
+    return there_and_back(cell, frames, speed=speed, cycles=asked.cycles,
+                          pause=asked.pause, start=joints, blocked=blocked)
 
 
 def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, Any],
@@ -348,18 +338,18 @@ def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, 
         lines.append(line)
 
 
-def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str, Any],
-            ) -> dict[str, Any]:
+def _finish(branch: Branch, asked: RecordPull, ended: dict[str, Any]) -> dict[str, Any]:
     """Import the streams into the branch folder."""
     from limber.recordings.time_series import read_stream
 
+    name = asked.name
     prefix = f"pulls/{name}/"
     left = [file for file in branch.streams() if file.startswith(prefix)]
     if f"{prefix}robot.csv" not in left or f"{prefix}pull.toml" not in left:
         raise InputError(f"There is no interrupted recording {name}.",
                          f"Interrupted recordings: {', '.join(branch.streams()) or 'none'}.",
                          "Give the name of one of those.")
-    with branch.stage(f"record:{name}", settings) as stage:
+    with branch.stage(f"record:{name}", asked) as stage:
         for file in left:
             stage.adopt(file)
         samples = read_stream(stage.path(f"{prefix}robot.csv"))
@@ -377,14 +367,3 @@ def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str
              "depth_images": images or None,
              "seconds": float(samples.times[-1]), "peak_force_n": float(force.max())} | ended)
     return stage.result
-
-
-STAGE = StageDescription(
-    "record", 55, by_name(record, folder="branch_folder", cell_file="cell"), RecordInputs,
-    RecordSettings, RecordOptions, key="record:{name}", result=Pull,
-    reads=("skeleton.swc",), writes=("pulls/{name}/",),
-    found=("Pull {pull}: {sample_count:count} samples in {seconds:s}, {marker_frames} marker "
-           "frames, peak force {peak_force_n:N}; ended: {ended}.",
-           "{depth_images} depth images."),
-    then="limber estimate {branch_folder}", step="pulls", label="Record a Pull",
-    moves_robot="always")

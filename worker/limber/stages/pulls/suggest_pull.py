@@ -1,15 +1,8 @@
-"""Suggest where to hold and how far to pull next to learn most.
-
-Pulls with several positions, directions and lengths are simulated on the branch as estimated. Their
-information on Young's modulus, with the errors of cell and sensors that the last pull stated, is
-compared with the strain they cause in the branch. With ``--plan`` the result also states whether
-another pull is worthwhile for that plan: whether it would change what the plan may do.
-"""
+"""Stage ``suggest-pull``."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -19,11 +12,10 @@ from limber.core.errors import Option, Text
 from limber.core.json_values import plain
 from limber.core.labels import table_of
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
+from limber.core.settings import Groups
 from limber.estimation.settings import EstimateSettings
-from limber.stages.inputs import BranchInputs, ParallelOptions, by_name
-from limber.stages.registry import StageDescription
 from limber.stages.result import Result, Table, Vector, filled
+from limber.stages.stage import About, BranchStage, ParallelStage, given
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -37,26 +29,6 @@ CANDIDATES = (0.5, 0.67, 0.8, 0.92)
 _CONFIDENCE = 0.95  # of plans made without one
 _MATTERS = 1.05  # factor on the usable part of a limit above which a pull changes a plan
 _USED = 0.95  # fraction of a limit with the confidence: a nearer plan is held back by it
-
-
-class SuggestPullInputs(BranchInputs):
-    """A branch folder, and a plan in it."""
-
-    groups: ClassVar[Groups] = {"input": ("plan",)}
-    common = ("plan",)
-
-    plan: str | None = Field(None, description=(
-        "Name of a plan. The result states whether another pull is worthwhile for it."))
-
-
-class SuggestPullSettings(Settings):
-    """Limits of a pull."""
-
-    groups: ClassVar[Groups] = {"limits": ("max_strain", "max_force")}
-
-    max_strain: float = Field(0.01, gt=0, lt=1, description=(
-        "Largest principal strain during a pull (0.01 is 1 %)."))
-    max_force: float | None = Field(None, gt=0, description="Largest force of the gripper [N].")
 
 
 class SuggestedPull(Result):
@@ -95,51 +67,76 @@ class SuggestedPulls(Result):
              [["yes" if plan["worth"] else "no"], [plan["why"]]]) if plan else ("", []))
 
 
-def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: str | None = None,
-                 workers: int | None = None, force: bool = False, progress: Progress = SILENT,
-                 ) -> dict[str, Any]:
-    """Write ``suggested_pull.json``: the best pull and others, and the information of each.
+class SuggestPull(ParallelStage, BranchStage):
+    """Suggest where to hold and how far to pull next to learn most.
 
-    Returns:
-        ``best`` and ``others``, each with ``grasp_fraction``, ``grasp_point_m``, ``end_m``,
-        ``travel_m``, ``peak_strain``, ``peak_force_n``, ``bits``, ``bits_per_percent_strain`` and
-        ``young_deviation`` (of log E at the control points, expected after the pull);
-        ``most_telling``, the most informative of them; ``instead``, other actions that narrow the
-        intervals, as of the estimate; ``young_deviation_now``; ``too_much_count``
-        and ``failed_count``; ``plan`` with ``worth`` and ``why`` if one is named.
-
-    Raises:
-        InputError: there is no such plan. WorkError: no pull keeps the limits.
+    Pulls with several positions, directions and lengths are simulated on the branch as estimated.
+    Their information on Young's modulus, with the errors of cell and sensors that the last pull
+    stated, is compared with the strain they cause in the branch. With ``--plan`` the result also
+    states whether another pull is worthwhile for that plan: whether it would change what the plan
+    may do.
     """
-    from limber.estimation.next_pull import suggest
 
-    branch = Branch.open(branch_folder)
-    branch.require("mesh.vtu", "reconstruct")
-    reads = [file for file in ("mesh.vtu", "skeleton.swc", "estimate.json") if branch.has(file)]
-    if plan is not None:
-        branch.require(f"plans/{plan}.json", "plan")
-        reads.append(f"plans/{plan}.json")
-    if not force and branch.is_current("suggest-pull", settings, reads=reads):
+    about = About(
+        "suggest-pull", 78, SuggestedPulls, key="suggest-pull",
+        reads=("mesh.vtu", "skeleton.swc", "estimate.json", "plans/"),
+        writes=("suggested_pull.json",),
+        found=("Best: hold the branch at {best[grasp_fraction]:.2f} of its main path and move it "
+               "by {best[travel_m]:m}, with up to {best[peak_force_n]:N}.",),
+        then="limber record {branch_folder} --suggested --cell cell.toml", step="estimate",
+        label="Suggest the Next Pull")
+    groups: ClassVar[Groups] = {"limits": ("max_strain", "max_force")}
+
+    plan: str | None = given(
+        "Name of a plan. The result states whether another pull is worthwhile for it.", common=True)
+    max_strain: float = Field(0.01, gt=0, lt=1, description=(
+        "Largest principal strain during a pull (0.01 is 1 %)."))
+    max_force: float | None = Field(None, gt=0, description="Largest force of the gripper [N].")
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Write ``suggested_pull.json``: the best pull and others, and the information of each.
+
+        Returns:
+            ``best`` and ``others``, each with ``grasp_fraction``, ``grasp_point_m``, ``end_m``,
+            ``travel_m``, ``peak_strain``, ``peak_force_n``, ``bits``, ``bits_per_percent_strain``
+            and ``young_deviation`` (of log E at the control points, expected after the pull);
+            ``most_telling``, the most informative of them; ``instead``, other actions that narrow
+            the intervals, as of the estimate; ``young_deviation_now``; ``too_much_count`` and
+            ``failed_count``; ``plan`` with ``worth`` and ``why`` if one is named.
+
+        Raises:
+            InputError: there is no such plan.
+            WorkError: no pull keeps the limits.
+        """
+        from limber.estimation.next_pull import suggest
+
+        branch = Branch.open(self.branch_folder)
+        branch.require("mesh.vtu", "reconstruct")
+        reads = [file for file in ("mesh.vtu", "skeleton.swc", "estimate.json") if branch.has(file)]
+        if self.plan is not None:
+            branch.require(f"plans/{self.plan}.json", "plan")
+            reads.append(f"plans/{self.plan}.json")
+        if self.is_kept(branch, reads=reads):
+            return branch.manifest.stages["suggest-pull"].result
+        with branch.stage("suggest-pull", self, reads=reads) as stage:
+            subject, values, known = _state(branch)
+            cell = _cell(branch)
+            most = np.inf if self.max_force is None else self.max_force
+            found = suggest(subject, values, known, cell, CANDIDATES, max_force=most,
+                            max_strain=self.max_strain, workers=self.workers,
+                            progress=progress.part(0.0, 0.8))
+            stage.result.update(_summary(found, known) | {"instead": _instead(branch)})
+            if self.plan is not None:
+                progress(0.8, "the plan under other moduli")
+                stage.result["plan"] = {"name": self.plan} | _for_plan(
+                    branch, self.plan, known, known.after(found.pulls[0].information),
+                    progress.part(0.8, 1.0))
+            stage.path(FILE).write_text(json.dumps(plain(stage.result), indent=1) + "\n",
+                                        encoding="utf-8")
         return branch.manifest.stages["suggest-pull"].result
-    with branch.stage("suggest-pull", settings, reads=reads) as stage:
-        subject, values, known = _state(branch, settings)
-        cell = _cell(branch)
-        most = np.inf if settings.max_force is None else settings.max_force
-        found = suggest(subject, values, known, cell, CANDIDATES, max_force=most,
-                        max_strain=settings.max_strain, workers=workers,
-                        progress=progress.part(0.0, 0.8))
-        stage.result.update(_summary(found, known) | {"instead": _instead(branch)})
-        if plan is not None:
-            progress(0.8, "the plan under other moduli")
-            stage.result["plan"] = {"name": plan} | _for_plan(
-                branch, plan, known, known.after(found.pulls[0].information),
-                progress.part(0.8, 1.0))
-        stage.path(FILE).write_text(json.dumps(plain(stage.result), indent=1) + "\n",
-                                    encoding="utf-8")
-    return branch.manifest.stages["suggest-pull"].result
 
 
-def _state(branch: Branch, settings: SuggestPullSettings) -> tuple[Subject, Values, Known]:
+def _state(branch: Branch) -> tuple[Subject, Values, Known]:
     """Return the branch, its moduli if known, and their uncertainty."""
     from dataclasses import replace
 
@@ -259,14 +256,3 @@ def verdict(now: Any, after: Any, confidence: float) -> tuple[bool, str]:
                       f"pull {100 * (ratio - 1):.0f} % more of that limit could be used.")
     return False, (f"The plan keeps its limits {sure}, and {words} restricts it. This pull would "
                    f"make only {100 * (ratio - 1):.1f} % more of that limit usable.")
-
-
-STAGE = StageDescription(
-    "suggest-pull", 78, by_name(suggest_pull), SuggestPullInputs, SuggestPullSettings,
-    ParallelOptions, key="suggest-pull",
-    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "plans/"), writes=("suggested_pull.json",),
-    result=SuggestedPulls,
-    found=("Best: hold the branch at {best[grasp_fraction]:.2f} of its main path and move it by "
-           "{best[travel_m]:m}, with up to {best[peak_force_n]:N}.",),
-    then="limber record {branch_folder} --suggested --cell cell.toml", step="estimate",
-    label="Suggest the Next Pull")

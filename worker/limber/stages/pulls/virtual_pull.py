@@ -1,81 +1,84 @@
-"""Simulate a recorded pull with a known Young's modulus and sensor noise."""
+"""Stage ``virtual-pull``."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import Field
 
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups
 from limber.estimation.settings import PullSpec, VirtualPullSettings
-from limber.stages.inputs import BranchInputs, RunOptions, by_name
 from limber.stages.pulls.import_pull import Pull
-from limber.stages.registry import StageDescription
+from limber.stages.stage import About, BranchStage, Repeatable, given
 from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.estimation.simulated_pull import TrueBranch
 
 
-class VirtualPullInputs(BranchInputs):
-    """A branch folder, and the pull's name."""
-
-    groups: ClassVar[Groups] = {"output": ("name",)}
-    common = ("name",)
-
-    name: str = Field("pull-1", description="Name of the pull.")
+def _assumed_line(result: Mapping[str, Any]) -> str | None:
+    return ("Its modulus is assumed: it says nothing of the real branch."
+            if result.get("young_assumed") else None)
 
 
-def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, *,
-                 force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Simulate a pull of a branch and write it as ``pulls/NAME``.
+class VirtualPull(VirtualPullSettings, Repeatable, BranchStage):
+    """Simulate a recorded pull with a known Young's modulus and sensor noise."""
 
-    Returns:
-        ``pull``, ``young_true_pa``, ``young_assumed``, ``control_points_m``, ``frame_count``,
-        ``tet_count`` of the truth's mesh, ``peak_force_n``, ``travel_m``.
+    about = About(
+        "virtual-pull", 52, Pull, key="pull:{name}", reads=("skeleton.swc",),
+        writes=("pulls/{name}/",),
+        found=("Simulated pull {pull}: {travel_m:m} of travel, peak force {peak_force_n:N}, "
+               "{frame_count} frames.", _assumed_line),
+        then="limber estimate {branch_folder}", step="pulls", label="Simulate a Pull")
 
-    Raises:
-        InputError: the branch has no skeleton, or the settings do not fit it.
-        WorkError: the branch cannot be pulled in this way.
-    """
-    from limber.estimation.simulated_pull import simulate_pull, write_depth_frames
-    from limber.recordings.recording import write_pull
+    name: str = given("Name of the pull.", "pull-1", group="output", common=True)
 
-    branch = Branch.open(branch_folder)
-    branch.require("skeleton.swc", "reconstruct")
-    key = f"pull:{name}"
-    body = ("mesh.vtu",) if _is_meshed_body(branch) else ()
-    reads = [file for file in ("skeleton.swc", "cloud.ply", "truth/skeleton.swc",
-                               "truth/truth.json", *body) if branch.has(file)]
-    digests = ({} if settings.cell_errors in ("none", "realistic") else
-               {"cell errors": settings.calibration.model_dump_json()})
-    if not force and branch.is_current(key, settings, reads=reads, digests=digests):
-        return branch.manifest.stages[key].result
-    spec = PullSpec.of(settings)
-    progress(0.02, "meshing the true branch")
-    truth = load_truth(branch, spec)
-    with branch.stage(key, settings, reads=reads, digests=digests) as stage:
-        prefix = f"pulls/{name}/"
-        for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
-            stage.remove(old)
-        folder = stage.path(prefix + "pull.toml").parent
-        pull, displacements = simulate_pull(truth, name, spec, progress=progress.part(0.1, 0.9))
-        write_pull(folder, pull)
-        if settings.camera:
-            write_depth_frames(folder, truth, pull, displacements, spec)
-        reaction = np.linalg.norm(pull.wrenches[:, :3], axis=1)
-        stage.result.update({
-            "pull": name, "young_true_pa": truth.young, "control_points_m": truth.control_points,
-            "young_assumed": truth.is_assumed,
-            "fractions": truth.fractions, "frame_count": len(pull.times),
-            "tet_count": truth.mesh.tet_count, "peak_force_n": reaction.max(),
-            "travel_m": np.linalg.norm(pull.poses[:, :3] - pull.poses[0, :3], axis=1).max()})
-    return stage.result
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Simulate a pull of a branch and write it as ``pulls/NAME``.
+
+        Returns:
+            ``pull``, ``young_true_pa``, ``young_assumed``, ``control_points_m``, ``frame_count``,
+            ``tet_count`` of the truth's mesh, ``peak_force_n``, ``travel_m``.
+
+        Raises:
+            InputError: the branch has no skeleton, or the settings do not fit it.
+            WorkError: the branch cannot be pulled in this way.
+        """
+        from limber.estimation.simulated_pull import simulate_pull, write_depth_frames
+        from limber.recordings.recording import write_pull
+
+        branch = Branch.open(self.branch_folder)
+        branch.require("skeleton.swc", "reconstruct")
+        key, name = self.entry, self.name
+        body = ("mesh.vtu",) if _is_meshed_body(branch) else ()
+        reads = [file for file in ("skeleton.swc", "cloud.ply", "truth/skeleton.swc",
+                                   "truth/truth.json", *body) if branch.has(file)]
+        digests = ({} if self.cell_errors in ("none", "realistic") else
+                   {"cell errors": self.calibration.model_dump_json()})
+        if self.is_kept(branch, reads=reads, digests=digests):
+            return branch.manifest.stages[key].result
+        spec = PullSpec.of(self)
+        progress(0.02, "meshing the true branch")
+        truth = load_truth(branch, spec)
+        with branch.stage(key, self, reads=reads, digests=digests) as stage:
+            prefix = f"pulls/{name}/"
+            for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
+                stage.remove(old)
+            folder = stage.path(prefix + "pull.toml").parent
+            pull, displacements = simulate_pull(truth, name, spec, progress=progress.part(0.1, 0.9))
+            write_pull(folder, pull)
+            if self.camera:
+                write_depth_frames(folder, truth, pull, displacements, spec)
+            reaction = np.linalg.norm(pull.wrenches[:, :3], axis=1)
+            stage.result.update({
+                "pull": name, "young_true_pa": truth.young,
+                "control_points_m": truth.control_points, "young_assumed": truth.is_assumed,
+                "fractions": truth.fractions, "frame_count": len(pull.times),
+                "tet_count": truth.mesh.tet_count, "peak_force_n": reaction.max(),
+                "travel_m": np.linalg.norm(pull.poses[:, :3] - pull.poses[0, :3], axis=1).max()})
+        return stage.result
 
 
 def load_truth(branch: Branch, settings: PullSpec) -> TrueBranch:
@@ -111,16 +114,3 @@ def _is_meshed_body(branch: Branch) -> bool:
     """Whether `limber mesh` made the branch: its own tetrahedra are then the truth."""
     return "mesh" in branch.manifest.stages and branch.has("mesh.vtu") and not branch.has(
         "truth/truth.json")
-
-
-def _assumed_line(result: Mapping[str, Any]) -> str | None:
-    return ("Its modulus is assumed: it says nothing of the real branch."
-            if result.get("young_assumed") else None)
-
-
-STAGE = StageDescription(
-    "virtual-pull", 52, by_name(virtual_pull), VirtualPullInputs, VirtualPullSettings, RunOptions,
-    key="pull:{name}", result=Pull, reads=("skeleton.swc",), writes=("pulls/{name}/",),
-    found=("Simulated pull {pull}: {travel_m:m} of travel, peak force {peak_force_n:N}, "
-           "{frame_count} frames.", _assumed_line),
-    then="limber estimate {branch_folder}", step="pulls", label="Simulate a Pull")

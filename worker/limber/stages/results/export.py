@@ -1,8 +1,4 @@
-"""Export the branch for robot simulators, finite element programs and others.
-
-The format is determined by OUTPUT's suffix. Links and cylinders are in the branch's frame, in
-metres. Modulus and damping are those in the folder, from the last estimate or swing.
-"""
+"""Stage ``export``, and the formats of other programs."""
 
 from __future__ import annotations
 
@@ -15,64 +11,16 @@ from pydantic import Field
 
 from limber.core.errors import InputError
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
+from limber.core.settings import Groups
 from limber.geometry.io.formats import Format, Registry, listed, unknown_suffix
 from limber.geometry.io.skeletons import SKELETONS
-from limber.stages.inputs import BranchInputs, NoOptions, by_name
-from limber.stages.registry import StageDescription
 from limber.stages.result import Written
+from limber.stages.stage import About, BranchStage, required
 from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.geometry.skeleton.skeleton import Skeleton
     from limber.mechanics.model import BranchModel
-
-
-class ExportSettings(Settings):
-    """Discretisation of the branch."""
-
-    groups: ClassVar[Groups] = {"output": ("links", "gravity", "load", "columns")}
-
-    links: int = Field(30, ge=2, le=500, description="Links along the main path (.xml, .urdf).")
-    gravity: bool = Field(True, description="Include the branch's weight, which the springs "
-                                            "carry.")
-    load: tuple[float, float, float] | None = Field(
-        None, description="Force on the tip in the static step of an .inp file [N].")
-    columns: Literal["rtwig", "simpleforest"] = Field(
-        "rtwig", description="Column names of a .csv file.")
-
-
-def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Progress = SILENT,
-           ) -> dict[str, Any]:
-    """Write a branch in another program's format; the folder stays as it is.
-
-    Returns:
-        ``output``, ``format``, and its content: ``link_count``, ``mass_kg`` and
-        ``stiffness_factor``, the scale of the links' springs with which they bend like the mesh; or
-        ``tet_count``, ``node_count`` and ``tip_node``; or those and ``young_pa``, the one modulus
-        that makes the tip as compliant as our mesh; or ``cylinder_count``.
-
-    Raises:
-        InputError: there is no such format, or the file cannot be written. BranchFolderError: the
-            folder lacks mesh or skeleton. MissingDependencyError: USD is not installed.
-    """
-    from limber.core.files.atomic import write_atomically
-
-    branch, chosen = Branch.read(folder), _format_of(output, settings.columns)
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch, f"branch{output.suffix.lower()}")
-        if chosen in SKELETONS.writers():
-            written = _write_skeleton(branch, path, chosen)
-        else:
-            written = EXPORTS.write_as(chosen, branch, path, settings, progress)
-        content = path.read_bytes()
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(output, content)
-    except OSError as error:
-        raise InputError(f"{output} cannot be written ({error.strerror}).",
-                         "The export goes there.", "Choose another location.") from error
-    return {"output": output, "format": output.suffix.lower(), **written}
 
 
 def _format_of(output: Path, columns: str) -> Format:
@@ -92,7 +40,7 @@ def _write_skeleton(branch: Branch, path: Path, chosen: Format) -> dict[str, Any
     return {"cylinder_count": skeleton.node_count - 1}
 
 
-def _write_links(branch: Branch, path: Path, settings: ExportSettings, progress: Progress,
+def _write_links(branch: Branch, path: Path, settings: Export, progress: Progress,
                  ) -> dict[str, Any]:
     from limber.results.exports.rigid_links import matched, mjcf_text, rod_tree, urdf_text
     from limber.store.loading import known_damping, load_branch, load_skeleton, load_targets
@@ -117,7 +65,7 @@ def _write_links(branch: Branch, path: Path, settings: ExportSettings, progress:
             "stiffness_factor": factor, "damping_stiffness_s": damping.stiffness}
 
 
-def _write_elements(branch: Branch, path: Path, settings: ExportSettings, progress: Progress,
+def _write_elements(branch: Branch, path: Path, settings: Export, progress: Progress,
                     ) -> dict[str, Any]:
     from limber.results.exports.volumes import inp_text
     from limber.store.loading import load_branch, load_skeleton
@@ -133,7 +81,7 @@ def _write_elements(branch: Branch, path: Path, settings: ExportSettings, progre
             "tip_node": tip + 1}
 
 
-def _write_body(branch: Branch, path: Path, _settings: ExportSettings, progress: Progress,
+def _write_body(branch: Branch, path: Path, _settings: Export, progress: Progress,
                 ) -> dict[str, Any]:
     from limber.core.optional import require_extra
     from limber.results.exports.volumes import as_deformable, write_usd
@@ -173,21 +121,61 @@ available too.
 """
 
 
-class ExportInputs(BranchInputs):
-    """A branch folder, and the file to write."""
+class Export(BranchStage):
+    """Export the branch for robot simulators, finite element programs and others.
 
-    groups: ClassVar[Groups] = {"output": ("output",)}
+    The format is determined by OUTPUT's suffix. Links and cylinders are in the branch's frame, in
+    metres. Modulus and damping are those in the folder, from the last estimate or swing.
+    """
 
-    output: Path = Field(
-        description="File to write; its suffix says what: "
-        f"{listed([*EXPORTS.writers(), *SKELETONS.writers()])}.",
-        json_schema_extra={"short": "-o", "example": "{stem}.urdf"})
+    about = About(
+        "export", 125, Written, reads=("mesh.vtu", "skeleton.swc"),
+        found=("{link_count} links on springs, {mass_kg:kg}.",
+               "{tet_count:count} tetrahedra, {node_count:count} nodes.",
+               "{cylinder_count:count} cylinders."),
+        step="report", label="Export for Other Programs")
+    groups: ClassVar[Groups] = {"output": ("links", "gravity", "load", "columns")}
 
+    output: Path = required(
+        "File to write; its suffix says what: "
+        f"{listed([*EXPORTS.writers(), *SKELETONS.writers()])}.", "{stem}.urdf", group="output",
+        short="-o")
+    links: int = Field(30, ge=2, le=500, description="Links along the main path (.xml, .urdf).")
+    gravity: bool = Field(True, description="Include the branch's weight, which the springs "
+                                            "carry.")
+    load: tuple[float, float, float] | None = Field(
+        None, description="Force on the tip in the static step of an .inp file [N].")
+    columns: Literal["rtwig", "simpleforest"] = Field(
+        "rtwig", description="Column names of a .csv file.")
 
-STAGE = StageDescription(
-    "export", 125, by_name(export, folder="branch_folder"), ExportInputs, ExportSettings, NoOptions,
-    result=Written, reads=("mesh.vtu", "skeleton.swc"),
-    found=("{link_count} links on springs, {mass_kg:kg}.",
-           "{tet_count:count} tetrahedra, {node_count:count} nodes.",
-           "{cylinder_count:count} cylinders."),
-    step="report", label="Export for Other Programs")
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Write a branch in another program's format; the folder stays as it is.
+
+        Returns:
+            ``output``, ``format``, and its content: ``link_count``, ``mass_kg`` and
+            ``stiffness_factor``, the scale of the links' springs with which they bend like the
+            mesh; or ``tet_count``, ``node_count`` and ``tip_node``; or those and ``young_pa``, the
+            one modulus that makes the tip as compliant as our mesh; or ``cylinder_count``.
+
+        Raises:
+            InputError: there is no such format, or the file cannot be written.
+            BranchFolderError: the folder lacks mesh or skeleton.
+            MissingDependencyError: USD is not installed.
+        """
+        from limber.core.files.atomic import write_atomically
+
+        branch, chosen = Branch.read(self.branch_folder), _format_of(self.output, self.columns)
+        with tempfile.TemporaryDirectory() as scratch:
+            path = Path(scratch, f"branch{self.output.suffix.lower()}")
+            if chosen in SKELETONS.writers():
+                written = _write_skeleton(branch, path, chosen)
+            else:
+                written = EXPORTS.write_as(chosen, branch, path, self, progress)
+            content = path.read_bytes()
+        try:
+            self.output.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(self.output, content)
+        except OSError as error:
+            raise InputError(f"{self.output} cannot be written ({error.strerror}).",
+                             "The export goes there.", "Choose another location.") from error
+        return {"output": self.output, "format": self.output.suffix.lower(), **written}

@@ -1,19 +1,16 @@
-"""Write one HTML page with figures and tables of all results."""
+"""Stage ``report``: one HTML page."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
-
-from pydantic import Field
+from typing import TYPE_CHECKING, Any
 
 from limber.core.files.atomic import file_digest, require_file
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups
-from limber.stages.inputs import BranchInputs, NoSettings, RunOptions, by_name
-from limber.stages.registry import StageDescription, result_kinds, result_of
+from limber.stages.registry import result_kinds, result_of
 from limber.stages.result import Written
 from limber.stages.shape.mesh import MeshNumbers, Shape
+from limber.stages.stage import About, BranchStage, Repeatable, given
 from limber.store import Branch
 from limber.version import VERSION
 
@@ -26,66 +23,63 @@ _ORDER = ("pull", "estimate", "swing", "vibration", "simulate", "load")
 """Results in the order of the page; others follow in that of the stages."""
 
 
-class ReportInputs(BranchInputs):
-    """A branch folder, and a picture of it."""
+class WriteReport(Repeatable, BranchStage):
+    """Write one HTML page with figures and tables of all results."""
 
-    groups: ClassVar[Groups] = {"input": ("picture", "caliper")}
-    common = ("caliper",)
+    about = About(
+        "report", 110, Written, key="report", writes=("report.html",),
+        found=("A page with {figure_count} figures. Open it in a browser.",
+               lambda result: ("Not done yet: " + ", ".join(result["missing"]) + "."
+                               if result["missing"] else None)),
+        step="report", label="Write Report")
 
-    picture: Path | None = Field(
-        None, description="A PNG for the top of the page, such as a render of `limber scene`.")
-    caliper: Path | None = Field(
-        None, description="Measured diameters to compare with the scan's: a CSV with the columns "
-        "along_m (from the root along the main path) and diameter_mm.")
+    picture: Path | None = given(
+        "A PNG for the top of the page, such as a render of `limber scene`.")
+    caliper: Path | None = given(
+        "Measured diameters to compare with the scan's: a CSV with the columns along_m (from the "
+        "root along the main path) and diameter_mm.", common=True)
 
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Write ``report.html`` into a branch folder for the stages that have been run.
 
-def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Path | None = None,
-                 force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Write ``report.html`` into a branch folder for the stages that have been run.
+        Returns:
+            ``report`` (its path), ``figure_count``, ``sections`` and the ``missing`` ones;
+            ``calipers``, the scan's diameters against the measured ones.
 
-    Args:
-        folder: The branch folder.
-        picture: A render of the scene to put at the top, PNG.
-        caliper_path: Measured diameters, see
-            :func:`limber.geometry.skeleton.qsm_tables.read_calipers`.
+        Raises:
+            InputError: the picture or the measured diameters cannot be used.
+        """
+        from limber.geometry.skeleton.qsm_tables import against_calipers, read_calipers
+        from limber.results.report.page import with_picture
+        from limber.results.report.section import read_png
+        from limber.store.loading import load_skeleton
 
-    Returns:
-        ``report`` (its path), ``figure_count``, ``sections`` and the ``missing`` ones;
-        ``calipers``, the scan's diameters against the measured ones.
-
-    Raises:
-        InputError: the picture or the measured diameters cannot be used.
-    """
-    from limber.geometry.skeleton.qsm_tables import against_calipers, read_calipers
-    from limber.results.report.page import with_picture
-    from limber.results.report.section import read_png
-    from limber.store.loading import load_skeleton
-
-    branch = Branch.open(folder)
-    png = None if picture is None else read_png(picture)
-    calipers = [] if caliper_path is None else read_calipers(caliper_path)
-    settings, digests = {"picture": bool(picture)}, _shown(branch, picture, caliper_path)
-    if not force and branch.is_current("report", settings, digests=digests):
+        branch = Branch.open(self.branch_folder)
+        png = None if self.picture is None else read_png(self.picture)
+        calipers = [] if self.caliper is None else read_calipers(self.caliper)
+        settings, digests = {"picture": bool(self.picture)}, _shown(
+            branch, self.picture, self.caliper)
+        if not self.force and branch.is_current("report", settings, digests=digests):
+            return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
+        if not self.force and png and branch.is_current(
+                "report", {"picture": False}, digests=_shown(branch, None, self.caliper)):
+            html = branch.path("report.html").read_text(encoding="utf-8")
+            found = branch.manifest.stages["report"].result
+        else:
+            html, page = page_of(branch, calipers=calipers, progress=progress)
+            found = {"figure_count": sum(len(section.pictures) for section in page),
+                     "sections": [section.title for section in page if not section.missing],
+                     "missing": [section.title for section in page if section.missing]}
+            if calipers:
+                found["calipers"] = against_calipers(load_skeleton(branch), calipers)
+        if png:
+            html = with_picture(html, png)
+            found = found | {"figure_count": found["figure_count"] + 1}
+        with branch.stage("report", settings, digests=digests) as stage:
+            stage.path("report.html").write_text(html, encoding="utf-8")
+            stage.result.update(found)
+        progress(1.0, "written")
         return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
-    if not force and png and branch.is_current(
-            "report", {"picture": False}, digests=_shown(branch, None, caliper_path)):
-        html = branch.path("report.html").read_text(encoding="utf-8")
-        found = branch.manifest.stages["report"].result
-    else:
-        html, page = page_of(branch, calipers=calipers, progress=progress)
-        found = {"figure_count": sum(len(section.pictures) for section in page),
-                 "sections": [section.title for section in page if not section.missing],
-                 "missing": [section.title for section in page if section.missing]}
-        if calipers:
-            found["calipers"] = against_calipers(load_skeleton(branch), calipers)
-    if png:
-        html = with_picture(html, png)
-        found = found | {"figure_count": found["figure_count"] + 1}
-    with branch.stage("report", settings, digests=digests) as stage:
-        stage.path("report.html").write_text(html, encoding="utf-8")
-        stage.result.update(found)
-    progress(1.0, "written")
-    return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
 
 
 def page_of(branch: Branch, *, calipers: "Sequence[Caliper]" = (), progress: Progress = SILENT,
@@ -128,13 +122,3 @@ def _shown(branch: Branch, picture: Path | None, caliper_path: Path | None) -> d
     return {"folder": branch.manifest.content_digest(), "limber": VERSION} | {
         name: file_digest(require_file(path, f"A {name} file"))
         for name, path in outside.items() if path is not None}
-
-
-STAGE = StageDescription(
-    "report", 110, by_name(write_report, folder="branch_folder", caliper_path="caliper"),
-    ReportInputs, NoSettings, RunOptions, key="report",
-    result=Written, writes=("report.html",),
-    found=("A page with {figure_count} figures. Open it in a browser.",
-           lambda result: ("Not done yet: " + ", ".join(result["missing"]) + "."
-                           if result["missing"] else None)),
-    step="report", label="Write Report")

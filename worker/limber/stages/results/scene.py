@@ -1,4 +1,4 @@
-"""Write a Blender scene with the branch, its motion and paths."""
+"""Stage ``scene``."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from pydantic import Field
 from limber.core.errors import Command, InputError, Option, Text, WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, NoOptions, by_name
-from limber.stages.registry import StageDescription
+from limber.core.settings import Groups
 from limber.stages.result import Written
+from limber.stages.stage import About, BranchStage, given
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -24,34 +23,28 @@ _MOVING = (".webp", ".gif", ".png")
 _TURN_SECONDS = 6.0
 
 
-class SceneInputs(BranchInputs):
-    """A branch folder, the robot's cell and the output files."""
+class MakeScene(BranchStage):
+    """Write a Blender scene with the branch, its motion and paths."""
 
-    groups: ClassVar[Groups] = {"input": ("cell",),
-                                "output": ("output", "render", "turntable", "data")}
-    common = ("output", "render")
-
-    cell: Path | None = Field(
-        None, description="The robot's cell file. Its arm, gripper, camera, obstacles and "
-        "workspace are shown as well.")
-
-    output: Path | None = Field(None, description="The .blend to write.",
-                                json_schema_extra={"short": "-o"})
-    render: Path | None = Field(
-        None, description="Also render a picture (PNG) of the end of the path.")
-    turntable: Path | None = Field(
-        None, description="Also render an animation of all sides (.webp, .gif or .png). It takes "
-        "seconds per view.")
-    data: Path | None = Field(
-        None, description="Write only the scene's data as arrays (.npz), which the add-on opens.")
-
-
-class SceneSettings(Settings):
-    """Content of a scene."""
-
+    about = About(
+        "scene", 120, Written, reads=("mesh.vtu",),
+        found=("{object_count} objects and {frame_count} frames, made by Blender {blender}.",
+               "Data of {vertex_count:count} vertices.", "Picture {picture}.",
+               "Turntable {turntable}."))
     groups: ClassVar[Groups] = {
         "picture": ("width", "sides", "color", "plan", "motion", "strength")}
 
+    cell: Path | None = given(
+        "The robot's cell file. Its arm, gripper, camera, obstacles and workspace are shown as "
+        "well.")
+    output: Path | None = given("The .blend to write.", group="output", common=True, short="-o")
+    render: Path | None = given(
+        "Also render a picture (PNG) of the end of the path.", group="output", common=True)
+    turntable: Path | None = given(
+        "Also render an animation of all sides (.webp, .gif or .png). It takes seconds per view.",
+        group="output")
+    data: Path | None = given(
+        "Write only the scene's data as arrays (.npz), which the add-on opens.", group="output")
     width: int = Field(1120, ge=160, le=8192, description=(
         "Width of the picture [pixels]; the height is three quarters of it."))
     sides: int = Field(48, ge=2, le=720, description="Number of frames of the turntable.")
@@ -67,69 +60,66 @@ class SceneSettings(Settings):
             "Strength of the wood (modulus of rupture) [Pa], to which stress is compared. "
             "Default: 0.6 % of Young's modulus, as of green wood (0.5 to 0.7 %)."))
 
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Make a Blender scene of a branch, or only its content as arrays.
 
-def scene(inputs: SceneInputs, settings: SceneSettings, *, progress: Progress = SILENT,
-          ) -> dict[str, Any]:
-    """Make a Blender scene of a branch, or only its content as arrays.
+        Raises:
+            InputError: not exactly one of output and data is given, or there is nothing to show.
+            WorkError: Blender failed.
+        """
+        from limber.cell.cell_file import read_cell
+        from limber.cell.obstacles import cell_obstacles
+        from limber.results.scene.contents import scene_data
+        from limber.results.scene.still_objects import add_cell
+        from limber.store.loading import load_targets
 
-    Raises:
-        InputError: not exactly one of output and data is given, or there is nothing to show.
-        WorkError: Blender failed.
-    """
-    from limber.cell.cell_file import read_cell
-    from limber.cell.obstacles import cell_obstacles
-    from limber.results.scene.contents import scene_data
-    from limber.results.scene.still_objects import add_cell
-    from limber.store.loading import load_targets
-
-    if (inputs.output is None) == (inputs.data is None):
-        raise InputError(Text("Exactly one of ", Option("output"), " and ", Option("data"), " must "
-                              "be given."),
-                         "It states what to write.", "Give -o scene.blend.")
-    progress(0.0, "reading the branch folder")
-    branch = Branch.read(inputs.branch_folder)
-    data = scene_data(branch, settings.plan, settings.motion, load_targets(branch),
-                      settings.strength)
-    if inputs.cell is not None:
-        cell = read_cell(inputs.cell)
-        add_cell(data, cell, cell_obstacles(cell, inputs.cell.parent))
-    if settings.color not in data.info["scalars"]:
-        raise InputError(f"The branch has no {settings.color} to show.",
-                         f"It has: {', '.join(data.info['scalars'])}.",
-                         "Run ", Command("plan"), " or ", Command("simulate"), " first.")
-    if inputs.data is not None:
-        data.write(_writable(inputs.data))
-        return {"data": inputs.data, "vertex_count": len(data.arrays["vertices"])}
-    turntable, output = inputs.turntable, present(inputs.output, "file for the scene")
-    if turntable is not None and turntable.suffix.lower() not in _MOVING:
-        raise InputError(f"{turntable.name} has no suffix of an animation.", "",
-                         f"Name it {' or '.join(_MOVING)}.")
-    result = _made(data, output, inputs, settings, progress.part(0.1, 1.0))
-    if not output.is_file():
-        raise WorkError(f"Blender ended without an error but did not write {output}.", "",
-                        Command("doctor"), " states which Blender was used.")
-    return result | {"scene": output, "picture": inputs.render, "turntable": turntable}
+        if (self.output is None) == (self.data is None):
+            raise InputError(Text("Exactly one of ", Option("output"), " and ", Option("data"),
+                                  " must be given."),
+                             "It states what to write.", "Give -o scene.blend.")
+        progress(0.0, "reading the branch folder")
+        branch = Branch.read(self.branch_folder)
+        data = scene_data(branch, self.plan, self.motion, load_targets(branch),
+                          self.strength)
+        if self.cell is not None:
+            cell = read_cell(self.cell)
+            add_cell(data, cell, cell_obstacles(cell, self.cell.parent))
+        if self.color not in data.info["scalars"]:
+            raise InputError(f"The branch has no {self.color} to show.",
+                             f"It has: {', '.join(data.info['scalars'])}.",
+                             "Run ", Command("plan"), " or ", Command("simulate"), " first.")
+        if self.data is not None:
+            data.write(_writable(self.data))
+            return {"data": self.data, "vertex_count": len(data.arrays["vertices"])}
+        turntable, output = self.turntable, present(self.output, "file for the scene")
+        if turntable is not None and turntable.suffix.lower() not in _MOVING:
+            raise InputError(f"{turntable.name} has no suffix of an animation.", "",
+                             f"Name it {' or '.join(_MOVING)}.")
+        result = _made(data, output, self, progress.part(0.1, 1.0))
+        if not output.is_file():
+            raise WorkError(f"Blender ended without an error but did not write {output}.", "",
+                            Command("doctor"), " states which Blender was used.")
+        return result | {"scene": output, "picture": self.render, "turntable": turntable}
 
 
-def _made(data: SceneData, output: Path, inputs: SceneInputs, settings: SceneSettings,
-          progress: Progress) -> dict[str, Any]:
+def _made(data: SceneData, output: Path, asked: MakeScene, progress: Progress) -> dict[str, Any]:
     """Have Blender make the scene and its renders; return its report."""
     from limber.results.scene.blender_process import make_scene
 
     with tempfile.TemporaryDirectory(prefix="limber-scene-") as temporary:
         prepared, frames = Path(temporary) / "scene.npz", Path(temporary) / "round"
         data.write(prepared)
-        arguments = ["--data", prepared, "--scene", _writable(output), "--color", settings.color,
-                     "--width", settings.width]
-        if inputs.render is not None:
-            arguments += ["--picture", _writable(inputs.render)]
-        if inputs.turntable is not None:
-            _writable(inputs.turntable)
+        arguments = ["--data", prepared, "--scene", _writable(output), "--color", asked.color,
+                     "--width", asked.width]
+        if asked.render is not None:
+            arguments += ["--picture", _writable(asked.render)]
+        if asked.turntable is not None:
+            _writable(asked.turntable)
             frames.mkdir()
-            arguments += ["--round", frames, "--sides", settings.sides]
+            arguments += ["--round", frames, "--sides", asked.sides]
         result = make_scene(arguments, progress)
-        if inputs.turntable is not None:
-            _write_moving(inputs.turntable, sorted(frames.glob("*.png")))
+        if asked.turntable is not None:
+            _write_moving(asked.turntable, sorted(frames.glob("*.png")))
     return result
 
 
@@ -159,11 +149,3 @@ def _writable(path: Path) -> Path:
     except OSError as error:
         raise InputError(f"{path.parent} cannot be written to ({error.strerror}).",
                          "The result goes there.", "Choose another location.") from error
-
-
-STAGE = StageDescription(
-    "scene", 120, by_name(scene), SceneInputs, SceneSettings, NoOptions,
-    result=Written, reads=("mesh.vtu",),
-    found=("{object_count} objects and {frame_count} frames, made by Blender {blender}.",
-           "Data of {vertex_count:count} vertices.", "Picture {picture}.",
-           "Turntable {turntable}."))

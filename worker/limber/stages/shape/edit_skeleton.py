@@ -1,26 +1,4 @@
-"""List doubtful parts of the skeleton, and edit it; the mesh follows.
-
-EDITS is a JSON list with one object per edit. Positions are in the coordinates and unit of the
-scan's file, as in the list of doubtful parts:
-
-\b
-  {"do": "move", "at": [x, y, z], "to": [x, y, z]}     put a node elsewhere
-  {"do": "delete", "at": [x, y, z]}                    cut a branch off, from there outwards
-  {"do": "merge", "at": [...], "to": [...]}            up to there it is one with the branch at "to"
-  {"do": "bridge", "at": [...], "to": [...]}           hang the whole branch on another place
-  {"do": "split", "at": [...], "to": [...]}            cut there; the rest hangs on "to"
-  {"do": "root", "at": [x, y, z]}                      here is the root
-  {"do": "radius", "at": [...], "radius": r}           with "to": all along the axes to there
-  {"do": "confirm", "at": [x, y, z]}                   the branch is there, no more doubt
-  {"do": "add", "at": [...], "to": [...], "radius": r} a straight branch from there to its tip
-
-The most likely alternatives to the skeleton in use are listed with their probabilities and edits;
---alternative N applies those of one of them.
-
-Edits are kept in the branch folder and applied again by each reconstruct. With --frame branch,
-positions and radii are in the branch's frame [m]; with --append they are added to the existing
-edits.
-"""
+"""Stage ``skeleton``."""
 
 from __future__ import annotations
 
@@ -28,20 +6,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from pydantic import Field
 
 from limber.core.alignment import Alignment
 from limber.core.constants import FOUND_SKELETON
 from limber.core.errors import Command, InputError, Option, Text
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups
-from limber.stages.inputs import BranchInputs, NoOptions, NoSettings, by_name
-from limber.stages.registry import StageDescription
 from limber.stages.result import Result, Table, filled
 from limber.stages.shape.reconstruct import EDITS, edits_digest, load_edits, write_branch
+from limber.stages.stage import About, BranchStage, given
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -50,27 +25,6 @@ if TYPE_CHECKING:
     from limber.geometry.skeleton.skeleton import Skeleton
 
 _SHOWN = 30  # doubtful parts in the table; the JSON result has all
-
-
-class SkeletonInputs(BranchInputs):
-    """A branch folder, edits of its skeleton, and where to write the skeleton."""
-
-    groups: ClassVar[Groups] = {"input": ("edits", "frame", "append", "alternative"),
-                                "output": ("output",)}
-    common = ("edits", "alternative")
-
-    edits: Path | None = Field(
-        None, description="Edits (JSON) that replace those of the branch. An empty list removes "
-        "all.")
-    frame: Literal["scan", "branch"] = Field(
-        "scan", description="Coordinates of the edits: those of the scan's file, or the branch's "
-        "frame [m].")
-    append: bool = Field(False, description="Append the edits to those of the branch.")
-    alternative: int | None = Field(
-        None, ge=2, description="Append the edits of this alternative, numbered as listed.")
-    output: Path | None = Field(
-        None, description="Also write the edited skeleton in the scan's coordinates: .swc, or "
-        ".csv with intervals and probabilities.", json_schema_extra={"short": "-o"})
 
 
 class Review(Result):
@@ -89,67 +43,109 @@ class Review(Result):
             (f"Alternatives, {places}", alternative_rows(others) if len(others) > 1 else []))
 
 
-def review_skeleton(folder: Path, *, edits_path: Path | None = None,
-                    frame: Literal["scan", "branch"] = "scan", append: bool = False,
-                    alternative: int | None = None, output: Path | None = None,
-                    progress: Progress = SILENT) -> dict[str, Any]:
-    """List the doubtful parts of a branch's skeleton, after applying edits if there are any.
+def _doubtful_line(result: Mapping[str, Any]) -> str:
+    count = len(result["doubtful"])
+    return (Text(f"{count} doubtful {'part' if count == 1 else 'parts'}. Edits (a JSON list) are "
+                 "applied with ", Option("edits"), ".") if count else "No part of it is doubtful.")
 
-    Args:
-        folder: The branch folder.
-        edits_path: Edits to apply to the skeleton as found; surface and mesh are made again.
-        frame: Frame of the edits' positions: the scan file's coordinates, or the branch's frame
-        [m].
-        append: Add the edits to those of the branch instead of replacing them.
-        alternative: Number of the alternative whose edits are added too.
-        output: ``.swc`` or ``.csv`` to write, in the scan file's coordinates and unit.
-        progress: Called during the work; receives warnings for the user.
 
-    Returns:
-        ``doubtful``: a list of ``kind``, ``branch``, ``at`` (in the scan's coordinates), ``at_m``
-        (in the branch's frame), ``length_m``, ``radius_m`` and ``value``; ``alternatives``: the
-        most likely graphs, the one in use first, each with ``probability``, ``length_m`` and
-        ``edits``; ``edits``, those that are applied; ``edit_effects``, of each the node that it
-        took (``at``, ``at_m``), how far that is from the requested position (``off_m``) and the
-        change of the branches' length (``length_change_m``); ``mesh``: ``current``, ``out of
-        date`` or ``missing``; ``unit`` of ``at``.
+class ReviewSkeleton(BranchStage):
+    """List doubtful parts of the skeleton, and edit it; the mesh follows.
 
-    Raises:
-        InputError: an edit does not fit. MeshingError: the edited skeleton cannot be meshed. The
-            folder is then unchanged.
-    """
-    from limber.geometry.skeleton.alternatives import SearchDoubts, open_questions
-    from limber.geometry.skeleton.confidence import doubtful_parts
+    EDITS is a JSON list with one object per edit. Positions are in the coordinates and unit of the
+    scan's file, as in the list of doubtful parts:
 
-    if edits_path is not None or alternative is not None:
-        branch = Branch.open(folder)
-        edits = _applied(branch) if edits_path is None else _requested_edits(
-            branch, edits_path, frame, append)
-        chosen = [] if alternative is None else _edits_of(branch, alternative)
-        _remade(branch, [*edits, *chosen], progress)
-    branch = Branch.read(folder)
-    skeleton, alignment, mesh = _latest(branch)
-    # An older skeleton than the mesh's has its own open questions.
-    result = branch.made.result if mesh == "current" and branch.made else {}
-    doubtful = [*doubtful_parts(skeleton), *open_questions(skeleton, SearchDoubts.of(result))]
-    if mesh == "out of date":
-        progress.warn("This skeleton is that of the last reconstruct, which made no mesh. The "
-                      "mesh is that of an earlier one.")
-    if output is not None:
-        _write(skeleton.in_file(alignment), output, branch.manifest.source.get("unit", "m"))
-    applied = _applied(branch)
-    return {
-        "doubtful": [_part_entry(uncertain_part, alignment) for uncertain_part in doubtful],
-        "alternatives": result.get("alternatives", []),
-        "node_count": skeleton.node_count,
-        "branch_count": skeleton.branch_count,
-        "length_m": skeleton.length,
-        "mesh": mesh,
-        "unit": _unit(branch),
-        "edits": [edit.model_dump(mode="json", exclude_none=True) for edit in applied],
-        "edit_effects": _effects(branch, applied, alignment, progress),
-        "output": output,
-    }
+    \b
+      {"do": "move", "at": [x, y, z], "to": [x, y, z]}     put a node elsewhere
+      {"do": "delete", "at": [x, y, z]}                    cut a branch off, from there outwards
+      {"do": "merge", "at": [...], "to": [...]}            up to there it is one with the branch at "to"
+      {"do": "bridge", "at": [...], "to": [...]}           hang the whole branch on another place
+      {"do": "split", "at": [...], "to": [...]}            cut there; the rest hangs on "to"
+      {"do": "root", "at": [x, y, z]}                      here is the root
+      {"do": "radius", "at": [...], "radius": r}           with "to": all along the axes to there
+      {"do": "confirm", "at": [x, y, z]}                   the branch is there, no more doubt
+      {"do": "add", "at": [...], "to": [...], "radius": r} a straight branch from there to its tip
+
+    The most likely alternatives to the skeleton in use are listed with their probabilities and
+    edits; --alternative N applies those of one of them.
+
+    Edits are kept in the branch folder and applied again by each reconstruct. With --frame branch,
+    positions and radii are in the branch's frame [m]; with --append they are added to the existing
+    edits.
+    """  # noqa: E501
+
+    about = About(
+        "skeleton", 25, Review, key="reconstruct",
+        reads=("cloud.ply", "skeleton.csv", f"{FOUND_SKELETON}.csv"),
+        writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
+                "point_masses.json", EDITS),
+        found=("{node_count:count} nodes in {branch_count:#branch/branches}, {length_m:m}; the "
+               "mesh is {mesh}.", _doubtful_line),
+        then="limber virtual-pull {branch_folder}", step="skeleton", label="Review and Edit")
+
+    edits: Path | None = given(
+        "Edits (JSON) that replace those of the branch. An empty list removes all.", common=True)
+    frame: Literal["scan", "branch"] = given(
+        "Coordinates of the edits: those of the scan's file, or the branch's frame [m].", "scan")
+    append: bool = given("Append the edits to those of the branch.", False)
+    alternative: int | None = given(
+        "Append the edits of this alternative, numbered as listed.", common=True,
+        limits={"ge": 2})
+    output: Path | None = given(
+        "Also write the edited skeleton in the scan's coordinates: .swc, or .csv with intervals "
+        "and probabilities.", group="output", short="-o")
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """List the doubtful parts of a branch's skeleton, after applying edits if there are any.
+
+        Returns:
+            ``doubtful``: a list of ``kind``, ``branch``, ``at`` (in the scan's coordinates),
+            ``at_m`` (in the branch's frame), ``length_m``, ``radius_m`` and ``value``;
+            ``alternatives``: the most likely graphs, the one in use first, each with
+            ``probability``, ``length_m`` and ``edits``; ``edits``, those that are applied;
+            ``edit_effects``, of each the node that it took (``at``, ``at_m``), how far that is from
+            the requested position (``off_m``) and the change of the branches' length
+            (``length_change_m``); ``mesh``: ``current``, ``out of date`` or ``missing``; ``unit``
+            of ``at``.
+
+        Raises:
+            InputError: an edit does not fit; the folder is then unchanged.
+            MeshingError: the edited skeleton cannot be meshed; likewise.
+        """
+        from limber.geometry.skeleton.alternatives import SearchDoubts, open_questions
+        from limber.geometry.skeleton.confidence import doubtful_parts
+
+        if self.edits is not None or self.alternative is not None:
+            branch = Branch.open(self.branch_folder)
+            edits = _applied(branch) if self.edits is None else _requested_edits(
+                branch, self.edits, self.frame, self.append)
+            chosen = [] if self.alternative is None else _edits_of(branch,
+                                                                          self.alternative)
+            _remade(branch, [*edits, *chosen], progress)
+        branch = Branch.read(self.branch_folder)
+        skeleton, alignment, mesh = _latest(branch)
+        # An older skeleton than the mesh's has its own open questions.
+        result = branch.made.result if mesh == "current" and branch.made else {}
+        doubtful = [*doubtful_parts(skeleton), *open_questions(skeleton, SearchDoubts.of(result))]
+        if mesh == "out of date":
+            progress.warn("This skeleton is that of the last reconstruct, which made no mesh. The "
+                          "mesh is that of an earlier one.")
+        if self.output is not None:
+            _write(skeleton.in_file(alignment), self.output,
+                   branch.manifest.source.get("unit", "m"))
+        applied = _applied(branch)
+        return {
+            "doubtful": [_part_entry(uncertain_part, alignment) for uncertain_part in doubtful],
+            "alternatives": result.get("alternatives", []),
+            "node_count": skeleton.node_count,
+            "branch_count": skeleton.branch_count,
+            "length_m": skeleton.length,
+            "mesh": mesh,
+            "unit": _unit(branch),
+            "edits": [edit.model_dump(mode="json", exclude_none=True) for edit in applied],
+            "edit_effects": _effects(branch, applied, alignment, progress),
+            "output": self.output,
+        }
 
 
 def _requested_edits(branch: Branch, path: Path, frame: str, append: bool) -> list[Edit]:
@@ -312,22 +308,3 @@ def _part_entry(uncertain_part: DoubtfulPart, alignment: Alignment) -> dict[str,
         "radius_m": uncertain_part.radius,
         "value": None if math.isnan(uncertain_part.value) else uncertain_part.value,
     }
-
-
-def _doubtful_line(result: Mapping[str, Any]) -> str:
-    count = len(result["doubtful"])
-    return (Text(f"{count} doubtful {'part' if count == 1 else 'parts'}. Edits (a JSON list) are "
-                 "applied with ", Option("edits"), ".") if count else "No part of it is doubtful.")
-
-
-STAGE = StageDescription(
-    "skeleton", 25, by_name(review_skeleton, folder="branch_folder", edits_path="edits"),
-    SkeletonInputs, NoSettings, NoOptions, key="reconstruct",
-    reads=("cloud.ply", "skeleton.csv", f"{FOUND_SKELETON}.csv"),
-    writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
-            "point_masses.json", EDITS),
-    result=Review,
-    found=("{node_count:count} nodes in {branch_count:#branch/branches}, {length_m:m}; the mesh is "
-           "{mesh}.",
-           _doubtful_line),
-    then="limber virtual-pull {branch_folder}", step="skeleton", label="Review and Edit")

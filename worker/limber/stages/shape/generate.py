@@ -1,4 +1,4 @@
-"""Generate a branch with known truth, and scan it as a scanner would."""
+"""Stage ``generate``."""
 
 from __future__ import annotations
 
@@ -12,31 +12,13 @@ from limber.core.errors import InputError
 from limber.core.files.atomic import file_digest, write_atomically
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
+from limber.core.settings import Groups
 from limber.geometry.settings import BranchSpec, GeneratedSettings
-from limber.stages.inputs import NoOptions, argument
-from limber.stages.registry import StageDescription
 from limber.stages.result import Numbers, Result, kept, shown
+from limber.stages.stage import About, Stage, argument
 
 if TYPE_CHECKING:
     from limber.geometry.generated import GeneratedBranch
-
-
-class GenerateInputs(Settings):
-    """Output folder of the scan and its truth."""
-
-    groups: ClassVar[Groups] = {"output": ("folder",)}
-
-    folder: Path = argument("The folder to make.")
-
-
-class GenerateSettings(GeneratedSettings):
-    """A generated branch and its seed."""
-
-    groups: ClassVar[Groups] = {"shape": ("seed",)}
-    common = ("seed",)
-
-    seed: int = Field(0, description="Seed of everything random.")
 
 
 class Generated(Result):
@@ -53,17 +35,31 @@ class Generated(Result):
     young: Numbers = kept("true Young's modulus at the control points [Pa], shape [K]")
 
 
-def generate(folder: Path, settings: BranchSpec, *, seed: int = 0,
-             progress: Progress = SILENT) -> dict[str, Any]:
-    """Make a branch with known truth and write its scan and the truth into ``folder``.
+class Generate(GeneratedSettings, Stage):
+    """Generate a branch with known truth, and scan it as a scanner would."""
 
-    Raises:
-        InputError: the folder cannot be written to.
-    """
-    from limber.geometry.generated import generate_branch
+    about = About(
+        "generate", 10, Generated,
+        found=("A branch with known truth: {length_m:m} in {branch_count:#branch/branches}, "
+               "scanned as {point_count:count} points.",),
+        then="limber reconstruct {cloud} -o {folder}.branch")
+    groups: ClassVar[Groups] = {"shape": ("seed",)}
+    common = ("seed",)
 
-    progress(0.1, "generating")
-    return write_generated(generate_branch(seed, **settings.model_dump()), folder)
+    folder: Path = argument("The folder to make.", group="output")
+    seed: int = Field(0, description="Seed of everything random.")
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Make a branch with known truth and write its scan and the truth into the folder.
+
+        Raises:
+            InputError: the folder cannot be written to.
+        """
+        from limber.geometry.generated import generate_branch
+
+        progress(0.1, "generating")
+        return write_generated(generate_branch(self.seed, **BranchSpec.of(self).model_dump()),
+                               self.folder)
 
 
 def write_generated(branch: GeneratedBranch, folder: Path) -> dict[str, Any]:
@@ -89,18 +85,3 @@ def write_generated(branch: GeneratedBranch, folder: Path) -> dict[str, Any]:
     return {"cloud": str(folder / "cloud.ply"), "point_count": len(branch.cloud),
             "branch_count": branch.skeleton.branch_count, "length_m": branch.skeleton.length,
             "young_pa": branch.young, "surface_volume_m3": branch.surface.volume}
-
-
-def run(inputs: GenerateInputs, settings: GenerateSettings, _options: NoOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    spec = BranchSpec(**settings.model_dump(exclude={"seed"}))
-    return generate(inputs.folder, spec, seed=settings.seed, progress=progress)
-
-
-STAGE = StageDescription(
-    "generate", 10, run, GenerateInputs, GenerateSettings, NoOptions,
-    result=Generated,
-    found=("A branch with known truth: {length_m:m} in {branch_count:#branch/branches}, scanned as "
-           "{point_count:count} points.",),
-    then="limber reconstruct {cloud} -o {folder}.branch")

@@ -1,21 +1,17 @@
-"""Mesh a closed surface, a table of sections or a cylinder model."""
+"""Stage ``mesh``, and the result of a branch that has been meshed."""
 
 import json
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pydantic import Field
-
 from limber.core.files.atomic import file_digest, require_file
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
 from limber.geometry.io.formats import listed
 from limber.geometry.io.skeletons import SKELETONS, write_cylinders
 from limber.geometry.io.surfaces import SURFACES, usable_surface
 from limber.geometry.settings import MeshSurfaceSettings
-from limber.stages.inputs import RunOptions, argument, by_name
-from limber.stages.registry import StageDescription
 from limber.stages.result import Interval, Result, kept, shown
+from limber.stages.stage import About, Repeatable, argument, required
 from limber.store import Branch
 
 
@@ -71,99 +67,85 @@ class Meshed(MeshNumbers, Shape):
     """A branch that has been meshed."""
 
 
-class MeshInputs(Settings):
-    """A closed surface, a table of sections or a cylinder model, and the branch folder to make."""
+class Mesh(MeshSurfaceSettings, Repeatable):
+    """Mesh a closed surface, a table of sections or a cylinder model."""
 
-    groups: ClassVar[Groups] = {"input": ("surface",), "output": ("output",)}
+    about = About(
+        "mesh", 30, Meshed, key="mesh",
+        writes=("skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu", "point_masses.json"),
+        found=("{length_m:m} of centreline in {branch_count:#branch/branches}, radius "
+               "{radius_min_m:m} to {radius_max_m:m}.",
+               "{tet_count:count} tetrahedra, {mesh_volume_m3:cm3}."),
+        then="limber virtual-pull {output}", step="mesh", label="Mesh a Closed Surface")
 
     surface: Path = argument(
         f"A closed surface: {listed(SURFACES.readers())}; a .csv of sections along an axis from "
         "the end that is held: x, y, z, width, height, and perhaps mass_kg, what hangs there; or "
         f"a cylinder model: {listed(SKELETONS.readers())}.")
-    output: Path = Field(description="The branch folder to make.",
-                         json_schema_extra={"short": "-o", "example": "{stem}.branch"})
+    output: Path = required("The branch folder to make.", "{stem}.branch", group="output",
+                            short="-o")
 
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Fill a closed surface with tetrahedra and mark base, control points and grasp.
 
-def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None = None, *,
-                 force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Fill a closed surface with tetrahedra and mark base, control points and grasp.
+        Raises:
+            InputError: the surface cannot be read or is not that of one solid
+                (:func:`limber.geometry.io.surfaces.usable_surface`), or the table is not one of
+                sections (:func:`limber.geometry.bodies.read_sections`), or the cylinder model
+                cannot be used (:func:`limber.geometry.bodies.mesh_model`).
+            MeshingError: fTetWild failed.
+        """
+        from limber.core.constants import UNIT_METRES
+        from limber.geometry.bodies import (
+            SECTIONS,
+            body_format,
+            mesh_body,
+            mesh_model,
+            mesh_sections,
+            read_sections,
+        )
+        from limber.geometry.cloud.preparation import size_doubts
 
-    Args:
-        path: A surface, a CSV of sections, or a cylinder model.
-        folder: The branch folder to make or replace.
-        settings: Settings to use.
-        force: Run even if nothing has changed.
-        progress: Called during the work; receives warnings for the user.
-
-    Raises:
-        InputError: the surface cannot be read or is not that of one solid
-            (:func:`limber.geometry.io.surfaces.usable_surface`), or the table is not one of
-            sections (:func:`limber.geometry.bodies.read_sections`), or the cylinder model cannot
-            be used (:func:`limber.geometry.bodies.mesh_model`).
-        MeshingError: fTetWild failed.
-    """
-    from limber.core.constants import UNIT_METRES
-    from limber.geometry.bodies import (
-        SECTIONS,
-        body_format,
-        mesh_body,
-        mesh_model,
-        mesh_sections,
-        read_sections,
-    )
-    from limber.geometry.cloud.preparation import size_doubts
-
-    settings = settings or MeshSurfaceSettings()
-    path, drawn = require_file(path, "A surface"), None
-    warnings: list[str] = []
-    chosen, is_stated = body_format(path), "unit" in settings.model_fields_set
-    has_cylinders = chosen in SKELETONS.readers()
-    if has_cylinders:
-        progress = progress.keeping(warnings)
-    elif chosen is SECTIONS:
-        drawn = read_sections(path, settings.unit)
-        warnings += size_doubts(drawn.axis, "axis of the sections", settings.unit,
-                                is_stated=is_stated)
-    else:
-        surface, warnings = usable_surface(
-            SURFACES.read_as(chosen, path, scale=UNIT_METRES[settings.unit]), path)
-        warnings += size_doubts(surface.vertices, "surface", settings.unit, is_stated=is_stated)
-    branch = Branch.create(folder)
-    digests = {"surface": file_digest(path)}
-    if not force and branch.is_current("mesh", settings, digests=digests):
-        return branch.manifest.stages["mesh"].result
-    for text in list(warnings):
-        progress.warn(text)
-    with branch.dropped_if_empty(), branch.stage("mesh", settings, digests=digests) as stage:
+        path, drawn = require_file(self.surface, "A surface"), None
+        warnings: list[str] = []
+        chosen, is_stated = body_format(path), "unit" in self.model_fields_set
+        has_cylinders = chosen in SKELETONS.readers()
         if has_cylinders:
-            made, masses = mesh_model(path, settings, progress)
-        elif drawn is not None:
-            made, masses = mesh_sections(drawn, settings)
+            progress = progress.keeping(warnings)
+        elif chosen is SECTIONS:
+            drawn = read_sections(path, self.unit)
+            warnings += size_doubts(drawn.axis, "axis of the sections", self.unit,
+                                    is_stated=is_stated)
         else:
-            made, masses = mesh_body(surface, settings, progress), []
-        stage.manifest.alignment = made.alignment
-        stage.manifest.source = {"file": path.name, "unit": settings.unit,
-                                 "sha256": digests["surface"]}
-        made.skeleton.write_swc(stage.path("skeleton.swc"))
-        made.surface.write_ply(stage.path("surface.ply"))
-        made.mesh.write(stage.path("mesh.vtu"))
-        for name in ("point_masses.json", "skeleton.csv"):
-            stage.remove(name)  # from an earlier scan in this folder
-        if has_cylinders:
-            write_cylinders(made.skeleton, stage.path("skeleton.csv"))
-        if masses:
-            stage.path("point_masses.json").write_text(json.dumps(masses, indent=1) + "\n",
-                                                       encoding="utf-8")
-        stage.result.update(made.numbers | {"warnings": warnings})
-        progress(1.0, "meshed", tets=made.mesh.tet_count)
-    return branch.manifest.stages["mesh"].result
-
-
-STAGE = StageDescription(
-    "mesh", 30, by_name(mesh_surface, path="surface", folder="output"), MeshInputs,
-    MeshSurfaceSettings, RunOptions, key="mesh", result=Meshed,
-    writes=("skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu", "point_masses.json"),
-    found=("{length_m:m} of centreline in {branch_count:#branch/branches}, radius "
-           "{radius_min_m:m} to {radius_max_m:m}.",
-           "{tet_count:count} tetrahedra, {mesh_volume_m3:cm3}."),
-    then="limber virtual-pull {output}", step="mesh", label="Mesh a Closed Surface")
+            surface, warnings = usable_surface(
+                SURFACES.read_as(chosen, path, scale=UNIT_METRES[self.unit]), path)
+            warnings += size_doubts(surface.vertices, "surface", self.unit, is_stated=is_stated)
+        branch = Branch.create(self.output)
+        digests = {"surface": file_digest(path)}
+        if self.is_kept(branch, digests=digests):
+            return branch.manifest.stages["mesh"].result
+        for text in list(warnings):
+            progress.warn(text)
+        with branch.dropped_if_empty(), branch.stage("mesh", self, digests=digests) as stage:
+            if has_cylinders:
+                made, masses = mesh_model(path, self, progress)
+            elif drawn is not None:
+                made, masses = mesh_sections(drawn, self)
+            else:
+                made, masses = mesh_body(surface, self, progress), []
+            stage.manifest.alignment = made.alignment
+            stage.manifest.source = {"file": path.name, "unit": self.unit,
+                                     "sha256": digests["surface"]}
+            made.skeleton.write_swc(stage.path("skeleton.swc"))
+            made.surface.write_ply(stage.path("surface.ply"))
+            made.mesh.write(stage.path("mesh.vtu"))
+            for name in ("point_masses.json", "skeleton.csv"):
+                stage.remove(name)  # from an earlier scan in this folder
+            if has_cylinders:
+                write_cylinders(made.skeleton, stage.path("skeleton.csv"))
+            if masses:
+                stage.path("point_masses.json").write_text(json.dumps(masses, indent=1) + "\n",
+                                                           encoding="utf-8")
+            stage.result.update(made.numbers | {"warnings": warnings})
+            progress(1.0, "meshed", tets=made.mesh.tet_count)
+        return branch.manifest.stages["mesh"].result

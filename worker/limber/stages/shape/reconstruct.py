@@ -1,4 +1,4 @@
-"""Reconstruct a scan: skeleton, radii, surface and tetrahedra."""
+"""Stage ``reconstruct``, and what a branch folder keeps of it."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ import itertools
 import json
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import Field
 
 from limber.core.alignment import Alignment
 from limber.core.constants import FOUND_SKELETON
@@ -26,15 +25,13 @@ from limber.core.files.atomic import file_digest, replacing, require_file
 from limber.core.files.safe_names import same_named
 from limber.core.machine_errors import machine_error
 from limber.core.progress import SILENT, Progress
-from limber.core.settings import Groups, Settings
 from limber.geometry.io.clouds import CLOUDS, read_points, unit_of
 from limber.geometry.io.formats import head_of, listed, suffixes_of
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton, read_swc, write_cylinders
 from limber.geometry.settings import ReconstructSettings
-from limber.stages.inputs import RunOptions, argument
-from limber.stages.registry import StageDescription
 from limber.stages.shape.mesh import Meshed
-from limber.store import Branch, Stage
+from limber.stages.stage import About, Repeatable, argument, given, required
+from limber.store import Branch, OpenStage
 from limber.store.manifest import MANIFEST
 
 if TYPE_CHECKING:
@@ -58,110 +55,111 @@ EDITS = "edits.json"
 """The edits that a branch keeps, in the coordinates of the scan's file."""
 
 
-class ReconstructInputs(Settings):
-    """A scan, its known properties, and the branch folder to make."""
+class Reconstruct(ReconstructSettings, Repeatable):
+    """Reconstruct a scan: skeleton, radii, surface and tetrahedra."""
 
-    groups: ClassVar[Groups] = {
-        "input": ("cloud", "without", "skeleton", "edits", "camera", "mask"),
-        "output": ("output",)}
-    common = ("camera",)
+    about = About(
+        "reconstruct", 20, Meshed, key="reconstruct",
+        writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
+                "point_masses.json", f"{FOUND_SKELETON}.swc", f"{FOUND_SKELETON}.csv", SEARCH,
+                EDITS, "truth/"),
+        found=("{length_m:m} of centreline in {branch_count:#branch/branches}, radius "
+               "{radius_min_m:m} to {radius_max_m:m}.",
+               "{tet_count:count} tetrahedra.", "Volume {mesh_volume_m3:cm3}.",
+               "{done_count:#scan/scans} reconstructed."),
+        then="{tet_count:if}limber skeleton {output}", step="skeleton", label="Reconstruct")
 
     cloud: Path = argument(
         f"A point cloud file ({' '.join(suffixes_of(CLOUDS.readers()))}), or a folder of them: "
         "then each becomes a branch folder in the output folder, and a bad one does not stop the "
         "others.")
-    output: Path = Field(
-        description="The branch folder to make. With a folder of scans: where to make the branch "
-                    "folders.",
-        json_schema_extra={"short": "-o", "example": "{stem}.branch"})
-    without: Path | None = Field(
-        None, description="A point cloud file of the points to leave out, in the cloud's "
-        "coordinates, such as those that were deleted in Blender.")
-    skeleton: Path | None = Field(
-        None, description="Your own skeleton in the cloud's coordinates: "
-        f"{listed(SKELETONS.readers())}.")
-    edits: Path | None = Field(
-        None, description="Edits of the skeleton (JSON, see `limber skeleton`). They stay in the "
-        "branch folder, and each reconstruct without --skeleton applies them again.")
-    camera: Path | None = Field(
-        None, description="camera.toml of the depth camera; CLOUD is then a depth image.")
-    mask: Path | None = Field(
-        None, description="With --camera: a mask image, greater than 0 on the branch.")
+    output: Path = required(
+        "The branch folder to make. With a folder of scans: where to make the branch folders.",
+        "{stem}.branch", group="output", short="-o")
+    without: Path | None = given(
+        "A point cloud file of the points to leave out, in the cloud's coordinates, such as those "
+        "that were deleted in Blender.")
+    skeleton: Path | None = given(
+        f"Your own skeleton in the cloud's coordinates: {listed(SKELETONS.readers())}.")
+    edits: Path | None = given(
+        "Edits of the skeleton (JSON, see `limber skeleton`). They stay in the branch folder, and "
+        "each reconstruct without --skeleton applies them again.")
+    camera: Path | None = given(
+        "camera.toml of the depth camera; CLOUD is then a depth image.", common=True)
+    mask: Path | None = given("With --camera: a mask image, greater than 0 on the branch.")
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        """Make a branch folder from a scan: skeleton, surface and tetrahedra.
+
+        The skeleton is stored in the scan's own coordinates as soon as it is found
+        (``scan_skeleton.swc`` and ``.csv``), even if a later step fails or the program is killed.
+        The next run with the same scan and settings continues from it. A ``truth.json`` beside the
+        scan (`limber generate`) is copied too. Edits in the folder apply if the skeleton is not the
+        user's own.
+
+        Returns:
+            DESIGN's keys and more; of a folder of scans ``done``, name to result, and
+            ``done_count``.
+
+        Raises:
+            InputError: the scan, the skeleton or the folder cannot be used; there is no scan in a
+                folder, or two would have one branch folder.
+            WorkError: the work failed; the folder is unchanged except for the stored skeleton.
+            PartlyFailedError: some scans of a folder failed; ``result`` also has ``failed``, name
+                to message.
+        """
+        if not self.cloud.is_dir():
+            return _of_scan(self, progress)
+        one = [name for name in ("without", "skeleton", "edits", "camera", "mask")
+               if getattr(self, name)]
+        if one:
+            raise InputError(f"{self.cloud} is a folder, and --{one[0]} was given.",
+                             "That option applies to a single scan.",
+                             "Reconstruct that scan by itself.")
+        return _each_of_folder(self, progress)
 
 
-def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | None = None, *,
-                skeleton_path: Path | None = None, edits_path: Path | None = None,
-                camera_path: Path | None = None, mask_path: Path | None = None,
-                without_path: Path | None = None, force: bool = False,
-                progress: Progress = SILENT) -> dict[str, Any]:
-    """Make a branch folder from a scan: skeleton, surface and tetrahedra.
-
-    The skeleton is stored in the scan's own coordinates as soon as it is found
-    (``scan_skeleton.swc`` and ``.csv``), even if a later step fails or the program is killed. The
-    next run with the same scan and settings continues from it.
-
-    Args:
-        cloud_path: The scan. A ``truth.json`` beside it (`limber generate`) is copied too.
-        folder: The branch folder to make or replace.
-        settings: Settings to use.
-        skeleton_path: The user's own skeleton in the scan's coordinates and unit, instead of ours.
-        edits_path: Edits of the skeleton; without them those in the folder, if the skeleton is not
-            the user's own.
-        camera_path: ``camera.toml``, if ``cloud_path`` is a depth image.
-        mask_path: The depth image's mask of the branch.
-        without_path: Points of the scan to leave out, in its coordinates.
-        force: Run even if nothing has changed.
-        progress: Called during the work; receives warnings for the user.
-
-    Returns:
-        The stage's result (DESIGN's keys and more).
-
-    Raises:
-        InputError: the scan, the skeleton or the folder cannot be used.
-        WorkError: the work failed; the folder is unchanged except for the stored skeleton.
-    """
+def _of_scan(asked: Reconstruct, progress: Progress) -> dict[str, Any]:
     from limber.core.constants import UNIT_METRES
     from limber.geometry.io.depth_images import read_depth
     from limber.geometry.reconstruction import reconstruct_cloud
     from limber.geometry.skeleton.edits import edits_text, read_edits
 
-    settings = settings or ReconstructSettings()
-    raw = read_points(cloud_path) if camera_path is None else read_depth(
-        cloud_path, camera_path, mask_path)
-    unit, unit_notes = unit_of(raw, settings.unit)
-    if unit != settings.unit:
-        settings = settings.model_copy(update={"unit": unit})
-    digests = {"cloud": file_digest(cloud_path)}
-    for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path),
-                       ("without", without_path)):
-        if path is not None:
+    raw = read_points(asked.cloud) if asked.camera is None else read_depth(
+        asked.cloud, asked.camera, asked.mask)
+    unit, unit_notes = unit_of(raw, asked.unit)
+    if unit != asked.unit:
+        asked = asked.model_copy(update={"unit": unit})
+    digests = {"cloud": file_digest(asked.cloud)}
+    for name in ("skeleton", "camera", "mask", "without"):
+        if (path := getattr(asked, name)) is not None:
             digests[name] = file_digest(require_file(path, f"A {name} file"))
-    if without_path is not None:
-        raw = _without(raw, without_path)
-    entered = None if edits_path is None else read_edits(edits_path)
-    branch = Branch.create(folder)
+    if asked.without is not None:
+        raw = _without(raw, asked.without)
+    entered = None if asked.edits is None else read_edits(asked.edits)
+    branch = Branch.create(asked.output)
     if entered is not None:
         edits = entered
     else:
-        edits = [] if skeleton_path is not None else load_edits(branch)
+        edits = [] if asked.skeleton is not None else load_edits(branch)
     digests |= edits_digest(edits)
-    if not force and branch.is_current("reconstruct", settings, digests=digests):
+    if asked.is_kept(branch, digests=digests):
         return branch.manifest.stages["reconstruct"].result
     warnings: list[str] = []
     for text in (*raw.notes, *unit_notes):
         progress.keeping(warnings).warn(text)
-    if edits_path is None and not edits and branch.has(EDITS):
+    if asked.edits is None and not edits and branch.has(EDITS):
         progress.keeping(warnings).warn(
             "The edits in edits.json were not applied, because a skeleton was given.")
     searched = {name: value for name, value in digests.items() if name != "edits"}
-    known = None if force else load_search(branch, settings, searched,
-                                           progress.keeping(warnings))
+    known = None if asked.force else load_search(branch, asked, searched,
+                                                 progress.keeping(warnings))
     is_kept = known is not None
 
     def keep(alignment: Alignment, skeleton: Skeleton, found: FoundSkeleton) -> None:
         nonlocal is_kept
-        with branch.stage("skeleton", settings, digests=searched) as early:
-            _keep_skeleton(early, alignment, skeleton, settings.unit)
+        with branch.stage("skeleton", asked, digests=searched) as early:
+            _keep_skeleton(early, alignment, skeleton, asked.unit)
             found.write(early.path(SEARCH))
         is_kept = True
 
@@ -173,11 +171,11 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
                       "green, points on no round axis red, a pot grey, stakes, posts "
                       "and wires blue, another plant violet.")
     with branch.dropped_if_empty(), branch.stage(
-            "reconstruct", settings, digests=digests) as stage:
-        own = None if skeleton_path is None else read_skeleton(
-            skeleton_path, scale=UNIT_METRES[settings.unit])
+            "reconstruct", asked, digests=digests) as stage:
+        own = None if asked.skeleton is None else read_skeleton(
+            asked.skeleton, scale=UNIT_METRES[asked.unit])
         try:
-            made = reconstruct_cloud(raw, settings, own=own, edits=edits, eye=_eye(camera_path),
+            made = reconstruct_cloud(raw, asked, own=own, edits=edits, eye=_eye(asked.camera),
                                      known=known, keep=keep, show=show,
                                      progress=progress.keeping(warnings))
         except LimberError as error:
@@ -187,48 +185,35 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
                               Option("skeleton"), "), or edit it (", Option("edits"), ").")
             raise
         stage.manifest.alignment = made.alignment
-        stage.manifest.source = {"file": Path(cloud_path).name, "unit": settings.unit,
+        stage.manifest.source = {"file": asked.cloud.name, "unit": asked.unit,
                                  "sha256": digests["cloud"]}
         write_branch(stage, made.cloud, made.meshed)
         stage.remove(SEARCH)
         if edits:
             stage.path(EDITS).write_text(edits_text(edits), encoding="utf-8")
-        elif edits_path is not None:
+        elif asked.edits is not None:
             stage.remove(EDITS)
-        if _copy_truth(Path(cloud_path), stage, made.alignment):
+        if _copy_truth(asked.cloud, stage, made.alignment):
             stage.manifest.source["truth"] = "truth/truth.json"
         stage.result.update(made.numbers | {"warnings": warnings})
         progress(1.0, "reconstructed")
     return branch.manifest.stages["reconstruct"].result
 
 
-def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings | None = None, *,
-                       force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
-    """Reconstruct every cloud in a folder into ``folder/NAME.branch``.
+def _each_of_folder(asked: Reconstruct, progress: Progress) -> dict[str, Any]:
+    """Reconstruct every cloud in a folder into a branch folder ``NAME.branch`` in the output.
 
-    Args:
-        clouds: The folder of scans; hidden files and files of other kinds in it are skipped.
-        folder: Parent folder of the branch folders.
-        settings: Settings of all of them.
-        force: Run even if nothing has changed, and replace branches of other scans.
-        progress: Called as it goes; receives each scan's warnings, with its name, and each failure.
-
-    Returns:
-        ``done``: name to result; ``done_count``.
-
-    Raises:
-        InputError: there is no scan, or two would have one branch folder; nothing was computed.
-        PartlyFailedError: some failed; ``result`` also has ``failed``, name to message.
+    Hidden files and files of other kinds are skipped. Warnings and failures name their scan.
     """
     known = suffixes_of(CLOUDS.readers())
-    paths = sorted(p for p in Path(clouds).iterdir() if p.suffix.lower() in known
+    paths = sorted(p for p in asked.cloud.iterdir() if p.suffix.lower() in known
                    and not p.name.startswith(".") and not _shows_classes(p))
     if not paths:
-        raise InputError(f"{clouds} has no point clouds.", f"Known are: {' '.join(known)}.",
+        raise InputError(f"{asked.cloud} has no point clouds.", f"Known are: {' '.join(known)}.",
                          "Name another folder.")
     if clashes := same_named([path.stem for path in paths]):
         named = "; ".join(" and ".join(paths[index].name for index in group) for group in clashes)
-        raise InputError(f"Scans of {clouds} would have one branch folder: {named}.",
+        raise InputError(f"Scans of {asked.cloud} would have one branch folder: {named}.",
                          "A branch folder has the scan's name without its suffix, and many "
                          "systems do not distinguish upper and lower case. One would replace the "
                          "other.", "Rename these scans, or move copies of a scan elsewhere.")
@@ -236,11 +221,12 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
     failed: dict[str, str] = {}
     for number, path in enumerate(paths):
         part = progress.part(number / len(paths), (number + 1) / len(paths)).named(path.name)
-        target = Path(folder) / f"{path.stem}.branch"
+        target = asked.output / f"{path.stem}.branch"
         try:
-            if not force:
+            if not asked.force:
                 _require_same_scan(path, target)
-            done[path.name] = reconstruct(path, target, settings, force=force, progress=part)
+            done[path.name] = _of_scan(asked.model_copy(update={
+                "cloud": path, "output": target}), part)
             continue
         except Cancelled:
             raise
@@ -317,7 +303,7 @@ def _without(cloud: Cloud, path: Path) -> Cloud:
     return cloud.subset(keep)
 
 
-def _keep_skeleton(stage: Stage, alignment: Alignment, skeleton: Skeleton, unit: str) -> None:
+def _keep_skeleton(stage: OpenStage, alignment: Alignment, skeleton: Skeleton, unit: str) -> None:
     """Write a skeleton in the coordinates and the unit of the scan's file."""
     in_file = skeleton.in_file(alignment)
     in_file.write_swc(stage.path(f"{FOUND_SKELETON}.swc"), unit=unit)
@@ -348,7 +334,7 @@ def load_search(branch: Branch, settings: ReconstructSettings, digests: dict[str
         return None
 
 
-def write_branch(stage: Stage, cloud: Cloud, meshed: MeshedBranch) -> None:
+def write_branch(stage: OpenStage, cloud: Cloud, meshed: MeshedBranch) -> None:
     """Write the files of a branch that has been meshed."""
     cloud.write_ply(stage.path("cloud.ply"))
     meshed.skeleton.write_swc(stage.path("skeleton.swc"))
@@ -412,33 +398,3 @@ def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
     else:
         stage.remove("truth/surface.ply")
     return True
-
-
-def run(inputs: ReconstructInputs, settings: ReconstructSettings, options: RunOptions,
-        progress: Progress) -> dict[str, Any]:
-    """Run the stage."""
-    if inputs.cloud.is_dir():
-        one = [name for name in ("without", "skeleton", "edits", "camera", "mask")
-               if getattr(inputs, name)]
-        if one:
-            raise InputError(f"{inputs.cloud} is a folder, and --{one[0]} was given.",
-                             "That option applies to a single "
-                             "scan.", "Reconstruct that scan by itself.")
-        return reconstruct_folder(inputs.cloud, inputs.output, settings, force=options.force,
-                                  progress=progress)
-    return reconstruct(inputs.cloud, inputs.output, settings, skeleton_path=inputs.skeleton,
-                       edits_path=inputs.edits, camera_path=inputs.camera, mask_path=inputs.mask,
-                       without_path=inputs.without, force=options.force, progress=progress)
-
-
-STAGE = StageDescription(
-    "reconstruct", 20, run, ReconstructInputs, ReconstructSettings, RunOptions, key="reconstruct",
-    result=Meshed,
-    writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
-            "point_masses.json", f"{FOUND_SKELETON}.swc", f"{FOUND_SKELETON}.csv", SEARCH, EDITS,
-            "truth/"),
-    found=("{length_m:m} of centreline in {branch_count:#branch/branches}, radius "
-           "{radius_min_m:m} to {radius_max_m:m}.",
-           "{tet_count:count} tetrahedra.", "Volume {mesh_volume_m3:cm3}.",
-           "{done_count:#scan/scans} reconstructed."),
-    then="{tet_count:if}limber skeleton {output}", step="skeleton", label="Reconstruct")
