@@ -29,7 +29,7 @@ from limber.core.processes import Limits
 from limber.core.settings import nearest
 from limber.core.units import in_unit
 from limber.stages.registry import stage_class, stage_schema, stage_summaries
-from limber.stages.stage import Stage
+from limber.stages.stage import PARTS, Stage
 from limber.store.manifest import MANIFEST, read_manifest
 
 # The content of a job file: branches, and the stages to run on each.
@@ -308,45 +308,26 @@ class Source:
         return self.path.stem if self.is_scan else self.path.name.removesuffix(".branch")
 
 
-@dataclass(frozen=True)
-class StageTables:
-    """Makes the tasks of one branch; ``sweep`` has the branch's own values."""
+class _StageTable:
+    """One ``[[job.stage]]`` on one branch: its values, each with its position in the file.
 
-    problems: Problems
-    paths: JobPaths
-    source: Source
-    folder: Path
-    sweep: dict[str, Any]
+    Args:
+        sweep: The branch's own values.
+    """
 
-    def tasks(self, tables: list[dict[str, Any]], key_path: KeyPath) -> list[Stage]:
-        """Return the tasks of all stages of a job."""
-        return [task for number, table in enumerate(tables)
-                for task in self._tasks_of(table, (*key_path, "stage", number))]
-
-    def _tasks_of(self, table: dict[str, Any], key_path: KeyPath) -> list[Stage]:
-        name = str(table.get("run"))
-        if trouble := _trouble(name):
-            self.problems.add((*key_path, "run"), f"run = {table.get('run')!r}: {trouble}")
-            return []
-        entries = {key: (value, (*key_path, key)) for key, value in table.items() if key != "run"}
-        for swept, value in self.sweep.items():
-            stage, _, key = swept.partition(".")
-            if stage == name:
-                entries[key] = value, (*key_path[:2], "sweep", swept)
-        return _StageValues(self, stage_class(name), entries, key_path).tasks()
-
-
-class _StageValues:
-    """The values of one stage on one branch, each with its position in the file."""
-
-    def __init__(self, of: StageTables, stage: type[Stage],
-                 entries: dict[str, tuple[Any, KeyPath]], key_path: KeyPath):
-        self._of, self._problems, self._stage, self._key_path = of, of.problems, stage, key_path
-        self._key_paths = {key: where for key, (_, where) in entries.items()}
-        self._values = {key: value for key, (value, _) in entries.items()}
+    def __init__(self, reader: "_Reader", stage: type[Stage], table: dict[str, Any],
+                 key_path: KeyPath, source: Source, folder: Path, sweep: dict[str, Any]):
+        self._problems, self._paths, self._stage = reader.problems, reader.paths, stage
+        self._key_path, self._source, self._folder = key_path, source, folder
         self._name = stage.about.name
+        self._values = {key: value for key, value in table.items() if key != "run"}
+        self._key_paths: dict[str, KeyPath] = {key: (*key_path, key) for key in self._values}
+        for swept, value in sweep.items():
+            name, _, key = swept.partition(".")
+            if name == self._name:
+                self._values[key], self._key_paths[key] = value, (*key_path[:2], "sweep", swept)
         schema = stage_schema(self._name)
-        self._fields = {key: about for part in ("inputs", "settings", "options")
+        self._fields = {key: about for part in PARTS
                         for key, about in schema[part].get("properties", {}).items()}
         self._refused: set[str] = set()
         """Fields whose value was refused before reaching the stage's settings."""
@@ -377,7 +358,7 @@ class _StageValues:
                                and key in self._values) for index in group]
             same = tasks[group[0]].entry
             self._problems.add(self._key_path, (
-                f"{len(group)} runs of {self._name} on {self._of.source.name} would have one "
+                f"{len(group)} runs of {self._name} on {self._source.name} would have one "
                 f"result{f', {same}' if same else ''}: {'; '.join(files[:5])}. Each would replace "
                 "the one before. Put {file} into the name, and give files that differ in their "
                 "suffix only other names."))
@@ -385,12 +366,12 @@ class _StageValues:
     def _own_inputs(self) -> dict[str, Any]:
         """Return the inputs that follow from the branch."""
         if "branch_folder" in self._fields:
-            return {"branch_folder": self._of.folder}
+            return {"branch_folder": self._folder}
         source = next(key for key, about in self._fields.items() if about.get("argument"))
-        if not self._of.source.is_scan:
+        if not self._source.is_scan:
             self._problems.add((), f"{self._name} makes a branch from a scan, but this job "
                                "has branch folders.")
-        return {source: self._of.source.path, "output": self._of.folder}
+        return {source: self._source.path, "output": self._folder}
 
     def _value(self, key: str, value: Any) -> Any:
         """Return a value with its unit and its placeholders resolved."""
@@ -407,7 +388,7 @@ class _StageValues:
     def _filled(self, text: str, key_path: KeyPath) -> str:
         def fill(match: re.Match) -> str:
             if match.group(1) == "scan":
-                return self._of.source.name
+                return self._source.name
             if match.group(1) == "file":
                 return match.group(0)
             self._problems.add(key_path, f"{match.group(0)} is unknown. Use {{scan}} or {{file}}.")
@@ -433,15 +414,14 @@ class _StageValues:
 
     def _file(self, key: str, name: str) -> Path:
         """Return the file that a field names, one to write or one to read."""
-        key_path = (*self._key_path, key)
-        paths = self._of.paths
-        return (paths.written if self._fields[key]["group"] == "output" else paths.file)(
-            name, key_path)
+        find = (self._paths.written if self._fields[key]["group"] == "output"
+                else self._paths.file)
+        return find(name, (*self._key_path, key))
 
     def _files(self, key: str, pattern: str) -> list[Path]:
         """Return the files that match a pattern in an input."""
         key_path = (*self._key_path, key)
-        matches = self._of.paths.files(pattern, key_path)
+        matches = self._paths.files(pattern, key_path)
         if matches == []:
             self._problems.add(key_path, f"{key}: no file matches {pattern!r}.")
         return list(matches or ())
@@ -572,7 +552,14 @@ class _Reader:
             self.problems.add(key_path, f"{folder} was made from {before}, not from "
                               f"{source.path.name}, which would replace it. Use another `out`, or "
                               "remove that folder.")
-        tasks = StageTables(self.problems, paths, source, folder, sweep).tasks(stages, key_path)
+        tasks = []
+        for number, table in enumerate(stages):
+            place, run = (*key_path, "stage", number), str(table.get("run"))
+            if trouble := _trouble(run):
+                self.problems.add((*place, "run"), f"run = {table.get('run')!r}: {trouble}")
+            else:
+                tasks += _StageTable(self, stage_class(run), table, place, source, folder,
+                                     sweep).tasks()
         return BranchJob(name, folder, tuple(tasks), sweep,
                          paths.fetched([path for path in _paths_in(tasks) if path != folder]),
                          home)

@@ -5,7 +5,7 @@ from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from limber.batch.batch_progress import (
     DONE,
@@ -67,17 +67,6 @@ def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
         _Course(jobs, records, machines, staging, log, progress, retry_failed=retry_failed).run()
 
 
-class Machines(Protocol):
-    """Runs a limited number of tasks at a time; all can be stopped together."""
-
-    @property
-    def count(self) -> int: ...
-
-    def submit(self, task: Stage, folder: Path) -> Future: ...
-
-    def cancel(self) -> None: ...
-
-
 class _ThisProcess:
     """The pool of this process."""
 
@@ -103,8 +92,8 @@ class _ThisProcess:
 class _Course:
     """Runs the tasks of all branches; each branch may be fetched before and uploaded after."""
 
-    def __init__(self, jobs: JobFile, records: Records, machines: Machines, staging: Staging,
-                 log: BatchLog, progress: Progress, *, retry_failed: bool):
+    def __init__(self, jobs: JobFile, records: Records, machines: Cluster | _ThisProcess,
+                 staging: Staging, log: BatchLog, progress: Progress, *, retry_failed: bool):
         self.jobs, self.records, self.machines, self.progress = jobs, records, machines, progress
         self.staging, self.log, self.retry_failed = staging, log, retry_failed
         self.waiting = deque(jobs.branches)

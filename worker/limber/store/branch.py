@@ -13,6 +13,7 @@ writes (:mod:`limber.store.lock`), any number read (:meth:`Branch.read`, which c
 next writer finishes or removes the leftovers of killed programs.
 """
 
+import json
 import os
 import shutil
 import time
@@ -85,6 +86,12 @@ class OpenStage:
             raise gone(self._folder.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
+
+    def write(self, name: str, content: Any, *, indent: int | None = 1) -> None:
+        """Write a text, or anything else as JSON, as file ``name``."""
+        text = content if isinstance(content, str) else json.dumps(
+            plain(content), indent=indent, allow_nan=False) + "\n"
+        self.path(name).write_text(text, encoding="utf-8")
 
     def remove(self, name: str) -> None:
         """Drop file ``name`` of an earlier run when this stage succeeds."""

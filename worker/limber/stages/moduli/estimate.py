@@ -251,8 +251,7 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
                         "Run it again when there is time for it.")
     with branch.stage("estimate", asked, digests=digests) as stage:
         full = result | details(found, subject, pulls)
-        stage.path("estimate.json").write_text(
-            json.dumps(plain(full), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        stage.write("estimate.json", full)
         if not found.stopped:
             subject.mesh.with_data(cell_data={
                 "young": subject.young(found.values),

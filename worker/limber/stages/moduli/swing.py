@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from limber.core.errors import Command, InputError, Option, Text, WorkError
 from limber.core.files.reading import read_json
-from limber.core.json_values import number_array, plain
+from limber.core.json_values import number_array
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings, SwingSettings
@@ -125,8 +124,7 @@ class FitSwing(SwingSettings, Repeatable, BranchStage):
             with branch.stage("swing", self, digests=digests) as stage:
                 figure = {"times_s": found.times, "seen_m": found.seen,
                           "simulated_m": found.simulated}
-                stage.path("swing.json").write_text(json.dumps(
-                    plain(result | figure), allow_nan=False) + "\n", encoding="utf-8")
+                stage.write("swing.json", result | figure, indent=None)
                 subject.mesh.with_data(cell_data={
                     "young": young, "poisson": model.poisson, "density": model.density,
                 }).write(stage.path("mesh.vtu"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -135,8 +134,7 @@ class FitVibration(Repeatable, BranchStage):
             young = fitted["young_factor"] * model.young
             result = _summary(seen, fitted, float(young.mean()))
             with branch.stage("vibration", self, digests=digests) as stage:
-                stage.path("vibration.json").write_text(
-                    json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+                stage.write("vibration.json", result)
                 mesh.with_data(cell_data={"young": young, "poisson": model.poisson,
                                           "density": model.density}).write(stage.path("mesh.vtu"))
                 stage.result.update(result)

@@ -287,8 +287,7 @@ def _keep(branch: Branch, settings: ApplyLoads, inputs: dict[str, Any], model: B
     displacements = np.stack([np.zeros_like(bent.displacement), bent.displacement])
     states = [strain_state(model, displacement) for displacement in displacements]
     with branch.stage(f"load:{settings.name}", settings, **inputs) as stage:
-        stage.path(f"loads/{settings.name}.json").write_text(
-            json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        stage.write(f"loads/{settings.name}.json", result)
         write_pc2(stage.path(f"{name}.pc2"), model.mesh.nodes[nodes] + displacements[:, nodes])
         np.savez_compressed(stage.path(f"{name}.npz"), **surface_fields(model.mesh, states))
         stage.path(f"{name}.json").write_text(json.dumps({

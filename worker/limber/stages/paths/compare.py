@@ -123,7 +123,7 @@ class ComparePlanners(ParallelStage, PlacedStage):
                 if trial.trouble:
                     progress.warn(f"Trial {trial.number + 1} has no path: {trial.trouble}")
             gaps = [trial.gap_percent for trial in good if trial.gap_percent is not None]
-            stage.path(f"comparisons/{self.name}.csv").write_text(_rows(good), encoding="utf-8")
+            stage.write(f"comparisons/{self.name}.csv", _rows(good))
             planner_figure(field, good).savefig(stage.path(f"comparisons/{self.name}.png"), dpi=150)
             stage.result.update({
                 "goal": goal.describe(), "trial_count": len(trials), "planned_count": len(good),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from dataclasses import dataclass
@@ -330,10 +329,7 @@ def _armed(planned: PlannedMotion, progress: Progress) -> dict[str, Any]:
         with branch.stage(f"execute:{name}", asked,
                           reads=[f"plans/{name}.csv"]) as stage:
             stage.adopt(log)
-            from limber.core.json_values import plain
-
-            stage.path(f"executions/{name}/report.json").write_text(
-                json.dumps(plain(result), indent=1) + "\n", encoding="utf-8")
+            stage.write(f"executions/{name}/report.json", result)
             stage.result.update(result)
     if not reached:
         raise SafetyStop(f"The robot was stopped: {event['reason']}.",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +20,6 @@ from limber.core.errors import (
     Text,
 )
 from limber.core.files.atomic import file_digest
-from limber.core.json_values import plain
 from limber.core.progress import Progress
 from limber.planning.settings import PlanSettings
 from limber.stages.result import (
@@ -328,8 +326,7 @@ class PlanPaths(PlanSettings, ParallelStage, PlacedStage):
             progress(0.95, "writing")
             rate = SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
             found.summary["setpoint_rate_hz"] = rate
-            stage.path(f"plans/{name}-setpoints.csv").write_text(setpoints(motion, pace, rate),
-                                                                 encoding="utf-8")
+            stage.write(f"plans/{name}-setpoints.csv", setpoints(motion, pace, rate))
             _write(stage, name, limits, pace, motion, grasp_model, found)
             with open(stage.path(f"plans/{name}-damage.csv"), "w", encoding="utf-8") as stream:
                 DamageAlong.of(grasp_model, load_skeleton(branch), found.plan.ahead.displacements,
@@ -466,23 +463,21 @@ def _write(stage: OpenStage, name: str, limits: Limits, pace: Pace, motion: Plan
     baseline, plan = (path_record(path.solved, names, pace=pace,
                                   field_energies=found.field.energy(path.solved.poses[:, :3]))
                       for path in (found.baseline, found.plan))
-    stage.path(f"plans/{name}.json").write_text(plan_text(
-        found.summary, baseline, plan, motion, limits_of_motion(motion, limits), pace),
-                                                encoding="utf-8")
-    stage.path(f"plans/{name}.csv").write_text(path_table(plan), encoding="utf-8")
-    stage.path(f"plans/{name}-baseline.csv").write_text(path_table(baseline), encoding="utf-8")
-    stage.path(f"plans/{name}-motion.csv").write_text(motion_table(motion), encoding="utf-8")
-    stage.path(f"plans/{name}-trees.csv").write_text(trees_table(found.trees), encoding="utf-8")
+    stage.write(f"plans/{name}.json", plan_text(
+        found.summary, baseline, plan, motion, limits_of_motion(motion, limits), pace))
+    stage.write(f"plans/{name}.csv", path_table(plan))
+    stage.write(f"plans/{name}-baseline.csv", path_table(baseline))
+    stage.write(f"plans/{name}-motion.csv", motion_table(motion))
+    stage.write(f"plans/{name}-trees.csv", trees_table(found.trees))
     if found.to_go is not None:
         found.to_go.write(stage.path(f"plans/{name}-bound.npz"))
     displacements = found.plan.solved.displacements
     vertices = np.unique(grasp_model.mesh.surface_faces())
     frames = grasp_model.mesh.nodes[vertices] + displacements[:, vertices]
     write_pc2(stage.path(f"frames/{name}.pc2"), frames, 0.0, 1.0)
-    stage.path(f"frames/{name}.json").write_text(json.dumps(plain({
+    stage.write(f"frames/{name}.json", {
         "frame_count": len(frames), "rate": _FRAME_RATE, "vertex_count": len(vertices),
-        "energies_j": plan.energies, "forces_n": plan.force_sizes, "path": name})) + "\n",
-                                                 encoding="utf-8")
+        "energies_j": plan.energies, "forces_n": plan.force_sizes, "path": name}, indent=None)
     # Values for colouring the surface in the scene, at the vertices and in the order of the frames.
     model, mesh = grasp_model.model, grasp_model.mesh
     states = [strain_state(model, u) for u in displacements]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from limber.core.errors import Option, Text
-from limber.core.json_values import plain
 from limber.core.labels import table_of
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
@@ -131,8 +129,7 @@ class SuggestPull(ParallelStage, BranchStage):
                 stage.result["plan"] = {"name": self.plan} | _for_plan(
                     branch, self.plan, known, known.after(found.pulls[0].information),
                     progress.part(0.8, 1.0))
-            stage.path(FILE).write_text(json.dumps(plain(stage.result), indent=1) + "\n",
-                                        encoding="utf-8")
+            stage.write(FILE, stage.result)
         return branch.manifest.stages["suggest-pull"].result
 
 

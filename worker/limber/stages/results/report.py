@@ -76,7 +76,7 @@ class WriteReport(Repeatable, BranchStage):
             html = with_picture(html, png)
             found = found | {"figure_count": found["figure_count"] + 1}
         with branch.stage("report", settings, digests=digests) as stage:
-            stage.path("report.html").write_text(html, encoding="utf-8")
+            stage.write("report.html", html)
             stage.result.update(found)
         progress(1.0, "written")
         return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}

@@ -268,7 +268,7 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
         write_branch(stage, labelled(cloud, skeleton),
                      replace(meshed, masses=[*meshed.masses, *leaves]))
         if edits:
-            stage.path(EDITS).write_text(edits_text(edits), encoding="utf-8")
+            stage.write(EDITS, edits_text(edits))
         else:
             stage.remove(EDITS)
         doubts = SearchDoubts.of(made.result)

@@ -1,6 +1,5 @@
 """Stage ``mesh``, and the result of a branch that has been meshed."""
 
-import json
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -144,8 +143,7 @@ class Mesh(MeshSurfaceSettings, Repeatable):
             if has_cylinders:
                 write_cylinders(made.skeleton, stage.path("skeleton.csv"))
             if masses:
-                stage.path("point_masses.json").write_text(json.dumps(masses, indent=1) + "\n",
-                                                           encoding="utf-8")
+                stage.write("point_masses.json", masses)
             stage.result.update(made.numbers | {"warnings": warnings})
             progress(1.0, "meshed", tets=made.mesh.tet_count)
         return branch.manifest.stages["mesh"].result

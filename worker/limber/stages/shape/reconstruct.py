@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -190,7 +189,7 @@ def _of_scan(asked: Reconstruct, progress: Progress) -> dict[str, Any]:
         write_branch(stage, made.cloud, made.meshed)
         stage.remove(SEARCH)
         if edits:
-            stage.path(EDITS).write_text(edits_text(edits), encoding="utf-8")
+            stage.write(EDITS, edits_text(edits))
         elif asked.edits is not None:
             stage.remove(EDITS)
         if _copy_truth(asked.cloud, stage, made.alignment):
@@ -342,7 +341,7 @@ def write_branch(stage: OpenStage, cloud: Cloud, meshed: MeshedBranch) -> None:
     meshed.surface.write_ply(stage.path("surface.ply"))
     meshed.mesh.write(stage.path("mesh.vtu"))
     if meshed.masses:
-        stage.path("point_masses.json").write_text(json.dumps(meshed.masses, indent=1) + "\n")
+        stage.write("point_masses.json", meshed.masses)
     else:
         stage.remove("point_masses.json")  # from an earlier run: its twigs are in the mesh now
 
@@ -389,7 +388,7 @@ def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
     skeleton = read_swc(skeleton_path)
     skeleton.moved(alignment.apply(skeleton.nodes)).write_swc(stage.path("truth/skeleton.swc"))
     truth["control_points_m"] = alignment.apply(np.array(truth["control_points_m"])).tolist()
-    stage.path("truth/truth.json").write_text(json.dumps(truth, indent=1) + "\n")
+    stage.write("truth/truth.json", truth)
     surface_path = cloud_path.parent / "truth_surface.ply"
     if surface_path.is_file():
         surface = Surface.read(surface_path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -88,7 +87,7 @@ class SetTarget(Repeatable, PlacedStage):
             found = {} if self.at is None else _placed(load_mesh(branch), self.name, self.at,
                                                        self.mass)
             targets = others if self.at is None else [*others, found.pop("target")]
-            stage.path(FILE).write_text(_text(targets), encoding="utf-8")
+            stage.write(FILE, _content(targets))
             stage.result.update(
                 {"target": self.name, **found,
                  "targets": sorted(target.name for target in targets)})
@@ -138,9 +137,9 @@ def _numbers(point: np.ndarray) -> str:
     return ", ".join(f"{value:.3f}" for value in point)
 
 
-def _text(targets: list[NamedTarget]) -> str:
+def _content(targets: list[NamedTarget]) -> dict[str, Any]:
     from limber.store.loading import TARGETS_FORMAT
 
     entries = [{"name": target.name, "position_m": list(target.position), "mass_kg": target.mass}
                for target in sorted(targets, key=lambda target: target.name)]
-    return json.dumps({"format_version": TARGETS_FORMAT, "targets": entries}, indent=1) + "\n"
+    return {"format_version": TARGETS_FORMAT, "targets": entries}
