@@ -392,10 +392,11 @@ def test_surfaces_become_branches(tmp_path):
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_verbs_are_the_commands(own, tmp_path):
     """A command with the same settings finds all done, and prints what the verb returned."""
-    fit = {"fractions": (0.5,), "quick": True}
+    fit = {"fractions": (0.2, 0.4, 0.6, 0.8), "quick": True}
     done = {}
     for command, verb, *options in (
-            ("estimate", lambda: own.estimate(**fit), "--fractions", 0.5, "--quick"),
+            ("estimate", lambda: own.estimate(**fit), "--fractions",
+             "0.2,0.4,0.6,0.8", "--quick"),
             ("energy", lambda: own.energy_field(samples=30, workers=1), "--samples", 30),
             ("plan", lambda: own.plan(name="p", iterations=200, workers=1), "--name", "p",
              "--iterations", 200),

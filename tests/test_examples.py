@@ -90,6 +90,8 @@ def test_the_notebook(tmp_path):
     """From a scan to a plan with a picture in eight lines; the modulus is about the true one."""
     first, *others = notebook_code()
     assert len([line for line in first.splitlines() if line.strip()]) <= 8
+    first = first.replace("length=0.4, fork_count=1", "length=0.3, fork_count=0")  # half the time
+    assert "fork_count=0" in first
     script = tmp_path / "cells.py"
     # A cell's last line is what a notebook shows.
     script.write_text("\n".join(
@@ -132,7 +134,7 @@ def test_headless_estimation(branch_folder, tmp_path):
     recording = tmp_path / "pull-2.mcap"
     ExportPull(branch_folder=branch_folder, name="pull-1", mcap=recording).run()
     run("bash", SCRIPTS / "estimate.sh", branch_folder, recording, ESTIMATE=(
-        "--pull pull-2 --fractions 0.5 --quick"))
+        "--pull pull-2 --fractions 0.2,0.4,0.6,0.8 --quick"))
     told = json.loads((tmp_path / "small-estimate.json").read_text())
     assert told["status"] == "done" and told["converged"] and min(told["young_pa"]) > 0
     assert len(read_pull(branch_folder / "pulls" / "pull-2").times) > 10
@@ -146,16 +148,16 @@ def test_rendering(tmp_path):
     from PIL import Image
 
     folder = shutil.copytree(EXAMPLE, tmp_path / "a.branch")
-    run("bash", SCRIPTS / "render.sh", folder, WIDTH="160", SIDES="3")
+    run("bash", SCRIPTS / "render.sh", folder, WIDTH="160", SIDES="2")
     assert (tmp_path / "a.blend").stat().st_size > 10_000
     assert (tmp_path / "a.png").stat().st_size > 2000
     with Image.open(tmp_path / "a.webp") as moving:
-        assert moving.n_frames == 3 and moving.size == (160, 120)
+        assert moving.n_frames == 2 and moving.size == (160, 120)
         sides = []
-        for number in range(3):
+        for number in range(2):
             moving.seek(number)
             sides.append(np.asarray(moving.convert("L"), float))
-    assert all(np.abs(sides[k] - sides[k - 1]).max() > 30 for k in range(3))
+    assert np.abs(sides[1] - sides[0]).max() > 30
 
 
 @pytest.mark.slow

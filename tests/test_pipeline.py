@@ -48,9 +48,9 @@ def done(tmp_path_factory) -> tuple[Path, dict[str, dict]]:
     stage("estimate", branch)
     stage("simulate", branch)
     stage("energy", branch, "--samples", 40, "--seed", 3, "--workers", 1)
-    stage("plan", branch, "--name", "to-goal", "--seed", 3, "--iterations", 500, "--workers", 1)
+    stage("plan", branch, "--name", "to-goal", "--seed", 3, "--iterations", 200, "--workers", 1)
     stage("scene", branch, "-o", folder / "scene.blend", "--render", folder / "scene.png",
-          "--width", 560)
+          "--width", 320)
     stage("report", branch, "--picture", folder / "scene.png")
     assert "NaN" not in json.dumps(results)
     return branch, results
@@ -95,7 +95,7 @@ def test_picture_shows_something(done):
     branch, _ = done
     with Image.open(branch.parent / "scene.png") as image:
         colours = np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0)
-        assert min(image.size) >= 400
+        assert min(image.size) >= 240
     assert len(colours) > 500
 
 
@@ -113,12 +113,16 @@ def test_second_run_computes_nothing(done):
 
 @pytest.mark.slow
 def test_folder_can_be_moved(done, tmp_path):
-    """A copy elsewhere verifies and goes on from where it was."""
-    branch, _ = done
+    """A copy elsewhere verifies, is up to date, and goes on from where it was."""
+    branch, results = done
     moved = tmp_path / "elsewhere" / "small.branch"
     shutil.copytree(branch, moved)
     Branch.open(moved, verify=True)
-    assert result_of("report", moved)["missing"] == []
+    page = (moved / "report.html").stat().st_mtime_ns
+    told = result_of("report", moved, "--picture", branch.parent / "scene.png")
+    assert told["sections"] == results["report"]["sections"]
+    assert (moved / "report.html").stat().st_mtime_ns == page
+    assert result_of("predict", moved, "--weight", 0.1)["drop_m"] > 0
 
 
 @pytest.mark.slow
@@ -128,17 +132,14 @@ def test_bad_cloud_costs_no_result(done, tmp_path):
     bad = tmp_path / "bad.ply"
     bad.write_bytes((branch / "cloud.ply").read_bytes()[:300])
     before = {p: p.read_bytes() for p in branch.rglob("*") if p.is_file()}
-    code = subprocess.run([sys.executable, "-m", "limber", "reconstruct", str(bad), "-o",
-                           str(branch)], check=False, capture_output=True).returncode
-    assert code == 2
+    assert call(["reconstruct", str(bad), "-o", str(branch)]) == 2
     assert {p: p.read_bytes() for p in branch.rglob("*") if p.is_file()} == before
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
-@pytest.mark.parametrize(("stage", "options"), [
-    ("estimate", ["--force"]), ("energy", ["--force", "--samples", "200", "--workers", "1"]),
-])
+@pytest.mark.parametrize(("stage", "options"), [("estimate", ["--force"]), pytest.param(
+    "energy", ["--force", "--samples", "200", "--workers", "1"], marks=pytest.mark.campaign)])
 def test_ctrl_c_in_a_stage_keeps_the_folder(done, tmp_path, stage: str, options: list[str]):
     """Ctrl-C in the middle of a stage ends with 130; the folder verifies, its files unchanged."""
     branch = tmp_path / "copy.branch"
