@@ -75,8 +75,7 @@ def _users_level() -> int:
 @contextlib.contextmanager
 def script_run_once() -> Iterator[None]:
     """Keep the processes that a stage starts from importing the user's script: that would run it
-    again, and they do not need it.
-    """
+    again, and they do not need it."""
     with _lock:
         _hidden.append(_hidden[0] if _hidden else sys.modules["__main__"])
         sys.modules["__main__"] = types.ModuleType("__main__")

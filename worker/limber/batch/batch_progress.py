@@ -35,10 +35,8 @@ WAITING, RUNNING, DONE, KEPT, FAILED = "waiting", "running", "done", "up to date
 
 @dataclass(frozen=True)
 class Record:
-    """The state of a task: ``numbers`` are those of its result, ``memory_mb`` its largest.
-
-    ``content`` is the digest of the branch shown by a stage that stores no results in it.
-    """
+    """The state of a task: ``numbers`` of its result, ``memory_mb`` its largest, ``content`` the
+    digest of the branch shown by a stage that stores no results in it."""
 
     status: str = WAITING
     error: str = ""
@@ -159,10 +157,8 @@ def path_of_log(jobs: JobFile) -> Path:
 
 
 class BatchLog:
-    """Appends lines with their time to a batch's log; use it in a ``with``.
-
-    A line that cannot be written, on a full disk, is printed on standard error instead.
-    """
+    """Appends lines with their time to a batch's log, in a ``with``; one that cannot be written, on
+    a full disk, is printed on standard error."""
 
     def __init__(self, jobs: JobFile):
         self._handler = RotatingFileHandler(path_of_log(jobs), maxBytes=MOST_BYTES,
@@ -193,10 +189,8 @@ _VIEWS = (("from the front", 0), ("from the side", 1))
 
 
 def pictures(folder: Path) -> str:
-    """Return drawings (SVG) of a branch, with the range of its modulus; empty if it has no axes.
-
-    The modulus is that of the mesh; if it is uniform or unknown, wood is brown.
-    """
+    """Return drawings (SVG) of a branch, with the range of the mesh's modulus, or brown if uniform
+    or unknown; empty if it has no axes."""
     try:
         skeleton = read_swc(folder / "skeleton.swc")
     except (OSError, LimberError):

@@ -49,21 +49,12 @@ class ClusterLostError(WorkError):
 
 
 class Cluster:
-    """Runs tasks on a Dask cluster; use it in a ``with``.
-
-    Args:
-        jobs: The job file; its limits hold for each stage.
-        kind: One of :data:`~limber.batch.job_file.CLUSTERS`, or None with an ``address``.
-        address: Address of a running scheduler: ``tls://HOST:PORT``, or ``tcp://`` on loopback.
-        workers: Number of workers to start, or of jobs to request from a queue.
-        progress: Reports the wait for the first worker; cancelling it ends the wait.
-
-    Raises:
-        InputError: the address is not safe, or the number of jobs for a queue is missing.
-        MissingDependencyError: Dask is not installed.
-        WorkError: the cluster could not be started, or a worker of it cannot run the tasks.
-        Cancelled: it was cancelled before a worker came.
-    """
+    """Runs tasks of a job file, within its limits for each stage, on a Dask cluster, in a ``with``:
+    one of :data:`~limber.batch.job_file.CLUSTERS` with that many workers or queued jobs, or a
+    scheduler's ``tls://HOST:PORT``, or ``tcp://`` on loopback; ``progress`` reports the wait for
+    the first worker. InputError for an unsafe address, or no number of jobs; MissingDependencyError
+    without Dask; WorkError if it does not start, or a worker cannot run the tasks; Cancelled before
+    one came."""
 
     def __init__(self, jobs: JobFile, kind: str | None = None, *, address: str | None = None,
                  workers: int | None = None, progress: Progress):
@@ -84,9 +75,7 @@ class Cluster:
 
     def submit(self, task: Stage, folder: Path) -> Future:
         """Submit a task; its future holds the result of :func:`~limber.batch.stage_task.run_task`.
-
-        If a worker is lost, only this stage is lost: another worker runs it again.
-        """
+        If a worker is lost, another runs this stage again."""
         from distributed.utils import TimeoutError as NoAnswer
 
         future: Future = Future()

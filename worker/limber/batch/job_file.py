@@ -44,11 +44,9 @@ def fingerprint(task: Stage) -> str:
 
 @dataclass(frozen=True)
 class BranchJob:
-    """The stages to run on one branch, in this order; ``sweep`` contains its own values.
-
-    ``fetched`` has the addresses of its inputs and their local paths, ``home`` the address of the
-    branch folder itself, or an empty text.
-    """
+    """The stages to run on one branch, in this order; ``sweep`` contains its own values,
+    ``fetched`` the addresses of its inputs and their local paths, ``home`` the branch folder's
+    address, or ""."""
 
     name: str
     folder: Path
@@ -86,10 +84,8 @@ _KEY = re.compile(rf"({_PART}(?:\s*\.\s*{_PART})*)\s*=")
 
 
 def toml_lines(text: str) -> dict[KeyPath, int]:
-    """Return the line, from 1, of every table and key: ``("job", 0, "stage", 1, "run")``.
-
-    Text in a multi-line string that looks like a key counts as one, which does no harm.
-    """
+    """Return the line, from 1, of every table and key: ``("job", 0, "stage", 1, "run")``; text in a
+    multi-line string that looks like a key counts as one, which does no harm."""
     found: dict[KeyPath, int] = {(): 1}
     counts: dict[KeyPath, int] = {}
     table: KeyPath = ()
@@ -179,16 +175,9 @@ class Problems:
 
 
 class JobPaths:
-    """Finds the files that a job file names, and remembers their addresses.
-
-    Args:
-        folder: Folder of the job file: paths in it are relative to it.
-        problems: Collects the errors of a path, with its position in the job file.
-
-    Attributes:
-        out: Folder of results and fetched files.
-        home: The address of results; empty if they stay in ``out``.
-    """
+    """Finds the files that a job file names, relative to its folder, and remembers their addresses;
+    ``problems`` collects errors with their position, ``out`` is the folder of results and fetched
+    files, ``home`` the address of results, empty if they stay there."""
 
     def __init__(self, folder: Path, problems: Problems):
         self._folder, self._problems = folder, problems
@@ -283,11 +272,8 @@ _ROBOTS = {"always": "It moves a robot, which a person must supervise.",
 
 
 def why_not_in_batches(name: str) -> str:
-    """Return why a stage is not allowed in a job file; an empty text if it is allowed.
-
-    Raises:
-        KeyError: there is no such stage.
-    """
+    """Return why a stage is not allowed in a job file, else ""; KeyError if there is no such
+    stage."""
     stage = stage_class(name)
     if stage.about.moves_robot:
         return _ROBOTS[stage.about.moves_robot]
@@ -309,11 +295,8 @@ class Source:
 
 
 class _StageTable:
-    """One ``[[job.stage]]`` on one branch: its values, each with its position in the file.
-
-    Args:
-        sweep: The branch's own values.
-    """
+    """One ``[[job.stage]]`` on one branch, whose own values are ``sweep``: its values with their
+    positions in the file."""
 
     def __init__(self, reader: "_Reader", stage: type[Stage], table: dict[str, Any],
                  key_path: KeyPath, source: Source, folder: Path, sweep: dict[str, Any]):
@@ -467,11 +450,8 @@ _MOST_BRANCHES = 100_000
 
 
 def read_jobs(path: Path) -> JobFile:
-    """Read and check a job file.
-
-    Raises:
-        InputError: it is not TOML, or cannot be run; lists every problem with its line.
-    """
+    """Read and check a job file; InputError, with every problem and its line, if it is not TOML, or
+    cannot be run."""
     path = Path(path)
     require_file(path, "A job file")
     try:

@@ -37,26 +37,12 @@ _MEMORY_MB_EACH = 1000.0
 def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
              workers: int | None = None, cluster: str | None = None,
              scheduler: str | None = None, progress: Progress = SILENT) -> None:
-    """Run the tasks that are not up to date; a failure ends only its own branch.
-
-    Tasks that failed before with the same settings are run again only with ``retry_failed``. Each
-    stage itself checks whether the branch already has its result.
-
-    Args:
-        jobs: The checked job file.
-        records: Records the outcome of each task as it ends.
-        retry_failed: Try failed tasks again.
-        workers: Largest number of parallel branches; by default the file's, or the core budget. On
-            a queue's cluster: the number of jobs to request.
-        cluster: Where to run, one of :data:`limber.batch.job_file.CLUSTERS`; by default the
-            file's, or this process's own pool.
-        scheduler: Address of a Dask scheduler to use instead.
-        progress: Cancelling it stops all; finished results stay.
-
-    Raises:
-        Cancelled: it was cancelled.
-        WorkError: the cluster was not available, or was lost.
-    """
+    """Run the tasks that are not up to date; a failure ends only its own branch, and is tried again
+    only with ``retry_failed``. ``records`` gets each outcome; ``workers``: most parallel branches,
+    or jobs of a queue, by default the file's or the core budget; ``cluster``: one of
+    :data:`limber.batch.job_file.CLUSTERS`, by default the file's, or this process's own pool, or a
+    Dask ``scheduler``. Cancelled if ``progress`` was, finished results stay; WorkError if the
+    cluster was not available, or lost."""
     jobs.out.mkdir(parents=True, exist_ok=True)
     kind = None if scheduler else cluster or jobs.cluster
     with records.writing(), (
@@ -210,8 +196,7 @@ class _Course:
 
     def moved(self, future: Future, branch: BranchJob, number: int, seconds: float) -> None:
         """Continue after a branch was fetched, or end with it; a failure counts for the next task,
-        or for the last.
-        """
+        or the last."""
         try:
             future.result()
         except LimberError as error:

@@ -25,11 +25,8 @@ def emitted(jobs: JobFile, kind: str) -> str:
 
 
 def write_script(jobs: JobFile, kind: str) -> Path:
-    """Write the script into the job file's results folder, as JOBS.slurm or JOBS.smk.
-
-    Raises:
-        InputError: inputs or results are at addresses.
-    """
+    """Write the script into the job file's results folder, as JOBS.slurm or JOBS.smk; InputError if
+    inputs or results are at addresses."""
     if jobs.home or any(branch.is_moved for branch in jobs.branches):
         raise InputError(f"{jobs.path} contains addresses.", "A script runs stages on local "
                          "files. Only the batch itself fetches and uploads remote files.",

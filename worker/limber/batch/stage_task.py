@@ -22,18 +22,10 @@ _SAMPLE_SECONDS = 0.2
 
 
 def run_task(task: Stage, folder: Path, progress: Progress) -> dict[str, Any]:
-    """Run a stage; return its outcome, also if it failed.
-
-    Returns:
-        ``error`` (empty if it succeeded), ``result``, ``warnings``, ``seconds``, ``memory_mb`` at
-        its largest, ``content``, the digest of the branch shown by a stage that stores no results
-        in it, and ``is_kept``: the branch already had the result, from this input with these
-        settings.
-
-    Raises:
-        BranchBusyError: another program is writing to the branch.
-        Cancelled: the stage was cancelled.
-    """
+    """Run a stage; return its outcome, also if it failed: ``error`` or "", ``result``,
+    ``warnings``, ``seconds``, ``memory_mb`` at its largest, ``content``, the digest of the branch
+    shown by a stage that stores no results in it, ``is_kept``: the branch had the result from this
+    input and settings. BranchBusyError if another program writes to the branch; Cancelled."""
     warnings: list[str] = []
     before = _finished(task, folder)
     started = time.perf_counter()
@@ -58,11 +50,8 @@ def run_task(task: Stage, folder: Path, progress: Progress) -> dict[str, Any]:
 
 
 def is_shown(task: Stage, folder: Path, content: str) -> bool:
-    """Whether a stage that stores no results in the branch, such as a scene, is up to date.
-
-    Args:
-        content: Digest of the branch that it has shown; empty if it has shown none.
-    """
+    """Whether a stage that stores no results in the branch, such as a scene, is up to date;
+    ``content``: digest of the branch that it has shown, or ""."""
     outputs = _outputs(task)
     return bool(content and outputs) and content == _content(task, folder) and all(
         path.exists() for path in outputs)
@@ -147,22 +136,10 @@ def unfit(version: str) -> str:
 
 def run_remotely(name: str, stated: dict[str, Any], directory: str, folder: str, limits: Limits,
                  version: str) -> dict[str, Any]:
-    """Run a stage in a process of this worker's pool; return its outcome.
-
-    Args:
-        name: The stage.
-        stated: Its values, as of :meth:`limber.stages.stage.Stage.stated`.
-        directory: The folder to which its paths are relative.
-        folder: The branch folder.
-        limits: Its limits on time and memory.
-        version: Version of the batch.
-
-    Returns:
-        As for :func:`limber.batch.stage_task.run_task`.
-
-    Raises:
-        Cancelled: the batch was cancelled.
-    """
+    """Run a stage with values as of :meth:`limber.stages.stage.Stage.stated`, paths relative to
+    ``directory``, in a process of this worker's pool, within limits on time and memory, for a batch
+    of this version; return its outcome as :func:`limber.batch.stage_task.run_task`. Cancelled if
+    the batch was."""
     reason = unfit(version)
     if reason:
         return _failed(f"The worker {os.getpid()} cannot run this stage: {reason}.", 0.0)

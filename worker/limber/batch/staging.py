@@ -61,11 +61,8 @@ class Staging:
 
 
 def bring_in(branch: BranchJob, stop: Callable[[], None]) -> None:
-    """Fetch the inputs of a branch, and the branch if it is missing here or changed remotely.
-
-    Raises:
-        WorkError: a file cannot be fetched. BranchFolderError: both copies were changed.
-    """
+    """Fetch the inputs of a branch, and the branch if missing here or changed remotely. WorkError
+    if a file cannot be fetched; BranchFolderError if both copies were changed."""
     for address, path in branch.fetched:
         fetch(address, path, stop)
     if not branch.home:
@@ -83,10 +80,7 @@ def bring_in(branch: BranchJob, stop: Callable[[], None]) -> None:
 
 def put_out(jobs: JobFile, branch: BranchJob) -> None:
     """Upload the new files of a branch to its address, and those that its stages wrote beside it.
-
-    Raises:
-        WorkError: it cannot be written there. BranchFolderError: the remote branch changed.
-    """
+    WorkError if it cannot be written; BranchFolderError if the remote branch changed."""
     if (branch.folder / MANIFEST).is_file():
         _put_branch(branch)
     if jobs.home:
@@ -102,11 +96,8 @@ def put_summary(jobs: JobFile) -> None:
 
 
 def _is_unchanged(branch: BranchJob, theirs: bytes) -> bool:
-    """Whether the local branch is the one at its address, or newer.
-
-    Raises:
-        BranchFolderError: each has content that the other lacks.
-    """
+    """Whether the local branch is the one at its address, or newer; BranchFolderError if each has
+    content that the other lacks."""
     path = branch.folder / MANIFEST
     if not path.is_file():
         return False

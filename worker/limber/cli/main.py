@@ -47,10 +47,8 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 def command_summaries() -> dict[str, str]:
-    """Return a summary of each command in one line, by name; imports none of them.
-
-    `limber --help` must not wait for the numerical packages.
-    """
+    """Return a summary of each command in one line, by name, importing none of them: `limber
+    --help` must not wait for the numerical packages."""
     found = {}
     for path in sorted((Path(__file__).parent / "commands").glob("*.py")):
         if path.stem != "__init__":

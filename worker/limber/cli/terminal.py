@@ -81,8 +81,7 @@ UNITS: dict[str, Callable[[float], str]] = {
     "MB": lambda value: f"{value / 1e6:,.1f} MB", "count": lambda value: f"{value:,.0f}",
     "share": lambda value: f"{100 * value:.3g} %", "%": lambda value: f"{value:.3g} %"}
 """Format of a value in SI units for people; ``|m`` is the length of a vector, and
-``#branch/branches`` a number of them.
-"""
+``#branch/branches`` a number of them."""
 
 
 class _NotThere(Exception):

@@ -128,10 +128,8 @@ def options_of(command: click.Command) -> frozenset[str]:
 
 
 def without_foreign_options(message: Text, own: Collection[str]) -> str:
-    """Return a message without the brackets and sentences that name options not among ``own``.
-
-    For a command that runs others: its user cannot give their options.
-    """
+    """Return a message without the brackets and sentences that name options not among ``own``, for
+    a command that runs others: its user cannot give theirs."""
     text = message.shown(lambda part: str(part) if is_own(part, own) else "\0")
     return " ".join(part for part in re.split(r"(?<=[.?!])\s+", re.sub(
         r"\s*\([^()]*\0[^()]*\)", "", text)) if "\0" not in part)
@@ -144,16 +142,9 @@ def is_own(part: Option | Command, own: Collection[str]) -> bool:
 
 def settings_options(model: type[BaseModel], name: str = "settings", *,
                      without: Collection[str] = ()) -> Callable[[Callable], Callable]:
-    """Add one option for each field of a model; the function gets ``name=model(...)``.
-
-    Args:
-        model: The model.
-        name: Name of the function's argument.
-        without: Fields that get no option and keep their defaults.
-
-    Raises:
-        InputError: when the command is called with values that the model refuses.
-    """
+    """Add one option for each field of a model but ``without``, which keep their defaults; the
+    function gets ``name=model(...)``. InputError when it is called with values that the model
+    refuses."""
     fields = {field: model for field in model.model_fields if field not in without}
 
     def wrap(function: Callable) -> Callable:

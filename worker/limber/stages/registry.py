@@ -104,11 +104,7 @@ def stage_summaries() -> dict[str, str]:
 
 
 def stage_class(name: str) -> "type[Stage]":
-    """Return the class of a stage.
-
-    Raises:
-        KeyError: there is no such stage.
-    """
+    """Return the class of a stage; KeyError if there is no such stage."""
     found = _stages()[name]
     registered = [kind for kind in _registered if kind.about.name == name]
     return registered[0] if registered else getattr(
@@ -167,8 +163,7 @@ def stage_schema(name: str) -> dict[str, Any]:
 
 def all_schemas() -> dict[str, Any]:
     """Return the schemas of all stages by name, the format's version, the presets of species and
-    sensors, and the largest size [m] without a question about the unit.
-    """
+    sensors, and the largest size [m] without a question about the unit."""
     from limber.geometry.cloud.preparation import LONGEST
     from limber.mechanics.materials.materials import SOURCE, SPECIES
     from limber.recordings.sensor_checks import SENSORS

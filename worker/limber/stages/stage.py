@@ -211,8 +211,7 @@ class Repeatable(Stage):
 
     def is_kept(self, branch: "Branch", key: str = "", **inputs: Any) -> bool:
         """Whether its result in a branch holds, as :meth:`limber.store.Branch.is_current` takes
-        ``inputs``; never with ``force``.
-        """
+        ``inputs``; never with ``force``."""
         return not self.force and branch.is_current(key or self.entry, self, **inputs)
 
 

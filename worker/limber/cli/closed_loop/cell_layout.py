@@ -131,8 +131,7 @@ _FORCE_MARGIN = 2.0
 """Ratio of the largest force of a path to the force that holds the flower at its goal."""
 _SOFT_MARGIN, _HARD_MARGIN = 1.3, 1.5
 """Ratio of the guard's pause force to a path's force, and of its stop force to the pause force: the
-measured force of a stiff branch differs from its prediction.
-"""
+measured force of a stiff branch differs from its prediction."""
 _BEYOND = 1.5
 """Reach of the sampled energy field as a multiple of the distance to the goal."""
 

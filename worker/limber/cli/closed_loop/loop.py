@@ -54,8 +54,7 @@ _PEAK_N, _TRAVEL_M = 6.0, 0.04
 _SOFTER = 5.0  # a branch is this much stiffer nearer to its root, at most
 OPEN_FACTOR = 4.0
 """Ratio of the ends of a modulus's interval above which `limber suggest-pull` decides whether
-another pull is worthwhile for the plan.
-"""
+another pull is worthwhile for the plan."""
 _MOST_PULLS = 3
 _MORE_SAMPLES = 450  # about twice the default
 _FRACTIONS = (0.5, 0.67, 0.8, 0.92)  # fractions of the main path at which another pull may hold it

@@ -90,10 +90,8 @@ class _Demo:
                 self.run.progress.warn(f"{name}: {text}")
 
     def show(self) -> None:
-        """Write the report, then scene and picture, unless they exist and show the current branch.
-
-        The report needs no Blender; it gets the picture once there is one.
-        """
+        """Write the report, then scene and picture, unless they show the current branch; the report
+        needs no Blender, and gets the picture once there is one."""
         title, note = "a Blender scene and its picture", self.folder / "demo.json"
         origin = {"branch": self._digest(), "limber": VERSION}
         scene, picture = self.folder / "scene.blend", self.folder / "scene.png"
@@ -245,11 +243,8 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
 
 def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
                 options: Mapping[str, Any]) -> LimberError | None:
-    """Run all stages up to the plan; a failure after the mesh still ends in a report.
-
-    Returns:
-        The stages that failed.
-    """
+    """Run all stages up to the plan; a failure after the mesh still ends in a report. Return those
+    that failed."""
     branch = demo.branch
     truth: tuple[str, ...] = ()
     errors = "realistic"

@@ -328,13 +328,9 @@ def gripper(run: Run, cell_file: Path, position: float, effort: float, action: s
 
 def _followed(run: Run, cell: Cell, trajectory: Trajectory | None, url: str, *, is_held: bool,
               goes_on: bool = False, across: Nudge | None = None) -> dict[str, Any]:
-    """Tare, or with the branch held recall the tare, and follow; return how that ended.
-
-    Args:
-        trajectory: None: go back along the path that was followed last.
-        goes_on: It belongs to the path of the leg before: a retreat goes back along both.
-        across: Nudge of the held branch before it, which shows a wrong sensor.
-    """
+    """Tare, or with the branch held recall the tare, and follow ``trajectory``, None: back along
+    the last path; return how that ended. ``goes_on``: a retreat goes back along the leg before as
+    well; ``across``: nudge of the held branch before, which shows a wrong sensor."""
     from limber.core.errors import SafetyStop
     from limber.robot.driver.real_time import claim_real_time, keep_awake
     from limber.robot.ros.bridge import Bridge

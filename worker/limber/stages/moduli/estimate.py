@@ -272,11 +272,8 @@ def _with_supported_points(
         branch: Branch, pulls: list[Pull], subject: Subject, settings: FitSpec,
         log: EvaluationLog, progress: Progress,
         ) -> tuple[fit_assessment.Estimate, FitSpec, Subject, dict[int, float] | None]:
-    """Fit with as many control points as the pulls support, starting from a fit with four.
-
-    Returns:
-        The fit, its settings and its branch, and the log evidence by number of control points.
-    """
+    """Fit with as many control points as the pulls support, from a fit with four on; return the
+    fit, its settings and branch, and the log evidence by number of control points."""
     from limber.estimation.control_point_count import supported
     from limber.estimation.fit import complete, fit_branch
     from limber.estimation.fitting.objective import EvaluationLog
@@ -334,15 +331,10 @@ def _finished_bases(branch: Branch) -> dict[str, str]:
 
 
 def follow(asked: EstimateYoung, progress: Progress, training_count: int = 60) -> dict[str, Any]:
-    """Estimate frame by frame from the first named pull (or the only one).
-
-    A pull that is still being recorded is read as it arrives. A finished one is replayed at
-    ``pace`` times its own speed (0: as fast as possible). Writes ``estimate-online.json`` with the
-    estimate after every frame; `limber estimate` afterwards gives the final result.
-
-    Raises:
-        InputError: no such pull, or one without markers.
-    """
+    """Estimate frame by frame from the first named pull (or the only one), as it arrives, or
+    replayed at ``pace`` times its speed (0: as fast as possible); writes ``estimate-online.json``
+    after every frame, `limber estimate` then gives the final result. InputError without such a
+    pull, or without markers."""
     from limber.estimation.online.follow import follow as follow_pull
     from limber.store.loading import load_subject
 
@@ -361,9 +353,8 @@ def follow(asked: EstimateYoung, progress: Progress, training_count: int = 60) -
 
 
 def _followed(branch: Branch, settings: EstimateSettings) -> tuple[str, Callable[[], Path]]:
-    """The pull to follow, and what identifies its folder. A pull that is being recorded is not in
-    the manifest, and its folder is a different one until it has ended.
-    """
+    """The pull to follow, and what identifies its folder, which of one that is being recorded is
+    not in the manifest, and is another until it has ended."""
     from limber.store.loading import pull_names
 
     name = settings.pull[0] if settings.pull else None
@@ -388,10 +379,8 @@ def _cloud(branch: Branch) -> np.ndarray | None:
 def _score_unused_pulls(branch: Branch, names: list[str], subject: Subject,
                         found: fit_assessment.Estimate, settings: FitSpec,
                         initial: Subject, progress: Progress) -> None:
-    """Score the branch's pulls that this estimate did not use.
-
-    ``initial``: the branch with the control points where markers without a position are.
-    """
+    """Score the branch's pulls that this estimate did not use; ``initial``: the branch with the
+    control points where markers without a position are."""
     from limber.estimation.fit_assessment import score_unused
     from limber.store.loading import known_pulls, load_pulls
 

@@ -32,13 +32,8 @@ MOST = 2
 
 @dataclass(frozen=True)
 class _Graph:
-    """An alternative.
-
-    Attributes:
-        number: As listed by ``limber skeleton``.
-        odds: Its probability over that of the skeleton in use.
-        edits: What makes it of that skeleton, in the scan's coordinates.
-    """
+    """An alternative, numbered as in ``limber skeleton``, its probability over that of the skeleton
+    in use, and the edits that make it of that, in the scan's coordinates."""
 
     number: int
     odds: float
@@ -47,12 +42,8 @@ class _Graph:
 
 def add_other_skeletons(found: Estimate, branch: Branch, pulls: Sequence[Pull],
                         settings: FitSpec, progress: Progress = SILENT) -> None:
-    """Add the differences of other likely skeletons' moduli to the errors of the model.
-
-    Args:
-        found: The estimate on the skeleton in use.
-        pulls: Each with the rest positions of its observed points.
-    """
+    """Add the differences of other likely skeletons' moduli to the errors of the model, by the
+    estimate on the skeleton in use and pulls with the rest positions of their observed points."""
     changes, weights = [], [1.0]
     for graph in _graphs(branch):
         named = Text(f"The skeleton may be another one: alternative {graph.number} of ",

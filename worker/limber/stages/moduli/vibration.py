@@ -142,14 +142,9 @@ class FitVibration(Repeatable, BranchStage):
 
 
 def young_of(model: BranchModel, seen: Ringing, settings: FitVibration) -> dict[str, Any]:
-    """Return the factor on the modulus for which a model has the record's first frequency.
-
-    Returns:
-        ``young_factor``, ``deviation`` (of its logarithm) and ``model_frequencies_hz``.
-
-    Raises:
-        WorkError: there is no such factor.
-    """
+    """Return the factor on the modulus for which a model has the record's first frequency:
+    ``young_factor``, ``deviation`` (of its logarithm), ``model_frequencies_hz``. WorkError if there
+    is none."""
     from limber.mechanics.dynamics.modes import lowest_modes
 
     target, factor, last = float(seen.frequencies[0]), 1.0, None

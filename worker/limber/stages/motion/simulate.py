@@ -237,11 +237,8 @@ def _write(stage: OpenStage, model: BranchModel, settings: SimulateSettings,
 
 
 def _replay(asked: Simulate, name: str) -> tuple[Simulate, PoseTable, float]:
-    """Return the stage, the gripper's path and the grasp's radius [m] of a recording.
-
-    Raises:
-        InputError: there is no recording of that name, or its gripper does not drive the branch.
-    """
+    """Return the stage, the gripper's path and the grasp's radius [m] of a recording; InputError if
+    there is none of that name, or its gripper does not drive the branch."""
     from limber.mechanics.dynamics.drive import PoseTable
     from limber.recordings.recording import read_pull
     from limber.store.loading import known_pulls

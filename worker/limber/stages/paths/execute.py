@@ -145,13 +145,9 @@ class ExecutePlan(BranchStage):
 
 @dataclass(frozen=True)
 class PlannedMotion:
-    """What :class:`ExecutePlan` follows.
-
-    Attributes:
-        asked: With the plan's own values where none were given.
-        across: The nudge before the path; None where the arm can make none.
-        result: Computed values, as :meth:`ExecutePlan.run` returns them.
-    """
+    """What :class:`ExecutePlan` follows: ``asked`` with the plan's own values where none were
+    given, the nudge before the path, None where the arm can make none, and ``result`` as of
+    :meth:`ExecutePlan.run`."""
 
     branch: Branch
     cell: Cell
@@ -162,11 +158,8 @@ class PlannedMotion:
 
 
 def planned_motion(asked: ExecutePlan, progress: Progress, *, is_to_move: bool) -> PlannedMotion:
-    """Return the checked motion of a plan.
-
-    Raises:
-        InputError, NoPathError: as :meth:`ExecutePlan.run`.
-    """
+    """Return the checked motion of a plan; InputError, NoPathError as of
+    :meth:`ExecutePlan.run`."""
     branch, cell, asked, stated = _plan_of_cell(asked, progress)
     if is_to_move:
         from limber.cell.cell_file import require_payload
@@ -238,9 +231,8 @@ def _plan_of_cell(asked: ExecutePlan, progress: Progress,
 
 
 def _stated_by_plan(branch: Branch, name: str) -> dict[str, Any]:
-    """Robot, clearance, pace, legs and the check in motion that a plan's file states, if in this
-    program's format.
-    """
+    """Robot, clearance, pace, legs and check in motion of a plan's file, if in this program's
+    format."""
     from limber.planning.plan_file import read_plan_summary
 
     file = f"plans/{name}.json"
@@ -384,9 +376,8 @@ def _stand(cell: Cell, link: RobotLink, leg: Leg, progress: Progress) -> None:
 
 
 def _open_at_start(cell: Cell, link: RobotLink, motion: RobotMotion) -> None:
-    """Open the gripper if Limber drives it: it closes on the branch later, and a tare needs it
-    empty. Only at the path's start, as elsewhere it may hold something.
-    """
+    """Open the gripper if Limber drives it, only at the path's start, as elsewhere it may hold
+    something: it closes on the branch later, and a tare needs it empty."""
     from limber.core.numerics.rigid import inverted, matrices, pose_vectors
     from limber.robot.motion.retreat import require_start
     from limber.robot.ur.grippers import is_driven

@@ -37,11 +37,8 @@ _BEFORE_PATH_SECONDS = 10.0  # from the tare to the path's start
 
 
 def planned_poses(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
-    """Return the path of the grasp from rest to the path's end [m, rad], shape [n, 6].
-
-    Rotations are those of the branch; NaN if the table has none. Approach and path are as planned;
-    a path without a planned approach gets a straight one.
-    """
+    """Return the planned approach, else a straight one, and path of the grasp from rest [m, rad],
+    shape [n, 6], with the branch's rotations; NaN if the table has none."""
     whole = branch.has(f"plans/{name}-motion.csv")
     path = branch.require(f"plans/{name}-motion.csv" if whole else f"plans/{name}.csv", "plan")
     table = read_columns(path, ("x_m", "y_m", "z_m"), "the table of a path")
@@ -73,16 +70,11 @@ def offsets_along(turning: dict[str, Any] | None, positions: np.ndarray) -> np.n
 def predicted_along(branch: Branch, model: GraspModel, positions: np.ndarray,
                     turning: dict[str, Any] | None, clear: KeptClear, progress: Progress,
                     ) -> Predicted:
-    """Return the model's prediction from rest to the path's end, through ``positions`` [n, 3].
-
-    The grasp passes the plan's positions, rotated as the branch itself would rotate, and by the
-    plan's offset from that (``turning``) if it has one. Steps are small enough that straight lines
-    between positions stretch nothing. The wrench is that of the branch clamped in this way.
-
-    Raises:
-        NoPathError: the branch comes nearer to an obstacle than ``clear`` allows.
-        WorkError: a pose has no reliable solution.
-    """
+    """Return the model's prediction from rest to the path's end: the grasp passes the plan's
+    ``positions`` [n, 3], rotated as the branch would and by the plan's offset (``turning``), in
+    steps so small that straight lines stretch nothing, and the wrench is that of the branch so
+    clamped. NoPathError if it comes nearer to an obstacle than ``clear`` allows; WorkError if a
+    pose has no reliable solution."""
     uncertainty = estimated_uncertainty(branch, model)
     if uncertainty is None:
         progress.warn("There is no estimate, so the uncertainty of Young's modulus is unknown. "
@@ -123,10 +115,7 @@ def predicted_along(branch: Branch, model: GraspModel, positions: np.ndarray,
 def path_nudge(branch: Branch, model: GraspModel, cell: Cell, motion: RobotMotion,
                blocked: Blocked, progress: Progress) -> Nudge | None:
     """Return the nudge of the held branch before its path; None where the arm can make none.
-
-    Raises:
-        ConvergenceError: its force cannot be predicted.
-    """
+    ConvergenceError if its force cannot be predicted."""
     path = motion.path
     assert path.joints is not None
     base = matrices(np.array(cell.base.pose))
@@ -136,11 +125,8 @@ def path_nudge(branch: Branch, model: GraspModel, cell: Cell, motion: RobotMotio
 
 
 def require_within_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:
-    """Refuse a path at ``poses`` [n, 6] with ``forces`` [n, 3] that the guard would stop.
-
-    Raises:
-        InputError: states the limit and the value, or the position outside the workspace.
-    """
+    """Refuse a path at ``poses`` [n, 6] with ``forces`` [n, 3] that the guard would stop:
+    InputError with the limit and the value, or the position outside the workspace."""
     peak = float(np.linalg.norm(forces, axis=1).max())
     if peak >= cell.limits.soft_force_n:
         raise InputError(f"The path needs {peak:.3g} N, the soft limit is "
@@ -159,15 +145,9 @@ def require_within_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> 
 
 def require_watched(cell: Cell, path: Trajectory, is_unwatched: bool, warn: Callable[[Text], None],
                     noise: float | None = None) -> None:
-    """Refuse a path with forces so small that the guard cannot see that the branch is lost.
-
-    Args:
-        is_unwatched: The user accepts that: it is only told.
-        noise: Of the filtered force at rest, per axis [N], if it was measured.
-
-    Raises:
-        InputError: states the peak force, what is explained otherwise, and what would be seen.
-    """
+    """Refuse a path with forces so small that the guard cannot see that the branch is lost, or only
+    tell it if ``is_unwatched``; ``noise`` of the filtered force at rest per axis [N], if measured.
+    InputError with the peak force, what is explained otherwise, and what would be seen."""
     expected = path.expected
     assert expected is not None
     settings = GuardSettings.of_cell(cell, cell.arm.rate)
@@ -197,11 +177,8 @@ def require_watched(cell: Cell, path: Trajectory, is_unwatched: bool, warn: Call
 
 
 def force_sigma(cell: Cell, samples: np.ndarray) -> float:
-    """Return the deviation of the smoothed force by noise and by drift since the tare [N].
-
-    Args:
-        samples: Of the path, as :data:`limber.robot.driver.link.COLUMNS`.
-    """
+    """Return the deviation of the smoothed force by noise and by drift since the tare [N], of
+    samples of the path as :data:`limber.robot.driver.link.COLUMNS`."""
     minutes = (samples[-1, 0] - samples[0, 0] + _BEFORE_PATH_SECONDS) / 60.0
     return float(np.hypot(cell.sensor.force_sigma_n / np.sqrt(INDEPENDENT_READINGS),
                           cell.sensor.drift_n_per_minute * minutes))

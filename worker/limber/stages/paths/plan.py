@@ -374,12 +374,8 @@ class _InCell:
     def taken(self, motion: PlanPath, grasp_model: GraspModel, found: PlannedMotion,
               settings: PlanSettings, progress: Progress) -> dict[str, Any]:
         """Return a plan's entries about its robot, the clearance, the legs of its motion, and how
-        the gripper turns if not with the branch.
-
-        Raises:
-            NoPathError: there is no continuous branch of the inverse kinematics, or the gripper
-                meets an obstacle; the message states where.
-        """
+        the gripper turns if not with the branch. NoPathError, with the place, without a continuous
+        branch of the inverse kinematics, or if the gripper meets an obstacle."""
         from limber.cell.reach_and_collision import blocked_by
         from limber.robot.motion.execution import robot_motion
         from limber.stages.paths.plan_cell import predicted_ahead, robot_summary
@@ -434,11 +430,8 @@ class _InCell:
 
 
 def _stiffer(branch: Branch) -> float:
-    """Return the largest ratio of Young's modulus to its estimate, by the widest interval.
-
-    Raises:
-        InputError: an interval has no upper end.
-    """
+    """Return the largest ratio of Young's modulus to its estimate, by the widest interval;
+    InputError if one has no upper end."""
     if "estimate" not in branch.manifest.stages:
         return 1.0
     result = branch.manifest.stages["estimate"].result

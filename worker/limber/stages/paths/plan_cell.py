@@ -40,11 +40,7 @@ _CLAMPED = 0.001  # [m] by which a piece that is clamped, not only held, moves t
 
 
 def cell_for(branch: Branch, path: Path, progress: Progress) -> Cell:
-    """Return the cell of a file after checking that it is this branch's.
-
-    Raises:
-        InputError: it cannot be read, or belongs to another branch.
-    """
+    """Return the cell of a file; InputError if it cannot be read, or belongs to another branch."""
     cell = read_cell(path)
     if warning := check_branch(cell, branch.uuid, branch.folder):
         progress.warn(warning)
@@ -53,11 +49,8 @@ def cell_for(branch: Branch, path: Path, progress: Progress) -> Cell:
 
 def cell_positions(cell: Cell, obstacles: tuple[Obstacle, ...] = (),
                    live: LiveView | None = None) -> dict[str, CellPlace]:
-    """Return the cell's constraints on goals: its camera's view and its second arm's reach.
-
-    Args:
-        live: What the connected camera sees now; its own intrinsics are the view then.
-    """
+    """Return the cell's constraints on goals: its camera's view, whose intrinsics are those of
+    ``live``, what the connected camera sees now, and its second arm's reach."""
     found = {}
     if (view := _view_of(cell, live)) is not None:
         found["in_view"] = CellPlace(
@@ -80,10 +73,8 @@ def cell_positions(cell: Cell, obstacles: tuple[Obstacle, ...] = (),
 def hiding(view: View, obstacles: tuple[Obstacle, ...], point: np.ndarray,
            surface: np.ndarray | None, live: LiveView | None = None) -> str:
     """Return in words that the branch's surface, an obstacle or what the camera sees now hides a
-    target at ``point`` [3]; empty if nothing does.
-
-    The wood that the target sits on does not: a tip, on the axis, would be seen from ahead only.
-    """
+    target at ``point`` [3], else "". The wood that it sits on does not: a tip, on the axis, would
+    be seen from ahead only."""
     if surface is not None:
         away = np.linalg.norm(surface.reshape(-1, 3) - point, axis=1)
         own = _OWN_WOOD * float(np.median(np.sort(away)[:_NEXT]))
@@ -117,14 +108,9 @@ def _view_of(cell: Cell, live: LiveView | None) -> View | None:
 
 @dataclass
 class KeptClear:
-    """Check of the clearance that a plan was made with, when it is executed.
-
-    Attributes:
-        obstacles: Obstacles of the cell, branch frame.
-        clearance: Distance that branch, gripper and arm keep from them [m].
-        least: Least distance of the branch so far [m]; infinite without obstacles.
-        surfaces: Points of the branch's surface at each state so far [m], shape [k, 3] each.
-    """
+    """Check of the clearance [m] from obstacles, branch frame, that branch, gripper and arm keep in
+    a plan, when it is executed; ``least``: the branch's least distance so far [m], infinite without
+    obstacles, ``surfaces``: points of its surface at each state [m], shape [k, 3]."""
 
     obstacles: tuple[Obstacle, ...]
     clearance: float
@@ -134,20 +120,15 @@ class KeptClear:
     @classmethod
     def of(cls, cell: Cell, folder: Path, grasp_model: GraspModel, planned: float | None,
            ) -> "KeptClear":
-        """Return the check with the clearance ``planned`` [m]; None: the one of a plan of today.
-        """
+        """Return the check with the clearance ``planned`` [m]; None: the one of a plan of today."""
         obstacles = cell_obstacles(cell, folder)
         nodes = grasp_model.mesh.nodes + grasp_model.rest.displacement
         return cls(obstacles, clearance_in(cell, planned, obstacles, grasp_model.rest_position,
                                            nodes))
 
     def require(self, grasp: np.ndarray, mesh: TetMesh, moved: np.ndarray) -> None:
-        """Check the branch with its grasp at ``grasp`` [3] and its nodes displaced by ``moved``
-        [n, 3].
-
-        Raises:
-            NoPathError: it is nearer to an obstacle than the plan allows.
-        """
+        """Check the branch with its grasp at ``grasp`` [3], nodes displaced by ``moved`` [n, 3]:
+        NoPathError if it is nearer to an obstacle than the plan allows."""
         nodes = mesh.nodes + moved
         self.surfaces.append(surface_points(mesh, moved[None])[0])
         for obstacle in self.obstacles:
@@ -172,11 +153,8 @@ class KeptClear:
 
 def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...], clearance: float = 0.0,
               ) -> Limits:
-    """Return limits that include the cell's workspace, force and obstacles.
-
-    Raises:
-        InputError: the two workspaces do not intersect.
-    """
+    """Return limits that include the cell's workspace, force and obstacles; InputError if the
+    workspaces do not intersect."""
     box = cell.workspace
     return limits.with_cell(None if box is None else np.array(box.low_m),
                             None if box is None else np.array(box.high_m),

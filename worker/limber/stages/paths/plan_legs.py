@@ -52,13 +52,9 @@ def legs_without_cell(motion: PlanPath, hold: float) -> list[dict[str, Any]]:
 def legs_in_cell(cell: Cell, obstacles: tuple[Obstacle, ...], motion: RobotMotion,
                  places: np.ndarray, surfaces: np.ndarray, hold: float, progress: Progress,
                  ) -> list[dict[str, Any]]:
-    """Return the legs of a robot's motion as plain data, each checked for collisions; warn where a
-    link of the arm would be in the branch, or in another.
-
-    Args:
-        places: Positions of the grasp from rest to the path's end [m], shape [n, 3].
-        surfaces: Points of the branch's surface there, branch frame [m], shape [n, k, 3].
-    """
+    """Return the legs of a robot's motion as plain data, each checked for collisions, and warn
+    where a link of the arm would be in the branch, or in another; positions of the grasp from rest
+    to the path's end [m], [n, 3], and points of the surface there, branch frame [m], [n, k, 3]."""
     around, along = ArmSurroundings(cell, obstacles, None), arc_lengths(places)
     legs = legs_of(cell, motion, hold)
     found = [row | _distances(around, leg, along, surfaces)
@@ -76,8 +72,7 @@ def legs_in_cell(cell: Cell, obstacles: tuple[Obstacle, ...], motion: RobotMotio
 def _distances(around: ArmSurroundings, leg: Leg, along: np.ndarray, surfaces: np.ndarray,
                ) -> dict[str, float | None]:
     """Return the least distances of a leg [m], with the branch's ``surfaces`` [n, k, 3] after
-    lengths ``along`` [n] of the path; None where nothing moves or nothing is there.
-    """
+    lengths ``along`` [n] of the path; None where nothing moves or is."""
     moved = leg.trajectory
     if moved is None or moved.joints is None:
         return dict.fromkeys(("self_distance_m", "obstacle_distance_m", "branch_distance_m"))

@@ -24,11 +24,8 @@ from limber.store import Branch
 
 def strength_for(branch: Branch, settings: PlanSettings, break_tests: Path | None,
                  ) -> Strength | None:
-    """Return the strength from the user's break tests, else from --wood; None if neither is given.
-
-    Raises:
-        InputError: the tests cannot be used, or --max-damage is given without a strength.
-    """
+    """Return the strength from the user's break tests, else from --wood, else None; InputError if
+    the tests cannot be used, or --max-damage is given without a strength."""
     deviation = _radius_deviation(branch)
     if break_tests is not None:
         return Strength.of_tests(read_break_tests(break_tests), str(break_tests), deviation)
@@ -44,11 +41,9 @@ def strength_for(branch: Branch, settings: PlanSettings, break_tests: Path | Non
 
 def with_damage(limits: Limits, settings: PlanSettings, strength: Strength | None,
                 young: float = 0.0) -> Limits:
-    """Return the limits, with the strain's reduced to the allowed probability of damage.
-
-    Where the settings limit neither, it is half of the strain at which half of such branches
-    break, if that is known or, by the branch's median modulus ``young`` [Pa], assumed.
-    """
+    """Return the limits, the strain's reduced to the allowed probability of damage; where neither
+    is limited, to half of the strain at which half of such branches break, known or assumed by the
+    branch's median modulus ``young`` [Pa]."""
     if settings.max_damage is not None and strength is not None:
         most = strength.strain_limit(settings.max_damage)
     elif np.isfinite(limits.strain):
@@ -72,8 +67,7 @@ def default_limit(limits: Limits, settings: PlanSettings, strength: Strength | N
 def strength_of_plan(strength: Strength | None, plan: ResolvedPath,
                      in_motion: dict[str, Any] | None, progress: Progress) -> dict[str, Any]:
     """Return the assessment of a plan's largest strain by a known strength, or that of green wood;
-    warn if it exceeds a known one.
-    """
+    warn if it exceeds a known one."""
     states = plan.ahead
     at = int(states.strains.argmax())
     peak = float(states.strains[at])

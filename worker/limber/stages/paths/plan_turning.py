@@ -23,15 +23,9 @@ _STATES = 6  # along the path, of which the stiffness is computed, and the turne
 
 @dataclass(frozen=True)
 class Clamped:
-    """The clamped branch at some states along a plan, at its natural rotations.
-
-    Attributes:
-        firm, grasp: The branch with a rigid gripper.
-        rows: Which states of the plan these are, shape [k].
-        poses: Their poses [m, rad], shape [k, 6].
-        displacements: Their displacements [m], [nodes, 3] each.
-        cost: Their wrenches and stiffness.
-    """
+    """The branch clamped by a rigid gripper (``firm``, ``grasp``) at the states ``rows`` [k] of a
+    plan, at its natural rotations: poses [m, rad], [k, 6], displacements [m], [nodes, 3] each,
+    wrenches and stiffness (``cost``)."""
 
     firm: BranchModel
     grasp: Grasp
@@ -42,11 +36,8 @@ class Clamped:
 
     @classmethod
     def of(cls, grasp_model: GraspModel, states: SolvedPoses) -> "Clamped":
-        """Solve the clamped branch at some of a plan's states.
-
-        Raises:
-            NoPathError: one has no solution.
-        """
+        """Solve the clamped branch at some of a plan's states; NoPathError if one has no
+        solution."""
         grasp = Grasp.gripping(grasp_model.mesh, grasp_model.grasp.centre, GRASP_RADIUS_M)
         firm = grasp_model.model.gripped(grasp)
         rows = np.unique(np.linspace(0, len(states.poses) - 1, _STATES).astype(int))
@@ -60,11 +51,8 @@ class Clamped:
 
     def checked(self, offsets: np.ndarray, limits: Limits) -> dict[str, float]:
         """Return the largest torque and force on the full model with ``offsets`` [k, 3] at these
-        states, and the error of the second-order function, as plain data.
-
-        Raises:
-            NoPathError: a state has no solution, or breaks a limit.
-        """
+        states, and the error of the second-order function, as plain data. NoPathError if a state
+        has no solution, or breaks a limit."""
         wrenches = []
         for pose, begin in zip(turned(self.poses, offsets), self.displacements, strict=True):
             one = _solved(self.firm, self.grasp, pose, begin)
@@ -97,12 +85,8 @@ def _solved(firm: BranchModel, grasp: Grasp, pose: np.ndarray, begin: np.ndarray
 def turned_by(cell: Cell, predicted: Predicted, grasp_model: GraspModel, states: SolvedPoses,
               slack: float, limits: Limits, **asked: Any) -> tuple[Turned, dict[str, Any]]:
     """Return the robot's motion with the gripper turned by at most ``slack`` [rad] beyond the
-    branch's own rotation, checked on the full model; and a plan's entry about it. Its torque stays
-    below the one at which the guard would stop the arm.
-
-    Raises:
-        NoPathError: no such rotation helps, or it breaks a limit.
-    """
+    branch's own rotation, checked on the full model, its torque below the guard's stop, and a
+    plan's entry about it. NoPathError if no such rotation helps, or it breaks a limit."""
     limits = replace(limits, torque=min(limits.torque, _OF_HARD * cell.limits.hard_torque_nm))
     clamped = Clamped.of(grasp_model, states)
     along = arc_lengths(states.poses[:, :3])

@@ -14,11 +14,8 @@ _INTERVAL = 2 * 1.96  # standard deviations in a 95 % interval
 
 
 def young_uncertainty(branch: Branch, grasp_model: GraspModel, limits: Limits) -> YoungUncertainty:
-    """Return the moduli's distribution from the branch's estimate, for a plan with limits.
-
-    Raises:
-        InputError: there is no limit, no estimate, or one without intervals.
-    """
+    """Return the moduli's distribution from the branch's estimate, for a plan with limits;
+    InputError without limit or estimate, or for one without intervals."""
     if not limits.asked():
         raise InputError(Text(Option("confidence"), " was given without a limit."), "It is the "
                          "probability that the limits hold.", "Give ", Option("max_force"), ", ",
@@ -33,15 +30,10 @@ def young_uncertainty(branch: Branch, grasp_model: GraspModel, limits: Limits) -
 
 
 def estimated_uncertainty(branch: Branch, grasp_model: GraspModel) -> YoungUncertainty | None:
-    """Return the moduli's distribution from the branch's estimate; None if there is none.
-
-    Deviations are those of the stated intervals of bending stiffness: a plan uses the mesh of the
-    estimate, and an error of its radius cancels with that of the modulus. Correlations are those of
-    the fit. Control points of one group share one modulus.
-
-    Raises:
-        InputError: the estimate has no interval.
-    """
+    """Return the moduli's distribution from the branch's estimate, if any: deviations of the
+    intervals of bending stiffness, as a plan uses the estimate's mesh, whose error of radius
+    cancels with the modulus's, and the fit's correlations. Control points of one group share a
+    modulus. InputError without interval."""
     if not branch.has("estimate.json"):
         return None
     found = read_estimate(branch.require("estimate.json", "estimate"))

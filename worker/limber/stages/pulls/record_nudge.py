@@ -48,12 +48,9 @@ class Nudge:
 def nudge_and_checks(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
                      pull: Trajectory, blocked: Blocked, progress: Progress,
                      ) -> tuple[Nudge | None, list[PullPlausibility]]:
-    """Return the nudge before a pull, if there is one; and the check of the pull.
-
-    Args:
-        point: Position of the grasp, branch frame [m], shape [3].
-        sample: Of the robot at the start, as :data:`limber.robot.driver.link.COLUMNS`.
-    """
+    """Return the nudge before a pull, if there is one, and the check of the pull; ``point`` of the
+    grasp, branch frame [m], ``sample`` at the start, as
+    :data:`limber.robot.driver.link.COLUMNS`."""
     try:
         model = PullModel.of_branch(branch, cell, point, progress)
         checks = [PullPlausibility(cell, model.predicted(pull))]
@@ -68,13 +65,7 @@ def nudge_and_checks(branch: Branch, cell: Cell, point: np.ndarray, sample: np.n
 def checked_nudge(cell: Cell, model: PullModel, pose: np.ndarray, joints: np.ndarray,
                   pull: Trajectory, blocked: Blocked | None, progress: Progress) -> Nudge | None:
     """Return the nudge before a motion that holds the branch; None where the arm can make none.
-
-    Args:
-        pose, joints: As :func:`nudge` takes them.
-
-    Raises:
-        ConvergenceError: its force cannot be predicted.
-    """
+    ``pose``, ``joints`` as of :func:`nudge`; ConvergenceError if its force cannot be predicted."""
     across = nudge(cell, model.stiffness, pose, joints, pull, blocked)
     if across is None:
         progress.warn("The arm cannot nudge the branch across the pull, so a sensor whose "
@@ -85,12 +76,9 @@ def checked_nudge(cell: Cell, model: PullModel, pose: np.ndarray, joints: np.nda
 
 def nudged(link: RobotLink, live: LiveForce, across: Nudge, judging: list[PullPlausibility],
            ) -> dict[str, Any]:
-    """Nudge the held branch and return how it ended, as :meth:`.RobotLink.follow` does.
-
-    Args:
-        judging: Gets the check while it is in use: whoever takes the samples lets the last one
-            judge them, and stops the arm for its reason.
-    """
+    """Nudge the held branch and return how it ended, as :meth:`.RobotLink.follow`; ``judging`` gets
+    the check meanwhile: whoever takes the samples lets the last judge them, and stops the arm for
+    its reason."""
     live.at("nudging")
     judging.append(across.check)
     try:
@@ -109,13 +97,9 @@ def nudged(link: RobotLink, live: LiveForce, across: Nudge, judging: list[PullPl
 
 def nudge(cell: Cell, stiffness: np.ndarray, pose: np.ndarray, joints: np.ndarray,
           pull: Trajectory, blocked: Blocked | None) -> Trajectory | None:
-    """Return the nudge before a pull, out and back; None where the arm can make none.
-
-    Args:
-        stiffness: Of the held branch, branch frame [N/m], shape [3, 3].
-        pose: Of the gripper at the start, branch frame [m, rad], shape [6].
-        joints: Of the arm there [rad], shape [n].
-    """
+    """Return the nudge before a pull, out and back; None where the arm can make none. ``stiffness``
+    of the held branch, branch frame [N/m], [3, 3]; ``pose`` of the gripper at the start, branch
+    frame [m, rad], and ``joints`` of the arm there [rad]."""
     away = np.linalg.norm(pull.poses[:, :3] - pull.poses[0, :3], axis=1)
     farthest = float(away.max())
     first = int(np.argmax(away >= min(LOOKED_M, farthest)))

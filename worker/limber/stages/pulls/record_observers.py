@@ -21,21 +21,10 @@ if TYPE_CHECKING:
 
 
 class Observers:
-    """Writes what is seen beside ``robot.csv``; a context manager.
-
-    Args:
-        folder: Gets the depth images; that of the recording's streams.
-        markers: Port of a tracker at the robot's address, or None.
-        realsense: Whether the connected camera records depth images.
-
-    Attributes:
-        kind: What ``pull.toml`` states as the observation.
-        lines: Stream of the tracker's points, or None.
-
-    Raises:
-        InputError: both are asked for, or the cell's camera is not fixed.
-        WorkError: the tracker or the camera does not answer.
-    """
+    """Writes what is seen beside ``robot.csv``; a context manager. ``folder`` gets the depth images
+    of the connected camera (``realsense``), ``markers`` is the port of a tracker at the robot's
+    address, ``lines`` its stream; ``kind`` goes into ``pull.toml``. InputError for both, or a
+    camera not fixed; WorkError if either does not answer."""
 
     def __init__(self, branch: Branch, cell: Cell, name: str, folder: Path, markers: int | None,
                  realsense: bool):
@@ -78,11 +67,8 @@ class Observers:
         self._around.__exit__(*exception)
 
     def at_rest(self) -> tuple[tuple[Any, ...] | None, float | None]:
-        """Return the tracker's points of the resting branch [m], and the noise of one [m].
-
-        Raises:
-            WorkError: as :meth:`.MarkerStream.at_rest`.
-        """
+        """Return the tracker's points of the resting branch [m], and the noise of one [m];
+        WorkError as of :meth:`.MarkerStream.at_rest`."""
         if self._tracker is None or self.lines is None:
             return None, None
         points, noise = self._tracker.at_rest()

@@ -28,11 +28,7 @@ _NEAR_M = 0.005  # from the gripper to the first given pose
 
 def grasp_point(branch: Branch, gripper: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the place on the branch's axis nearest to the gripper's middle [3], branch frame [m],
-    shape [3]; and how far away it is [m].
-
-    Raises:
-        InputError: it is too far away.
-    """
+    and how far away it is [m]; InputError if too far."""
     from limber.store.loading import load_skeleton
 
     skeleton = load_skeleton(branch)
@@ -54,23 +50,11 @@ def grasp_point(branch: Branch, gripper: np.ndarray) -> tuple[np.ndarray, float]
 
 def arc_path(branch: Branch, point: np.ndarray, direction: np.ndarray, distance: float,
              progress: Progress) -> np.ndarray:
-    """Return frames [n, 4, 4] that move the held piece from its position along its arc.
-
-    The arc is the path and rotation of the branch's model under a growing force along
-    ``direction``. The level of stiffness does not affect it, and the variation of stiffness along
-    the branch only a little. Without an estimate the arc is computed with one modulus throughout.
-
-    Args:
-        point: Position of the grasp, branch frame [m], shape [3].
-        direction: Shape [3].
-        distance: Distance of the grasp from rest [m].
-
-    Returns:
-        Frames in the branch's frame to apply to the gripper's pose; the first is the identity.
-
-    Raises:
-        WorkError: no such force moves it so far.
-    """
+    """Return frames [n, 4, 4], branch frame, from the identity on, to apply to the gripper's pose:
+    they move the held piece at ``point`` [m, 3] along its arc up to ``distance`` [m], the model's
+    path and rotation under a growing force along ``direction`` [3]. The level of stiffness does not
+    affect it, its course along the branch a little; without an estimate the modulus is one.
+    WorkError if no force moves it so far."""
     from limber.estimation.forward.gripper_path import force_for_travel
     from limber.mechanics import Grasp, solve_static
     from limber.store.loading import load_branch
@@ -92,14 +76,9 @@ def arc_path(branch: Branch, point: np.ndarray, direction: np.ndarray, distance:
 
 
 def suggested_pull(branch: Branch, point: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return direction [3] across the branch and distance [m] of the suggested pull.
-
-    Args:
-        point: Position of the gripper on the branch, branch frame [m], shape [3].
-
-    Raises:
-        BranchFolderError: none was suggested. InputError: the suggested grasp is elsewhere.
-    """
+    """Return direction [3] across the branch and distance [m] of the suggested pull, for a gripper
+    at ``point``, branch frame [m, 3]. BranchFolderError if none was suggested; InputError if its
+    grasp is elsewhere."""
     from limber.stages.pulls.suggest_pull import SuggestedPulls
 
     path = branch.require("suggested_pull.json", "suggest-pull")
@@ -117,14 +96,9 @@ def suggested_pull(branch: Branch, point: np.ndarray) -> tuple[np.ndarray, float
 
 
 def waypoint_path(path: Path, gripper: np.ndarray) -> np.ndarray:
-    """Return frames [n, 4, 4] of the gripper through the positions of a CSV file, branch frame.
-
-    Without columns of rotation the gripper is not rotated.
-
-    Raises:
-        InputError: it cannot be read, has only one position, or starts too far from ``gripper``
-        [6].
-    """
+    """Return frames [n, 4, 4] of the gripper through the positions of a CSV file, branch frame, not
+    rotated without columns of rotation. InputError if it cannot be read, has only one position, or
+    starts too far from ``gripper`` [6]."""
     table = read_columns(path, POSE_COLUMNS[:3], "a table of way-points (x_m, y_m, z_m, and "
                          "rx_rad, ry_rad, rz_rad if the gripper turns)")
     poses = np.tile(gripper, (len(table["x_m"]), 1))
@@ -144,17 +118,10 @@ def waypoint_path(path: Path, gripper: np.ndarray) -> np.ndarray:
 
 def there_and_back(cell: Cell, frames: np.ndarray, *, speed: float, cycles: int, pause: float,
                    start: np.ndarray | None = None, blocked: Blocked | None = None) -> Trajectory:
-    """Return the motion through frames of the gripper [n, 4, 4], branch frame, out and back.
-
-    Args:
-        speed: [m/s].
-        pause: Standstill at each end [s].
-        start: Current joint angles of the arm [rad], shape [6].
-
-    Raises:
-        NoPathError: the arm cannot follow it, or is blocked; the message states where and why.
-        SafetyStop: the arm could follow it only from another configuration than its current one.
-    """
+    """Return the motion through frames of the gripper [n, 4, 4], branch frame, out and back at
+    ``speed`` [m/s], standing for ``pause`` [s] at each end, from joint angles ``start`` [rad].
+    NoPathError, where and why, if the arm cannot follow it, or is blocked; SafetyStop if only from
+    another configuration."""
     out = densely(pose_vectors(inverted(matrices(np.array(cell.base.pose))) @ frames))
     flange = matrices(out) @ inverted(matrices(np.array(cell.tool.grasp_pose)))
     taken = joint_path(cell.arm, flange, start=start, joint_limits=cell.joint_limits,

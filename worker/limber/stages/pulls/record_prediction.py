@@ -25,20 +25,10 @@ _DEVIATIONS, _LEAST_FACTOR = 3.0, 2.0
 
 
 class PullModel:
-    """The branch's model, clamped where the gripper holds it.
-
-    Args:
-        model: The branch as it hangs.
-        deviation: Standard deviation of log E; None: the moduli are not known.
-        cell: States the robot's base.
-        point: Position of the grasp, branch frame [m], shape [3].
-
-    Attributes:
-        stiffness: Force over displacement of the gripper that does not turn [N/m], shape [3, 3].
-
-    Raises:
-        ConvergenceError: a small displacement has no solution.
-    """
+    """The branch's model as it hangs, clamped where the gripper holds it at ``point``, branch frame
+    [m, 3], in a cell; ``deviation`` of log E, None if the moduli are not known; ``stiffness``:
+    force over displacement of the gripper that does not turn [N/m], [3, 3]. ConvergenceError if a
+    small displacement has no solution."""
 
     def __init__(self, model: BranchModel, deviation: float | None, cell: Cell,
                  point: np.ndarray):
@@ -56,11 +46,7 @@ class PullModel:
     @classmethod
     def of_branch(cls, branch: Branch, cell: Cell, point: np.ndarray, progress: Progress,
                   ) -> PullModel:
-        """Return the model of a branch folder.
-
-        Raises:
-            LimberError: there is no usable model.
-        """
+        """Return the model of a branch folder; LimberError if there is no usable one."""
         from limber.store.loading import load_branch, stiffness_deviation
 
         return cls(load_branch(branch, progress=progress).model, stiffness_deviation(branch), cell,
@@ -77,13 +63,9 @@ class PullModel:
         return np.column_stack([(force(_SMALL_M * unit) - still) / _SMALL_M for unit in np.eye(3)])
 
     def predicted(self, trajectory: Trajectory) -> PredictedPull:
-        """Return the forces on the first outward motion of a trajectory of the gripper, base frame.
-
-        Beyond the first :data:`.LOOKED_M` they end where the model does not converge any more.
-
-        Raises:
-            ConvergenceError: it does not converge before.
-        """
+        """Return the forces on the first outward motion of a trajectory of the gripper, base frame;
+        beyond the first :data:`.LOOKED_M` they end where the model does not converge any more,
+        before that with a ConvergenceError."""
         from limber.mechanics import follow_poses
 
         frames = self._base @ matrices(trajectory.poses)

@@ -227,10 +227,8 @@ def _for_plan(branch: Branch, name: str, now: Known, after: Known, progress: Pro
 
 
 def verdict(now: Any, after: Any, confidence: float) -> tuple[bool, str]:
-    """Return whether a pull between two risks is worthwhile for a plan, and why.
-
-    Risks are :class:`limber.planning.constraints.chance.Risk`.
-    """
+    """Return whether a pull between two :class:`limber.planning.constraints.chance.Risk` is
+    worthwhile for a plan, and why."""
     over = [name for name, share in now.excess.items() if share > 1.0]
     sure = f"with a confidence of {confidence:g}"
     if over:

@@ -82,8 +82,7 @@ class VirtualPull(VirtualPullSettings, Repeatable, BranchStage):
 
 
 def load_truth(branch: Branch, settings: PullSpec) -> TrueBranch:
-    """The truth of a branch folder: its generator's, the meshed body, or one that fits its scan.
-    """
+    """The truth of a branch folder: its generator's, the meshed body, or one that fits its scan."""
     from limber.estimation.simulated_pull import true_branch
     from limber.geometry.generated import read_truth
     from limber.geometry.io.skeletons import read_swc

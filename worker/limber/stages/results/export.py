@@ -117,8 +117,7 @@ EXPORTS = Registry("export", "limber.exports", [
            "tetrahedra, held base, a static and a frequency step")])
 """``write`` is called with the open branch folder, the path, the settings and progress; it returns
 the content of the file. All formats of :data:`~limber.geometry.io.skeletons.SKELETONS` are
-available too.
-"""
+available too."""
 
 
 class Export(BranchStage):

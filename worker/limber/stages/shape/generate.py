@@ -63,12 +63,8 @@ class Generate(GeneratedSettings, Stage):
 
 
 def write_generated(branch: GeneratedBranch, folder: Path) -> dict[str, Any]:
-    """Write the scan and the truth: ``cloud.ply``, ``truth_skeleton.swc``, ``truth_surface.ply``
-    and ``truth.json``; return what was written.
-
-    Raises:
-        InputError: the folder cannot be written to.
-    """
+    """Write the scan and the truth, ``cloud.ply``, ``truth_skeleton.swc``, ``truth_surface.ply``
+    and ``truth.json``; return what was written. InputError if the folder cannot be written to."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -44,8 +44,7 @@ if TYPE_CHECKING:
 
 SEARCH = f"{FOUND_SKELETON}.npz"
 """Result of the skeleton search, kept until there is a mesh: a reconstruct that is stopped in
-between continues from it.
-"""
+between continues from it."""
 CLASSES = "_points.ply"
 """End of the file, beside the folder of a refused scan, that shows its points by class."""
 CLASSES_COMMENT = "limber: points of a refused scan by class"
@@ -200,10 +199,8 @@ def _of_scan(asked: Reconstruct, progress: Progress) -> dict[str, Any]:
 
 
 def _each_of_folder(asked: Reconstruct, progress: Progress) -> dict[str, Any]:
-    """Reconstruct every cloud in a folder into a branch folder ``NAME.branch`` in the output.
-
-    Hidden files and files of other kinds are skipped. Warnings and failures name their scan.
-    """
+    """Reconstruct every cloud in a folder into ``NAME.branch`` in the output, past hidden files and
+    other kinds; warnings and failures name their scan."""
     known = suffixes_of(CLOUDS.readers())
     paths = sorted(p for p in asked.cloud.iterdir() if p.suffix.lower() in known
                    and not p.name.startswith(".") and not _shows_classes(p))
@@ -277,12 +274,10 @@ def _shows_classes(path: Path) -> bool:
 
 
 def _without(cloud: Cloud, path: Path) -> Cloud:
-    """Return a cloud without the points of a file; InputError if it has none of them, or all.
-
-    Each of the file's points leaves out the nearest one of the cloud that single precision cannot
-    distinguish from it, and all at that very place: no others, as map coordinates are so large that
-    single precision cannot distinguish a whole plant's points.
-    """
+    """Return a cloud without the points of a file; InputError if it has none of them, or all. Each
+    leaves out the nearest point that single precision cannot distinguish from it, and all at that
+    very place: no others, as map coordinates are so large that it cannot distinguish a whole
+    plant's."""
     from scipy.spatial import cKDTree
 
     gone = read_points(path).points
@@ -313,10 +308,8 @@ def _keep_skeleton(stage: OpenStage, alignment: Alignment, skeleton: Skeleton, u
 
 def load_search(branch: Branch, settings: ReconstructSettings, digests: dict[str, str],
                 progress: Progress = SILENT) -> FoundSkeleton | None:
-    """Return the skeleton that an earlier run of this version found in a scan, if no mesh followed.
-
-    A file that cannot be used counts as none; ``progress`` receives a warning.
-    """
+    """Return the skeleton that an earlier run of this version found in a scan, if no mesh followed;
+    a file that cannot be used counts as none, with a warning."""
     from limber.geometry.skeleton.search_result import FoundSkeleton
     from limber.store import program_versions
 
@@ -347,11 +340,8 @@ def write_branch(stage: OpenStage, cloud: Cloud, meshed: MeshedBranch) -> None:
 
 
 def load_edits(branch: Branch) -> list[Edit]:
-    """Return the edits of its skeleton that a branch keeps.
-
-    Raises:
-        InputError: the file was changed by hand and is no longer valid.
-    """
+    """Return the edits of its skeleton that a branch keeps; InputError if the file was changed by
+    hand and is no longer valid."""
     from limber.geometry.skeleton.edits import read_edits
 
     return read_edits(branch.path(EDITS)) if branch.has(EDITS) else []
