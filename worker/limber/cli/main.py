@@ -161,7 +161,7 @@ def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.
 
 def command_of(stage: "type[Stage]") -> click.Command:
     """Make the command of a stage: its fields become options."""
-    from limber.stages.command_line import GroupedOption, given, stage_options
+    from limber.stages.command_line import GroupedOption, settings_options
 
     about = stage.about
 
@@ -170,9 +170,8 @@ def command_of(stage: "type[Stage]") -> click.Command:
                   expose_value=False, callback=functools.partial(_show_schema, about.name),
                   help="Print the stage's inputs, settings and options as a JSON schema, and "
                        "exit.")
-    @stage_options(stage)
-    def command(run: Run, **options: Any) -> dict[str, Any]:
-        made = stage.checked(given(options))
+    @settings_options(stage, "made")
+    def command(run: Run, made: "Stage") -> dict[str, Any]:
         result = made.run(run.progress)
         for title, rows in about.result.of(_plain(result)).tables() if about.result else ():
             run.show(title, rows)

@@ -10,7 +10,7 @@ import functools
 import re
 import types
 import typing
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, Literal
 
@@ -145,34 +145,28 @@ def settings_options(model: type[BaseModel], name: str = "settings", *,
     """Add one option for each field of a model but ``without``, which keep their defaults; the
     function gets ``name=model(...)``. InputError when it is called with values that the model
     refuses."""
-    fields = {field: model for field in model.model_fields if field not in without}
+    prefix = f"{name}__"
 
     def wrap(function: Callable) -> Callable:
+        @functools.wraps(function)
         def body(*args: Any, **options: Any) -> Any:
-            settings = checked_settings(model, given(options, name))
+            given = {option: options.pop(option) for option in list(options)
+                     if option.startswith(prefix)}
+            settings = checked_settings(model, {
+                option.removeprefix(prefix): value for option, value in given.items()
+                if value is not None})
             return function(*args, **{name: settings}, **options)
-        return _with_options(functools.wraps(function)(body), fields, name)
+        command: Callable = body
+        for field in reversed(_names(model)):
+            if field not in without:
+                command = _parameter(model, field, model.model_fields[field],
+                                     prefix + field)(command)
+        return command
     return wrap
 
 
-def stage_options(stage: type[Stage]) -> Callable[[Callable], Callable]:
-    """Add one option for each field of a stage; :func:`given` takes them."""
-    return lambda function: _with_options(function, dict.fromkeys(stage.names(), stage), "stage")
-
-
-def _with_options(function: Callable, fields: Mapping[str, type[BaseModel]],
-                  prefix: str) -> Callable:
-    for name, model in reversed(fields.items()):
-        function = _parameter(model, name, model.model_fields[name], f"{prefix}__{name}")(function)
-    return function
-
-
-def given(options: dict[str, Any], prefix: str = "stage") -> dict[str, Any]:
-    """Take from a command's options those of a model's fields, and return the values given."""
-    chosen = {option: options.pop(option) for option in list(options)
-              if option.startswith(f"{prefix}__")}
-    return {option.removeprefix(f"{prefix}__"): value for option, value in chosen.items()
-            if value is not None}
+def _names(model: type[BaseModel]) -> list[str]:
+    return model.names() if issubclass(model, Stage) else list(model.model_fields)
 
 
 def command_line(model: Settings) -> list[str]:
@@ -180,7 +174,7 @@ def command_line(model: Settings) -> list[str]:
     arguments: list[str] = []
     options: list[str] = []
     kind = type(model)
-    for name in kind.names() if issubclass(kind, Stage) else kind.model_fields:
+    for name in _names(kind):
         field, value = kind.model_fields[name], getattr(model, name)
         # A stated value counts even if it is the default: the unit would be asked for.
         if not field.is_required() and name not in model.model_fields_set and (

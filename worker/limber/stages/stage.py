@@ -2,7 +2,7 @@
 
 It is the single source of a command, its options and schema, a job table and a Python verb::
 
-    class Count(BranchStage, Repeatable):
+    class Count(BranchStage, KeptStage):
         '''Count the nodes of the skeleton.'''
 
         about = About("count", 27, key="count", writes=("count.txt",))
@@ -204,7 +204,7 @@ class PlacedStage(BranchStage):
         return self.model_copy(update=moved)
 
 
-class Repeatable(Stage):
+class KeptStage(Stage):
     """A stage whose result is kept, and made again only if something has changed."""
 
     force: bool = option("Run again even if nothing has changed.", False, switch=True)
@@ -215,7 +215,7 @@ class Repeatable(Stage):
         return not self.force and branch.is_current(key or self.entry, self, **inputs)
 
 
-class ParallelStage(Repeatable):
+class ParallelStage(KeptStage):
     """A stage that uses several processes."""
 
     workers: int | None = option(

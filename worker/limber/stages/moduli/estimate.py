@@ -16,7 +16,7 @@ from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings, FitSpec
 from limber.stages.result import Numbers, Picture, Result, Table, filled, frozen, of_files, shown
-from limber.stages.stage import About, BranchStage, Repeatable, option
+from limber.stages.stage import About, BranchStage, KeptStage, option
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def _moduli_line(values: Mapping[str, Any]) -> str:
     return modulus_sentence(values, ASSUMED_PULL if pull and pull["young_assumed"] else "")
 
 
-class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
+class EstimateYoung(EstimateSettings, KeptStage, BranchStage):
     """Estimate Young's modulus along the branch from pulls."""
 
     about = About(

@@ -13,7 +13,7 @@ from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings, SwingSettings
 from limber.stages.result import Interval, Picture, Result, frozen, kept, of_files, shown
-from limber.stages.stage import About, BranchStage, Repeatable
+from limber.stages.stage import About, BranchStage, KeptStage
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ _DAMAGED = "The result of a swing was expected.", Text("The file is damaged. Run
                                                        Command("swing"), " again.")
 
 
-class FitSwing(SwingSettings, Repeatable, BranchStage):
+class FitSwing(SwingSettings, KeptStage, BranchStage):
     """Estimate Young's modulus and damping from a free swing, without a robot."""
 
     about = About(

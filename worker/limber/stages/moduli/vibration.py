@@ -15,7 +15,7 @@ from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
 from limber.stages.result import Interval, Numbers, Result, kept, shown
-from limber.stages.stage import About, BranchStage, Repeatable, argument
+from limber.stages.stage import About, BranchStage, KeptStage, argument
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Vibration(Result):
         section.tables.append(("Vibrations in the recording", rows))
 
 
-class FitVibration(Repeatable, BranchStage):
+class FitVibration(KeptStage, BranchStage):
     """Estimate Young's modulus and damping from ringing (accelerometer, strain gauge, video).
 
     RECORD is a table of times and one or more columns of accelerations, strains or displacements in

@@ -31,7 +31,7 @@ from limber.stages.result import (
     kept,
     shown,
 )
-from limber.stages.stage import About, BranchStage, Repeatable
+from limber.stages.stage import About, BranchStage, KeptStage
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def _failure_line(result: Mapping[str, Any]) -> str:
     return failure_sentence(result.get("strain_over_limit", 0.0))
 
 
-class ApplyLoads(Repeatable, BranchStage):
+class ApplyLoads(KeptStage, BranchStage):
     """Compute sag, strain and frequencies under wind, gusts, snow, fruit or pruning."""
 
     about = About(

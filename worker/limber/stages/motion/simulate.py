@@ -14,7 +14,7 @@ from limber.core.files.atomic import write_atomically
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.settings import FRAME_RATE, GRASP_RADIUS_M, SimulateSettings
 from limber.stages.result import FORCE, Picture, Result, Vector, frozen, of_files, shown
-from limber.stages.stage import About, BranchStage, Repeatable, given
+from limber.stages.stage import About, BranchStage, KeptStage, given
 from limber.store import Branch, OpenStage
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def _peaks_line(result: Mapping[str, Any]) -> str:
     return peaks_line(result)
 
 
-class Simulate(SimulateSettings, Repeatable, BranchStage):
+class Simulate(SimulateSettings, KeptStage, BranchStage):
     """Simulate a pull by a pose or a force; writes motion, energy and forces."""
 
     about = About(

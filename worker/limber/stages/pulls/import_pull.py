@@ -16,7 +16,7 @@ from limber.geometry.io.formats import listed
 from limber.recordings.recording_formats import RECORDINGS, recording_format
 from limber.recordings.settings import ImportSettings
 from limber.stages.result import FORCE, POSE, Picture, Result, frozen, of_files, shown
-from limber.stages.stage import About, BranchStage, Repeatable, argument, given, required
+from limber.stages.stage import About, BranchStage, KeptStage, argument, given, required
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def _moved(values: Mapping[str, Any]) -> str | None:
     return f"The points moved by up to {1e3 * farthest:.3g} mm under the load."
 
 
-class ImportPull(ImportSettings, Repeatable, BranchStage):
+class ImportPull(ImportSettings, KeptStage, BranchStage):
     """Import a recording of a pull into the branch folder."""
 
     about = About(

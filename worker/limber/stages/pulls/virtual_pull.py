@@ -11,7 +11,7 @@ import numpy as np
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import PullSpec, VirtualPullSettings
 from limber.stages.pulls.import_pull import Pull
-from limber.stages.stage import About, BranchStage, Repeatable, given
+from limber.stages.stage import About, BranchStage, KeptStage, given
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def _assumed_line(result: Mapping[str, Any]) -> str | None:
             if result.get("young_assumed") else None)
 
 
-class VirtualPull(VirtualPullSettings, Repeatable, BranchStage):
+class VirtualPull(VirtualPullSettings, KeptStage, BranchStage):
     """Simulate a recorded pull with a known Young's modulus and sensor noise."""
 
     about = About(

@@ -10,7 +10,7 @@ from limber.core.progress import SILENT, Progress
 from limber.stages.registry import result_kinds, result_of
 from limber.stages.result import Written
 from limber.stages.shape.mesh import MeshNumbers, Shape
-from limber.stages.stage import About, BranchStage, Repeatable, given
+from limber.stages.stage import About, BranchStage, KeptStage, given
 from limber.store import Branch
 from limber.version import VERSION
 
@@ -23,7 +23,7 @@ _ORDER = ("pull", "estimate", "swing", "vibration", "simulate", "load")
 """Results in the order of the page; others follow in that of the stages."""
 
 
-class WriteReport(Repeatable, BranchStage):
+class WriteReport(KeptStage, BranchStage):
     """Write one HTML page with figures and tables of all results."""
 
     about = About(

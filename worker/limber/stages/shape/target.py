@@ -11,7 +11,7 @@ from limber.core.errors import InputError, Option, Text
 from limber.core.progress import Progress
 from limber.core.settings import POSITION, Groups
 from limber.stages.result import Result, Vector, kept, shown
-from limber.stages.stage import About, PlacedStage, Repeatable, argument
+from limber.stages.stage import About, KeptStage, PlacedStage, argument
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class Target(Result):
     mass: float | None = shown("mass that hung there when the branch was scanned", ".3g kg")
 
 
-class SetTarget(Repeatable, PlacedStage):
+class SetTarget(KeptStage, PlacedStage):
     """Name a place on the branch, such as a flower, that all stages follow."""
 
     about = About(
