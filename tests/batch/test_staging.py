@@ -233,7 +233,7 @@ def test_no_file_that_a_link_names_is_put_to_an_address(away, memory, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_batch_from_addresses_to_an_address(memory, tmp_path, capsys):
+def test_a_batch_from_addresses_to_an_address(memory, here, tmp_path, capsys):
     """Scans and results in fsspec's memory; again from nothing here it repeats no stage."""
     for name in ("one", "two"):
         memory.pipe_file(f"/scans/{name}.csv", BODY.encode())
