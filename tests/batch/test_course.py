@@ -95,7 +95,7 @@ def test_run_fail_mend_and_resume(orchard, capsys):
 
 
 @pytest.mark.slow
-def test_a_killed_batch_goes_on(orchard, monkeypatch):
+def test_a_killed_batch_goes_on(orchard, here):
     """SIGKILL to the batch: nothing half made, a new run ends with what an undisturbed one has."""
     jobs = orchard / "jobs.toml"
     log = orchard / "results" / "jobs.jobs.jsonl"
@@ -193,7 +193,7 @@ def test_records_and_log_stay_short(orchard, monkeypatch):
 
 
 @pytest.mark.slow
-def test_text_of_files_is_no_page_and_no_formula(orchard, capsys):
+def test_text_of_files_is_no_page_and_no_formula(orchard, here, capsys):
     """A branch named like a formula or a script is text in the table and on the page."""
     name = "=1+<b>"
     shutil.move(orchard / "two.branch", orchard / f"{name}.branch")
