@@ -7,10 +7,8 @@ import pytest
 from tests.subjects.grown import grown
 
 from limber.core.errors import MeshingError
-from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import bending_factor, polygon_factor, rings
-from limber.geometry.surface.forks import level_surface, smooth_forks
 from limber.geometry.surface.surface import Surface, check_surface, distance_to_surface
 from limber.geometry.surface.tubes import branch_surface
 from limber.geometry.tets import tetrahedra
@@ -36,38 +34,6 @@ def test_branch_surface_is_closed_and_of_the_right_volume(y_skeleton):
     twig = np.pi * 0.006**2 * (0.2 - 0.01 / 0.8)  # from the stem's side on
     round_volume = stem + twig + 2 / 3 * np.pi * (0.008**3 + 0.006**3)
     assert surface.volume == pytest.approx(round_volume, rel=0.03)
-
-
-def _crease_angles(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
-    """Angles [rad] by which faces turn towards each other at hollow edges, and their lengths."""
-    faces = surface.faces
-    edges = np.sort(np.vstack([faces[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
-    owner = np.tile(np.arange(len(faces)), 3)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    pair, one, other = edges[order[::2]], owner[order[::2]], owner[order[1::2]]
-    a, b, c = (surface.vertices[faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    ends = surface.vertices[pair]
-    corner = surface.vertices[faces[other]].sum(axis=1) - ends.sum(axis=1)
-    hollow = np.einsum("ij,ij->i", normal[one], corner - ends[:, 0]) > 0
-    cosine = np.einsum("ij,ij->i", normal[one], normal[other])
-    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-    return np.arccos(np.clip(cosine[hollow], -1, 1)), length[hollow]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fork_count", [1, 10])
-def test_smoothed_forks_are_less_sharp_and_sound(fork_count):
-    """Fillets: few creases are left; the surface is valid; volume within 2 %, not less."""
-    skeleton = generate_branch(3, fork_count=fork_count, point_spacing=0.01).skeleton
-    plain = branch_surface(skeleton)
-    smooth, check, warnings = smooth_forks(plain, skeleton)
-    assert check.valid and check.piece_count == 1 and not warnings
-    assert 1 < smooth.volume / plain.volume < 1.02
-    (before, length), (after, length_after) = _crease_angles(plain), _crease_angles(smooth)
-    for angle in np.deg2rad([45, 75]):
-        assert length_after[after > angle].sum() < 0.4 * length[before > angle].sum()
 
 
 def _forked(*twigs: tuple[float, float, float, float]) -> Skeleton:
@@ -96,47 +62,10 @@ def _forked(*twigs: tuple[float, float, float, float]) -> Skeleton:
     ("hanging", [(0.3, 150, 40, 0.006)]),
     ("hanging below the root", [(0.15, 170, 40, 0.003), (0.12, 140, 0, 0.005)]),
 ])
-def test_every_fork_is_rounded(name, twigs):
-    """Fillets hold at any angle, thickness and company; nothing comes out of the flat base."""
-    skeleton = _forked(*twigs)
-    plain = branch_surface(skeleton)
-    smooth, check, warnings = smooth_forks(plain, skeleton)
-    assert check.valid and check.piece_count == 1 and not warnings, name
-    assert 1 < smooth.volume / plain.volume < 1.02
-    (before, length), (after, length_after) = _crease_angles(plain), _crease_angles(smooth)
-    if name != "at the root":  # there the flat cut goes through the fork
-        sharp = np.deg2rad(60 if name != "acute" else 100)
-        assert length_after[after > sharp].sum() < 0.5 * length[before > sharp].sum()
-        assert smooth.vertices[:, 2].min() >= plain.vertices[:, 2].min() - 1e-9
-
-
-def test_level_surface_closes_a_ball():
-    """Marching tetrahedra give a closed, oriented sphere, closer to it on a finer lattice."""
-    errors = []
-    for step in (0.2, 0.1):
-        ball = level_surface(lambda points: np.linalg.norm(points - 0.01, axis=1) - 1,
-                             np.full(3, -1.4), np.full(3, 1.4), step)
-        check = check_surface(ball)
-        assert check.valid and check.piece_count == 1
-        errors.append(abs(ball.volume / (4 / 3 * np.pi) - 1))
-    assert errors[0] < 0.01 and errors[1] < 0.3 * errors[0]
-
-
-def test_an_empty_union_of_fillets_leaves_the_surface(y_skeleton, monkeypatch):
-    """Where the union fails, the surface without fillets comes back with a warning."""
-    monkeypatch.setattr("limber.geometry.surface.forks._joined", lambda *_: None)
-    plain = branch_surface(y_skeleton)
-    smooth, check, warnings = smooth_forks(plain, y_skeleton)
-    assert smooth is plain and check.valid and "1 of 1 forks" in warnings[0]
-
-
-def test_forks_stay_sharp_where_a_fillet_fails(y_skeleton, monkeypatch):
-    """A fillet that adds too much volume is given up, with a warning."""
-    monkeypatch.setattr("limber.geometry.surface.forks.VOLUME_CHANGE", 1e-5)
-    plain = branch_surface(y_skeleton)
-    smooth, check, warnings = smooth_forks(plain, y_skeleton)
-    assert smooth is plain and check.valid
-    assert len(warnings) == 1 and "1 of 1 forks keep sharp edges" in warnings[0]
+def test_every_fork_is_one_solid(name, twigs):
+    """Closed, oriented and uncrossed at any angle, thickness and company."""
+    check = check_surface(branch_surface(_forked(*twigs)))
+    assert check.valid and check.piece_count == 1, name
 
 
 def test_sharp_bend_does_not_cross_itself():
@@ -214,9 +143,9 @@ def test_swept_sections_have_the_circles_second_moment(sides):
 
 
 def test_quality_states_the_distance_from_the_surface(forked_branch):
-    """The mesh of the default sweep lies within a tenth of the radius of the rounded surface."""
+    """The mesh of the default sweep lies within a tenth of the radius of the round cylinders."""
     skeleton = forked_branch.skeleton
-    surface, _, _ = smooth_forks(branch_surface(skeleton), skeleton)
+    surface = branch_surface(skeleton)
     quality = measure_quality(mesh_branch(skeleton).mesh, surface.volume, skeleton, surface)
     assert 1 <= quality.elements_across < 1.6
     assert 0.02 < quality.surface_distance_mean < 0.1

@@ -8,7 +8,6 @@ from limber.geometry.skeleton.radii.fit_kernels import (
     normal_blocks,
     reach_on_circle,
 )
-from limber.geometry.surface.forks import fillet_level
 from limber.geometry.surface.surface import _distances, pierced
 from limber.geometry.warm_up import warm_up
 
@@ -16,6 +15,6 @@ from limber.geometry.warm_up import warm_up
 def test_warm_up_compiles_the_loops():
     """After it they exist as machine code, each in one form."""
     warm_up()
-    for kernel in (pierced, fillet_level, _distances, nearest_of, normal_blocks, mean_on_circle,
+    for kernel in (pierced, _distances, nearest_of, normal_blocks, mean_on_circle,
                    reach_on_circle, priced, nearest_others, far_sides, _voted):
         assert len(kernel.signatures) == 1

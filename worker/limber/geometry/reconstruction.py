@@ -46,7 +46,7 @@ from limber.geometry.skeleton.plausibility import (
     OPEN,
     RESOLVED,
     check_explained,
-    check_surface,
+    check_surface_shown,
     off_axes,
     root_question,
     surface_share,
@@ -65,8 +65,7 @@ from limber.geometry.skeleton.skeleton import (
     upright_rotation,
 )
 from limber.geometry.skeleton.skeletonise import Apart, skeletonise
-from limber.geometry.surface.forks import smooth_forks
-from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.surface import Surface, check_surface
 from limber.geometry.surface.tubes import branch_surface
 from limber.geometry.tets.tet_mesh import TetMesh, mark, measure_quality
 from limber.geometry.tets.tetrahedra import MeshResult, mesh_branch
@@ -224,7 +223,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
                                 settings.leaves != "keep" and show_leaves(wood, off)))
             share = surface_share(whole.skeleton, whole.node_of_point, whole.residual)
             if not found.leafy:
-                check_surface(share, len(wood.cloud), whole.skeleton.length)
+                check_surface_shown(share, len(wood.cloud), whole.skeleton.length)
         if is_open:
             raise root_question(found.root_ends, alignment.undo)
     # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.
@@ -348,10 +347,8 @@ def mesh_skeleton(skeleton: Skeleton, settings: ReconstructSettings,
                   progress: Progress = SILENT) -> MeshedBranch:
     """Make surface and mesh of an aligned skeleton."""
     kept, masses = leave_out_twigs(skeleton, settings)
-    surface, check, sharp = smooth_forks(branch_surface(kept), kept)
-    check.require()
-    for text in sharp:
-        progress.warn(text)
+    surface = branch_surface(kept)
+    check = check_surface(surface).require()
     progress(0.1, "surface", faces=len(surface.faces))
     meshed = mesh_branch(kept, settings, progress=progress.part(0.1, 0.9))
     for text in meshed.warnings:

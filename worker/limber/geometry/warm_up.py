@@ -8,7 +8,6 @@ from limber.geometry.skeleton.joining import join_pieces
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.surface.forks import smooth_forks
 from limber.geometry.surface.surface import distance_to_surface
 from limber.geometry.surface.tubes import branch_surface
 
@@ -19,7 +18,7 @@ def warm_up(progress: Progress = SILENT) -> None:
         np.array([[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2], [0.05, 0, 0.15]]),
         np.array([-1, 0, 1, 1]), np.array([0.01, 0.01, 0.01, 0.005]))
     progress(0.1, "compiling the surface's loops")
-    surface, _, _ = smooth_forks(branch_surface(skeleton), skeleton)
+    surface = branch_surface(skeleton)
     distance_to_surface(skeleton.nodes, surface)
     fit_axes(skeleton, surface.vertices, rounds=1, settled=True)
     line = np.array([[0, 0, 0.01 * k] for k in (*range(4), *range(6, 10))])

@@ -29,7 +29,7 @@ PARTS = [
     ("robust_laplacian", "robust_laplacian",
      "the robust Laplacian; without it our own is used", ""),
     ("pytetwild", "pytetwild", "fTetWild meshes; without it the sweep mesher is used", ""),
-    ("manifold3d", "manifold3d", "smooth unions at forks", ""),
+    ("manifold3d", "manifold3d", "unions of tubes at forks", ""),
     ("ompl", "ompl",
      "OMPL's RRT*; without it our own planner is used (no wheel for Windows)", "planning"),
     ("rtde_control", "ur-rtde", "motion of a UR robot", "robot"),

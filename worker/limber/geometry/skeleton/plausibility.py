@@ -165,7 +165,7 @@ def _doubt_texts(result: Any, where: Where) -> list[str]:
     return texts
 
 
-def check_surface(share: float, count: int, length: float) -> None:
+def check_surface_shown(share: float, count: int, length: float) -> None:
     """InputError if no points show a surface: ``share`` is the fraction of the volume that they
     show, ``length`` that of all axes [m]."""
     if share == 0:

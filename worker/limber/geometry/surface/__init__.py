@@ -1,1 +1,1 @@
-"""Closed surfaces: tubes round a skeleton, joined and rounded, checked."""
+"""Closed surfaces: tubes round a skeleton, united and checked."""

@@ -167,7 +167,6 @@ def pieces(surface: Surface) -> np.ndarray:
 def crossings(surface: Surface) -> np.ndarray:
     """Return points [m] where an edge of one face passes through another face, shape [c, 3]. Faces
     that share an edge are not compared; of those that share a corner, only the opposite edges."""
-
     if len(surface.faces) == 0:
         return np.empty((0, 3))
     faces = np.ascontiguousarray(surface.faces, np.int64)

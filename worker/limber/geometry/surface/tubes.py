@@ -11,31 +11,10 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import frames, polygon_factor, resample, rings, tangents
 from limber.geometry.surface.surface import Surface, crossings
 
-# Positions of a run's cross-sections, and their number of sides.
-
-SPACING = 1.5
-"Distance between cross-sections in local radii."
-
-_SIDES, _MOST_SIDES = 12, 48
-_FACET = 0.025  # deviation of a carrier's facets from its circle, in radii of its thinnest twig
+_SIDES, _SPACING = 12, 1.5  # of the cross-sections; the distance between them in local radii
 
 
-def sides_of_runs(skeleton: Skeleton, requested: int | None = None) -> list[int]:
-    """Sides of each run's cross-section: given, or enough to hide facets beside a twig.
-    """
-    if requested is not None:
-        return [requested] * skeleton.branch_count
-    sides = [_SIDES] * skeleton.branch_count
-    for members in skeleton.runs()[1:]:
-        carrier = int(skeleton.branch[members[0]])
-        ratio = skeleton.radius[members[0]] / max(skeleton.radius[members[1]], 1e-300)
-        # polygon_factor(n) is about 1 + pi^2 / (3 n^2).
-        needed = 2 * int(np.ceil(np.pi * np.sqrt(ratio / (3 * _FACET)) / 2))
-        sides[carrier] = min(max(sides[carrier], needed), _MOST_SIDES)
-    return sides
-
-
-def run_axis(skeleton: Skeleton, run: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+def _run_axis(skeleton: Skeleton, run: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Axis [m], shape [k, 3], and radii [m] of a run, ``spacing`` radii from point to point. A side
     run starts on its parent's axis, with a radius that stays inside the parent."""
     nodes = skeleton.runs()[run]
@@ -52,7 +31,7 @@ def run_axis(skeleton: Skeleton, run: int, spacing: float) -> tuple[np.ndarray, 
 
 
 @dataclass(frozen=True)
-class Tube:
+class _Tube:
     """Axis and radii of one unforked run, resampled and safe to sweep."""
 
     centres: np.ndarray
@@ -65,15 +44,14 @@ _CAP = np.deg2rad([35.0, 65.0])  # angles of a rounded end's rings on its half s
 _CORNER = np.deg2rad(30.0)
 
 
-def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: float = SPACING,
+def branch_surface(skeleton: Skeleton, *, sides: int = _SIDES, spacing: float = _SPACING,
                    ) -> Surface:
     """Sweep a tube along each run and join them: watertight, rounded tips, a flat base; sections
     across the tangent, as in the paper's plant model. MeshingError if the union is empty."""
-    tubes = {run: tubes_of_run(skeleton, run, spacing) for run in range(skeleton.branch_count)}
-    count = sides_of_runs(skeleton, sides)
+    tubes = {run: _tubes_of_run(skeleton, run, spacing) for run in range(skeleton.branch_count)}
     in_pieces: set[int] = set()
     for _ in range(4):
-        surface = _union(tubes, in_pieces, count, 0.02 * float(skeleton.radius.min()))
+        surface = _union(tubes, in_pieces, sides, 0.02 * float(skeleton.radius.min()))
         points = crossings(surface)
         more = _runs_near(tubes, points) - in_pieces
         if not more:
@@ -84,22 +62,22 @@ def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: flo
     return surface
 
 
-def _union(tubes: dict[int, list[Tube]], in_pieces: set[int], sides: list[int], tolerance: float,
+def _union(tubes: dict[int, list[_Tube]], in_pieces: set[int], sides: int, tolerance: float,
            ) -> Surface:
     import manifold3d
 
     solids = []
     for run, parts in tubes.items():
         for tube in parts:
-            vertices, faces = tube_triangles(tube, sides[run])
-            solids += _pieces(tube, vertices, sides[run]) if run in in_pieces else [
-                solid(vertices, faces)]
+            vertices, faces = _tube_triangles(tube, sides)
+            solids += _pieces(tube, vertices, sides) if run in in_pieces else [
+                _solid(vertices, faces)]
     joined = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
     # Where tubes cross, the union leaves slivers far below any relevant size.
-    return largest_piece(joined.simplify(tolerance))
+    return _largest_piece(joined.simplify(tolerance))
 
 
-def largest_piece(joined) -> Surface:
+def _largest_piece(joined) -> Surface:
     """The surface of a union's largest piece; MeshingError if it is empty."""
     pieces = joined.decompose()
     if not pieces:
@@ -113,7 +91,7 @@ def largest_piece(joined) -> Surface:
     return Surface(vertices, np.array(mesh.tri_verts, np.int64))
 
 
-def _pieces(tube: Tube, vertices: np.ndarray, sides: int) -> list:
+def _pieces(tube: _Tube, vertices: np.ndarray, sides: int) -> list:
     import manifold3d
 
     ring = vertices[:-2].reshape(-1, sides, 3)
@@ -125,7 +103,7 @@ def _pieces(tube: Tube, vertices: np.ndarray, sides: int) -> list:
     return [manifold3d.Manifold.hull_points(np.ascontiguousarray(hull)) for hull in hulls]
 
 
-def _runs_near(tubes: dict[int, list[Tube]], points: np.ndarray) -> set[int]:
+def _runs_near(tubes: dict[int, list[_Tube]], points: np.ndarray) -> set[int]:
     if len(points) == 0:
         return set()
     near = set()
@@ -137,16 +115,16 @@ def _runs_near(tubes: dict[int, list[Tube]], points: np.ndarray) -> set[int]:
     return near
 
 
-def tubes_of_run(skeleton: Skeleton, run: int, spacing: float) -> list[Tube]:
+def _tubes_of_run(skeleton: Skeleton, run: int, spacing: float) -> list[_Tube]:
     """Return run ``run`` as a tube, or as several overlapping ones where it bends too sharply."""
-    points, radius = run_axis(skeleton, run, spacing)
+    points, radius = _run_axis(skeleton, run, spacing)
     # A round start there would bulge out of the flat cut at the root.
     at_root = np.linalg.norm(points[0] - skeleton.nodes[0]) < 1.2 * skeleton.radius[0]
-    return [Tube(p, r, tangents(p), flat_start=bool(at_root and part == 0))
+    return [_Tube(p, r, tangents(p), flat_start=bool(at_root and part == 0))
             for part, (p, r) in enumerate(_split_at_bends(points, radius))]
 
 
-def tube_triangles(tube: Tube, sides: int) -> tuple[np.ndarray, np.ndarray]:
+def _tube_triangles(tube: _Tube, sides: int) -> tuple[np.ndarray, np.ndarray]:
     """Triangles of a tube with a rounded end and start, or a flat start: vertices [m], faces."""
     normals, binormals = frames(tube.centres, tube.tangent)
     centres, radius = tube.centres, tube.radius
@@ -205,7 +183,7 @@ def _split_at_folds(points: np.ndarray, radius: np.ndarray,
     return [part for part in parts if len(part[0]) > 1]
 
 
-def solid(vertices: np.ndarray, faces: np.ndarray):
+def _solid(vertices: np.ndarray, faces: np.ndarray):
     """A solid of manifold3d; MeshingError if the triangles do not close one."""
     import manifold3d
 

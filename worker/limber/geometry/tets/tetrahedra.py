@@ -64,8 +64,7 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
                                   or _share(skeleton, swept.left_out) < _LEFT_OUT_LIMIT):
             return swept
     try:
-        mesh, mesher, mesh_warnings = _wild(skeleton, settings, progress)
-        return MeshResult(mesh, mesher, warnings + mesh_warnings)
+        return MeshResult(*_wild(skeleton, settings, progress), warnings)
     except (MeshingError, MissingDependencyError) as error:
         if swept is None and settings.mesher == "auto":
             raise
@@ -92,18 +91,16 @@ def _swept(skeleton: Skeleton, settings: MeshSettings) -> MeshResult:
 
 
 def _wild(skeleton: Skeleton, settings: MeshSettings, progress: Progress,
-          ) -> tuple[TetMesh, str, list[str]]:
-    from limber.geometry.surface.forks import smooth_forks
+          ) -> tuple[TetMesh, str]:
     from limber.geometry.surface.tubes import branch_surface
 
-    shape = {"sides": _SIDES, "spacing": settings.mesh_spacing}
-    surface, _, warnings = smooth_forks(branch_surface(skeleton, **shape), skeleton, **shape)
+    surface = branch_surface(skeleton, sides=_SIDES, spacing=settings.mesh_spacing)
     radii = np.sort(skeleton.radius)
     mesh, cached = tetrahedralise(
         surface, edge_length=4 * float(np.median(radii)),
         epsilon=0.25 * float(radii[len(radii) // 10]), time_limit=_SECONDS,
         progress=progress)
-    return mesh, "ftetwild (cached)" if cached else "ftetwild", warnings
+    return mesh, "ftetwild (cached)" if cached else "ftetwild"
 
 
 def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,
