@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="scripts/test", description=__doc__, epilog=(
         "Other arguments go to pytest: scripts/test tests/geometry -k skeleton"))
     parser.add_argument("--fast", action="store_true",
-                        help="style, types and the quick tests of every package: for each save")
+                        help="style, types, layers and quick tests of every package: for each save")
     parser.add_argument("--campaign", action="store_true",
                         help="the long tests that no other run has: for each night")
     parser.add_argument("--ci", action="store_true",
@@ -63,6 +63,7 @@ def main(arguments: list[str]) -> int:
     parts.append(command("style", [BIN / "ruff", "check", "addon", "worker", "tests", "scripts"]))
     if asked.fast or not (others or asked.campaign):
         parts.append(command("types", [BIN / "mypy"]))
+        parts.append(command("layers", [BIN / "lint-imports", "--no-cache", "--no-logo"]))
         parts.append(command("packages", [sys.executable, ROOT / "scripts/check_dependencies"]))
     if asked.campaign:
         parts.append(pytest_part("campaign", ["-m", "campaign", "--timeout", "3600", *others]))

@@ -2,8 +2,6 @@
 
 import ast
 import functools
-import graphlib
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,13 +18,11 @@ class Source:
 
     Attributes:
         imports: All statements that import.
-        type_imports: Those for type checkers alone.
         calls: Line and dotted name of what is called.
         attributes: Line and dotted name of what is looked up with a dot.
     """
 
     imports: list[ast.Import | ast.ImportFrom]
-    type_imports: set[ast.Import | ast.ImportFrom]
     calls: list[tuple[int, str]]
     attributes: list[tuple[int, str]]
 
@@ -34,13 +30,10 @@ class Source:
 @functools.cache
 def source(path: Path) -> Source:
     """Read a file once for all rules."""
-    found = Source([], set(), [], [])
+    found = Source([], [], [])
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import | ast.ImportFrom):
             found.imports.append(node)
-        elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            found.type_imports.update(each for each in ast.walk(node)
-                                      if isinstance(each, ast.Import | ast.ImportFrom))
         elif isinstance(node, ast.Call):
             found.calls.append((node.lineno, _dotted(node.func)))
         elif isinstance(node, ast.Attribute):
@@ -156,131 +149,6 @@ def test_no_text_advises_the_stranger_of_our_name():
 
 CORE = ROOT / "worker" / "limber"
 
-# What may import what: a layer imports those before it, never one beside it or after it.
-LAYERS = (
-    ("version",),
-    ("core",),
-    ("geometry",),
-    ("cell",),
-    ("mechanics",),
-    ("reduced", "recordings"),
-    ("perception",),
-    ("estimation", "planning", "robot"),
-    ("store",),
-    ("session",),
-    ("results",),
-    ("stages",),
-    ("batch",),
-    ("cli", "api"),
-    ("__main__",),
-)
-NUMERICAL = ("geometry", "mechanics", "reduced", "recordings", "perception", "estimation",
-             "planning")
-# The same between the parts of two packages; what is a plain file there is not ordered.
-PARTS = {"core": ("numerics", "files", "processes"),
-         "geometry": ("cloud", "skeleton", "surface", "tets"),
-         "mechanics": ("materials", "elements", "linear", "statics", "dynamics", "loads"),
-         "estimation": ("forward", "fitting", "uncertainty", "online"),
-         "planning": ("field", "goals", "constraints", "certificate", "planners"),
-         "robot": ("ur", "motion", "driver", "virtual"),
-         "results": ("exports", "scene", "report")}
-
-
-@functools.cache
-def core_imports() -> dict[str, set[str]]:
-    """Return, for each module of the core (dotted, without ``limber``), those that it imports.
-
-    Imports inside functions count; those for type checkers alone do not.
-    """
-    files = {}
-    for path in CORE.rglob("*.py"):
-        parts = path.relative_to(CORE).with_suffix("").parts
-        files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return {module: set(_imported(source(path), files)) - {""}
-            for module, path in files.items()}
-
-
-def _imported(read: Source, files: dict[str, Path]) -> Iterator[str]:
-    for node in read.imports:
-        if node in read.type_imports:
-            continue
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "limber":
-            base = (node.module or "").removeprefix("limber").strip(".")
-            for alias in node.names:
-                inside = f"{base}.{alias.name}".strip(".")
-                yield inside if inside in files else base
-        elif isinstance(node, ast.Import):
-            yield from (alias.name.removeprefix("limber.") for alias in node.names
-                        if alias.name.startswith("limber."))
-
-
-def place_of(module: str) -> tuple[int, str]:
-    """Return the layer of a module and the entry of LAYERS that it belongs to, the closest."""
-    fitting = [(name, number) for number, layer in enumerate(LAYERS) for name in layer
-               if module == name or module.startswith(name + ".")]
-    assert fitting, f"limber.{module} stands in no layer of this test: give it one"
-    name, number = max(fitting, key=lambda entry: len(entry[0]))
-    return number, name
-
-
-def test_layers_import_downwards():
-    """Every module imports its own package or a lower layer; among small ones is no circle."""
-    wrong = []
-    graph: dict[str, set[str]] = {}
-    for module, imported in core_imports().items():
-        if not module:
-            continue
-        layer, name = place_of(module)
-        for other in imported:
-            below, other_name = place_of(other)
-            if layer == below == 0:
-                graph.setdefault(name, set()).add(other_name)
-            elif name != other_name and below >= layer:
-                wrong.append(f"limber.{module} imports limber.{other}")
-    assert not wrong
-    graphlib.TopologicalSorter({name: others - {name} for name, others in graph.items()}).prepare()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("package", list(PARTS))
-def test_parts_of_a_package_import_downwards(package):
-    """No part imports one after it, nor a plain file of the package that imports it back."""
-    order = PARTS[package]
-    wrong = []
-    for module, imported in core_imports().items():
-        words = module.split(".")
-        if words[0] != package or len(words) < 2 or words[1] not in order:
-            continue
-        for other in imported:
-            others = other.split(".")
-            if others[0] == package and len(others) > 1 and others[1] in order and (
-                    order.index(others[1]) > order.index(words[1])):
-                wrong.append(f"limber.{module} imports limber.{other}")
-    assert not wrong
-    assert not _circles(package)
-
-
-def _circles(package: str) -> list[str]:
-    """Parts and files of a package that import each other in a circle."""
-    graph: dict[str, set[str]] = {}
-    for module, imported in core_imports().items():
-        words = module.split(".")
-        if words[0] == package and len(words) > 1:
-            others = {other.split(".")[1] for other in imported
-                      if other.startswith(package + ".")}
-            graph.setdefault(words[1], set()).update(others - {words[1]})
-    try:
-        graphlib.TopologicalSorter(graph).prepare()
-    except graphlib.CycleError as error:
-        return error.args[1]
-    return []
-
-
-def test_no_file_imports_itself_in_a_circle():
-    """No chain of imports, those inside functions with them, leads back to where it began."""
-    graphlib.TopologicalSorter(core_imports()).prepare()
-
-
 # Lines between processes of ours, and lines that a killed program may have left half written.
 OWN_LINES = {"robot", "session", "core.json_values", "batch.batch_progress", "store.lock",
              "geometry.tets.tetwild_process"}
@@ -299,14 +167,6 @@ def test_files_come_in_through_one_door():
             continue
         wrong += [f"limber.{module}, line {line}: {name}" for line, name in source(path).calls
                   if name in doors]
-    assert not wrong
-
-
-def test_numerical_packages_know_no_branch_folder():
-    """They take and return values: only stages, and what stands above, open a branch folder."""
-    wrong = {module for module, imported in core_imports().items()
-             if module.split(".")[0] in NUMERICAL
-             and any(other.split(".")[0] == "store" for other in imported)}
     assert not wrong
 
 
