@@ -75,7 +75,6 @@ class ReducedState:
     Attributes:
         converged: Whether it is a stable equilibrium of the reduced model.
         trusted: Whether it is also within the training of the basis.
-        uncertainty: Why it is not trusted, empty if it is.
         coordinates: q, shape [size].
         young: At the control points [Pa], shape [K].
         strain_energy: Energy of the strain relative to the model's mesh [J].
@@ -87,7 +86,6 @@ class ReducedState:
 
     converged: bool
     trusted: bool
-    uncertainty: str
     coordinates: np.ndarray
     pose: np.ndarray
     young: np.ndarray
@@ -381,17 +379,12 @@ class ReducedModel:
             np.log(self.training_young / self.young)).max(axis=1)
         return np.argsort(distance)[:count]
 
-    def uncertainty(self, pose: np.ndarray, novelty: float, limit: float) -> str:
-        """Return why a state lies outside the range of the basis, or an empty string."""
-        distance = self._table.distance(pose).min()
-        if distance > 3 * self._spacing:
-            return f"the pose is {distance:.3g} m from the nearest training grasp"
+    def covers(self, pose: np.ndarray, novelty: float, limit: float) -> bool:
+        """Whether a state lies in the range of the basis: near a training grasp, at a sampled
+        Young's modulus, no coordinate over ``limit`` times its largest value in training."""
         factor = np.exp(np.abs(np.log(self.young / self.control_young)).max())
-        if factor > 1.05 * self.young_spread:
-            return f"Young's modulus differs from the sampled range by a factor of {factor:.3g}"
-        if novelty > limit:
-            return f"a coordinate is {novelty:.3g} times its largest value in training"
-        return ""
+        return bool(self._table.distance(pose).min() <= 3 * self._spacing
+                    and factor <= 1.05 * self.young_spread and novelty <= limit)
 
     def _starts(self, pose: np.ndarray, start: ReducedState | None,
                 ) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -470,10 +463,9 @@ class ReducedModel:
         energy, force = self.energy_force(found.q)
         reaction, torque = self.wrench(pose, force - load)
         strain = energy - 0.5 * float(found.q @ self.weight_stiffness @ found.q)
-        uncertainty = "" if found.converged else "no stable equilibrium was found"
-        uncertainty = uncertainty or self.uncertainty(pose, found.novelty, settings.novelty_limit)
+        trusted = found.converged and self.covers(pose, found.novelty, settings.novelty_limit)
         return ReducedState(
-            found.converged, not uncertainty, uncertainty, found.q, pose, self.young, strain,
+            found.converged, trusted, found.q, pose, self.young, strain,
             float(energy - self.load @ found.q), reaction, torque, found.novelty, iterations,
             time.perf_counter() - began)
 

@@ -1,22 +1,20 @@
 """The error of a reduced model against the full one, and its refresh where that is too large.
 
 A few Newton corrections of the full model at a reduced state give its error at the cost of as many
-factorisations. A :class:`RefreshingModel` does this on request, answers with the full solution if
-the reduced one is not good enough, and adds the new full solutions to the basis.
+factorisations. A :class:`RefreshingModel` does this on request, and adds full solutions where the
+reduced one is not good enough to the basis.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from limber.core.errors import InputError
 from limber.core.numerics.sparse import NotPositiveDefiniteError
-from limber.core.progress import SILENT, Progress
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.equilibrium_path import StaticProblem, make_result
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, Status
-from limber.reduced.model_cache import build_reduced, reduce_snapshots
+from limber.reduced.model_cache import reduce_snapshots
 from limber.reduced.reduced_model import ReducedModel, ReducedSettings, ReducedState
 from limber.reduced.training import Snapshots, Trainer
 
@@ -52,6 +50,13 @@ class ErrorEstimate:
     certain: bool
     displacement: np.ndarray
 
+    @property
+    def is_small(self) -> bool:
+        """Whether the state may be taken as it is. Its distance from the training says little: most
+        bad states are within it, with a free end slightly misaligned."""
+        return (self.certain and self.min_det_f > 0 and self.position <= _POSITION
+                and abs(self.energy) <= _ENERGY)
+
 
 def estimate_error(model: BranchModel, weights: np.ndarray, reduced: ReducedModel,
                    state: ReducedState) -> ErrorEstimate:
@@ -79,29 +84,6 @@ def estimate_error(model: BranchModel, weights: np.ndarray, reduced: ReducedMode
     energy = state.strain_energy / max(now.strain_energy, 1e-12) - 1
     return ErrorEstimate(off, energy, first.min_det_f,
                          bool(certain and np.isfinite(off + energy)), u)
-
-
-def checked(state: ReducedState, estimate: ErrorEstimate, *, position_tolerance: float = _POSITION,
-            energy_tolerance: float = _ENERGY) -> ReducedState:
-    """Return a state with the doubt that follows from its measured error; none if it is small. Its
-    distance from the training says little: most bad states are within it, at moduli that the basis
-    covers, with a free end slightly misaligned."""
-    if not state.converged:
-        uncertainty = "no stable equilibrium was found"
-    elif not estimate.certain:
-        uncertainty = "the full model is not stable there"
-    elif estimate.min_det_f <= 0:
-        uncertainty = "an element of the full mesh is inside out there"
-    elif estimate.position > position_tolerance:
-        uncertainty = (
-            f"on the full model a node is {100 * estimate.position:.2g} % of the branch's "
-            "extent away"
-        )
-    elif abs(estimate.energy) > energy_tolerance:
-        uncertainty = f"its energy differs from the full model's by {100 * estimate.energy:+.2g} %"
-    else:
-        uncertainty = ""
-    return replace(state, trusted=not uncertainty, uncertainty=uncertainty)
 
 
 def corrected_once(model: BranchModel, reduced: ReducedModel, state: ReducedState,
@@ -137,84 +119,29 @@ def corrected_once(model: BranchModel, reduced: ReducedModel, state: ReducedStat
     return result, np.array(tangents)
 
 
-@dataclass(frozen=True)
-class Answer:
-    """A static answer that is good enough, from ``source`` reduced or full: displacement
-    [node_count, 3] [m], strain energy [J], force of the gripper on the branch [3] [N]; the reduced
-    state even if not good enough, and its error if it was checked."""
-
-    source: str
-    state: ReducedState
-    displacement: np.ndarray
-    strain_energy: float
-    reaction_force: np.ndarray
-    estimate: ErrorEstimate | None
-
-
 class RefreshingModel:
-    """A reduced model and its full one, with arguments as for ``build_reduced``. After
-    ``refresh_every`` new full solutions the basis is made again. Tolerances: a node's error
-    relative to the extent, and the energy's relative error."""
+    """A reduced model and its full one, with arguments as for ``build_reduced``, and the full
+    ``snapshots`` it was made from. After ``refresh_every`` new ones the basis is made again."""
 
     def __init__(self, model: BranchModel, grasp: Grasp, weights: np.ndarray,
-                 control_young: np.ndarray, settings: ReducedSettings | None = None, *,
-                 position_tolerance: float = _POSITION, energy_tolerance: float = _ENERGY,
-                 refresh_every: int = 6, reduced: ReducedModel | None = None,
-                 snapshots: Snapshots | None = None, progress: Progress = SILENT):
-        if (reduced is None) != (snapshots is None):
-            raise InputError("Only one of the reduced model and its snapshots is given.",
-                             "A refresh needs both.", "Give both, or neither.")
-        self.model, self.grasp, self.weights = model, grasp, weights
-        self.settings = settings or ReducedSettings()
-        self.position_tolerance, self.energy_tolerance = position_tolerance, energy_tolerance
-        self.refresh_every = refresh_every
-        if reduced is None or snapshots is None:
-            reduced, snapshots = build_reduced(model, grasp, weights, control_young,
-                                               self.settings, progress)
+                 settings: ReducedSettings, reduced: ReducedModel, snapshots: Snapshots, *,
+                 refresh_every: int = 6):
+        self.model, self.grasp, self.weights, self.settings = model, grasp, weights, settings
         self.reduced, self.snapshots = reduced, snapshots
+        self.refresh_every, self.refresh_count = refresh_every, 0
         self.trainer = Trainer(model, grasp, weights, reduced.control_young,
                                young_tangents=snapshots.young_tangents.shape[1] > 0)
-        self.refresh_count = 0
         self._new: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-
-    @property
-    def pending(self) -> int:
-        """Full solutions that the basis does not contain yet."""
-        return len(self._new)
-
-    def solve(self, pose: np.ndarray, young: np.ndarray | None = None, *,
-              check: bool = True) -> Answer:
-        """Return the equilibrium at a pose [m, rad] within the tolerances, by the full model where
-        the check fails. Without ``check`` trained states are taken as they are, in a millisecond;
-        at a new E every eighth is off by more. ConvergenceError if the full model finds none."""
-        reduced = self.reduced if young is None else self.reduced.with_young(young)
-        state = reduced.solve_static(pose)
-        if state.trusted and not check:
-            return self._reduced_answer(reduced, state, None)
-        estimate = self.check(state)
-        state = checked(state, estimate, position_tolerance=self.position_tolerance,
-                        energy_tolerance=self.energy_tolerance)
-        if state.trusted:
-            return self._reduced_answer(reduced, state, estimate)
-        result = self.learn(pose, state.young, estimate).require()
-        return Answer("full", state, result.displacement, result.strain_energy,
-                      result.reaction_force, estimate)
 
     def check(self, state: ReducedState) -> ErrorEstimate:
         """Return the error of a reduced state."""
         return estimate_error(self.model, self.weights, self.reduced, state)
 
-    def accepts(self, state: ReducedState, estimate: ErrorEstimate) -> bool:
-        """Whether a state's measured error is within the tolerances."""
-        return checked(state, estimate, position_tolerance=self.position_tolerance,
-                       energy_tolerance=self.energy_tolerance).trusted
-
     def learn(self, pose: np.ndarray, young: np.ndarray,
-              estimate: ErrorEstimate | None = None) -> StaticResult:
+              estimate: ErrorEstimate) -> StaticResult:
         """Solve the full model at a pose and keep it; refresh after ``refresh_every`` of them."""
-        start = estimate.displacement if estimate is not None and estimate.certain else None
-        if start is None:
-            start = self.snapshots.displacement[int(self.reduced.nearest(pose, 1)[0])]
+        start = estimate.displacement if estimate.certain else self.snapshots.displacement[
+            int(self.reduced.nearest(pose, 1)[0])]
         result = self.trainer.solve(pose, young, start)
         if result.converged:
             self._new.append((np.asarray(pose, float), np.asarray(young, float),
@@ -225,8 +152,6 @@ class RefreshingModel:
 
     def refresh(self) -> None:
         """Make the basis again with the full solutions found since."""
-        if not self._new:
-            return
         poses, young, displacements = (np.array(column)
                                        for column in zip(*self._new, strict=True))
         added = self.trainer.differentiate(poses, young, displacements)
@@ -237,8 +162,3 @@ class RefreshingModel:
                                         keeps_strain=self.reduced.strain_fields is not None)
         self._new = []
         self.refresh_count += 1
-
-    def _reduced_answer(self, reduced: ReducedModel, state: ReducedState,
-                        estimate: ErrorEstimate | None) -> Answer:
-        return Answer("reduced", state, reduced.displacement(state), state.strain_energy,
-                      state.reaction_force, estimate)

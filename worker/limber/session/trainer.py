@@ -90,8 +90,8 @@ def _serve(folder: Path, settings: SessionSettings, cache: ReducedCache) -> None
     key = model_key(held.model, grasp, weights, young, about)
     learnt = learnt_model(held.model, grasp, weights, young, about, cache=cache,
                           progress=progress)
-    refreshing = RefreshingModel(held.model, grasp, weights, young, about, reduced=learnt.reduced,
-                                 snapshots=learnt.snapshots)
+    refreshing = RefreshingModel(held.model, grasp, weights, about, learnt.reduced,
+                                 learnt.snapshots)
     _announce(cache, key, refreshing, began, learnt)
     _step_back()
     while (request := requests.get()) is not None:
@@ -123,7 +123,7 @@ def _check(refreshing: RefreshingModel, request: dict[str, Any]) -> None:
     pose, young = np.array(request["pose"], float), np.array(request["young_pa"], float)
     state = refreshing.reduced.with_young(young).solve_static(pose)
     estimate = refreshing.check(state)
-    good = refreshing.accepts(state, estimate)
+    good = state.converged and estimate.is_small
     learned = not good and refreshing.learn(pose, young, estimate).converged
     say(event="check", position_error=estimate.position, energy_error=estimate.energy,
         certain=estimate.certain, good=good, learned=learned)
