@@ -67,7 +67,7 @@ class Solid:
         low, high = self.surface.vertices.min(axis=0), self.surface.vertices.max(axis=0)
         near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
         for part in np.array_split(near, 1 + len(near) * len(self.surface.faces) // _CHUNK):
-            distance[part] *= np.where(np.abs(_winding(self.surface, points[part])) > 0.5, -1, 1)
+            distance[part] *= np.where(np.abs(self.surface.winding(points[part])) > 0.5, -1, 1)
         return distance
 
 
@@ -85,16 +85,6 @@ def closest(obstacles: tuple[Obstacle, ...], points: np.ndarray, radius: float =
         if depth[index] > 0.0 and (worst is None or depth[index] > worst[1]):
             worst = obstacle.name, float(depth[index]), points[index]
     return worst
-
-
-def _winding(surface: Surface, points: np.ndarray) -> np.ndarray:
-    """Winding number of a surface around points [n, 3] (Van Oosterom and Strackee 1983), [n]."""
-    a, b, c = (surface.vertices[surface.faces[:, k]][None] - points[:, None] for k in range(3))
-    la, lb, lc = (np.linalg.norm(v, axis=2) for v in (a, b, c))
-    over = np.einsum("nij,nij->ni", a, np.cross(b, c))
-    under = (la * lb * lc + np.einsum("nij,nij->ni", a, b) * lc
-             + np.einsum("nij,nij->ni", b, c) * la + np.einsum("nij,nij->ni", c, a) * lb)
-    return np.arctan2(over, under).sum(axis=1) / (2 * np.pi)
 
 
 class Limbs:

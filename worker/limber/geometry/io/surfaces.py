@@ -7,7 +7,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.geometry.io.formats import Format, Registry
-from limber.geometry.surface.surface import Surface, crossings, pieces
+from limber.geometry.surface.surface import Surface, crossings, pieces, position_text
 
 SURFACES = Registry("surface", "limber.surfaces", [
     Format("triangles", (".stl", ".ply", ".obj", ".off", ".glb", ".gltf"), Surface.read)])
@@ -34,7 +34,7 @@ def usable_surface(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
     found = crossings(surface)
     if len(found):
         raise InputError(f"{path} intersects itself at {len(found)} points, one of them at "
-                         f"{_at_text(found[0])}.",
+                         f"{position_text(found[0])}.",
                          "The surface of a solid must not intersect itself.",
                          "Unite its parts (in Blender: a Boolean modifier with Self), then mesh "
                          "the surface again.")
@@ -79,19 +79,19 @@ def _check_edges(surface: Surface, path: Path) -> None:
     middle = surface.vertices[unique].mean(axis=1)
     if (counts == 1).any():
         raise InputError(f"{path} has holes: {int((counts == 1).sum())} open edges, one of them at "
-                         f"{_at_text(middle[counts == 1][0])}.", "The surface must be closed.",
+                         f"{position_text(middle[counts == 1][0])}.", "The surface must be closed.",
                          "Close the holes (in Blender: select non-manifold, fill), then mesh the "
                          "surface again.")
     if (counts > 2).any():
         raise InputError(f"{path} has {int((counts > 2).sum())} edges with more than two faces, "
-                         f"one of them at {_at_text(middle[counts > 2][0])}.",
+                         f"one of them at {position_text(middle[counts > 2][0])}.",
                          "Each edge of a solid has two faces.",
                          "Delete duplicate and inner faces (in Blender: Merge by Distance, then "
                          "select non-manifold), then mesh the surface again.")
     balance = np.bincount(inverse.ravel(), np.where(edges[:, 0] < edges[:, 1], 1, -1), len(counts))
     if balance.any():
         raise InputError(f"{path} has faces that point inwards and faces that point outwards, for "
-                         f"example at {_at_text(middle[balance != 0][0])}.",
+                         f"example at {position_text(middle[balance != 0][0])}.",
                          "All faces must have the same orientation.",
                          "Recalculate the normals (in Blender: Shift N).")
 
@@ -106,11 +106,13 @@ def _one_body(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
         raise InputError(f"{path} encloses no volume.", "A solid was expected, not a sheet.",
                          "Give it thickness (in Blender: a Solidify modifier).")
     if len(parts) > 1:
-        inner = _within(parts, volume)
-        if inner:
+        largest = int(np.argmax(np.abs(volume)))
+        others = [part.faces[0, 0] for k, part in enumerate(parts) if k != largest]
+        corner = surface.vertices[others]
+        inner = corner[np.abs(parts[largest].winding(corner)) > 0.5]
+        if len(inner):
             raise InputError(f"{path} has {len(inner)} closed surfaces inside its largest one, one "
-                             "of them at "
-                             f"{_at_text(parts[inner[0]].vertices[parts[inner[0]].faces[0, 0]])}.",
+                             f"of them at {position_text(inner[0])}.",
                              "A branch is a solid without cavities.",
                              "Delete the inner surfaces (in Blender: separate by loose parts), "
                              "then mesh the surface again.")
@@ -125,25 +127,3 @@ def _one_body(surface: Surface, path: Path) -> tuple[Surface, list[str]]:
         return Surface(surface.vertices, surface.faces[:, ::-1]), [
             "All faces pointed inwards. They were flipped."]
     return surface, []
-
-
-def _within(parts: list[Surface], volume: np.ndarray) -> list[int]:
-    """Parts inside the largest one: its winding number around a corner is not 0."""
-    largest = int(np.argmax(np.abs(volume)))
-    outer = parts[largest]
-    return [k for k, part in enumerate(parts) if k != largest and abs(_winding(
-        outer, part.vertices[part.faces[0, 0]])) > 0.5]
-
-
-def _winding(surface: Surface, point: np.ndarray) -> float:
-    """Winding number of a surface around a point (Van Oosterom and Strackee 1983)."""
-    a, b, c = (surface.vertices[surface.faces[:, k]] - point for k in range(3))
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    over = np.einsum("ij,ij->i", a, np.cross(b, c))
-    under = (la * lb * lc + np.einsum("ij,ij->i", a, b) * lc + np.einsum("ij,ij->i", b, c) * la
-             + np.einsum("ij,ij->i", c, a) * lb)
-    return float(np.arctan2(over, under).sum() / (2 * np.pi))
-
-
-def _at_text(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{v:.4f}" for v in point) + ") m"

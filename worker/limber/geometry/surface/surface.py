@@ -42,6 +42,16 @@ class Surface:
         used = len(np.unique(self.faces))
         return max(round((2 - used + len(self.faces) / 2) / 2), 0)
 
+    def winding(self, points: np.ndarray) -> np.ndarray:
+        """Return the winding number around points [n, 3] [m], shape [n] (Van Oosterom and Strackee
+        1983): 1 inside a closed surface, 0 outside."""
+        a, b, c = (self.vertices[self.faces[:, k]][None] - points[:, None] for k in range(3))
+        la, lb, lc = (np.linalg.norm(v, axis=2) for v in (a, b, c))
+        over = np.einsum("nij,nij->ni", a, np.cross(b, c))
+        under = (la * lb * lc + np.einsum("nij,nij->ni", a, b) * lc
+                 + np.einsum("nij,nij->ni", b, c) * la + np.einsum("nij,nij->ni", c, a) * lb)
+        return np.arctan2(over, under).sum(axis=1) / (2 * np.pi)
+
     def write_ply(self, path: Path) -> None:
         """Write a binary PLY file, in double precision: rounding could make faces cross."""
         from plyfile import PlyData, PlyElement
@@ -119,8 +129,8 @@ class SurfaceCheck:
         if not self.watertight:
             raise MeshingError(f"The surface has {len(self.open_edges)} open edges or edges with "
                                "more than two faces, one of them at "
-                               f"{_position_text(self.open_edges[0])} "
-                               "m.", "The surface must be closed.",
+                               f"{position_text(self.open_edges[0])}.",
+                               "The surface must be closed.",
                                "Prune the skeleton there, or close the holes of the surface.")
         if not self.oriented:
             raise MeshingError("Not all faces of the surface point outwards.",
@@ -128,7 +138,7 @@ class SurfaceCheck:
                                "Make the normals consistent.")
         if len(self.crossings):
             raise MeshingError(f"The surface intersects itself at {len(self.crossings)} points, "
-                               f"one of them at {_position_text(self.crossings[0])} m.",
+                               f"one of them at {position_text(self.crossings[0])}.",
                                "The surface of a solid must not intersect itself.",
                                "Edit the skeleton there, or smooth it.")
         return self
@@ -170,7 +180,16 @@ def crossings(surface: Surface) -> np.ndarray:
     if len(surface.faces) == 0:
         return np.empty((0, 3))
     faces = np.ascontiguousarray(surface.faces, np.int64)
-    corner = surface.vertices[faces]
+    low, high, _, first, counts, keys, owner = _cells(surface)
+    return pierced(np.ascontiguousarray(surface.vertices, np.float64), faces, low, high, first,
+                   counts, keys, owner)
+
+
+def _cells(surface: Surface) -> tuple:
+    """A grid of cells over the faces: boxes of the faces ``low`` and ``high`` [n, 3] [m], edge of a
+    cell [m], each face's first cell [n, 3], number of cells [3], and by ascending number of the
+    cell those numbers and the face in each, see :func:`by_cell`."""
+    corner = surface.vertices[surface.faces]
     low, high = corner.min(axis=1), corner.max(axis=1)
     extent = (high - low).max(axis=1)
     # A cell has a few faces, and a face is in few cells.
@@ -180,12 +199,12 @@ def crossings(surface: Surface) -> np.ndarray:
     counts = last.max(axis=0) + 1
     keys, owner = by_cell(first, last, counts)
     order = np.argsort(keys, kind="stable")
-    return pierced(np.ascontiguousarray(surface.vertices, np.float64), faces, low, high, first,
-                   counts, keys[order], owner[order])
+    return low, high, cell, first, counts, keys[order], owner[order]
 
 
-def _position_text(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{v:.4f}" for v in point) + ")"
+def position_text(point: np.ndarray) -> str:
+    """Return a position [m] as messages name it."""
+    return "(" + ", ".join(f"{v:.4f}" for v in point) + ") m"
 
 
 # Crossings of a surface's faces: a grid of cells, and Moeller and Trumbore's test within them.
@@ -290,21 +309,12 @@ def _compare(vertices: np.ndarray, faces: np.ndarray, one: int, other: int, foun
 
 def distance_to_surface(points: np.ndarray, surface: Surface) -> np.ndarray:
     """Distances [m] of points [n, 3] from a surface, shape [n]."""
-    corner = surface.vertices[surface.faces]
-    low, high = corner.min(axis=1), corner.max(axis=1)
-    origin = low.min(axis=0)
-    extent = (high - low).max(axis=1)
-    cell = max(1.5 * float(np.median(extent)), float(extent.max()) / 24, 1e-12)
-    first = np.floor((low - origin) / cell).astype(np.int64)
-    last = np.floor((high - origin) / cell).astype(np.int64)
-    counts = last.max(axis=0) + 1
-    keys, owner = by_cell(first, last, counts)
-    order = np.argsort(keys, kind="stable")
+    low, _, cell, _, counts, keys, owner = _cells(surface)
     # No farther than the nearest vertex, so that few cells are searched.
     bound, _ = cKDTree(surface.vertices).query(points)
     return _distances(np.ascontiguousarray(points, np.float64), bound,
-                      np.ascontiguousarray(corner), origin, cell, counts, keys[order],
-                      owner[order])
+                      np.ascontiguousarray(surface.vertices[surface.faces]), low.min(axis=0), cell,
+                      counts, keys, owner)
 
 
 @compiled_exactly
