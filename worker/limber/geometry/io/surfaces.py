@@ -7,7 +7,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.geometry.io.formats import Format, Registry
-from limber.geometry.surface.surface import Surface, crossings, pieces, position_text
+from limber.geometry.surface.surface import Surface, crossings, edges_of, pieces, position_text
 
 SURFACES = Registry("surface", "limber.surfaces", [
     Format("triangles", (".stl", ".ply", ".obj", ".off", ".glb", ".gltf"), Surface.read)])
@@ -68,15 +68,12 @@ def _welded(surface: Surface) -> tuple[Surface, list[str]]:
 
 def _open_edges(faces: np.ndarray) -> int:
     """Edges of a single face."""
-    edges = np.sort(np.vstack([faces[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
-    return int((np.unique(edges, axis=0, return_counts=True)[1] == 1).sum())
+    return int((edges_of(faces)[1] == 1).sum())
 
 
 def _check_edges(surface: Surface, path: Path) -> None:
-    edges = np.vstack([surface.faces[:, [k, (k + 1) % 3]] for k in range(3)])
-    unique, inverse, counts = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
-    middle = surface.vertices[unique].mean(axis=1)
+    edges, counts, balance = edges_of(surface.faces)
+    middle = surface.vertices[edges].mean(axis=1)
     if (counts == 1).any():
         raise InputError(f"{path} has holes: {int((counts == 1).sum())} open edges, one of them at "
                          f"{position_text(middle[counts == 1][0])}.", "The surface must be closed.",
@@ -88,7 +85,6 @@ def _check_edges(surface: Surface, path: Path) -> None:
                          "Each edge of a solid has two faces.",
                          "Delete duplicate and inner faces (in Blender: Merge by Distance, then "
                          "select non-manifold), then mesh the surface again.")
-    balance = np.bincount(inverse.ravel(), np.where(edges[:, 0] < edges[:, 1], 1, -1), len(counts))
     if balance.any():
         raise InputError(f"{path} has faces that point inwards and faces that point outwards, for "
                          f"example at {position_text(middle[balance != 0][0])}.",
