@@ -144,7 +144,7 @@ def seven(tmp_path):
 def test_seven_joints_are_planned_with(seven):
     joints = np.array([0.3, 0.6, -0.2, 1.1, 0.4, 0.7, 0.1])
     start = pose_vectors(seven.forward(joints))
-    frames = matrices(densely(np.array([start, start + [0.02, 0.032, -0.012, 0, 0, 0.04]])))
+    frames = matrices(densely(np.array([start, start + [0.05, 0.08, -0.03, 0, 0, 0.1]])))
     path = joint_path(seven, frames)
     assert path.joints.shape == (len(frames), 7) and path.limit_margin > 0.05
     assert np.abs(seven.forward(path.joints) - frames).max() < 1e-9
