@@ -34,9 +34,9 @@ def start(operator, **keywords):
 
 def is_idle():
     """Done for a while: a stage's job is followed by that which shows its result."""
-    if part("jobs").is_running():
+    if part("jobs").is_running() or part("jobs").waiting():
         idle["since"] = time.monotonic()
-    return time.monotonic() - max(idle["since"], started["step"]) > 1.5
+    return time.monotonic() - max(idle["since"], started["step"]) > 0.5
 
 
 def begin():

@@ -87,8 +87,13 @@ def picture(name):
     return step
 
 
+def leave():
+    """Quit Blender; drive_cases.py waits for its next case instead."""
+    bpy.ops.wm.quit_blender()
+
+
 def drive(steps, longest):
-    """Do the steps one after the other, none longer than ``longest`` [s]; quit Blender then."""
+    """Do the steps one after the other, none longer than ``longest`` [s]; leave then."""
     left = list(steps)
 
     def run():
@@ -105,8 +110,10 @@ def drive(steps, longest):
                 return 0.02
         except Exception:
             seen["error"] = traceback.format_exc()
-        (FOLDER / "log.json").write_text(json.dumps(seen))
-        bpy.ops.wm.quit_blender()
+        log = FOLDER / "log.new"
+        log.write_text(json.dumps(seen))
+        log.rename(FOLDER / "log.json")
+        leave()
         return None
 
     bpy.context.preferences.view.show_splash = False
@@ -114,4 +121,4 @@ def drive(steps, longest):
     bpy.context.preferences.use_preferences_save = False
     # A view is at once where it is turned to.
     bpy.context.preferences.view.smooth_view = 0
-    bpy.app.timers.register(run, first_interval=0.1)
+    bpy.app.timers.register(run, first_interval=0.1, persistent=True)

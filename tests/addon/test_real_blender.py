@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.addon.window import colour_count, driven, require_screen
+from tests.addon.window import SharedBlender, colour_count, driven, require_screen
 
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -23,6 +23,14 @@ from limber.store import Branch
 pytestmark = [pytest.mark.real_blender, pytest.mark.slow]
 
 FOLDER = Path(__file__).parent
+
+
+@pytest.fixture(scope="module")
+def shared_blender(run, blender, environment, tmp_path_factory):
+    """A window for what is not about Blender's own start or end."""
+    require_screen()
+    with SharedBlender(blender, environment, tmp_path_factory.mktemp("window")) as shared:
+        yield shared
 
 
 @pytest.mark.slow
@@ -144,12 +152,11 @@ def test_interface(run, blender, environment, beam, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_first_view(run, blender, environment, tmp_path):
+def test_the_first_view(shared_blender, tmp_path):
     """Beside Blender's startup cube: example and scan are in sight, whole; undo shows the cube."""
-    require_screen()
     generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud.write_ply(
         tmp_path / "scan.ply")
-    seen = driven("drive_factory_start.py", blender, environment, tmp_path)
+    seen = shared_blender.driven("drive_factory_start.py", tmp_path)
     assert seen["at_start"] == ["Camera", "Cube", "Light"], "a Blender that has just started"
     for name in ("bending_branch", "scan scan"):
         found = seen[name]
@@ -160,10 +167,9 @@ def test_the_first_view(run, blender, environment, tmp_path):
 
 
 @pytest.mark.slow
-def test_things_of_the_users_stay(run, blender, environment, beam, tmp_path):
+def test_things_of_the_users_stay(shared_blender, beam, tmp_path):
     """From Blender's start, with things of one's own: results of stages leave them, undone too."""
-    require_screen()
-    seen = driven("drive_own_things.py", blender, environment, tmp_path)
+    seen = shared_blender.driven("drive_own_things.py", tmp_path)
     before = seen["before"]
     assert seen["first_range"] == [1, len(beam.frames)]
     assert before["modifiers"] == ["MESH_CACHE", "SUBSURF"] and before["materials"] == ["mine"]
@@ -200,16 +206,15 @@ def _coloured_count(path: Path, part: tuple[int, ...] | None = (200, 200, 800, 6
 
 
 @pytest.mark.slow
-def test_grab(run, blender, environment, beam, tmp_path):
+def test_grab(shared_blender, beam, tmp_path):
     """By mouse events: pressed and dragged the beam follows; kept, left, undone; Esc restores.
 
     A fruit, a cut and wind act while it is held; left by Esc, the branch is whole again."""
-    require_screen()
     with Branch.open(beam.folder).stage("axes") as stage:
         height = np.linspace(0.0, 0.6, 31)
         Skeleton.from_edges(np.column_stack([0 * height, 0 * height, height]), np.arange(-1, 30),
                             0.012 - height / 0.6 * 0.007).write_swc(stage.path("skeleton.swc"))
-    seen = driven("drive_grab.py", blender, environment, tmp_path)
+    seen = shared_blender.driven("drive_grab.py", tmp_path)
     assert seen["began"] == ["RUNNING_MODAL"]
     is_given, move, place, mode = seen["kept"]
     assert is_given and mode == "point"
@@ -257,11 +262,10 @@ def _cropped(path: Path):
 
 
 @pytest.mark.slow
-def test_skeleton(run, blender, environment, tmp_path):
+def test_skeleton(shared_blender, tmp_path):
     """In Edit Mode: a node moved, a twig cut, one hung over; undone; applied by the worker."""
-    require_screen()
     shutil.copytree(FOLDER.parents[1] / "blend_files" / "bending_branch", tmp_path / "twig.branch")
-    seen = driven("drive_skeleton.py", blender, environment, tmp_path)
+    seen = shared_blender.driven("drive_skeleton.py", tmp_path)
     assert (seen["moved"], seen["deleted"], seen["split"]) == (1, 2, 3)
     assert (seen["after_undo"], seen["still_editing"]) == (2, "EDIT")
     assert seen["node_count_after"] < seen["node_count"] and seen["edited"] >= 1

@@ -5,8 +5,8 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -24,19 +24,72 @@ def require_screen() -> None:
 
 def driven(script: str, blender: str, environment: dict[str, str], folder: Path,
            size: tuple[int, int] = (1280, 800), seconds: float = 240.0) -> dict:
-    """Run a script that drives Blender in a window as large as the screen; return what it has seen.
+    """Run a script that drives a Blender of its own in a window as large as the screen, until that
+    is closed; return what it has seen.
     """
-    with virtual_screen(size) as display:
-        process = subprocess.Popen(
+    with virtual_screen(size) as display, _window(script, blender, environment, folder, size,
+                                                  display) as process:
+        _take_pictures(folder, display, seconds, lambda: process.poll() is not None)
+    return _seen(folder, folder)
+
+
+class SharedBlender:
+    """A Blender with a window in which one script runs after another; a context manager.
+
+    Each begins as Blender starts. Where one fails, the next gets another Blender.
+    """
+
+    size = (1280, 800)
+
+    def __init__(self, blender: str, environment: dict[str, str], folder: Path):
+        self._open = lambda display: _window("drive_cases.py", blender, environment, folder,
+                                             self.size, display)
+        self._folder = folder
+        self._stack = ExitStack()
+
+    def __enter__(self) -> "SharedBlender":
+        self._display = self._stack.enter_context(virtual_screen(self.size))
+        self._blender = ExitStack()
+        self._process: subprocess.Popen | None = None
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._blender.close()
+        self._stack.close()
+
+    def driven(self, script: str, folder: Path, seconds: float = 240.0) -> dict:
+        """Run a script; return what it has seen."""
+        if self._process is None:
+            self._blender.close()
+            self._process = self._blender.enter_context(self._open(self._display))
+        process, self._process = self._process, None
+        asked = self._folder / "case.new"
+        asked.write_text(json.dumps({"script": script, "folder": str(folder)}))
+        asked.rename(self._folder / "case.json")
+        _take_pictures(folder, self._display, seconds,
+                       lambda: (folder / "log.json").is_file() or process.poll() is not None)
+        seen = _seen(folder, self._folder)
+        self._process = process
+        return seen
+
+
+@contextmanager
+def _window(script: str, blender: str, environment: dict[str, str], folder: Path,
+            size: tuple[int, int], display: str) -> Iterator[subprocess.Popen]:
+    with (folder / "said.txt").open("w") as said, subprocess.Popen(
             [blender, "--enable-event-simulate", "--window-geometry", "0", "0", *map(str, size),
              "--python", str(FOLDER / script), "--", str(folder)],
             env=environment | {"DISPLAY": display}, stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE, text=True)
+            stderr=said) as process:
         try:
-            _take_pictures(folder, display, process, seconds)
+            yield process
         finally:
             process.kill()
-    assert (folder / "log.json").is_file(), process.stderr.read()[-2000:]
+
+
+def _seen(folder: Path, window: Path) -> dict:
+    """What a script has seen; ``window`` is the folder with what its Blender said."""
+    assert (folder / "log.json").is_file(), (window / "said.txt").read_text()[-2000:]
     seen = json.loads((folder / "log.json").read_text())
     assert seen["error"] is None, seen
     return seen
@@ -59,12 +112,11 @@ def virtual_screen(size: tuple[int, int]) -> Iterator[str]:
         server.wait(10)
 
 
-def _take_pictures(folder: Path, display: str, process: subprocess.Popen,
-                   seconds: float) -> None:
-    """Take a picture of the screen whenever Blender asks for one; return when it has ended, or
-    after some seconds."""
+def _take_pictures(folder: Path, display: str, seconds: float, over: Callable[[], object]) -> None:
+    """Take a picture of the screen whenever Blender asks for one, until it is over, or for some
+    seconds."""
     end = time.monotonic() + seconds
-    while process.poll() is None and time.monotonic() < end:
+    while not over() and time.monotonic() < end:
         for request in folder.glob("*.request"):
             # Packed little: a tall screen would take a second.
             ImageGrab.grab(xdisplay=display).save(request.with_suffix(".png"), compress_level=1)
