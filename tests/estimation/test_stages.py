@@ -9,7 +9,7 @@ from tests.stages.specified import Fit
 
 from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError
-from limber.core.progress import Progress
+from limber.core.progress import SILENT, Progress
 from limber.estimation import fit
 from limber.estimation.fitting import reduced_fit
 from limber.estimation.parameters import Values
@@ -189,7 +189,8 @@ def test_following_a_pull(branch_folder):
                 frames=24, seed=6, phase=0.5, position_noise=5e-4).run()
     # What follows frame by frame knows one form of the field.
     settings = FitSpec(pull=("long",), key_frames=6, field="inverse_distance")
-    result = follow(branch_folder, settings, pace=0, training_count=12)
+    result = follow(Fit.of(settings, branch_folder=branch_folder, pace=0), SILENT,
+                    training_count=12)
     assert result["frame_count"] == 24 and result["method"] == "online"
     stored = json.loads((branch_folder / "estimate-online.json").read_text())
     widths = [np.log(np.array(state["young_interval_pa"])) @ [-1, 1]
