@@ -8,6 +8,9 @@ import pytest
 from limber.session.client import InteractiveSession
 from limber.session.frame_buffer import Status
 
+# Each needs a session that has learnt, for seconds.
+pytestmark = pytest.mark.slow
+
 SMALL = {"grasps": 24, "size": 36, "fields": 70}
 
 
@@ -83,7 +86,6 @@ def test_loads_are_not_answered_by_a_model_that_does_not_know_them(session):
     assert at(session, 0.01).status == Status.reduced
 
 
-@pytest.mark.slow
 def test_a_second_session_does_not_learn_again(session, branch_folder, cache):
     """It finds the model, and answers the same."""
     first = at(session, 0.015, 0.004)
@@ -95,7 +97,6 @@ def test_a_second_session_does_not_learn_again(session, branch_folder, cache):
         assert frame.energy == pytest.approx(first.energy, rel=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("session")
 def test_a_damaged_cache_is_said_and_learnt_again(branch_folder, cache, tmp_path):
     """A broken file costs a warning and the time to learn, not the session."""

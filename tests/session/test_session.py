@@ -25,7 +25,7 @@ SMALL = {"grasps": 24, "size": 36, "fields": 70, "cache": False}
 
 @pytest.fixture(scope="module")
 def session(branch_folder):
-    """A session whose reduced model is ready."""
+    """A session whose reduced model is ready: its tests are slow, as it learns for seconds."""
     with InteractiveSession(branch_folder, mode="point", **SMALL) as running:
         assert running.wait_for("model", 90) is not None, running.events
         yield running
@@ -70,6 +70,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
         FrameReader(path)
 
 
+@pytest.mark.slow
 def test_answers_agree_with_the_full_model(session, branch_folder):
     """A session's energy, force and surface are the full model's."""
     pose = moved(session, x=0.03, y=0.01, z=-0.006)
@@ -85,6 +86,7 @@ def test_answers_agree_with_the_full_model(session, branch_folder):
     np.testing.assert_allclose(frame.positions, expected, atol=0.005 * 0.2)
 
 
+@pytest.mark.slow
 def test_the_newest_pose_wins(session):
     """Of many poses sent at once the last is answered, and not all the others."""
     before = session.latest().sequence
@@ -97,6 +99,7 @@ def test_the_newest_pose_wins(session):
     assert np.abs(frame.positions - target.positions).max() > 0.01
 
 
+@pytest.mark.slow
 def test_a_stiffer_branch_pulls_harder(session):
     """A change of Young's modulus takes effect on the next answer."""
     young = np.array(session.hello["young_pa"])
@@ -108,6 +111,7 @@ def test_a_stiffer_branch_pulls_harder(session):
     assert stiff.energy == pytest.approx(2 * soft.energy, rel=0.05)
 
 
+@pytest.mark.slow
 def test_what_is_not_understood_is_named_and_survived(session):
     """A broken command gets an error with its id; the session goes on."""
     session._child.process.stdin.write('{"command": "move", "id": 77, "pose": [1, 2]}\nnonsense\n')
