@@ -98,7 +98,9 @@ def test_one_bad_sample_stops_and_says_why(bench, name):
     assert bench.guard.state == State.STOPPED and bench.guard.reason == str(decision)
 
 
-@pytest.mark.parametrize("name", ONE_SAMPLE)
+@pytest.mark.parametrize("name", [
+    pytest.param(name, marks=() if name in ("force", "protective stop") or "clock" in name
+                 else pytest.mark.slow) for name in ONE_SAMPLE])
 def test_after_a_stop_nothing_goes_on_by_itself(bench, name):
     """A thousand good samples do not start it; nor does begin or resume; a person does."""
     changes = dict(ONE_SAMPLE[name])
