@@ -12,7 +12,7 @@ WAYS = frozenset({"move"})
 """Vectors in metres that are displacements, not positions: the 3D cursor does not give them."""
 REGIONS = ("goal", "tip_goal", "target_box", "workspace")
 """Fields of a plan that the active object gives: a ball or a box."""
-SCAN_PLACES = frozenset({"root", "crop_low", "crop_high", "camera_at"})
+SCAN_PLACES = frozenset({"root", "camera_at"})
 """Positions in the coordinates of a scan's file."""
 PLACES = {"fruit": (0.1,), "cut": ()}
 """Lists of positions on the branch, and the values after a position: the mass [kg] of a fruit."""

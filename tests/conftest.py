@@ -99,8 +99,9 @@ def plain_pull() -> Pull:
 @pytest.fixture(scope="session")
 def branch_template(tmp_path_factory, small, small_bench):
     """A branch folder as reconstruct leaves it, with one virtual pull of 12 frames."""
-    from limber.estimation.settings import VirtualPullSettings
-    from limber.stages.pulls.virtual_pull import VirtualPull
+    from tests.stages.specified import SpecifiedPull
+
+    from limber.estimation.settings import PullSpec
     from limber.store import Branch
 
     folder = tmp_path_factory.mktemp("branches") / "small.branch"
@@ -111,8 +112,8 @@ def branch_template(tmp_path_factory, small, small_bench):
         small_bench.mesh.with_data(cell_data={
             "young": np.full(count, 1e8), "poisson": np.full(count, 0.36),
             "density": np.full(count, 900.0)}).write(stage.path("mesh.vtu"))
-    settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=12, seed=4, phase=0.5)
-    VirtualPull.of(settings, branch_folder=folder, name="pull-1").run()
+    settings = PullSpec(young=small.young, poisson=0.36, frames=12, seed=4, phase=0.5)
+    SpecifiedPull.of(settings, branch_folder=folder, name="pull-1").run()
     return folder
 
 

@@ -276,8 +276,8 @@ def test_a_missing_folder_is_refused(tmp_path):
 def test_settings_are_listed():
     """All of a verb's and no more; required ones are marked; a verb goes by its command's name."""
     known = limber.settings("energy_field")
-    assert set(known) == {"samples", "field_error", "deflection", "gravity", "seed", "forward",
-                          "force", "workers"}
+    assert set(known) == {"samples", "field_error", "deflection", "seed", "forward",
+                          "force"}
     assert known["samples"].default == 225 and "  samples = 225: Number" in repr(known)
     assert known._repr_html_().count("<tr>") == len(known) + 1
     assert limber.settings("add_pull")["source"].default == "required"
@@ -305,7 +305,7 @@ def test_quiet_shows_nothing(own, capfd):
         patch.setitem(sys.modules, "ipykernel", sys)
         quiet = own.simulate(**settings, quiet=True)
         assert capfd.readouterr().err == ""
-        shown = own.simulate(**settings, force=True)
+        shown = own.simulate(**settings, name="shown")
         assert "simulate" in capfd.readouterr().err
     assert shown.energies.tolist() == quiet.energies.tolist()
 
@@ -397,9 +397,8 @@ def test_verbs_are_the_commands(own, tmp_path):
     for command, verb, *options in (
             ("estimate", lambda: own.estimate(**fit), "--fractions",
              "0.2,0.4,0.6,0.8", "--quick"),
-            ("energy", lambda: own.energy_field(samples=30, workers=1), "--samples", 30),
-            ("plan", lambda: own.plan(name="p", iterations=200, workers=1), "--name", "p",
-             "--iterations", 200),
+            ("energy", lambda: own.energy_field(samples=30), "--samples", 30),
+            ("plan", lambda: own.plan(name="p"), "--name", "p"),
             ("virtual-pull", lambda: own.virtual_pull(name="q", frames=4, seed=5), "--name", "q",
              "--frames", 4, "--seed", 5),
             ("load", lambda: own.load(snow=1.0), "--snow", 1),
@@ -441,7 +440,7 @@ def test_a_script_needs_no_guard(example, tmp_path):
     script = tmp_path / "script.py"
     script.write_text("import limber\nprint('begun')\n"
                       f"branch = limber.open({str(folder)!r})\n"
-                      "print(branch.energy_field(samples=30, workers=2))\n")
+                      "print(branch.energy_field(samples=30))\n")
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False,
                           timeout=250, env=os.environ | {"LIMBER_CORES": "2"})
     assert done.returncode == 0, done.stderr

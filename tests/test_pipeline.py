@@ -47,8 +47,8 @@ def done(tmp_path_factory) -> tuple[Path, dict[str, dict]]:
     stage("virtual-pull", branch, "--name", "pull-1", "--seed", 3)
     stage("estimate", branch)
     stage("simulate", branch)
-    stage("energy", branch, "--samples", 40, "--seed", 3, "--workers", 1)
-    stage("plan", branch, "--name", "to-goal", "--seed", 3, "--iterations", 200, "--workers", 1)
+    stage("energy", branch, "--samples", 40, "--seed", 3)
+    stage("plan", branch, "--name", "to-goal", "--seed", 3)
     stage("scene", branch, "-o", folder / "scene.blend", "--render", folder / "scene.png",
           "--width", 320)
     stage("report", branch, "--picture", folder / "scene.png")
@@ -139,7 +139,7 @@ def test_bad_cloud_costs_no_result(done, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 @pytest.mark.parametrize(("stage", "options"), [("estimate", ["--force"]), pytest.param(
-    "energy", ["--force", "--samples", "200", "--workers", "1"], marks=pytest.mark.campaign)])
+    "energy", ["--force", "--samples", "200"], marks=pytest.mark.campaign)])
 def test_ctrl_c_in_a_stage_keeps_the_folder(done, tmp_path, stage: str, options: list[str]):
     """Ctrl-C in the middle of a stage ends with 130; the folder verifies, its files unchanged."""
     branch = tmp_path / "copy.branch"

@@ -128,15 +128,17 @@ def test_options_are_finite_and_directions_have_a_length(name, value):
     ("geometry:MeshSurfaceSettings", {"young": 1e-300}, "between 1 kPa and 100 GPa"),
     ("geometry:MeshSurfaceSettings", {"density": 1e5}, "between 50 and 3000"),
     ("mechanics:SimulateSettings", {"young": 1e12}, "between 1 kPa and 100 GPa"),
-    ("estimation:EstimateSettings", {"young": 0.1}, "for 0.1 GPa write 0.1e9"),
-    ("estimation:EstimateSettings", {"density": 900e3}, "between 50 and 3000"),
+    ("estimation:FitSpec", {"young": 0.1}, "for 0.1 GPa write 0.1e9"),
+    ("estimation:FitSpec", {"density": 900e3}, "between 50 and 3000"),
     ("estimation:PredictSettings", {"weight": 1e29}, "no branch bears 1e+29 N"),
     ("estimation:PredictSettings", {"load": (0.0, 0.0, -250e3)}, "for -250000 mN write -250"),
     ("mechanics:SimulateSettings", {"grasp_force": (1e30, 0.0, 0.0)}, "no branch bears"),
     ("mechanics:SimulateSettings", {"load_at": ((0, 0, 0.3, 0, 0, 1e6),)}, "no branch bears"),
     ("mechanics:SimulateSettings", {"mass_at": ((0, 0, 0.3, 1e5),)}, "no branch bears"),
-    ("stages.motion.load:LoadSettings", {"wind": (300.0, 0.0, 0.0)}, "83.3333 m/s would be 300"),
-    ("stages.motion.load:LoadSettings", {"fruit": ((0, 0, 0.3, 1e20),)}, "no branch bears"),
+    ("stages.motion.load:ApplyLoads", {"branch_folder": "a", "wind": (300.0, 0.0, 0.0)},
+     "83.3333 m/s would be 300"),
+    ("stages.motion.load:ApplyLoads", {"branch_folder": "a", "fruit": ((0, 0, 0.3, 1e20),)},
+     "no branch bears"),
     ("recordings:ImportSettings", {"weight": 1e6}, "for 1e+06 mN write 1000"),
     ("estimation:VirtualPullSettings", {"young": (1e8, 9.0)}, "for 9 GPa write 9e9")])
 def test_moduli_and_densities_are_those_of_matter(model, values, told):
@@ -154,7 +156,7 @@ def test_lists_of_a_recording_stay_in_its_folder(tmp_path):
     from PIL import Image
 
     from limber.recordings.image_folders import copy_rgbd
-    from limber.recordings.settings import ImportSettings
+    from limber.recordings.settings import ImportSpec
 
     (tmp_path / "in" / "depth").mkdir(parents=True)
     for name in ("in/depth/1.png", "in/depth/2.png", "secret.png"):
@@ -163,8 +165,8 @@ def test_lists_of_a_recording_stay_in_its_folder(tmp_path):
     (source / "calibration.txt").write_text("40 40 3 2")
     (source / "depth.txt").write_text("1.0 depth/1.png\n2.0 ../secret.png\n")
     with pytest.raises(InputError, match="outside the recording's folder"):
-        copy_rgbd(source, tmp_path / "out", ImportSettings())
+        copy_rgbd(source, tmp_path / "out", ImportSpec())
     (source / "depth.txt").unlink()
     (source / "groundtruth.txt").write_text("1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 1\n")
     with pytest.raises(InputError, match="quaternion"):
-        copy_rgbd(source, tmp_path / "out", ImportSettings())
+        copy_rgbd(source, tmp_path / "out", ImportSpec())

@@ -135,9 +135,9 @@ class LIMBER_OT_crop_scan(bpy.types.Operator):
             return {"CANCELLED"}
         settings = context.scene.limber.reconstruct
         places = _in_file(scan, places)
-        for name, bound in (("crop_low", min), ("crop_high", max)):
-            setattr(settings, name, [bound(place[axis] for place in places) for axis in range(3)])
-            setattr(settings, properties.OPEN + name, True)
+        settings.crop = [bound(place[axis] for place in places)
+                         for bound in (min, max) for axis in range(3)]
+        setattr(settings, properties.OPEN + "crop", True)
         self.report({"INFO"}, "The scan is cropped when it is reconstructed")
         return {"FINISHED"}
 

@@ -21,8 +21,8 @@ def scan(bpy, registered, tmp_path):
 
 def _cropped(bpy):
     settings = bpy.context.scene.limber.reconstruct
-    assert settings.use_crop_low and settings.use_crop_high
-    return [*settings.crop_low, *settings.crop_high]
+    assert settings.use_crop
+    return list(settings.crop)
 
 
 def test_a_box_around_a_part_is_kept_in_the_files_numbers(bpy, scan):

@@ -18,7 +18,7 @@ def part(name):
 
 ERROR = InputError(
     "The scan contains two plants.", "A branch belongs to one plant.", "Crop the scan (",
-    Option("crop_low"), ", ", Option("crop_high"), "). Or use the larger plant (",
+    Option("crop"), "). Or use the larger plant (",
     Option("plants", "largest"), ").").at([1200.0, 2000.0, 300.0])
 TOLD = json.loads(json.dumps(ERROR.as_json()))
 TOLD["remedies"].append(Option("unknown", 1).as_json())
@@ -65,7 +65,7 @@ def test_a_choice_is_a_button_that_runs_the_step_again(bpy, failing):
     assert not [text for text in labels if "--" in text]
     assert ("operator", "limber.take_choice", "Plants: largest") in drawn.calls
     assert drawn.names("operator").count("limber.take_choice") == 1, "what is unknown has no button"
-    assert {"crop_low", "crop_high"} <= set(drawn.names("prop")), "settings without a value"
+    assert "crop" in drawn.names("prop"), "settings without a value"
     result = bpy.ops.limber.take_choice(stage="reconstruct", option="plants", value='"largest"')
     assert result == {"FINISHED"}
     assert "--plants" in json.loads(failing.read_text().splitlines()[-1])
@@ -74,11 +74,11 @@ def test_a_choice_is_a_button_that_runs_the_step_again(bpy, failing):
 
 
 @pytest.mark.parametrize(("stage", "named", "wanted"), [
-    ("reconstruct", Option("crop_low"), "Crop low"),
+    ("reconstruct", Option("crop"), "Crop"),
     ("reconstruct", Option("plants", "joined"), "Plants: joined"),
     ("reconstruct", Option("root", (1.0, -2.0, 0.5)), "Root: 1 -2 0.5"),
     ("plan", Command("energy", "b.branch"), "Sample the Energy"),
-    ("energy", Option("gravity", False), "Gravity: off"),
+    ("simulate", Option("gravity", False), "Gravity: off"),
     ("energy", Command("cache", Option("clear", True)), "`limber cache --clear`"),
     ("energy", Option("such_a_thing", 3), "--such-a-thing 3")])
 def test_options_are_told_by_their_titles(addon, stage, named, wanted):
@@ -95,11 +95,11 @@ def test_settings_without_a_value_are_shown(bpy, registered, whole_texts):
     layout, steps = Layout(), part("panels.steps")
     stage = part("stages").stages()["reconstruct"]
     error = InputError("Two plants.", "", *map(Option, (
-        "crop_low", "crop_high", "root", "crop_low", "force", "output", "such_a_thing")),
+        "crop", "camera_at", "root", "crop", "force", "output", "such_a_thing")),
                        Option("plants", "joined"))
     steps.draw_error(layout, bpy.context, stage, error.as_json())
     assert [name for name in layout.names("prop") if name in stage.fields] == [
-        "crop_low", "crop_high", "root"]
+        "crop", "camera_at", "root"]
 
 
 def test_a_step_that_an_error_names_is_a_button(bpy, registered, whole_texts):

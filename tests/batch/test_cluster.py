@@ -30,7 +30,6 @@ run = "virtual-pull"
 name = "pull-2"
 frames = 4
 young = ["40 MPa", "22 MPa", "12 MPa", "3 MPa"]
-reach = 0.2
 """
 
 
@@ -80,8 +79,8 @@ def _digests(folder: Path) -> dict[str, str]:
 
 def test_a_task_is_the_same_after_its_json():
     """Numbers to the last digit, vectors, switches, lists, paths that look like options."""
-    for task in (VirtualPull(branch_folder=Path("-odd name.branch"), reach=0.1 + 0.2,
-                             young=(4e7, 1 / 3e-7, 1e7, 3e6), frames=4),
+    for task in (VirtualPull(branch_folder=Path("-odd name.branch"), frames=4,
+                             young=(4e7, 1 / 3e-7, 0.1 + 2e3, 3e6)),
                  Reconstruct(cloud=Path("a b.xyz"), output=Path("a.branch"), unit="mm",
                              up=(0.0, 1.0, 1e-17))):
         again = type(task).checked(json.loads(json.dumps(task.stated())))

@@ -34,14 +34,13 @@ run = "virtual-pull"
 name = "pull-2"
 frames = 4
 young = ["40 MPa", "22 MPa", "12 MPa", "3 MPa"]
-reach = {reach}
 """
 
 
 @pytest.fixture
 def orchard(two_branches):
     """Two branch folders and a job file for them."""
-    (two_branches / "jobs.toml").write_text(JOBS.replace("{reach}", "0.2"))
+    (two_branches / "jobs.toml").write_text(JOBS)
     return two_branches
 
 
@@ -121,7 +120,7 @@ def test_a_killed_batch_goes_on(orchard, here):
 def test_what_is_written_beside_the_branch_is_not_written_again(orchard, here, capsys):
     """An export, as a scene, is made once, and again when the branch or the file has changed."""
     jobs = orchard / "jobs.toml"
-    jobs.write_text(JOBS.replace("{reach}", "0.2").split("[[job.stage]]\nrun = \"virtual")[0] +
+    jobs.write_text(JOBS.split("[[job.stage]]\nrun = \"virtual", maxsplit=1)[0] +
                     '[[job.stage]]\nrun = "export"\noutput = "{scan}.swc"\n')
     ran: list[str] = []
     here.before = staticmethod(lambda task, folder: ran.append(f"{folder.stem} {task.label}"))
@@ -145,7 +144,7 @@ def test_what_is_written_beside_the_branch_is_not_written_again(orchard, here, c
 def test_the_page_shows_what_was_rendered(orchard):
     """Pictures that `limber scene` has made of a branch, by ways that hold when all is moved."""
     jobs = orchard / "jobs.toml"
-    jobs.write_text(JOBS.replace("{reach}", "0.2") + '[[job.stage]]\nrun = "scene"\n'
+    jobs.write_text(JOBS + '[[job.stage]]\nrun = "scene"\n'
                     'output = "{scan}.blend"\nrender = "views/{scan} & co.png"\n')
     checked = read_jobs(jobs)
     (checked.out / "views").mkdir(parents=True)
@@ -199,7 +198,7 @@ def test_text_of_files_is_no_page_and_no_formula(orchard, here, capsys):
     shutil.move(orchard / "two.branch", orchard / f"{name}.branch")
     (orchard / f"{name}.branch" / "mesh.vtu").write_bytes(b"")
     jobs = orchard / "jobs.toml"
-    jobs.write_text(JOBS.replace("{reach}", "0.2").replace('["*.branch"]', f'["{name}.branch"]'))
+    jobs.write_text(JOBS.replace('["*.branch"]', f'["{name}.branch"]'))
     assert call(capsys, "batch", jobs, "--workers", "1")[0] == 3
     row = next(csv.DictReader((orchard / "results/jobs.csv").open()))
     assert row["branch"] == f"'{name}"

@@ -252,7 +252,7 @@ def test_an_endless_sweep_is_refused_before_it_is_made(write):
     values = list(range(1, 101))
     told = refusal(write(SCANS + "[job.sweep]\n" + "".join(
         f'"reconstruct.{name}" = {values}\n' for name in (
-            "seed", "young", "density", "poisson", "up", "twig_radius", "radius_low", "leaves"))))
+            "seed", "young", "density", "poisson", "up", "twig_radius", "gap_factor", "leaves"))))
     assert "The sweep has 1e+16 combinations" in told and "line 6" in told
 
 

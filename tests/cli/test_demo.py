@@ -47,8 +47,7 @@ def test_what_is_known_of_a_scan_reaches_the_stages(stages, tmp_path) -> None:
                      "--root", "1", "2", "3", "--crop", "-1", "0", "-2", "4", "5", "6",
                      "--goal", "0.1", "0.2", "0.3"]) == 0
     told = " ".join(stages["reconstruct"])
-    for part in ("--up 0.0 -1.0 0.0", "--root 1.0 2.0 3.0", "--crop-low -1.0 0.0 -2.0",
-                 "--crop-high 4.0 5.0 6.0"):
+    for part in ("--up 0.0 -1.0 0.0", "--root 1.0 2.0 3.0", "--crop -1.0 0.0 -2.0 4.0 5.0 6.0"):
         assert part in told
     assert " ".join(stages["plan"]).endswith("--goal 0.1 0.2 0.3")
     assert main.call(["demo", str(scan), "-o", str(tmp_path / "other")]) == 0
@@ -180,7 +179,7 @@ def test_refusals_of_a_scan_name_only_options_that_the_demo_has() -> None:
              folder / "reconstruction.py", folder / "pruned_twigs.py"]
     named = {"--" + option.replace("_", "-") for path in files for option in re.findall(
         r'Option\("(\w+)"', path.read_text(encoding="utf-8"))}
-    assert {"--plants", "--crop-low", "--skeleton", "--unexplained"} <= named
+    assert {"--plants", "--crop", "--skeleton", "--unexplained"} <= named
     assert named <= options_of(demo.command)
 
 

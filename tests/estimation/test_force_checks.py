@@ -173,7 +173,7 @@ def followed(bench, small, pull, young=None, **settings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("advised", [{"drive": "pose"}, {"free_frame": True}])
+@pytest.mark.parametrize("advised", [{"drive": "pose"}, {"also": ("frame",)}])
 def test_intervals_hold_whatever_was_advised(small_bench, small, off, advised):
     """A prescribed path, a free frame."""
     interval = followed(small_bench, small, off, **advised)

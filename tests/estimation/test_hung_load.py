@@ -128,7 +128,7 @@ def test_from_one_load_to_another_by_commands(rig, tmp_path, capsys):
 
 
 def test_a_swing_comes_in_whole_and_estimate_points_on(rig, tmp_path, capsys):
-    """--swing keeps all frames, load and mass; dynamic, and `limber estimate`, say where."""
+    """A swing keeps all frames, load and mass; dynamic, and `limber estimate`, say where."""
     write_nominal(tmp_path / "nominal.csv", rig.nominal)
     times, seen = rig.recording(WEIGHTS[0])
     write_csv(tmp_path / "swing.csv", times, seen)
@@ -138,7 +138,7 @@ def test_a_swing_comes_in_whole_and_estimate_points_on(rig, tmp_path, capsys):
               "--progress", "none"]
     assert call([*common, "--motion", "dynamic"]) == 2
     assert "limber swing" in capsys.readouterr().err
-    assert call([*common, "--swing"]) == 0
+    assert call([*common, "--motion", "swing"]) == 0
     pull = read_pull(rig.folder / "pulls" / "swing")
     assert pull.entry.motion == "swing" and pull.entry.swing.start == "held"
     assert pull.entry.swing.load_mass_kg == pytest.approx(WEIGHTS[0] / 9.80665, rel=1e-6)

@@ -281,7 +281,7 @@ def test_a_free_frame_is_put_right_though_it_is_turned_far(small_bench, small, s
     pull = replace(small_pull, entry=entry,
                    observations=replace(small_pull.observations, positions=wrong))
     settings = SETTINGS.model_copy(update={
-        "free_frame": True, "field": "inverse_distance", "poisson_sigma": 0.0, "key_frames": 4,
+        "also": ("frame",), "field": "inverse_distance", "poisson_sigma": 0.0, "key_frames": 4,
         "mesh_check": False})
     found = fit_branch([pull], subject_of(small_bench, small), settings,
                        log=EvaluationLog(None, ""))

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from tests.stages.specified import Fit
+from tests.stages.specified import Fit, SpecifiedPull
 
 from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError
@@ -18,7 +18,6 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.recordings.recording import read_pull
 from limber.results.report.estimate_figures import report_figures
 from limber.stages.moduli.estimate import EVALUATIONS, EstimateYoung, follow
-from limber.stages.pulls.virtual_pull import VirtualPull
 from limber.store import Branch
 from limber.store.loading import load_estimated_subject, stiffness_deviation
 
@@ -35,8 +34,8 @@ def test_virtual_pull_is_a_recording_with_its_truth(branch_folder):
     truth = pull.entry.truth
     assert truth["young_pa"] == TRUTH.tolist()
     assert truth["tet_count"] > 1.1 * TetMesh.read(branch_folder / "mesh.vtu").tet_count
-    again = VirtualPull(branch_folder=branch_folder, name="again", young=tuple(TRUTH), poisson=0.36,
-                        frames=12, seed=4, phase=0.5).run()
+    again = SpecifiedPull(branch_folder=branch_folder, name="again", young=tuple(TRUTH),
+                          poisson=0.36, frames=12, seed=4, phase=0.5).run()
     assert again["frame_count"] == 12
     same = read_pull(branch_folder / "pulls" / "again")
     assert np.allclose(same.wrenches[:, :3], pull.wrenches[:, :3], atol=1e-6)
@@ -166,7 +165,7 @@ def test_pulls_that_are_not_there(branch_folder):
 
 def test_without_force_the_estimate_refuses(branch_folder):
     """Through the whole stage: positions alone are refused, and nothing is written."""
-    VirtualPull(branch_folder=branch_folder, name="blind", young=tuple(TRUTH), frames=5, seed=1,
+    SpecifiedPull(branch_folder=branch_folder, name="blind", young=tuple(TRUTH), frames=5, seed=1,
                 phase=0.5).run()
     robot = branch_folder / "pulls" / "blind" / "robot.csv"
     lines = [",".join(line.split(",")[:7]) for line in robot.read_text().splitlines()]
@@ -185,12 +184,12 @@ def test_without_force_the_estimate_refuses(branch_folder):
 @pytest.mark.slow
 def test_following_a_pull(branch_folder):
     """Frame by frame the intervals narrow; it ends at what all frames together give."""
-    VirtualPull(branch_folder=branch_folder, name="long", young=tuple(TRUTH), poisson=0.36,
+    SpecifiedPull(branch_folder=branch_folder, name="long", young=tuple(TRUTH), poisson=0.36,
                 frames=24, seed=6, phase=0.5, position_noise=5e-4).run()
     # What follows frame by frame knows one form of the field.
     settings = FitSpec(pull=("long",), key_frames=6, field="inverse_distance")
-    result = follow(Fit.of(settings, branch_folder=branch_folder, pace=0), SILENT,
-                    training_count=12)
+    result = follow(Fit.of(settings, branch_folder=branch_folder), SILENT, training_count=12,
+                    pace=0)
     assert result["frame_count"] == 24 and result["method"] == "online"
     stored = json.loads((branch_folder / "estimate-online.json").read_text())
     widths = [np.log(np.array(state["young_interval_pa"])) @ [-1, 1]

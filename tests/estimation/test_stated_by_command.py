@@ -57,17 +57,17 @@ def estimated(folder, branch, pull, capsys, *options, tables=""):
     """The result of import-pull and estimate, or None if they refuse."""
     entry, stated = pull.entry, folder / "cell.toml"
     stated.write_text("[calibration]\npose_sigma_m = 2e-4\npose_sigma_rad = 3.5e-3\n"
-                      f"force_bias_sigma_n = 0.02\nforce_drift_sigma_n = 0.02\n{tables}")
+                      f"force_bias_sigma_n = 0.02\nforce_drift_sigma_n = 0.02\n{tables}"
+                      f"[sensor]\nposition_sigma_m = {entry.sensor.position_sigma_m}\n")
     assert call(["import-pull", str(branch), str(folder / "markers.csv"), "--name", "pull-2",
                  "--robot", str(folder / "robot.csv"), "--time-offset", "0",
                  "--grasp-point", *map(str, entry.grasp.point_m),
                  "--grasp-radius", str(entry.grasp.radius_m), "--grasp-mode", "point",
-                 "--position-sigma", str(entry.sensor.position_sigma_m),
                  "--force-sigma", str(entry.sensor.force_sigma_n),
                  "--pull-toml", str(stated), "--progress", "none"]) == 0
     capsys.readouterr()
     code = call(["estimate", str(branch), "--pull", "pull-2", "--fractions", "0.2,0.4,0.6,0.8",
-                 "--poisson", "0.36", "--json", "--progress", "none", *options])
+                 "--json", "--progress", "none", *options])
     told = capsys.readouterr()
     assert code in (0, 3), told.err
     return json.loads(told.out.strip().splitlines()[-1]) if code == 0 else None
@@ -86,7 +86,7 @@ def branch_of(small):
 @pytest.mark.slow
 @pytest.mark.parametrize(("layers", "options"), [
     ((PITH, 0.0, 0.0), ("--pith-radius", str(PITH))),
-    ((0.0, BARK, BARK_SHARE), ("--bark-thickness", str(BARK), "--bark-modulus", str(BARK_SHARE)))])
+    ((0.0, BARK, BARK_SHARE), ("--bark", str(BARK), str(BARK_SHARE)))])
 def test_stated_layers_give_the_modulus_of_the_wood(branch_of, branch_folder, tmp_path, capsys,
                                                     layers, options):
     """Stated or not, E I is the same and right; stated, E is that of the wood as well."""

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid, trapezoid
+from tests.stages.specified import Fit
 
 from limber.cli.main import call
 from limber.core.constants import STANDARD_GRAVITY
@@ -17,7 +18,6 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.time_series import Stream, write_stream
-from limber.stages.moduli.estimate import EstimateYoung
 from limber.stages.pulls.import_pull import ImportPull
 from limber.stages.results.export import Export
 from limber.stages.shape.mesh import Mesh
@@ -92,7 +92,7 @@ def test_own_sag_gives_the_modulus(tmp_path):
         f"m{k}_{axis}_m" for k in range(len(places)) for axis in "xyz")))
     ImportPull(branch_folder=branch, source=tmp_path / "sag.csv", name="sag", weight=0,
                own_weight=True).run()
-    found = EstimateYoung(branch_folder=branch, fractions=(0.5,), density_sigma=0.01).run()
+    found = Fit(branch_folder=branch, fractions=(0.5,), density_sigma=0.01).run()
     low, high = found["young_interval_pa"][0]
     assert found["young_pa"][0] == pytest.approx(YOUNG, rel=0.02)
     assert low < YOUNG < high and high / low < 1.2

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from tests.stages.specified import Simulated
 
 from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError, PartlyFailedError
@@ -18,8 +19,7 @@ from limber.geometry.io.skeletons import read_swc
 from limber.geometry.reconstruction import ReconstructSettings, reconstruct_cloud
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import solve_static
-from limber.mechanics.pull_simulation import SimulateSettings
-from limber.stages.motion.simulate import Simulate
+from limber.mechanics.settings import SimulateSpec
 from limber.stages.shape.generate import write_generated
 from limber.stages.shape.mesh import Mesh
 from limber.stages.shape.reconstruct import (
@@ -183,11 +183,11 @@ def test_left_out_twigs_weigh_in_a_simulation(generated, tmp_path):
     weight = np.linalg.norm(solve_static(model).require().base_force)
     mass = 900 * result["mesh_volume_m3"] + result["left_out_mass_kg"]
     assert weight == pytest.approx(9.80665 * mass, rel=0.01)
-    settings = SimulateSettings(kind="static", move=(0.0, 0.0, 1e-5), rest_shape=False)
-    held = np.array(Simulate.of(settings, branch_folder=place).run()["grasp_force_n"])
+    settings = SimulateSpec(kind="static", move=(0.0, 0.0, 1e-5), rest_shape=False)
+    held = np.array(Simulated.of(settings, branch_folder=place).run()["grasp_force_n"])
     with Branch.open(place).stage("reconstruct") as stage:
         stage.path("point_masses.json").write_text("[]")
-    bare = np.array(Simulate.of(settings, branch_folder=place, force=True).run()["grasp_force_n"])
+    bare = np.array(Simulated.of(settings, branch_folder=place, name="bare").run()["grasp_force_n"])
     assert 0.02 < np.linalg.norm(held - bare) / (9.80665 * result["left_out_mass_kg"]) < 2.0
 
 

@@ -41,16 +41,16 @@ STAGES = {
                     "--frames 8",
     "export-pull": "export-pull a.branch --name pull-1 --mcap pull.mcap",
     "estimate": "estimate a.branch --force",
-    "swing": "import-pull a.branch swing.csv --name swing --swing --weight 0.02 "
+    "swing": "import-pull a.branch swing.csv --name swing --motion swing --weight 0.02 "
              "--grasp-distance 0.3 && swing a.branch",
     "vibration": "vibration a.branch ring.csv",
     "predict": "predict a.branch --weight 0.5",
-    "suggest-pull": "suggest-pull a.branch --plan to-goal",
-    "energy": "energy a.branch --force --samples 30 --workers 1",
-    "plan": "plan a.branch --name new --iterations 200 --workers 1",
-    "plan-limits": "plan a.branch --name new --iterations 200 --workers 1 --max-force 1.9 "
+    "suggest-pull": "suggest-pull a.branch --plan to-goal --fractions 0.8",
+    "energy": "energy a.branch --force --samples 30",
+    "plan": "plan a.branch --name new",
+    "plan-limits": "plan a.branch --name new --max-force 1.9 "
                    "--goal -0.056 0.046 0.266 --max-strain 0.02",
-    "compare": "compare a.branch --trials 1 --workers 1 "
+    "compare": "compare a.branch --trials 1 "
                "--goal -0.056 0.046 0.266",
     "execute": "execute a.branch --name to-goal --cell cell.toml --unwatched "
                "--gripper-rotation 1.4096 -1.2795 -0.8176",
@@ -178,10 +178,11 @@ def _workplace():
 
 @contextlib.contextmanager
 def _small():
-    """Every part of a stage, of few frames, shapes, grasps and cells; pictures without pixels."""
+    """Every part of a stage, of few frames, shapes, samples and cells; pictures without pixels."""
     from matplotlib import pyplot
 
     from limber.estimation.settings import FitSpec
+    from limber.planning.settings import Effort, PlanSettings
 
     usual = FitSpec.of.__func__
 
@@ -190,7 +191,7 @@ def _small():
         return found if found.quick else found.model_copy(update={"key_frames": 5, "shapes": 8})
 
     with (patch.object(FitSpec, "of", classmethod(of)),
-          patch("limber.stages.pulls.suggest_pull.CANDIDATES", (0.8,)),
+          patch.object(PlanSettings, "effort", Effort(iterations=200)),
           patch("limber.planning.certificate.lower_bound._MOST_CELLS", 60_000),
           patch("limber.results.report.section._png", lambda figure: pyplot.close(figure) or b"")):
         yield

@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from tests.stages.specified import Simulated
 from tests.subjects.meshes import box_mesh
 
 from limber.cli.main import call
@@ -258,10 +259,8 @@ def test_a_load_grows_as_a_grasp_force_does(folder):
 
 def test_a_hung_mass_presses_the_branch(folder):
     """One kilogram at the tip of an upright beam: shorter by m g L / (E A) from the start."""
-    assert call(["simulate", str(folder), "--kind", "static", "--mass-at", "0", "0", "0.3", "0.4",
-                 "--mass-at", "0", "0", "0.3", "0.6", "--duration", "0.0166667",
-                 "--progress", "none", "--young", "5e8", "--no-rest-shape",
-                 "--grasp-force", "0", "0", "0"]) == 0
+    Simulated(branch_folder=folder, kind="static", mass_at=((0, 0, 0.3, 0.4), (0, 0, 0.3, 0.6)),
+              duration=0.0166667, young=5e8, rest_shape=False, grasp_force=(0, 0, 0)).run()
     mesh = TetMesh.read(folder / "mesh.vtu")
     surface = np.unique(mesh.surface_faces())
     positions, _, _ = read_pc2(folder / "frames" / "simulate.pc2")

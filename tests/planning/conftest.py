@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from tests.stages.specified import Planned
 
 from limber.core.progress import Progress
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -17,7 +18,6 @@ from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_model import grasp_model_of
 from limber.planning.field.stored_states import GraspSamples
 from limber.stages.paths.energy import SampleEnergy
-from limber.stages.paths.plan import PlanPaths
 from limber.store import Branch
 
 STIFFNESS = np.array([8.0, 8.0, 30.0])  # [N/m] soft to the sides, stiff along the branch
@@ -118,8 +118,8 @@ def planned_branch(tmp_path_factory, small_mesh, small_skeleton):
     with branch.stage("mesh") as stage:
         small_mesh.write(stage.path("mesh.vtu"))
         small_skeleton.write_swc(stage.path("skeleton.swc"))
-    SampleEnergy(branch_folder=folder, samples=60, workers=1).run()
-    PlanPaths(branch_folder=folder, iterations=800, start_seed=3, name="there", workers=1).run()
+    SampleEnergy(branch_folder=folder, samples=60).run()
+    Planned(branch_folder=folder, iterations=800, start_seed=3, name="there").run()
     return folder
 
 

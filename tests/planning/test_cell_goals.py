@@ -7,22 +7,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.stages.specified import Planned
 
 from limber.cell.cell_file import Cell, write_cell
 from limber.cell.obstacles import Box
 from limber.core.errors import NoPathError
-from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals.goal import Ball, CellPlace, GoalRequest, goal_points, with_near_side
 from limber.planning.goals.goal_kinds import CellGoal, TargetGoal, goal_of
 from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.plan_file import read_plan
-from limber.stages.paths.plan import PlanPaths
+from limber.planning.settings import PlanSpec
 from limber.stages.paths.plan_cell import cell_positions, hiding
 from limber.store import Branch
 
 pytestmark = pytest.mark.usefixtures("rough_plan")
-SETTINGS = PlanSettings(iterations=300, inertia=False)
+SETTINGS = PlanSpec(iterations=300, inertia=False)
 AWAY = 0.04  # [m] that the tip must be brought
 
 
@@ -94,12 +94,13 @@ def test_a_refusal_describes_its_region_in_words(field, small_model):
         "tip_goal": (far, "the tip within 0.010 m of (9.000, 0.000, 0.500) m", "--goal-tolerance"),
         "target_box": ((9.0, 0, 0, 9.1, 1, 1), "the tip within the box from (9.000, 0.000, 0.000) "
                        "to (9.100, 1.000, 1.000) m", "a larger --target-box"),
-        "in_view": (True, "the tip within the image of the camera at (9.000, 0.000, 0.000) m that "
-                    "looks along (0.000, 0.000, 1.000), 0.300 to 1.000 m ahead of it",
-                    "Move the camera"),
-        "second_arm": (True, "of the shoulder of the second arm (ur5) at (9.000, ",
+        "view": ("view", "the tip within the image of the camera at (9.000, 0.000, 0.000) m that "
+                 "looks along (0.000, 0.000, 1.000), 0.300 to 1.000 m ahead of it",
+                 "Move the camera"),
+        "second_arm": ("second_arm", "of the shoulder of the second arm (ur5) at (9.000, ",
                        "Move the second arm")}
     for name, (value, words, advice) in asked.items():
+        name = "goal_in" if name == value else name
         settings = SETTINGS.model_copy(update={name: value})
         goal = goal_of(GoalRequest(field, small_model, settings, field.limited(),
                                    cell_positions(cell)))
@@ -207,7 +208,7 @@ def test_walking_into_a_large_region_stays_among_the_samples(field):
 
 
 def test_an_obstacle_hides_what_is_behind_it():
-    view = cell_positions(camera_cell(1.0))["in_view"].region
+    view = cell_positions(camera_cell(1.0))["view"].region
     place = np.array([0.1, 0.0, 0.45])
     box = Box("the post", np.full(3, 0.02), np.array([0.05, -0.4, 0.47]), np.eye(3))
     assert hiding(view, (), place, None) == ""
@@ -238,7 +239,7 @@ def arm_cell(tip):
 
 @pytest.mark.slow  # two plans on the full model
 @pytest.mark.usefixtures("coarse_bound")
-@pytest.mark.parametrize("kind", ["second_arm", "in_view"])
+@pytest.mark.parametrize("kind", ["second_arm", "view"])
 def test_a_target_is_brought_where_it_can_be_taken_or_seen(planned_branch, tmp_path, kind):
     """From rest, where it cannot: the end does on the full model, and is not far in."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
@@ -247,8 +248,8 @@ def test_a_target_is_brought_where_it_can_be_taken_or_seen(planned_branch, tmp_p
     place = cell_positions(cell)[kind]
     path = tmp_path / "cell.toml"
     write_cell(path, cell.model_copy(update={"branch": Branch.open(folder).uuid}))
-    PlanPaths.of(SETTINGS.model_copy(update={kind: True}), branch_folder=folder, name="brought",
-                 cell=path, workers=1).run()
+    Planned.of(SETTINGS.model_copy(update={"goal_in": kind}), branch_folder=folder, name="brought",
+               cell=path).run()
     plan = read_plan(folder / "plans/brought.json")
     end = np.array(plan.summary["target_end_m"])
     place.require("the tip", end, None)

@@ -27,7 +27,7 @@ from limber.planning.planners.refine import (
     refine,
     smooth_cost,
 )
-from limber.planning.settings import PlanSettings
+from limber.planning.settings import PlanSpec
 
 START = np.array([-0.06, -0.03, 0.02])
 GOAL = GraspGoal((0.1, 0.06, 0.02), 0.01)
@@ -410,7 +410,7 @@ def test_where_the_target_moves_fast_far_from_the_goal_nothing_counts_as_near_it
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_plan_is_bounded_closely_once_it_holds(ridge_field):
     """Before, any bound will do; afterwards the same path has one as close as if asked at once."""
-    settings = PlanSettings(iterations=300, engine="own")
+    settings = PlanSpec(iterations=300, engine="own")
     at_once = plan_pair(ridge_field, START, GOAL, settings)
     before = plan_pair(ridge_field, START, GOAL, settings, is_bounded=False)
     after = with_bound(before)
@@ -425,7 +425,7 @@ def test_a_plan_is_bounded_closely_once_it_holds(ridge_field):
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_detour_may_count_from_the_tree(ridge_field):
     """As in the paper's table: the path of RRT* as its tree has it is longer than the shortest."""
-    settings = PlanSettings(iterations=300, engine="own", max_detour=2.0)
+    settings = PlanSpec(iterations=300, engine="own", max_detour=2.0)
     shortest, tree = (plan_pair(ridge_field, START, GOAL, settings, detour_from_tree=from_tree)
                       for from_tree in (False, True))
     raw = arc_lengths(resample(tree.compared["RRT*, not smoothed"], 0.005))[-1]
@@ -438,7 +438,7 @@ def test_a_detour_may_count_from_the_tree(ridge_field):
 @pytest.mark.usefixtures("coarse_bound")
 def test_costs_of_two_seeds_compare(ridge_field):
     """Scales and the plan's cost do not depend on the seed; D-RRT* is never below the bound."""
-    found = [plan_pair(ridge_field, START, GOAL, PlanSettings(
+    found = [plan_pair(ridge_field, START, GOAL, PlanSpec(
         seed=seed, iterations=300, engine="own", planner=planner))
         for seed, planner in ((0, "eikonal"), (1, "d-rrt-star"))]
     assert found[0].cost == found[1].cost

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import norm
+from tests.stages.specified import Planned
 
 from limber.core.errors import InputError
 from limber.planning.constraints.chance import Exposure, Surface, YoungUncertainty, _chosen, _design
 from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import resolve_path
-from limber.stages.paths.plan import PlanPaths
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_poses_are_asked_where_a_limit_may_break(bent):
 ])
 def test_a_confidence_needs_a_limit_and_an_estimate(planned_branch, settings, words):
     with pytest.raises(InputError, match=words):
-        PlanPaths(branch_folder=planned_branch, **settings, name="sure").run()
+        Planned(branch_folder=planned_branch, **settings, name="sure").run()
 
 
 def test_poses_that_break_under_other_moduli_share_the_chance():

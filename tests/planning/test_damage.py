@@ -10,7 +10,7 @@ from limber.core.errors import InputError
 from limber.core.progress import Progress
 from limber.planning.constraints.damage import DamageAlong, Strength, assumed, read_break_tests
 from limber.planning.constraints.limits import Limits
-from limber.planning.settings import PlanSettings
+from limber.planning.settings import PlanSpec
 from limber.results.report.damage_figure import damage_along_branch
 from limber.results.report.report_tables import comparison_rows
 from limber.stages.paths.plan_strength import (
@@ -89,9 +89,9 @@ SCANNED = SimpleNamespace(manifest=SimpleNamespace(stages={"reconstruct": Simple
 def test_a_probability_of_damage_limits_the_strain(tmp_path):
     """By tests before the species; the handbook's half no longer counts; a radius that is not known
     well lowers it; without a strength it is refused."""
-    settings = PlanSettings(wood="ash", max_damage=0.01)
+    settings = PlanSpec(wood="ash", max_damage=0.01)
     assert Limits.of(settings).strain == np.inf
-    assert Limits.of(PlanSettings(wood="ash")).strain < 0.01
+    assert Limits.of(PlanSpec(wood="ash")).strain < 0.01
     known, unsure = (strength_for(branch, settings, None) for branch in (BARE, SCANNED))
     limits = with_damage(Limits.of(settings), settings, known)
     assert known.damage(limits.strain) == pytest.approx(0.01)
@@ -103,20 +103,20 @@ def test_a_probability_of_damage_limits_the_strain(tmp_path):
     tested = strength_for(BARE, settings, path)
     assert tested.tests == 6 and tested.median > 5.0 * known.median
     with pytest.raises(InputError, match="--break-tests"):
-        strength_for(BARE, PlanSettings(max_damage=0.01), None)
-    assert strength_for(BARE, PlanSettings(), None) is None
+        strength_for(BARE, PlanSpec(max_damage=0.01), None)
+    assert strength_for(BARE, PlanSpec(), None) is None
 
 
 def test_a_plan_keeps_under_a_strength_that_is_known_or_assumed():
     """By half, unless the user limits the strain. Of stems softer than wood nothing is assumed."""
-    settings, tests = PlanSettings(), Strength.of_tests(np.linspace(0.04, 0.06, 9), "tests")
+    settings, tests = PlanSpec(), Strength.of_tests(np.linspace(0.04, 0.06, 9), "tests")
     assert with_damage(Limits(), settings, tests, 1e8).strain == pytest.approx(
         0.5 * tests.median)
     assert with_damage(Limits(), settings, None, 8e9).strain == pytest.approx(0.003)
     assert with_damage(Limits(), settings, None, 1e8).strain == np.inf
-    own = PlanSettings(max_strain=0.02)
+    own = PlanSpec(max_strain=0.02)
     assert with_damage(Limits.of(own), own, tests, 8e9).strain == 0.02
-    ash = PlanSettings(wood="ash")
+    ash = PlanSpec(wood="ash")
     of_ash = with_damage(Limits.of(ash), ash, Strength.of_species("ash"), 8e9)
     assert of_ash.strain == Limits.of(ash).strain
     assert "0.3 %, half of that at which" in default_limit(

@@ -16,7 +16,7 @@ from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.goals.goal import Ball
 from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
 from limber.planning.path_problem import UNPROVEN, BlockedError, GentleProblem
-from limber.planning.settings import PlanSettings
+from limber.planning.settings import PlanSpec
 
 START, GOAL = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
 LEVEL, RISE, ROUGH = 1.0, 2.0, 0.15
@@ -76,7 +76,7 @@ def test_what_the_field_may_be_wrong_by_is_no_proof(rough_field, name):
 def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch, seen):
     """With the limit looser by that error, for the full model to decide; and it is said. What is
     proven is tried neither so nor without margins."""
-    settings, limits, told, tried = PlanSettings(), Limits(strain=2.4), [], []
+    settings, limits, told, tried = PlanSpec(), Limits(strain=2.4), [], []
     there = baseline_and_plan.plan_pair(rough_field, START, GraspGoal(tuple(START), 0.01), settings)
 
     def plan_pair(_field, _start, _goal, _settings, tried_limits, *, beyond, **_options):
@@ -113,7 +113,7 @@ def test_where_cells_close_the_way_by_the_field_only_its_error_is_tried(rough_fi
 
     monkeypatch.setattr(baseline_and_plan, "plan_pair", plan_pair)
     with pytest.raises(BlockedError, match=UNPROVEN):
-        baseline_and_plan.plan_within(rough_field, START, GOAL, PlanSettings(), limits)
+        baseline_and_plan.plan_within(rough_field, START, GOAL, PlanSpec(), limits)
     uncertainty = limits.doubts(rough_field)["strain"]
     assert tried == [(pytest.approx(2.4 + uncertainty), False)]
 

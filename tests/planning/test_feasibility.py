@@ -19,7 +19,7 @@ from limber.planning.passages import solved_if_undecided
 from limber.planning.path_problem import BlockedError, GentleProblem
 from limber.planning.planners.least_violation import easiest_path
 from limber.planning.planners.refine import plan_gentle, refine
-from limber.planning.settings import PlanSettings
+from limber.planning.settings import PlanSpec
 
 RADIUS = 0.2  # [m] of the shell about the origin
 ALONG, OFF = 20.0, 4e4  # [N/m] along the shell and off it: it yields a two thousandth as easily
@@ -141,12 +141,12 @@ def test_a_plan_that_a_wrong_field_excludes_is_made_with_more_poses(
 
     monkeypatch.setattr(planning, "plan_within", excluded)
     warnings = []
-    settings = PlanSettings(goal=goal.position, goal_tolerance=goal.tolerance, iterations=300,
+    settings = PlanSpec(goal=goal.position, goal_tolerance=goal.tolerance, iterations=300,
                             max_force=1.3 * held, inertia=False)
     monkeypatch.setattr(planning, "_REPLANS", 2)
 
     def made():
-        return planning.plan_motion(field, small_model, settings, workers=1,
+        return planning.plan_motion(field, small_model, settings,
                                     progress=Progress(on_warning=warnings.append))
     if blind == 1:
         found = made()

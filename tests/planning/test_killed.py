@@ -35,7 +35,7 @@ def command(stage: str, *arguments: object) -> list[str]:
 
 def run(stage: str, *arguments: object) -> None:
     """Run a command in this process, which has its kernels loaded."""
-    assert call([stage, *map(str, arguments), "--workers", "1"]) == 0
+    assert call([stage, *map(str, arguments)]) == 0
 
 
 def killed_at_work(program: list[str], kind: signal.Signals) -> int:
@@ -108,8 +108,7 @@ def assert_same(now: np.ndarray, then: np.ndarray, name: str) -> None:
     signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.campaign)])
 def test_a_killed_plan_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
     """While both paths are solved on the full model."""
-    ask = (folder, "--start-seed", "3", "--iterations", "100", "--name",
-           "new")
+    ask = (folder, "--start-seed", "3", "--name", "new")
     before = Branch.open(folder).names("plans")
     killed_at_work(command("plan", *ask), kind)
     assert Branch.open(folder, verify=True).names("plans") == before

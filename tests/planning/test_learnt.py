@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.stages.specified import Sampled
 
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import CorrectedResult, Guess, LearntGraspModel
@@ -18,7 +19,7 @@ from limber.reduced import model_cache
 from limber.reduced.model_cache import ReducedCache
 from limber.reduced.reduced_model import ReducedSettings
 from limber.reduced.training import TrainingSettings
-from limber.stages.paths.energy import EnergySettings, SampleEnergy
+from limber.stages.paths.energy import EnergySpec
 from limber.store import Branch
 
 FEW = ReducedSettings(size=40, field_count=70, training=TrainingSettings(
@@ -106,8 +107,8 @@ def test_a_field_says_which_model_it_came_from(small_model, small_mesh, small_sk
     with branch.stage("mesh") as stage:
         small_mesh.write(stage.path("mesh.vtu"))
         small_skeleton.write_swc(stage.path("skeleton.swc"))
-    asked = EnergySettings(samples=45, forward="reduced", gravity=False)
-    result = SampleEnergy.of(asked, branch_folder=branch.folder, workers=1).run()
+    asked = EnergySpec(samples=45, forward="reduced", gravity=False)
+    result = Sampled.of(asked, branch_folder=branch.folder).run()
     field = EnergyField.read(branch.path("energy.npz"))
     samples = field.samples
     assert result["forward"] == "reduced" and len(list((tmp_path / "kept").glob("*.npz"))) == 1

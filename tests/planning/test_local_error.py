@@ -125,20 +125,20 @@ def test_a_wall_is_confirmed_by_the_full_model_or_refuted(apart, small_model, mo
     none = BlockedError("No path exists.", "Proven on a grid.", "").behind(places)
     low, high = Limits(force=0.3 * forces.min()), Limits(force=3.0 * forces.max())
     monkeypatch.setattr(Limits, "errors", lambda self, known: {})
-    check = checked_wall(field, small_model, low, none, AT_REST, workers=1)
+    check = checked_wall(field, small_model, low, none, AT_REST)
     assert check.bears_out and check.learnt is None and check.solved == 2
     assert "2 states of the full model, where the way is closed, confirm it" in str(
         confirmed(none, check))
-    refuted = checked_wall(field, small_model, high, none, AT_REST, workers=1)
+    refuted = checked_wall(field, small_model, high, none, AT_REST)
     assert not refuted.bears_out and len(refuted.learnt.poses) == 2
     again = small_model.follow(refuted.learnt.poses[:1, :3], small_model.rest.displacement)[0]
     assert np.allclose(again.reaction_force, refuted.learnt.forces[0], atol=1e-3 * forces.max())
     wrong = LocalError(np.zeros((1, 3)), np.zeros(1), 1.0, 0.0, -1.0)  # the field says too much
     monkeypatch.setattr(Limits, "errors", lambda self, known: {"force": wrong})
-    assert checked_wall(field, small_model, low, none, AT_REST, workers=1).learnt is not None
-    assert checked_wall(field, small_model, low, BlockedError("No."), AT_REST, workers=1).bears_out
+    assert checked_wall(field, small_model, low, none, AT_REST).learnt is not None
+    assert checked_wall(field, small_model, low, BlockedError("No."), AT_REST).bears_out
     monkeypatch.setattr(passages, "solve_branch", lambda *_, **__: ([None], []))
-    unsolved = checked_wall(field, small_model, low, none, AT_REST, workers=1)
+    unsolved = checked_wall(field, small_model, low, none, AT_REST)
     assert not unsolved.bears_out and unsolved.learnt is None
 
 
@@ -152,16 +152,16 @@ def test_a_target_out_of_reach_is_confirmed_by_the_full_model(apart, small_model
     tip = field.tip(places[:1])[0]
     off = float(field.place_errors(None, places[:1])[0])
     away = TargetGoal(Ball(tuple(tip + [0.0, 0.0, 0.02 + 3.0 * off]), 0.01))
-    check = checked_wall(field, small_model, Limits(), none, away, workers=1)
+    check = checked_wall(field, small_model, Limits(), none, away)
     assert check.bears_out and check.solved == 1
     inside = TargetGoal(Ball(tuple(tip), 0.01 + 3.0 * off))
-    refuted = checked_wall(field, small_model, Limits(), none, inside, workers=1)
+    refuted = checked_wall(field, small_model, Limits(), none, inside)
     assert not refuted.bears_out and len(refuted.learnt.poses) == 1
     low = Limits(force=0.3 * forces.min())
-    assert checked_wall(field, small_model, low, none, inside, workers=1).bears_out
+    assert checked_wall(field, small_model, low, none, inside).bears_out
     monkeypatch.setattr(TargetGoal, "uncertainty", lambda self, field, points: np.full(
         len(points), -1.0))
-    assert not checked_wall(field, small_model, Limits(), none, away, workers=1).bears_out
+    assert not checked_wall(field, small_model, Limits(), none, away).bears_out
 
 
 def test_a_proof_that_is_not_borne_out_is_none():

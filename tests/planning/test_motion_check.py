@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.stages.specified import Planned
 
 import limber.planning.make_plan as plan_module
 from limber.cell.obstacles import Box
@@ -17,9 +18,8 @@ from limber.planning.constraints.motion_check import MotionCheck, check_motion, 
 from limber.planning.field.energy_field import EnergyField, refit
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.plan_file import read_plan
-from limber.planning.settings import PlanSettings
+from limber.planning.settings import PlanSpec
 from limber.planning.timing import Pace, poses_at, time_law
-from limber.stages.paths.plan import PlanPaths
 
 BRISK = Pace(0.25, 2.0)
 
@@ -59,7 +59,7 @@ def test_a_slow_motion_is_as_standing_still(small_model, bent):
     """At 5 mm/s inertia adds under a percent to any limit's value, and nothing is slowed down."""
     standing = bent.ahead.force_sizes.max()
     limits = Limits(force=1.2 * standing, strain=0.2, axial_force=2 * standing)
-    found = check_motion(small_model, bent, limits, Pace(0.005, 0.02), slowings=2, workers=1)
+    found = check_motion(small_model, bent, limits, Pace(0.005, 0.02), slowings=2)
     assert not found.broken and found.slowings == 0
     assert found.peaks["force"] == pytest.approx(standing, rel=0.01)
     assert found.peaks["strain"] == pytest.approx(bent.ahead.strains.max(), rel=0.01)
@@ -71,7 +71,7 @@ def test_a_motion_that_inertia_takes_over_a_limit_is_slowed_until_it_holds(heavy
     standing, brisk = bent.ahead.force_sizes.max(), peak_force(heavy, bent, BRISK)
     assert brisk > 1.05 * standing
     limit = 0.7 * standing + 0.3 * brisk
-    found = check_motion(heavy, bent, Limits(force=limit), BRISK, slowings=4, workers=1)
+    found = check_motion(heavy, bent, Limits(force=limit), BRISK, slowings=4)
     assert not found.broken and found.slowings >= 1
     assert found.pace.speed < BRISK.speed
     assert peak_force(heavy, bent, found.pace) <= 1.005 * limit
@@ -82,7 +82,7 @@ def test_a_motion_that_inertia_takes_over_a_limit_is_slowed_until_it_holds(heavy
 def test_what_no_pace_keeps_is_broken_with_its_place(small_model, bent):
     """Standing still is over already: it is said at once, where."""
     limits = Limits(force=0.9 * bent.ahead.force_sizes.max())
-    found = check_motion(small_model, bent, limits, Pace(0.1, 1.0), slowings=4, workers=1)
+    found = check_motion(small_model, bent, limits, Pace(0.1, 1.0), slowings=4)
     assert found.slowings == 0 and found.excess["force"] > 1.0
     assert "force in motion" in found.broken[0] and "at (" in found.broken[0]
 
@@ -94,7 +94,7 @@ def test_an_obstacle_is_met_in_motion(small_model, bent):
     for place, met in ((tip, True), (tip + [0.0, 0.1, 0.0], False)):
         post = Box("the post", np.full(3, 0.01), place, np.eye(3))
         limits = Limits(constraints=(Obstacles((post,)),))
-        found = check_motion(small_model, bent, limits, Pace(0.1, 1.0), slowings=0, workers=1)
+        found = check_motion(small_model, bent, limits, Pace(0.1, 1.0), slowings=0)
         assert any("inside the post" in words for words in found.broken) == met
 
 
@@ -109,9 +109,8 @@ def test_a_plan_that_inertia_breaks_is_refused(planned_branch, tmp_path, monkeyp
         Pace(0.001, 0.001), [words], {"force": 99.0}, {"force": 10.0}, 4, {"force": 1.65}, 9, 0.1))
     monkeypatch.setattr(plan_module, "_REPLANS", 0)
     with pytest.raises(NoPathError, match="force in motion") as refused:
-        PlanPaths(branch_folder=folder, max_force=most, iterations=100,
-                  start=tuple(there.poses[0, :3]), goal=tuple(there.poses[-1, :3]), name="shaken",
-                  workers=1).run()
+        Planned(branch_folder=folder, max_force=most, iterations=100, name="shaken",
+                start=tuple(there.poses[0, :3]), goal=tuple(there.poses[-1, :3])).run()
     assert refused.value.exit_code == 3 and not (folder / "plans/shaken.json").exists()
 
 
@@ -135,9 +134,9 @@ def to_region(planned_branch, small_model):
     field = EnergyField.read(planned_branch / "energy.npz")
     far = np.linalg.norm(field.samples.positions - field.rest, axis=1).argmax()
     field.misplaced[:] = 0.003
-    settings = PlanSettings(tip_goal=tuple(map(float, field.samples.tips[far])),
+    settings = PlanSpec(tip_goal=tuple(map(float, field.samples.tips[far])),
                             goal_tolerance=0.02, iterations=300, inertia=False)
-    return lambda: planning.plan_motion(field, small_model, settings, workers=1)
+    return lambda: planning.plan_motion(field, small_model, settings)
 
 
 @pytest.mark.slow

@@ -21,7 +21,6 @@ from limber.estimation.next_pull import (
 from limber.estimation.settings import FitSpec
 from limber.planning.constraints.chance import Exposure, Surface
 from limber.recordings.recording import EXACT, SensorEntry
-from limber.stages.pulls import suggest_pull as stage
 from limber.stages.pulls.suggest_pull import SuggestPull, verdict
 from limber.store import Branch
 from limber.store.loading import load_subject
@@ -129,13 +128,11 @@ def test_no_pull_within_the_strain_is_said(subject, monkeypatch):
     monkeypatch.setattr(next_pull, "_tried", lambda *_: next(found))
     with pytest.raises(WorkError, match=r"7 of 8 are impossible, and the gentlest .* 5 %"
                        ) as error:
-        suggest(subject, subject.start, Known.nothing(2), Cell(), (0.8,), max_strain=0.01,
-                workers=1)
+        suggest(subject, subject.start, Known.nothing(2), Cell(), (0.8,), max_strain=0.01)
     # No limit of the force was set: it is not advised to raise it.
     assert "--max-strain 0.0525" in str(error.value) and "--max-force" not in str(error.value)
     with pytest.raises(WorkError, match="None of 4 pulls can be simulated"):
-        suggest(subject, subject.start, Known.nothing(2), Cell(), (0.8,), max_strain=0.01,
-                workers=1)
+        suggest(subject, subject.start, Known.nothing(2), Cell(), (0.8,), max_strain=0.01)
 
 
 def exposed(slope, value=0.8):
@@ -162,13 +159,11 @@ def test_a_pull_is_worth_it_where_it_changes_what_a_plan_may_do(value, now, afte
 
 
 @pytest.mark.slow
-def test_the_stage_writes_the_best_pull_and_answers_for_a_plan(planned_branch, tmp_path,
-                                                               monkeypatch):
+def test_the_stage_writes_the_best_pull_and_answers_for_a_plan(planned_branch, tmp_path):
     """Best first; a plan without limits needs no other pull."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
-    monkeypatch.setattr(stage, "CANDIDATES", (0.8,))
-    settings = {"max_strain": 0.05}
-    result = SuggestPull(branch_folder=folder, **settings, plan="there", workers=1).run()
+    settings = {"max_strain": 0.05, "fractions": (0.8,)}
+    result = SuggestPull(branch_folder=folder, **settings, plan="there").run()
     written = json.loads((folder / "suggested_pull.json").read_text())
     shares = [pull["bits_per_percent_strain"] for pull in [written["best"], *written["others"]]]
     assert shares == sorted(shares, reverse=True) and len(shares) > 4

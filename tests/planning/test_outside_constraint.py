@@ -7,19 +7,19 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from pydantic import Field
+from tests.stages.specified import Planned
 
 from limber.core.errors import NoPathError
 from limber.core.settings import Groups
 from limber.planning.constraints.limits import CONSTRAINTS, Constraint
 from limber.planning.plan_file import read_plan
-from limber.stages.paths.plan import PlanPaths
 
 pytestmark = pytest.mark.usefixtures("rough_plan")
 RADIUS = 0.015  # [m]
 SOFT = 0.04  # [m] over which the value falls
 
 
-class AroundPaths(PlanPaths):
+class AroundPaths(Planned):
     """Those of a plan, and a place to go round."""
 
     groups: ClassVar[Groups] = {"weights and limits": ("around",)}
@@ -70,10 +70,9 @@ def test_a_constraint_from_outside_is_kept(planned_branch, tmp_path):
 
     place = tuple(map(float, there.plan.poses[len(there.plan.poses) // 2, :3]))
     assert nearest("there", place) < 1e-6
-    done = AroundPaths(branch_folder=folder, **options, around=place, name="round",
-                       workers=1).run()
+    done = AroundPaths(branch_folder=folder, **options, around=place, name="round").run()
     assert nearest("round", place) >= RADIUS
     assert done["margins"]["nearness"] > 0.0 and done["rounds"][-1]["broken"] == []
     with pytest.raises(NoPathError, match=r"rest pose: nearness 1\.\d+ exceeds the limit 1 "):
-        AroundPaths(branch_folder=folder, **options, around=tuple(map(float, rest)), name="no",
-                    workers=1).run()
+        AroundPaths(branch_folder=folder, **options, around=tuple(map(float, rest)),
+                    name="no").run()

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from pydantic import Field
+from tests.stages.specified import Planned
 from tests.stages.test_registry import parsed
 
 from limber.core.errors import InputError, NoPathError
@@ -17,12 +18,11 @@ from limber.planning.goals.goal_kinds import KINDS
 from limber.planning.plan_file import read_plan
 from limber.results.scene.animation import _goal as drawn
 from limber.stages.paths import plan as plan_stage
-from limber.stages.paths.plan import PlanPaths
 
 pytestmark = pytest.mark.usefixtures("rough_plan")
 
 
-class SidePaths(PlanPaths):
+class SidePaths(Planned):
     """Those of a plan, and how far to the side."""
 
     groups: ClassVar[Groups] = {"start and goal": ("goal_side",)}
@@ -87,8 +87,7 @@ def test_a_goal_from_outside_is_planned_to(planned_branch, tmp_path):
     says, and file and picture show it."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
     rest = read_plan(folder / "plans/there.json").motion.poses[0]
-    asked = SidePaths(goal_side=rest[0] + 0.08, iterations=100, branch_folder=folder, name="side",
-                      workers=1)
+    asked = SidePaths(goal_side=rest[0] + 0.08, iterations=100, branch_folder=folder, name="side")
     done = asked.run()
     told = json.loads((folder / "plans/side.json").read_text())
     assert told["goal"] == {"kind": "side", "x_m": asked.goal_side, "chosen": False,

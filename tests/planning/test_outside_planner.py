@@ -45,7 +45,7 @@ def line():
 def test_a_planner_from_outside_finds_the_baseline(planned_branch, tmp_path, line):
     """Asked for the shortest and the gentle path, its line is the baseline, named as its own."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
-    done = LinePaths(branch_folder=folder, name="line", workers=1).run()
+    done = LinePaths(branch_folder=folder, name="line").run()
     shortest, gentle = line.searched
     assert shortest.weights.energy == 0.0 < gentle.weights.energy
     assert done["engine"] == "line"

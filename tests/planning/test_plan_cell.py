@@ -4,6 +4,7 @@ import shutil
 
 import numpy as np
 import pytest
+from tests.stages.specified import Planned
 
 from limber.cell.cell_file import Cell, write_cell
 from limber.cell.known_arms import arm_named
@@ -12,18 +13,17 @@ from limber.cell.reach_and_collision import ArmSurroundings, blocked_by, clearan
 from limber.core.errors import InputError, NoPathError
 from limber.core.numerics.rigid import angle_between, pose_vectors
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.goals.goal_kinds import View
 from limber.planning.plan_file import read_plan
+from limber.planning.settings import PlanSpec
 from limber.stages.paths.execute import _stated_by_plan
 from limber.stages.paths.execute_path import offsets_along
-from limber.stages.paths.plan import PlanPaths
 from limber.stages.paths.plan_cell import KeptClear, cell_positions, hiding
 from limber.store import Branch
 
 # No plan made anew because a field of 60 samples is rough.
 pytestmark = pytest.mark.usefixtures("rough_plan")
-SETTINGS = PlanSettings(iterations=300)
+SETTINGS = PlanSpec(iterations=300)
 
 
 @pytest.fixture
@@ -46,8 +46,7 @@ def cell_file(folder, **content):
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_plan_in_a_cell_says_how_the_arm_takes_it(copied):
     """With singularity and joint margins in the file; its force limit holds."""
-    PlanPaths.of(SETTINGS, branch_folder=copied, name="reached", cell=cell_file(copied),
-                 workers=1).run()
+    Planned.of(SETTINGS, branch_folder=copied, name="reached", cell=cell_file(copied)).run()
     plan = read_plan(copied / "plans/reached.json")
     assert plan.summary["robot"]["model"] == "ur5e"
     assert plan.summary["robot"]["singularity_distance"] > 0.05
@@ -82,9 +81,9 @@ def test_the_gripper_lags_behind_where_it_may_not_turn_with_the_branch(copied, m
         "iterations": 100, "inertia": False, "goal": tuple(map(float, there.plan.poses[-1, :3]))})
     path = cell_file(copied)
     with pytest.raises(NoPathError, match="Turned too far"):
-        PlanPaths.of(settings, branch_folder=copied, name="stiff", cell=path, workers=1).run()
-    PlanPaths.of(settings.model_copy(update={"turn_slack": turn}), branch_folder=copied,
-                 name="lagging", cell=path, workers=1).run()
+        Planned.of(settings, branch_folder=copied, name="stiff", cell=path).run()
+    Planned.of(settings.model_copy(update={"turn_slack": turn}), branch_folder=copied,
+                 name="lagging", cell=path).run()
     summary = read_plan(copied / "plans/lagging.json").summary
     turning, legs = summary["turning"], {leg["name"]: leg for leg in summary["legs"]}
     assert 0.2 * turn < turning["largest_rad"] < 0.6 * turn
@@ -104,7 +103,7 @@ def test_a_cell_that_allows_too_little_force_is_named(copied, monkeypatch):
     monkeypatch.setattr("limber.planning.make_plan._REPLANS", 0)
     weak = cell_file(copied, limits={"soft_force_n": 0.1, "hard_force_n": 20.0})
     with pytest.raises(NoPathError, match="force"):
-        PlanPaths.of(SETTINGS, branch_folder=copied, name="weak", cell=weak, workers=1).run()
+        Planned.of(SETTINGS, branch_folder=copied, name="weak", cell=weak).run()
 
 
 @pytest.mark.slow
@@ -112,7 +111,7 @@ def test_a_cell_that_allows_too_little_force_is_named(copied, monkeypatch):
 def test_a_robot_too_far_away_refuses_the_plan(copied):
     far = cell_file(copied, base={"pose": (3.0, 0.1, 0.0, 0, 0, 0.4)})
     with pytest.raises(NoPathError, match="reach") as refused:
-        PlanPaths.of(SETTINGS, branch_folder=copied, name="far", cell=far, workers=1).run()
+        Planned.of(SETTINGS, branch_folder=copied, name="far", cell=far).run()
     assert refused.value.exit_code == 3 and not (copied / "plans/far.json").exists()
 
 
@@ -124,8 +123,7 @@ def test_a_branch_that_meets_an_obstacle_refuses_the_plan(copied):
         "pose": (*map(float, path[-1]), 0, 0, 0)},))
     goal = tuple(map(float, path[-1]))
     with pytest.raises(NoPathError, match=r"goal .* mm inside the post"):
-        PlanPaths(branch_folder=copied, iterations=300, goal=goal, name="hit", cell=blocked,
-                  workers=1).run()
+        Planned(branch_folder=copied, iterations=300, goal=goal, name="hit", cell=blocked).run()
 
 
 @pytest.mark.slow
@@ -144,12 +142,12 @@ def test_a_branch_is_led_around_an_obstacle(copied):
             "pose": (*map(float, place), 0, 0, 0)},))
 
     # In motion: test_motion_check.
-    PlanPaths.of(SETTINGS.model_copy(update={"iterations": 100, "inertia": False, **ends}),
-                 branch_folder=copied, name="around", cell=post(tip), workers=1).run()
+    Planned.of(SETTINGS.model_copy(update={"iterations": 100, "inertia": False, **ends}),
+                 branch_folder=copied, name="around", cell=post(tip)).run()
     assert np.linalg.norm(read_plan(copied / "plans/around.json").motion.tips - tip,
                           axis=1).min() > 0.01
     with pytest.raises(NoPathError, match="at its rest pose"):
-        PlanPaths.of(SETTINGS, branch_folder=copied, name="leaning", workers=1,
+        Planned.of(SETTINGS, branch_folder=copied, name="leaning",
                      cell=post(there.motion.tips[0])).run()
 
 
@@ -254,13 +252,13 @@ def test_a_workspace_is_kept_and_one_without_the_goal_refused(copied):
     small = cell_file(copied, workspace={"low_m": (-1, -1, path[-1, 2] + 0.05),
                                          "high_m": (1, 1, 2)})
     with pytest.raises((NoPathError, InputError), match="workspace"):
-        PlanPaths(branch_folder=copied, goal=goal, name="outside", cell=small, workers=1).run()
+        Planned(branch_folder=copied, goal=goal, name="outside", cell=small).run()
 
 
 def test_cells_that_do_not_fit_are_refused(copied):
     """Of another branch; an obstacle with a hole; one in millimetres."""
     with pytest.raises(InputError, match="calibrated for branch"):
-        PlanPaths.of(SETTINGS, branch_folder=copied, cell=cell_file(copied, branch="another")).run()
+        Planned.of(SETTINGS, branch_folder=copied, cell=cell_file(copied, branch="another")).run()
     vertices = 5.0 * np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]], float)
     faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
     for name, kept, words in (("holed", 3, "hole|open|edge"), ("large", 4, "unit")):
@@ -269,4 +267,4 @@ def test_cells_that_do_not_fit_are_refused(copied):
         (copied.parent / f"{name}.obj").write_text("\n".join(lines) + "\n")
         cell = cell_file(copied, obstacles=({"kind": "mesh", "file": f"{name}.obj"},))
         with pytest.raises(InputError, match=words):
-            PlanPaths.of(SETTINGS, branch_folder=copied, cell=cell).run()
+            Planned.of(SETTINGS, branch_folder=copied, cell=cell).run()

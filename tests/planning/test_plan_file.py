@@ -17,7 +17,7 @@ from limber.planning.plan_file import (
     whole_motion,
 )
 from limber.planning.search_files import BoundGrid, CostToGo
-from limber.planning.settings import PlanSettings
+from limber.planning.settings import PlanSpec
 from limber.planning.timing import Pace
 
 
@@ -138,11 +138,11 @@ def test_joints_are_carried(path, tmp_path):
 
 def test_a_wood_limits_the_strain_to_half_of_what_it_breaks_at():
     """Cherry, 8,000 psi over 1.31 million psi, half of it; not together with another limit."""
-    assert Limits.of(PlanSettings(wood="cherry")).strain == pytest.approx(0.00305, abs=1e-5)
+    assert Limits.of(PlanSpec(wood="cherry")).strain == pytest.approx(0.00305, abs=1e-5)
     for wood in ("ash", "maple", "oak", "walnut"):
-        assert 0.0025 < Limits.of(PlanSettings(wood=wood)).strain < 0.0035
+        assert 0.0025 < Limits.of(PlanSpec(wood=wood)).strain < 0.0035
     with pytest.raises(InputError, match="--max-strain and --wood"):
-        Limits.of(PlanSettings(wood="oak", max_strain=0.01))
+        Limits.of(PlanSpec(wood="oak", max_strain=0.01))
 
 
 # What a plan's search leaves beside it: the bound comes back as it was, whole between cells.

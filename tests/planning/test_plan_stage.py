@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.stages.specified import Planned
 
 import limber.planning.make_plan as plan_module
 from limber.core.errors import (
@@ -19,14 +20,13 @@ from limber.core.errors import (
 )
 from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.planning.baseline_and_plan import PlanSettings
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.goals.goal_kinds import default_goal, hemisphere_goal
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.plan_file import doubts_of
+from limber.planning.settings import PlanSpec
 from limber.results.report.plan_figures import convergence, report_figures, searched
 from limber.stages.paths.energy import EnergySettings, SampleEnergy
-from limber.stages.paths.plan import PlanPaths
 from limber.store import Branch
 from limber.store.loading import load_grasp_model
 
@@ -113,8 +113,8 @@ def test_a_plan_whose_goal_is_its_start_saves_nothing(copied, place):
     if place == "elsewhere":
         where = np.array(read_plan(copied)["plan"]["poses"])[-1, :3]
         start = tuple(map(float, where))
-    PlanPaths(branch_folder=copied, start=start, goal=tuple(where + [0.004, 0.0, 0.0]),
-              inertia=False, name="stay", workers=1).run(Progress(on_warning=told.append))
+    Planned(branch_folder=copied, start=start, goal=tuple(where + [0.004, 0.0, 0.0]),
+              inertia=False, name="stay").run(Progress(on_warning=told.append))
     plan = read_plan(copied, "stay")
     assert plan["plan"]["length_m"] < 1e-9 and plan["baseline"]["length_m"] < 1e-9
     for change in ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent"):
@@ -130,8 +130,8 @@ def test_folder_can_be_read_again_and_is_not_done_twice(copied):
     before = branch.manifest.stages["plan:there"].finished, branch.digest("plans/there.json")
     field = EnergyField.read(branch.path("energy.npz"))
     assert field.energy(field.rest)[0] < 1e-3 * field.samples.energies.max()
-    SampleEnergy.of(ENERGY, branch_folder=copied, workers=1).run()
-    PlanPaths(branch_folder=copied, iterations=800, start_seed=3, name="there").run()
+    SampleEnergy.of(ENERGY, branch_folder=copied).run()
+    Planned(branch_folder=copied, iterations=800, start_seed=3, name="there").run()
     again = Branch.open(copied)
     assert (again.manifest.stages["plan:there"].finished,
             again.digest("plans/there.json")) == before
@@ -141,7 +141,7 @@ def test_folder_can_be_read_again_and_is_not_done_twice(copied):
 def test_same_seed_same_plan(copied):
     """Run again by force, the planner's path is the same to the bit."""
     before = read_plan(copied)
-    PlanPaths(branch_folder=copied, iterations=800, start_seed=3, name="there", workers=1,
+    Planned(branch_folder=copied, iterations=800, start_seed=3, name="there",
               force=True).run()
     after = read_plan(copied)
     for key in ("baseline", "plan"):
@@ -157,7 +157,7 @@ def test_other_modulus_makes_the_field_stale(copied):
         mesh.with_data(cell_data={"young": 2 * mesh.cell_data["young"]}).write(
             stage.path("mesh.vtu"))
     with pytest.raises(BranchFolderError, match="limber energy"):
-        PlanPaths(branch_folder=copied, **QUICK, name="other").run()
+        Planned(branch_folder=copied, **QUICK, name="other").run()
 
 
 @pytest.mark.slow
@@ -167,24 +167,24 @@ def test_refusals_leave_the_folder_as_it_was(copied, monkeypatch):
     monkeypatch.setattr("limber.planning.make_plan._REPLANS", 0)
     before = sorted(p.name for p in copied.rglob("*") if p.name != ".lock")
     with pytest.raises(NoPathError, match="misses it by"):
-        PlanPaths(branch_folder=copied, goal=(2.0, 0.0, 0.0), name="bad").run()
+        Planned(branch_folder=copied, goal=(2.0, 0.0, 0.0), name="bad").run()
     with pytest.raises(NoPathError, match=r"force .* exceeds the limit 0.01 "):
-        PlanPaths(branch_folder=copied, max_force=0.01, iterations=300, name="bad", workers=1).run()
+        Planned(branch_folder=copied, max_force=0.01, iterations=300, name="bad").run()
     with pytest.raises(NoPathError, match=r"in millimetres\?"):
-        PlanPaths(branch_folder=copied, goal=(20.0, 0.0, 400.0), name="bad").run()
+        Planned(branch_folder=copied, goal=(20.0, 0.0, 400.0), name="bad").run()
     with pytest.raises(InputError, match=r"in millimetres\?"):
-        PlanPaths(branch_folder=copied, start=(20.0, 0.0, 400.0), name="bad").run()
+        Planned(branch_folder=copied, start=(20.0, 0.0, 400.0), name="bad").run()
     with pytest.raises(InputError, match=r"workspace .*in millimetres\?"):
-        PlanPaths(branch_folder=copied, workspace=(50.0, -100.0, 0.0, 100.0, 100.0, 500.0),
+        Planned(branch_folder=copied, workspace=(50.0, -100.0, 0.0, 100.0, 100.0, 500.0),
                   name="bad").run()
     with pytest.raises(InputError, match="tip-goal"):
-        PlanPaths(branch_folder=copied, goal=(0, 0, 1), tip_goal=(0, 0, 1), name="bad").run()
+        Planned(branch_folder=copied, goal=(0, 0, 1), tip_goal=(0, 0, 1), name="bad").run()
     with pytest.raises(InputError, match="outside the sampled region"):
-        PlanPaths(branch_folder=copied, start=(1.0, 1.0, 1.0), name="bad").run()
+        Planned(branch_folder=copied, start=(1.0, 1.0, 1.0), name="bad").run()
     progress = Progress(lambda fraction, _message, _numbers:
                         progress.cancel() if fraction > 0.05 else None)
     with pytest.raises(Cancelled):
-        PlanPaths(branch_folder=copied, **QUICK, name="bad").run(progress)
+        Planned(branch_folder=copied, **QUICK, name="bad").run(progress)
     assert sorted(p.name for p in copied.rglob("*") if p.name != ".lock") == before
 
 
@@ -196,10 +196,9 @@ def test_stopped_while_the_bound_closes_the_best_so_far_is_kept(copied, monkeypa
         if message == "bounding the best path" and numbers["upper"] < np.inf:
             raise KeyboardInterrupt
 
-    settings = PlanSettings(iterations=100)
+    settings = PlanSpec(iterations=100)
     with pytest.raises(Cancelled, match=r"above the best possible.* stored as plan early"):
-        PlanPaths.of(settings, branch_folder=copied, name="early",
-                     workers=1).run(Progress(interrupt))
+        Planned.of(settings, branch_folder=copied, name="early").run(Progress(interrupt))
     early = read_plan(copied, "early")
     assert early["stopped"] and early["plan"]["unsolved_count"] == 0
 
@@ -212,10 +211,10 @@ def test_stopped_while_the_bound_closes_the_best_so_far_is_kept(copied, monkeypa
     monkeypatch.setattr(plan_module, "plan_motion", stopped)
     before = (copied / "plans/there.json").read_text()
     with pytest.raises(Cancelled, match="finished plan there is kept"):
-        PlanPaths.of(settings, branch_folder=copied, name="there", workers=1).run()
+        Planned.of(settings, branch_folder=copied, name="there").run()
     assert (copied / "plans/there.json").read_text() == before
     with pytest.raises(AttributeError):  # the stand-in has no paths: it was asked again
-        PlanPaths.of(settings, branch_folder=copied, name="early", workers=1).run()
+        Planned.of(settings, branch_folder=copied, name="early").run()
     assert len(asked) == 2
 
 
@@ -250,8 +249,7 @@ def test_limits_hold_on_the_full_model(copied):
         caps[name] = float(max(0.5 * (ends + free.max()), 1.05 * ends))
     for name, column in (("max_stress", "stresses_pa"), ("max_axial_force", "axial_forces_n")):
         caps[name] = 1.02 * float(np.abs(plan["motion"][column]).max())
-    done = PlanPaths(branch_folder=copied, **caps, **QUICK, inertia=False, name="capped",
-                     workers=1).run()
+    done = Planned(branch_folder=copied, **caps, **QUICK, inertia=False, name="capped").run()
     motion = read_plan(copied, "capped")["motion"]
     assert np.linalg.norm(motion["forces_n"], axis=1).max() <= caps["max_force"]
     assert max(motion["strains"]) <= caps["max_strain"]
@@ -277,8 +275,8 @@ def test_plan_that_breaks_a_limit_on_the_full_model_is_refused(copied, monkeypat
     monkeypatch.setattr(EnergyField, "read", promising)
     monkeypatch.setattr("limber.planning.make_plan._REPLANS", 0)
     with pytest.raises(NoPathError, match=r"force \[N\] .* exceeds .* at \(.*\) m") as refused:
-        PlanPaths(branch_folder=copied, max_force=cap, start=tuple(plan["plan"]["poses"][0][:3]),
-                  goal=tuple(plan["plan"]["poses"][-1][:3]), name="refused", workers=1).run()
+        Planned(branch_folder=copied, max_force=cap, start=tuple(plan["plan"]["poses"][0][:3]),
+                  goal=tuple(plan["plan"]["poses"][-1][:3]), name="refused").run()
     assert refused.value.exit_code == 3
     assert not (copied / "plans/refused.json").exists()
 
@@ -309,8 +307,7 @@ def test_tip_goal_puts_the_real_tip_there(copied):
     """With a goal for the tip, the full model's tip ends within the tolerance."""
     field = EnergyField.read(copied / "energy.npz")
     wanted = field.tip(np.array(default_goal(field, 0.01).position))[0]
-    done = PlanPaths(branch_folder=copied, tip_goal=tuple(wanted), iterations=300, name="tip",
-                     workers=1).run()
+    done = Planned(branch_folder=copied, tip_goal=tuple(wanted), iterations=300, name="tip").run()
     assert np.linalg.norm(np.array(done["plan"]["tip_end_m"]) - wanted) <= 0.01 * 1.001
 
 

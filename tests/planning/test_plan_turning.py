@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.stages.specified import Planned
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, NoPathError
@@ -11,7 +12,6 @@ from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import resolve_path
 from limber.robot.motion.execution import Turned
 from limber.stages.paths import plan_turning
-from limber.stages.paths.plan import PlanPaths
 from limber.stages.paths.plan_turning import Clamped, turned_by
 
 
@@ -60,4 +60,4 @@ def test_an_offset_never_needs_the_torque_at_which_the_guard_stops(clamped, monk
 
 def test_a_slack_without_an_arm_is_refused(planned_branch):
     with pytest.raises(InputError, match="--turn-slack is given without --cell"):
-        PlanPaths(branch_folder=planned_branch, turn_slack=0.2, name="turned").run()
+        Planned(branch_folder=planned_branch, turn_slack=0.2, name="turned").run()

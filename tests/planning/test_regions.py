@@ -19,7 +19,7 @@ from limber.planning.goals.goal_kinds import (
     tip_goal,
 )
 from limber.planning.path_problem import random_start
-from limber.planning.settings import PlanSettings
+from limber.planning.settings import PlanSpec
 
 # A camera a metre along x that looks back at the origin; its picture is 0.6 m wide there.
 BACK = np.array([[0, 0, -1, 1], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
@@ -88,7 +88,7 @@ def test_a_start_in_the_goal_stays_there(ridge_field):
     """Both paths have no length, and no path costs less."""
     goal = TargetGoal(Ball((0.0, 0.7, 0.3), 0.65))
     start = np.array([0.0, 0.1, 0.0])
-    found = plan_pair(ridge_field, start, goal, PlanSettings())
+    found = plan_pair(ridge_field, start, goal, PlanSpec())
     assert found.stays and found.certificate.gap == 0.0
     for path in (found.plan, found.baseline):
         assert np.array_equal(path.points, [start, start])
@@ -97,10 +97,10 @@ def test_a_start_in_the_goal_stays_there(ridge_field):
 
 def test_an_empty_workspace_names_its_axis():
     """The side that is wrong, and none of those that were not given."""
-    asked = PlanSettings(workspace=(-1.0, 0.2, 0.0, 1.0, 0.1, 1.0))
+    asked = PlanSpec(workspace=(-1.0, 0.2, 0.0, 1.0, 0.1, 1.0))
     with pytest.raises(InputError, match=r"workspace is empty along y, from 0\.200 to 0\.100 m"):
         Limits.of(asked)
-    inner = Limits.of(PlanSettings(workspace=(-1.0, -1.0, -1.0, 20.0, 20.0, 20.0)))
+    inner = Limits.of(PlanSpec(workspace=(-1.0, -1.0, -1.0, 20.0, 20.0, 20.0)))
     with pytest.raises(InputError, match=r"empty along x, from -1\.000 to -2\.000 m"):
         inner.with_cell(None, np.array([-2.0, 1.0, 1.0]), np.inf, ())
 
@@ -110,7 +110,7 @@ def test_a_random_start_lies_outside_a_large_goal(ridge_field):
     goal = TargetGoal(Ball((0.0, 0.9, 0.3), 0.8))
     away = np.linalg.norm(ridge_field.samples.positions - ridge_field.rest, axis=1)
     for seed in range(4):
-        start = random_start(ridge_field, goal, PlanSettings(), seed)
+        start = random_start(ridge_field, goal, PlanSpec(), seed)
         outside = goal.distance(ridge_field, start[None])[0] - goal.tolerance
         assert outside >= 0.25 * away.max()
 
@@ -139,10 +139,10 @@ def test_the_goal_of_a_demo_is_a_small_ball_that_the_tip_reaches(ridge_field):
     ({"target": "flower"}, "without a goal for it"),
     ({"target": "flower", "tip_goal": (0, 0, 1)}, "no target named flower"),
     ({"target_box": (0, 0, 1, 1, 1, 0)}, r"box is empty along z, from 1\.000 to 0\.000 m"),
-    ({"in_view": True}, r"without a cell that has a \[camera\]"),
-    ({"second_arm": True}, r"without a cell that has a \[second_arm\]"),
+    ({"goal_in": "view"}, r"without a cell that has a \[camera\]"),
+    ({"goal_in": "second_arm"}, r"without a cell that has a \[second_arm\]"),
 ])
 def test_goals_that_make_no_sense_are_refused(small_model, ridge_field, settings, words):
     with pytest.raises(InputError, match=words):
-        goal_of(GoalRequest(ridge_field, small_model, PlanSettings(**settings),
+        goal_of(GoalRequest(ridge_field, small_model, PlanSpec(**settings),
                             ridge_field.limited(), {}))

@@ -19,7 +19,7 @@ from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal, default_goal
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners.rrt_star import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, OmplRrtStar, plan_path
-from limber.planning.settings import PlanSettings
+from limber.planning.settings import PlanSpec
 from limber.stages.paths.compare import ComparePlanners
 from limber.stages.registry import stage_class
 
@@ -198,12 +198,12 @@ def test_the_tree_comes_with_the_path(ridge_field, engine):
 
 # The paper's experiment: planners over random starts, its table and its figure.
 
-SETTINGS = PlanSettings(iterations=300, engine="own", seed=3)
+SETTINGS = PlanSpec(iterations=300, engine="own", seed=3)
 
 
 @pytest.fixture(scope="module")
 def trials(ridge_field):
-    return run_trials(ridge_field, GraspGoal((0.1, 0.06, 0.02), 0.02), SETTINGS, 3, workers=1)
+    return run_trials(ridge_field, GraspGoal((0.1, 0.06, 0.02), 0.02), SETTINGS, 3)
 
 
 def test_trials_start_elsewhere_and_are_scored_alike(trials, ridge_field):
@@ -241,8 +241,7 @@ def test_the_table_has_means_deviations_and_changes(trials):
 def test_the_command_writes_table_and_figure(planned_branch, tmp_path, monkeypatch):
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
     settings = {"trials": 1, "seed": 3}
-    result = ComparePlanners(branch_folder=folder, **settings,
-                             workers=1).run(Progress(on_warning=pytest.fail))
+    result = ComparePlanners(branch_folder=folder, **settings).run(Progress(on_warning=pytest.fail))
     with (folder / "comparisons/planners.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["planner"] for row in rows] == list(COMPARED.values())

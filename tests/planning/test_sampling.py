@@ -159,7 +159,7 @@ def test_grasp_moves_on_a_sphere_by_itself(small_model):
 @pytest.mark.slow
 def test_rest_lies_inside_the_sampled_region(small_model):
     """Samples lie beyond rest on all sides, and so do those of the shell about it."""
-    sampled = sample_field(small_model, EnergySettings(samples=60), workers=1)
+    sampled = sample_field(small_model, EnergySettings(samples=60))
     field = fit_field(sampled.samples, sampled.energy_surface.pivot, sampled.energy_surface.radius)
     assert sampled.samples.energies[0] == 0.0
     assert field.region.height(field.rest[None])[0] < -1e-4
@@ -246,14 +246,14 @@ def test_poses_are_added_until_the_asked_error_holds(ridge, followed):
         samples, list(samples.positions[:, None]), LowEnergySurface(np.zeros(3), 0.0), {}, 0
     )
     asked = 0.4 * field.errors["energy_error"]
-    after, finer = refined(followed, before, field, asked, 200, workers=1)
+    after, finer = refined(followed, before, field, asked, 200)
     assert finer.errors["energy_error"] <= asked and 60 < len(finer.samples.poses) < 200
     assert after.samples is finer.samples
     assert np.allclose(np.concatenate(after.displacements), after.samples.positions)
     truth = ridge.energy(after.samples.positions[60:])
     assert np.allclose(after.samples.energies[60:], truth)
-    assert len(refined(followed, before, field, 1e-9, 75, workers=1)[1].samples.poses) == 75
-    same, untouched = refined(followed, before, field, 1.0, 200, workers=1)
+    assert len(refined(followed, before, field, 1e-9, 75)[1].samples.poses) == 75
+    same, untouched = refined(followed, before, field, 1.0, 200)
     assert same is before and untouched is field
 
 

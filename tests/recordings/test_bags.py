@@ -16,7 +16,7 @@ from limber.recordings.bag_pull import _Messages, pull_of_bag, write_mcap
 from limber.recordings.bag_reader import Bag, Topic, read_bag, stamped
 from limber.recordings.import_request import ImportRequest
 from limber.recordings.recording import read_pull, write_pull
-from limber.recordings.settings import ImportSettings
+from limber.recordings.settings import ImportSpec
 from limber.stages.pulls.export_pull import ExportPull
 from limber.stages.pulls.import_pull import ImportPull
 
@@ -222,7 +222,7 @@ def test_joints_are_called_as_the_cells_arm_calls_them(tmp_path, bare_folder, re
             for time in np.linspace(1.0, 3.0, 21):
                 bag.joints(time, called, [1.4, -1.5, 0.1 * time, -1.2, -1.5, 0.2])
                 bag.wrench("/wrench", time, [time - 1, 0, 0])
-        settings = ImportSettings(cell=str(path))
+        settings = ImportSpec(cell=str(path))
         if called is names:
             ImportPull.of(settings, branch_folder=bare_folder, source=tmp_path / "joints.mcap",
                           name="j").run()
@@ -385,7 +385,7 @@ def test_the_reported_bag(tmp_path, clock):
     if not REPORTED.exists():
         pytest.skip("the reports are not beside this checkout")
     found = pull_of_bag(read_bag(REPORTED), ImportRequest(
-        REPORTED, tmp_path, settings=ImportSettings(bag_clock=clock)))
+        REPORTED, tmp_path, settings=ImportSpec(bag_clock=clock)))
     assert found.robot.times[-1] == pytest.approx(5.2, abs=0.1) and len(found.robot.times) == 21
     assert sum("have a time of 0" in text for text in found.warnings) == 3
 

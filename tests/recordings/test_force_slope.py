@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.stages.specified import Fit
 
 from limber.cli.main import call
 from limber.core.errors import InputError
@@ -239,12 +240,11 @@ def test_three_columns_are_a_pull(branch_folder, table, capsys):
 
 
 @pytest.mark.slow
-def test_a_gauge_and_a_ruler_give_the_modulus(branch_folder, table, capsys):
+def test_a_gauge_and_a_ruler_give_the_modulus(branch_folder, table):
     """Of one slope only the common scale is known: the moduli between are assumed to vary."""
     assert imported(branch_folder, table) == 0
-    assert call(["estimate", str(branch_folder), "--pull", "gauge", "--fractions", "0.4",
-                 "--no-gravity", "--quick", "--json", "--progress", "none"]) == 0
-    line = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    line = Fit(branch_folder=branch_folder, pull=("gauge",), fractions=(0.4,), gravity=False,
+               quick=True).run()
     (low, high), = line["young_interval_pa"]
     assert low < YOUNG < high and high / low < 2
     assert line["young_pa"][0] == pytest.approx(YOUNG, rel=0.1)

@@ -21,7 +21,7 @@ from limber.recordings.recording import (
     write_pull,
 )
 from limber.recordings.recording_formats import RECORDINGS
-from limber.recordings.settings import ImportSettings
+from limber.recordings.settings import ImportSpec
 from limber.recordings.time_series import Stream, read_stream, write_stream
 from limber.stages.pulls.import_pull import ImportPull
 from limber.store import Branch
@@ -60,7 +60,7 @@ def test_entries_of_the_users_file_replace_the_imports(bare_folder, source, tmp_
     """Table by table, also those of a whole pull; a wrong key is named."""
     stated = tmp_path / "mine.toml"
     stated.write_text("[calibration]\ncamera_sigma_m = 0.004\n[sensor]\ntared = false\n")
-    settings = ImportSettings(robot=str(source / "robot.csv"), unit="mm", force_unit="gf",
+    settings = ImportSpec(robot=str(source / "robot.csv"), unit="mm", force_unit="gf",
                               time_offset=0.05, pull_toml=str(stated))
     ImportPull.of(settings, branch_folder=bare_folder, source=source / "markers.csv",
                   name="m").run()
@@ -229,7 +229,8 @@ def test_masks_of_a_yolo_model_of_ones_own(bare_folder, source, monkeypatch, cap
     assert [np.flatnonzero(mask.any(axis=0)).tolist() for mask in masks] == [[0], [1], [2]]
     monkeypatch.setitem(sys.modules, "ultralytics", None)
     capsys.readouterr()
-    assert call([*arguments, "--force"]) != 0
+    arguments[4] = "unseen"
+    assert call(arguments) != 0
     assert "ultralytics" in json.loads(capsys.readouterr().out.strip().splitlines()[-1])["error"]
 
 

@@ -167,7 +167,7 @@ def test_what_stands_before_the_camera_hides_a_goal(library):
     assert np.isnan(seen.depth[5, 8]) and seen.depth[2, 3] == 0.5
     # Its own intrinsics are the view, and the cell's are named.
     assert sum("The connected camera's own view is taken" in text for text in told) == 3
-    place = cell_positions(CELL, (), seen)["in_view"]
+    place = cell_positions(CELL, (), seen)["view"]
     assert place.blocked(at(3.0, 2.0, 0.7), None) == seen.hiding(at(3.0, 2.0, 0.7))
     assert place.region.distance(at(3.0, 2.0, 0.7)[None])[0] <= 0.0
     assert place.region.distance(at(13.0, 2.0, 0.7)[None])[0] > 0.0

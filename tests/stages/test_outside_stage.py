@@ -26,11 +26,11 @@ from pydantic import Field
 
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
-from limber.stages.stage import About, BranchStage, KeptStage
+from limber.stages.stage import About, BranchStage, Repeatable
 from limber.store import Branch
 
 
-class Count(KeptStage, BranchStage):
+class Count(Repeatable, BranchStage):
     """Count the nodes of the skeleton.
 
     Of every axis.

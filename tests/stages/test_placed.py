@@ -152,7 +152,7 @@ def test_one_that_is_there_is_left_as_it_is(folder):
     again = SetTarget(branch_folder=folder, name="flower", **wish).run()
     assert finished() == before and again["targets"] == ["flower", "leaf"]
     assert again["position_m"] == list(first["position_m"])
-    SetTarget(branch_folder=folder, name="flower", **wish, force=True).run()
+    SetTarget(branch_folder=folder, name="flower", **wish | {"mass": 0.5}).run()
     assert finished() != before
     SetTarget(branch_folder=folder, name="flower", remove=True).run()
     assert SetTarget(branch_folder=folder, name="flower", remove=True).run()["targets"] == ["leaf"]

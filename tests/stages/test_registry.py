@@ -96,18 +96,18 @@ def test_units_and_experts_are_in_the_schema():
     """A panel finds units, titles, groups and what only experts are shown."""
     properties = stage_schema("simulate")["settings"]["properties"]
     assert properties["young"]["unit"] == "Pa"
-    assert properties["damping_mass"]["expert"] and not properties["young"]["expert"]
-    assert properties["damping_mass"] | {"title": "Damping mass", "group": "material"} == (
-        properties["damping_mass"])
+    assert properties["damping"]["expert"] and not properties["young"]["expert"]
+    assert properties["damping"] | {"title": "Damping", "group": "material"} == (
+        properties["damping"])
 
 
 def test_help_shows_what_most_users_choose(capsys):
     """--help leaves other options out and says so; --help-all has them."""
     assert main.call(["simulate", "--help"]) == 0
     short = capsys.readouterr().out
-    assert "--damping-mass" not in short and "--help-all" in short and "Material:" in short
+    assert "--damping" not in short and "--help-all" in short and "Material:" in short
     assert main.call(["simulate", "--help-all"]) == 0
-    assert "--damping-mass" in capsys.readouterr().out
+    assert "--damping" in capsys.readouterr().out
 
 
 def test_help_shows_at_most_ten_options():

@@ -67,7 +67,7 @@ def test_import_pull_takes_a_record_of_a_swing(branch, tmp_path, capsys):
         f"{number};{1e3 * float(time):.3f};{reading};{'' if number == 7 else reading}\n"
         for number, (time, reading) in enumerate(rows)))
     assert call(["import-pull", str(branch.folder), str(tmp_path / "strain.csv"), "--name", "s",
-                 "--swing", "--json"]) == 0
+                 "--motion", "swing", "--json"]) == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert told["kind"] == "ringing"
     assert told["frequencies_hz"][0] == pytest.approx(2.5, rel=1e-3)

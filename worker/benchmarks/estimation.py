@@ -30,13 +30,13 @@ from limber.estimation.simulated_pull import PullSpec, simulate_pull, write_dept
 from limber.estimation.vibration.ringing import identify
 from limber.geometry.generated import generate_branch
 from limber.geometry.reconstruction import mesh_skeleton
-from limber.geometry.settings import ReconstructSettings
+from limber.geometry.settings import DENSITY_SIGMA, ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.dynamics.modes import Modes, lowest_modes
 from limber.mechanics.model import BranchModel
 from limber.recordings.recording import Pull
 from limber.recordings.synchronisation import frames_of
-from limber.stages.moduli.vibration import FitVibration, young_of
+from limber.stages.moduli.vibration import RADIUS_SIGMA, young_of
 
 SETTINGS = FitSpec(hold_out=False)
 PULL_COUNTS, DRIVES = (1, 3), ("pose", "force")
@@ -319,21 +319,20 @@ def ringing_row(setting: Setting) -> list[Row]:
 def _ringing(seed: int) -> dict[str, list[float]]:
     """Several trials on one generated geometry."""
     rng = np.random.default_rng([seed, 77])
-    settings = FitVibration(branch_folder=Path(), record=Path())
     skeleton = generate_branch(int(rng.integers(1, 10**6))).skeleton
     assumed = _model(skeleton, 1.0, _YOUNG, _DENSITY)
     found: dict[str, list[float]] = {"covered": [], "errors": [], "frequencies": []}
     for _ in range(_EACH):
         true = float(_YOUNG * np.exp(rng.normal(0, 0.5)))
         real = replace(skeleton, radius=skeleton.radius * np.exp(
-            settings.radius_sigma * rng.normal()))
+            RADIUS_SIGMA * rng.normal()))
         branch = _model(real, _FINER, true,
-                        _DENSITY * float(np.exp(settings.density_sigma * rng.normal())))
+                        _DENSITY * float(np.exp(DENSITY_SIGMA * rng.normal())))
         modes = lowest_modes(branch, 3)
         node = int(np.linalg.norm(branch.mesh.nodes
                                   - skeleton.nodes[skeleton.main_path()[-1]], axis=1).argmin())
         seen = identify(*_record(modes, node, rng))
-        told = young_of(assumed, seen, settings)
+        told = young_of(assumed, seen, DENSITY_SIGMA)
         away = float(np.log(told["young_factor"] * _YOUNG / true))
         found["covered"].append(float(abs(away) < 1.96 * told["deviation"]))
         found["errors"].append(abs(away))

@@ -39,7 +39,7 @@ from limber.planning.goals.goal_kinds import GraspGoal, default_goal, goal_of, n
 from limber.planning.make_plan import PlannedMotion, plan_motion
 from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses, resolve_path
 from limber.planning.path_problem import BlockedError, GentleProblem, random_start
-from limber.planning.settings import PlanSettings
+from limber.planning.settings import PlanSpec
 from limber.stages.paths.plan_cell import cell_positions
 
 ARC_NAMES = tuple(branch.name for branch in BRANCHES)
@@ -122,7 +122,7 @@ class Start:
     def goal(self) -> GraspGoal:
         return default_goal(self.known, 0.01)
 
-    def place(self, settings: PlanSettings) -> np.ndarray:
+    def place(self, settings: PlanSpec) -> np.ndarray:
         """Where the plan starts [m], shape [3]."""
         return self.known.rest.copy() if self.number == 0 else random_start(
             self.known, self.goal, settings, self.seed)
@@ -143,13 +143,13 @@ _PENALTY = 3e3  # on squared height above the sampled region, relative to the pa
 
 def run_trial(start: Start) -> dict[str, Any]:
     """Plan without limits, and with one that binds."""
-    settings = PlanSettings(seed=start.seed)
+    settings = PlanSpec(seed=start.seed)
     place = start.place(settings)
     values, learnt, path = _measure(start, place, settings)
     return values | _with_binding_force(start.model, learnt, place, path, settings)
 
 
-def _measure(start: Start, place: np.ndarray, settings: PlanSettings,
+def _measure(start: Start, place: np.ndarray, settings: PlanSpec,
              ) -> tuple[dict[str, Any], EnergyField, np.ndarray]:
     """Plan without limits; return values, the field at the end of planning, the path [n, 3]."""
     goal = start.goal
@@ -185,7 +185,7 @@ def _measure(start: Start, place: np.ndarray, settings: PlanSettings,
 
 
 def _with_binding_force(model: GraspModel, known: EnergyField, start: np.ndarray,
-                        free: np.ndarray, settings: PlanSettings) -> dict[str, Any]:
+                        free: np.ndarray, settings: PlanSpec) -> dict[str, Any]:
     """Plan to the same end under a force halfway from the ends' largest to the free peak."""
     force = np.linalg.norm(known.force(resample(free, 0.002)), axis=1)
     ends = max(force[0], force[-1])
@@ -284,7 +284,7 @@ DETOUR_ROWS = (*(Asked(
 
 def run_detour(start: Start) -> dict[str, Any]:
     """Plan within the paper's detour: savings [%], and the most points by which they could grow."""
-    known, settings = start.known, PlanSettings(seed=start.seed, max_detour=ADDED)
+    known, settings = start.known, PlanSpec(seed=start.seed, max_detour=ADDED)
     place, began = start.place(settings), time.process_time()
     pair = plan_pair(known, place, start.goal, settings, detour_from_tree=True)
     seconds = time.process_time() - began
@@ -351,16 +351,16 @@ COVERED_ROW = Asked("stated 95 % errors at fresh poses: energy, force, strain, a
                     "93-98 %")
 
 
-_free_paths: dict[tuple[str, int], tuple[PlanSettings, dict[str, float]]] = {}
+_free_paths: dict[tuple[str, int], tuple[PlanSpec, dict[str, float]]] = {}
 
 
 def _free_path(model: GraspModel, known: EnergyField, branch: str, seed: int,
-               ) -> tuple[PlanSettings, dict[str, float]]:
+               ) -> tuple[PlanSpec, dict[str, float]]:
     """Return settings with a random goal, and the peaks of the gentlest path to it, planned once
     for all limits."""
     if (branch, seed) in _free_paths:
         return _free_paths[branch, seed]
-    free = PlanSettings(seed=seed, inertia=False, iterations=500, goal_tolerance=0.01)
+    free = PlanSpec(seed=seed, inertia=False, iterations=500, goal_tolerance=0.01)
     goal = random_start(known, near(known.rest, 0.01), free, seed)
     asked = free.model_copy(update={"goal": tuple(map(float, goal))})
     peaks = _peaks(plan_motion(known, model, asked, workers=1).plan.ahead)
@@ -399,7 +399,7 @@ def run_near_limit(start: Start) -> dict[str, Any]:
     return found
 
 
-def _said(start: Start, settings: PlanSettings) -> tuple[str, float, PlannedMotion | None]:
+def _said(start: Start, settings: PlanSpec) -> tuple[str, float, PlannedMotion | None]:
     """What planning says: planned, proven that there is no path, or not found; and its time [s]."""
     began, motion = time.process_time(), None
     try:
@@ -472,7 +472,7 @@ def covered_row(found: list[dict[str, tuple[int, int]]]) -> Row:
 
 # --- goals in regions -------------------------------------------------------------------------
 
-_KINDS = (0.005, 0.05, 0.3, 1.0, "second_arm", "in_view")
+_KINDS = (0.005, 0.05, 0.3, 1.0, "second_arm", "view")
 """Radii of balls [m], and regions that a cell gives."""
 _SHARES = (0.2, 0.8)
 _TRIES = 60
@@ -512,7 +512,7 @@ def run_region_goal(start: Start) -> dict[str, Any]:
 
 
 def _drawn(kind: float | str, known: EnergyField, model: GraspModel, generator: np.random.Generator,
-           ) -> tuple[PlanSettings, dict[str, CellPlace], np.ndarray]:
+           ) -> tuple[PlanSpec, dict[str, CellPlace], np.ndarray]:
     """Return settings, the cell's places and a start outside the goal."""
     points = known.region.draw(_POSES, generator)
     reached = known.samples.tips[known.region.contains(known.samples.positions)]
@@ -531,7 +531,7 @@ def _drawn(kind: float | str, known: EnergyField, model: GraspModel, generator: 
 
 
 def _asked(kind: float | str, tips: np.ndarray, generator: np.random.Generator,
-           ) -> tuple[PlanSettings, dict[str, CellPlace]]:
+           ) -> tuple[PlanSpec, dict[str, CellPlace]]:
     place = tips[generator.integers(len(tips))]
     outward = generator.normal(size=3)
     outward /= np.linalg.norm(outward)
@@ -539,8 +539,8 @@ def _asked(kind: float | str, tips: np.ndarray, generator: np.random.Generator,
     if not isinstance(kind, str):
         # Its border is a little behind a position that the tip reaches.
         centre = place + (kind - min(0.5 * kind, 0.01)) * outward
-        return PlanSettings(tip_goal=tuple(map(float, centre)), goal_tolerance=kind, **common), {}
-    settings = PlanSettings(**{kind: True}, **common)
+        return PlanSpec(tip_goal=tuple(map(float, centre)), goal_tolerance=kind, **common), {}
+    settings = PlanSpec(goal_in=kind, **common)
     return settings, cell_positions(_cell(kind, place, generator.uniform(0.0, 2.0 * np.pi),
                                           generator.uniform(0.75, 1.0)))
 
@@ -566,8 +566,8 @@ def _refused(kind: float | str, known: EnergyField, model: GraspModel) -> str:
     """Return why a goal out of reach is refused; empty if it is not."""
     place = known.tip(known.rest[None])[0] + [_FAR, 0.0, 0.0]
     settings, cell = _asked(kind, place[None], np.random.default_rng(0))
-    if kind == "in_view":
-        cell = cell_positions(_cell("in_view", place, 0.0, 1.0))
+    if kind == "view":
+        cell = cell_positions(_cell("view", place, 0.0, 1.0))
     try:
         plan_motion(known, model, settings, cell=cell, workers=1)
     except LimberError as error:
@@ -613,7 +613,7 @@ def run_sure(start: Start, draws: int) -> dict[str, Any]:
         of ``_TIGHT`` for the limit.
     """
     unknown = uncertainty_of(start.subject)
-    motion, cap, tight = _sure_plan(start, unknown, PlanSettings(
+    motion, cap, tight = _sure_plan(start, unknown, PlanSpec(
         seed=start.seed, iterations=500, goal=start.goal.position,
         goal_tolerance=start.goal.tolerance))
     states = motion.plan.approach.joined(motion.plan.solved)
@@ -626,7 +626,7 @@ def run_sure(start: Start, draws: int) -> dict[str, Any]:
             "before": motion.summary["confidence"]["of_a_plan_for_the_estimate"]}
 
 
-def _sure_plan(start: Start, unknown: YoungUncertainty, settings: PlanSettings,
+def _sure_plan(start: Start, unknown: YoungUncertainty, settings: PlanSpec,
                ) -> tuple[PlannedMotion, float, float]:
     """Return a plan with confidence under a force limit that binds, the limit [N], its place.
 

@@ -31,6 +31,7 @@ from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
 from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, control_points
 from limber.recordings.recording import CalibrationEntry, Pull, write_pull
+from limber.recordings.settings import ImportSpec
 from limber.stages.moduli.estimate import EstimateYoung
 from limber.stages.pulls.import_pull import ImportPull
 from limber.stages.shape.reconstruct import Reconstruct
@@ -52,6 +53,10 @@ is chosen for the branch.
 LACKS = ("scan", "cloud", "point")
 """A helpful refusal names one of these."""
 SETTINGS = FitSpec(hold_out=False)
+
+
+class _Import(ImportSpec, ImportPull):
+    """An import."""
 
 
 class _Fit(FitSpec, EstimateYoung):
@@ -258,7 +263,7 @@ def _imported(folder: Path, pull: Pull, branch: Path) -> None:
     sensor.write_text("[calibration]\n" + "".join(
         f"{name} = {getattr(entry.calibration, name)!r}\n"
         for name in ("force_bias_sigma_n", "force_drift_sigma_n")), encoding="utf-8")
-    ImportPull(branch_folder=branch, source=folder / "markers.csv", name="pull-1",
+    _Import(branch_folder=branch, source=folder / "markers.csv", name="pull-1",
                robot=str(folder / "robot.csv"), time_offset=0.0, grasp_point=entry.grasp.point_m,
                grasp_radius=entry.grasp.radius_m, grasp_mode="point",
                position_sigma=entry.sensor.position_sigma_m, force_sigma=entry.sensor.force_sigma_n,

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.trials import column
+from limber.estimation.settings import FitSpec
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh, mark
 from limber.mechanics.grasp import Grasp
@@ -33,7 +34,7 @@ from limber.store import Branch
 FOLDER = Path(__file__).parents[3] / "shared/data/silicone_beam"
 RECORDING, RECORDING_C3D = FOLDER / "beam_load52_V2_a.csv", FOLDER / "beam_load52_V2_a.c3d"
 SIZE_M = (0.1, 0.03, 0.03)
-DENSITY, POISSON = 1070.0, 0.49
+DENSITY, DENSITY_SIGMA, POISSON = 1070.0, 0.02, 0.49
 GRAVITY = (0.0, 0.0, -9.80709)
 LOAD_N = 0.51012
 LABELS = ("tip1", "tip2", "tip3", "base1", "base2", "base3")
@@ -67,6 +68,10 @@ REAL_ROW = Asked(
     "said why not")
 
 
+class _Fit(FitSpec, EstimateYoung):
+    """An estimate."""
+
+
 @dataclass(frozen=True)
 class BeamResult:
     """Result of a recording.
@@ -95,7 +100,8 @@ def made_branch(folder: Path) -> Path:
     """The branch folder of ``beam.stl``, clamped at its far face, with the marker table."""
     branch = folder / "beam.branch"
     Mesh(surface=FOLDER / "beam.stl", output=branch, unit="mm", up=(0.0, 1.0, 0.0),
-         root=(15.0, 15.0, 0.0), poisson=POISSON, density=DENSITY).run()
+         root=(15.0, 15.0, 0.0), poisson=POISSON, density=DENSITY,
+         density_sigma=DENSITY_SIGMA).run()
     _write_places(folder / "nominal.csv", in_scan(NOMINAL_M))
     return branch
 
@@ -113,8 +119,7 @@ def estimate_beam(branch: Path, recording: Path, load: float, name: str) -> Beam
                       nominal=str(branch.parent / "nominal.csv"), coordinates="scan", weight=load,
                       own_weight=True, grasp_point=(float(x), float(y), float(z)),
                       grasp_radius=0.012).run()
-    found = EstimateYoung(branch_folder=branch, pull=(name,), fractions=(0.5,), density_sigma=0.02,
-                          force=True).run()
+    found = EstimateYoung(branch_folder=branch, pull=(name,), fractions=(0.5,), force=True).run()
     down = -np.array(pull["load_n"]) / load
     measured = -np.mean(np.array(pull["displacement_m"])[TIPS] @ down)
     deviation = found["young_deviation"]
@@ -245,8 +250,8 @@ def beam_rows(setting: Setting) -> list[Row]:
             branch = _bricks(folder / f"beam-{cells[0]}", cells)
             _imported(branch, folder / "hung.csv", "hung")
             # Poisson's ratio is given: near one half it would take up a coarse mesh's stiffness.
-            found.append(EstimateYoung(branch_folder=branch.folder, fractions=(0.5,),
-                                       density_sigma=0.02, poisson_sigma=0.0).run()["young_pa"][0])
+            found.append(_Fit(branch_folder=branch.folder, fractions=(0.5,),
+                              density_sigma=DENSITY_SIGMA, poisson_sigma=0.0).run()["young_pa"][0])
     young = np.array(found)
     spread = float(np.ptp(young) / young.mean())
     return [Row(*BEAM_ROWS[0], f"{100 * spread:.2f} % ("
@@ -298,7 +303,7 @@ def _bricks(folder: Path, cells: tuple[int, int, int]) -> Branch:
     skeleton = Skeleton.from_edges(axis, np.arange(-1, 20), np.full(21, width / 2))
     folder.mkdir()
     branch = Branch.create(folder / "beam.branch")
-    with branch.stage("mesh") as stage:
+    with branch.stage("mesh", {"density_sigma": DENSITY_SIGMA}) as stage:
         mark(box_mesh(cells), skeleton, young=2e5, poisson=POISSON, density=DENSITY).write(
             stage.path("mesh.vtu"))
         skeleton.write_swc(stage.path("skeleton.swc"))
@@ -328,7 +333,7 @@ def real_row(_setting: Setting) -> list[Row]:
         folder = Path(temporary)
         bricks = _bricks(folder / "swing", _SWING_MESH)
         _imported(bricks, RECORDING, "swing", "swing")
-        swung = FitSwing(branch_folder=bricks.folder, density_sigma=0.02).run()
+        swung = FitSwing(branch_folder=bricks.folder).run()
         found = estimate_beam(made_branch(folder), RECORDING, LOAD_N, "csv")
     (low, high), (soft, stiff) = found.interval, swung["young_interval_pa"]
     least, most = swung["damping_ratio_interval"]

@@ -240,7 +240,7 @@ def _act(name: str, branch: Path, cloud: Path, rng: np.random.Generator) -> None
     elif name == "import":
         limber.import_cloud(filepath=str(cloud))
     elif name == "setting":
-        bpy.context.scene.limber.estimate.density_sigma = float(rng.uniform(0.01, 0.2))
+        bpy.context.scene.limber.estimate.pith_radius = float(rng.uniform(0.001, 0.02))
 
 
 def _state() -> str:
@@ -254,7 +254,7 @@ def _state() -> str:
         skeleton.data, "radius").round(6).tolist()
     colour = None if surface is None else surface.data.color_attributes.active_color.name
     return json.dumps([things, radii, colour, list(limber.plan.goal),
-                       limber.estimate.density_sigma, limber.reconstruct.cloud])
+                       limber.estimate.pith_radius, limber.reconstruct.cloud])
 
 
 def _until(ready, seconds: float, fail: bool = True):

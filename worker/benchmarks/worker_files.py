@@ -95,7 +95,7 @@ def _intrinsics(_template: Path, folder: Path) -> list[Path]:
 def _rgbd(name: str, _template: Path, path: Path) -> Any:
     """An RGB-D folder with one of its lists changed."""
     from limber.recordings.image_folders import copy_rgbd
-    from limber.recordings.settings import ImportSettings
+    from limber.recordings.settings import ImportSpec
 
     with tempfile.TemporaryDirectory() as place:
         source, target = Path(place, "in"), Path(place, "out")
@@ -108,7 +108,7 @@ def _rgbd(name: str, _template: Path, path: Path) -> Any:
         if name == "camera_intrinsic.json":
             (source / "calibration.txt").unlink()
         shutil.copyfile(path, source / name)
-        copy_rgbd(source, target, ImportSettings())
+        copy_rgbd(source, target, ImportSpec())
         from limber.geometry.cloud.camera import read_camera
 
         return read_camera(target / "camera.toml")

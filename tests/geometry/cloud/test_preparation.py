@@ -69,9 +69,9 @@ def test_ground_leaves_the_plant_its_outliers():
 
 def test_crop_box():
     """The crop box is in the file's coordinates."""
-    settings = PreparationSettings(crop_low=(-1, -1, 0), crop_high=(1, 1, 500.0))
+    settings = PreparationSettings(crop=(-1, -1, 0, 1, 1, 500.0))
     prepared = prepare(Cloud(_rod() * 1000), 0.001, PreparationSettings(
-        crop_low=(-100, -100, 0), crop_high=(100, 100, 500)))
+        crop=(-100, -100, 0, 100, 100, 500)))
     assert np.ptp(prepared.cloud.points[:, 2]) == pytest.approx(0.5, abs=0.02)
     with pytest.raises(InputError, match="crop box holds no points"):
         prepare(Cloud(_rod() + 100), 1.0, settings)

@@ -109,7 +109,7 @@ def test_a_refusal_names_the_supports() -> None:
     found = find_supports(np.vstack([_rod(0.01, 1.0, tip=0.004, bend=0.1),
                                      _rod(0.006, 0.8, at=(0.0, 0.15))]), UP)
     text = supports_text(found, 8000, lambda place: 1000 * place)
-    assert "a stake (50 % of the points) at (" in text and "--crop-low" in text
+    assert "a stake (50 % of the points) at (" in text and "--crop" in text
     for added in (text, ""):
         with pytest.raises(InputError) as caught, named_if_refused(added):
             raise InputError("Too flat.", "Wood is round.", "Crop it.")

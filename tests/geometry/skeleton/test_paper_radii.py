@@ -35,7 +35,7 @@ def test_they_are_the_papers_medians_within_its_limits(k):
     points = rng.uniform(0, 0.1, (60, 3))
     nodes = np.array([[0.05, 0.05, 0.0], [0.05, 0.05, 0.05], [0.05, 0.05, 0.1]])
     skeleton = Skeleton(nodes, np.array([-1, 0, 1]), np.full(3, 0.02), np.full(3, 0.001))
-    settings = SkeletonSettings(radius_neighbours=k, radius_low=0.1, radius_high=0.3)
+    settings = SkeletonSettings(radius_neighbours=k, radius_range=(0.1, 0.3))
     found = nearest_point_radii(skeleton, points, settings)
     extent = points.max(axis=0) - points.min(axis=0)
     scale = float((extent @ extent) ** 0.5)
@@ -47,8 +47,8 @@ def test_they_are_the_papers_medians_within_its_limits(k):
 
 
 def test_limits_that_exclude_each_other_are_refused():
-    with pytest.raises(InputError, match=r"--radius-low 0\.2 is not below --radius-high 0\.1"):
-        checked_settings(ReconstructSettings, {"radius_low": 0.2})
+    with pytest.raises(InputError, match=r"--radius-range.*below the largest"):
+        checked_settings(ReconstructSettings, {"radius_range": (0.2, 0.1)})
 
 
 @pytest.fixture(scope="module")

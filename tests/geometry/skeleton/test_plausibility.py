@@ -39,7 +39,7 @@ def test_points_off_all_axes_are_named_with_their_place() -> None:
                              residual=points[:, 0] - 0.01, leafy=False)
     check_explained(result, 0.3, points, lambda place: place, np.any)
     check_explained(result, 0.2, points, lambda place: place, lambda off: False)
-    with pytest.raises(InputError, match=r"^25 % of the points.*--crop-low.*--unexplained 1") as no:
+    with pytest.raises(InputError, match=r"^25 % of the points.*--crop.*--unexplained 1") as no:
         check_explained(result, 0.2, points, lambda place: 1000 * place + 7, np.any)
     where = (np.array(no.value.place) - 7) / 1000
     assert where[0] == pytest.approx(0.1) and 0.38 < where[2] <= 0.5

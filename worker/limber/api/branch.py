@@ -249,7 +249,7 @@ class Branch:
 
         Args:
             quiet: Show no progress.
-            settings: ``samples``, ``field_error`` [%], ``deflection``, ``seed``, ``workers`` and
+            settings: ``samples``, ``field_error`` [%], ``deflection``, ``seed`` and
                 those that ``limber.settings("energy_field")`` lists.
 
         Raises:

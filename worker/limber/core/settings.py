@@ -88,6 +88,16 @@ def _numbers(value: Any) -> tuple[float, ...]:
     return () if value is None else value if isinstance(value, tuple) else (value,)
 
 
+def within(*limits: tuple[float, float]) -> AfterValidator:
+    """Return what validates each number of a vector (or None) by its least and greatest value."""
+    def check(values: Any) -> Any:
+        for value, (low, high) in zip(_numbers(values), limits, strict=False):
+            if not low <= value <= high:
+                raise ValueError(f"{value:g} is not between {low:g} and {high:g}")
+        return values
+    return AfterValidator(check)
+
+
 class OneOf:
     """Annotates a text that is one of a registry's names, which are looked up when needed."""
 

@@ -3,9 +3,9 @@
 The settings are checked when they are made:
 
 >>> from limber.estimation import EstimateSettings
->>> EstimateSettings(young=1e8).method
+>>> EstimateSettings().method
 'gauss-newton'
->>> EstimateSettings(young=-1.0)
+>>> EstimateSettings(delta_m2=-1.0)
 Traceback (most recent call last):
 ...
 pydantic_core._pydantic_core.ValidationError: ...

@@ -12,7 +12,7 @@ from limber.estimation.forward.forward_model import Forward, PointDirections, un
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
 from limber.estimation.parameters import ParameterSpace, Values, YoungField, open_field
-from limber.estimation.settings import EstimateSettings, FitSpec
+from limber.estimation.settings import FitSpec
 from limber.geometry.skeleton.skeleton import Skeleton, control_points
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import PointMass
@@ -66,7 +66,7 @@ class Subject:
 
 
 def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
-               gravity: tuple[float, float, float], settings: EstimateSettings) -> Subject:
+               gravity: tuple[float, float, float], settings: FitSpec) -> Subject:
     """Return the branch of a mesh, its axes and its point masses, with uniform initial moduli.
 
     Its rest shape is prestressed by gravity: the scanned shape holds for every Young's modulus.
@@ -79,7 +79,8 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     if len(wrong) and settings.young is None:
         raise InputError(f"Young's modulus is {mesh.cell_data['young'][wrong[0]]:g} Pa in "
                          f"tetrahedron {wrong[0]} of mesh.vtu.", "The initial modulus must be "
-                         "positive.", "Give ", Option("young"), ", or correct the mesh.")
+                         "positive.", "Correct the mesh, or make the branch again with ",
+                         Option("young"), ".")
     young = settings.young or float(np.exp(np.mean(np.log(mesh.cell_data["young"]))))
     poisson = _or_mean(settings.poisson, mesh.cell_data["poisson"])
     density = _or_mean(settings.density, mesh.cell_data["density"])
@@ -99,7 +100,7 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     return Subject(mesh, skeleton, points, weights, model, start, field)
 
 
-def observed(folder: Path, pull: Pull, subject: Subject, settings: EstimateSettings,
+def observed(folder: Path, pull: Pull, subject: Subject, settings: FitSpec,
              progress: Progress = SILENT) -> Pull:
     """Return a pull of images with the control points that are found in them."""
     from limber.perception.observe import observe
@@ -262,7 +263,7 @@ def _with_free_errors(entry: PullEntry, frames: Frames, settings: FitSpec,
     """Return the pull's calibration; of what is not calibrated at all, nothing is known."""
     known = calibration_of(entry)
     free: dict[str, float] = {}
-    if settings.free_frame:
+    if "frame" in settings.also:
         free |= {"camera_sigma_m": max(known.camera_sigma_m, FREE_FRAME_M),
                  "camera_sigma_rad": max(known.camera_sigma_rad, FREE_FRAME_RAD)}
     force = np.linalg.norm(frames.wrenches[:, :3], axis=1)

@@ -94,11 +94,12 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: FitSpec, *,
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run are reused.")
 
     def once(branch: Subject, chosen: FitSpec, log: EvaluationLog) -> Estimate:
-        if not chosen.free_frame:
+        if "frame" not in chosen.also:
             return in_frame(pulls, branch, chosen, log)
         found = _in_free_frame(pulls, lambda seen: in_frame(
             seen, branch, chosen, log if seen is pulls else EvaluationLog(None, "")))
-        as_stated = chosen.model_copy(update={"free_frame": False})
+        as_stated = chosen.model_copy(update={
+            "also": tuple(part for part in chosen.also if part != "frame")})
         try:
             other = in_frame(pulls, branch, as_stated, EvaluationLog(None, ""))
         except (WorkError, InputError):

@@ -352,9 +352,9 @@ def require_one_explanation(free: Estimate, as_stated: Estimate) -> None:
             "The pulls do not tell a shift of the frame from a shift of the points.",
             f"With a free frame they give {_listed(free.values.young)} MPa, with the frame as "
             f"stated and points off along the branch {_listed(young)} MPa. Both fit as well.",
-            "Register the camera (camera_sigma_m) and omit ", Option("free_frame"), ". Or mark the "
-            "points on the branch, give their positions (", Option("nominal"), " of import-pull), "
-            "and state that under [calibration] (point_sigma_m).")
+            "Register the camera (camera_sigma_m) and omit frame of ", Option("also"), ". Or mark "
+            "the points on the branch, give their positions (", Option("nominal"), " of "
+            "import-pull), and state that under [calibration] (point_sigma_m).")
 
 
 def _listed(young: np.ndarray) -> str:
@@ -388,7 +388,7 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
         hung=hung_error(found.fit.evaluation, found.objective, settings.hung_sigma),
         grip=grip_error(found.fit.evaluation, found.objective))
     _tell_largest_part(found.causes, progress)
-    if settings.free_frame:
+    if "frame" in settings.also:
         progress.warn(
             "The frame of the observed points was fitted freely. If it were known to 1 mm and 0.06 "
             f"degrees, the intervals would be {100 * found.prospects.cost_of_the_frame():.0f} % "

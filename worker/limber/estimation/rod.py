@@ -173,7 +173,7 @@ class Rod:
             else:
                 size = last + (size - last) * travel / moved
         raise WorkError(f"No sideways force moves the grasp by {travel:.3g} m.", "The rod is too "
-                        "short or too stiff at the grasp.", "Reduce ", Option("reach"), ".")
+                        "short or too stiff at the grasp.", "Reduce the reach.")
 
     def _rest(self) -> _State:
         """The state that no gripper holds."""
@@ -230,7 +230,7 @@ class Rod:
             max_nodes=MOST_NODES)
         if found.status or not np.isfinite(found.y).all():
             raise WorkError("The simulated rod finds no equilibrium.", "It is pulled too far, or "
-                            "cannot carry its own weight.", "Reduce ", Option("reach"), ", or "
+                            "cannot carry its own weight.", "Reduce the reach, or "
                             "give ", Option("model", "tetrahedra"), ".")
         return _State(found.x, found.y, found.p if force is None else force)
 

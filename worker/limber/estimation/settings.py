@@ -1,7 +1,7 @@
 """Settings of estimates, virtual pulls and predictions, without heavy imports."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -13,7 +13,9 @@ from limber.core.settings import (
     possible_density,
     possible_force,
     possible_young,
+    within,
 )
+from limber.geometry.settings import DENSITY_SIGMA
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,11 +29,9 @@ class EstimateSettings(Settings):
     """Options for estimating Young's modulus from pulls."""
 
     groups: ClassVar[Groups] = {
-        "input": ("pull", "drive", "motion", "fractions", "free_frame"),
-        "material": ("young", "poisson", "density", "gravity", "also", "pith_radius",
-                     "bark_thickness", "bark_modulus"),
+        "input": ("pull", "drive", "motion", "fractions"),
+        "material": ("also", "field", "pith_radius", "bark"),
         "solver": ("method", "delta_m2", "forward", "quick"),
-        "uncertainty": ("field", "poisson_sigma", "density_sigma", "hung_sigma"),
     }
     common = ("pull", "fractions")
 
@@ -58,43 +58,22 @@ class EstimateSettings(Settings):
         (), description="Positions of the control points as fractions of the main path. Default: "
         "0.2,0.4,0.6,0.8, or fewer or more (1 to 6 at equal distances) where the pulls clearly "
         "support them.")
-    free_frame: bool = Field(
-        False, description="Fit the frame of the observed points freely, to 10 cm and 17 degrees, "
-        "instead of within the pull's calibration. The result states what that costs.")
-    young: float | None = Field(
-        None, gt=0, description="Initial Young's modulus [Pa] where no measured force gives one.")
-    poisson: float | None = Field(
-        None, ge=0, lt=0.495, description="Poisson's ratio; constant unless --also poisson is "
-            "given.")
-    density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
-    gravity: bool = Field(
-        True, description="The branch carries its own weight, as when it was scanned.")
     field: Literal["open", "inverse_distance"] = Field(
         "open", description="Young's modulus between the control points. open: unknown, which "
         "widens the intervals. inverse_distance: interpolated exactly as in the paper.")
-    poisson_sigma: float = Field(
-        0.05, ge=0, description="Standard deviation of Poisson's ratio if it is not fitted.")
-    density_sigma: float = Field(
-        0.1, ge=0, description="Relative standard deviation of the density, if weight or inertia "
-            "acts.")
-    hung_sigma: float = Field(
-        0.4, ge=0, description="Relative standard deviation of the mass of twigs and leaves "
-        "outside the mesh. The default is the difference between two programs' volumes of one "
-        "crown.")
-    also: tuple[Literal["poisson", "density", "damping", "orders"], ...] = Field(
+    also: tuple[Literal["poisson", "density", "damping", "orders", "frame"], ...] = Field(
         (), description="What to estimate too. poisson: Poisson's ratio. density. damping: "
-        "Rayleigh damping (dynamic only). orders: the modulus of side branches over that of the "
-        "main path, one ratio for each branching order. Pull or observe side branches: otherwise "
-        "the pulls do not determine it.")
+        "Rayleigh damping (dynamic only). frame: that of the observed points, to 10 cm and 17 "
+        "degrees, instead of within the pull's calibration; the result states what that costs. "
+        "orders: the modulus of side branches over that of the main path, one ratio for each "
+        "branching order. Pull or observe side branches: otherwise the pulls do not determine "
+        "it.")
     pith_radius: float = Field(
         0.0, ge=0, description="Radius of a hollow or of pith that carries nothing [m]. The "
         "modulus is then that of the wood, and the mesh has an equivalent one for bending.")
-    bark_thickness: float = Field(0.0, ge=0, description="Thickness of the bark [m].")
-    bark_modulus: float = Field(
-        0.0, ge=0, description="Young's modulus of the bark over that of the wood.")
-
-    _young = field_validator("young")(possible_young)
-    _density = field_validator("density")(possible_density)
+    bark: Annotated[tuple[float, float] | None, within((0, 1), (0, 100))] = Field(
+        None, description="Thickness of the bark [m], and the ratio of its Young's modulus to that "
+        "of the wood.", json_schema_extra={"metavar": "THICKNESS RATIO"})
 
     @model_validator(mode="after")
     def _of_the_simplex(self) -> Self:
@@ -116,9 +95,10 @@ class EstimateSettings(Settings):
         """Layers of the cross-section, as :class:`limber.mechanics.materials.materials` takes
         them; empty for a solid one.
         """
-        layers = {"pith_radius": self.pith_radius, "bark_thickness": self.bark_thickness,
-                  "bark_modulus": self.bark_modulus}
-        return layers if self.pith_radius or self.bark_thickness else {}
+        thickness, modulus = self.bark or (0.0, 0.0)
+        layers = {"pith_radius": self.pith_radius, "bark_thickness": thickness,
+                  "bark_modulus": modulus}
+        return layers if self.pith_radius or thickness else {}
 
 
 class FitSpec(EstimateSettings):
@@ -137,6 +117,28 @@ class FitSpec(EstimateSettings):
         16, ge=0, description="Number of posterior samples of the branch's shape given the scan. "
         "The pulls are simulated on each one to include the uncertainty of the shape in the "
         "intervals. 0: only the uncertainty of the radii.")
+    young: float | None = Field(
+        None, gt=0, description="Initial Young's modulus [Pa] where no measured force gives "
+        "one. Default: the mesh's.")
+    poisson: float | None = Field(
+        None, ge=0, lt=0.495, description="Poisson's ratio, constant unless ``also`` has it. "
+        "Default: the mesh's.")
+    density: float | None = Field(
+        None, gt=0, description="Density [kg/m^3]. Default: the mesh's.")
+    gravity: bool = Field(
+        True, description="The branch carries its own weight, as when it was scanned.")
+    poisson_sigma: float = Field(
+        0.05, ge=0, description="Standard deviation of Poisson's ratio if it is not fitted.")
+    density_sigma: float = Field(
+        DENSITY_SIGMA, ge=0, description="Relative standard deviation of the density, if weight or "
+        "inertia acts.")
+    hung_sigma: float = Field(
+        0.4, ge=0, description="Relative standard deviation of the mass of twigs and leaves "
+        "outside the mesh. The default is the difference between two programs' volumes of one "
+        "crown.")
+
+    _young = field_validator("young")(possible_young)
+    _density = field_validator("density")(possible_density)
 
     @classmethod
     def of(cls, settings: Settings, **more: Any) -> Self:
@@ -149,24 +151,19 @@ class SwingSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("pull",),
-        "uncertainty": ("density_sigma",),
     }
     common = ("pull",)
 
     pull: str | None = Field(None, description="Name of the swing. Default: the only one.")
-    density_sigma: float = Field(
-        0.1, ge=0, description="Relative standard deviation of the density. A swing determines "
-        "the modulus through inertia, so this uncertainty enters the modulus in full.")
 
 
 class VirtualPullSettings(Settings):
     """A simulated pull."""
 
     groups: ClassVar[Groups] = {
-        "material": ("young", "poisson", "density", "gravity", "own_weight", "shape"),
-        "motion": ("model", "motion", "drive", "weight", "frames", "duration", "grasp_fraction",
-                   "mode", "reach", "phase"),
-        "noise": ("position_noise", "force_noise", "camera", "seed"),
+        "material": ("young",),
+        "motion": ("model", "motion", "drive", "frames"),
+        "noise": ("camera", "seed"),
         "errors of the cell": ("cell_errors",),
     }
     common = ("cell_errors", "seed")
@@ -174,8 +171,6 @@ class VirtualPullSettings(Settings):
     young: tuple[float, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]. Default: that of a "
         "generated branch, or a gradient from 160 to 40 MPa.")
-    poisson: float = Field(0.35, ge=0, lt=0.5, description="True Poisson's ratio.")
-    density: float = Field(900.0, gt=0, description="True density [kg/m^3].")
     model: Literal["tetrahedra", "rod"] = Field(
         "tetrahedra", description="tetrahedra: a finer mesh than the fit's. rod: a Cosserat rod of "
         "the true axes and radii, which shares no code with the fit's simulation. Only for slow "
@@ -186,40 +181,9 @@ class VirtualPullSettings(Settings):
     drive: Literal["pose", "force"] = Field(
         "pose", description="Quantity that drives the branch according to the recording: the "
             "gripper's pose, or its force as in the paper.")
-    weight: float | None = Field(
-        None, gt=0, description="Instead of pulling sideways, hang a weight on the grasp that "
-        "grows to this value [N]. The pull is slow and force-driven.")
     frames: int | None = Field(
         None, ge=2, description="Number of recorded frames. Default: 24, or 60 for a dynamic "
         "pull.")
-    duration: float | None = Field(
-        None, gt=0, description="Duration of the recording [s]. Default: 6, or 1.5 for a dynamic "
-        "pull.")
-    grasp_fraction: float = Field(
-        0.92, gt=0, le=1, description="Position of the grasp as a fraction of the main path. It "
-        "must be beyond the last control point: the branch does not bend beyond the grasp, so its "
-        "modulus there cannot be estimated.")
-    mode: GraspMode = Field(
-        "point", description="point: a loop holds the branch and lets it turn. rigid: "
-        "the gripper turns the branch less than it would turn freely, so that a torque "
-        "acts.")
-    reach: float = Field(
-        0.35, gt=0, le=0.8, description="Sideways travel of the grasp as a fraction of its arc "
-            "length.")
-    phase: float | None = Field(
-        None, description="Initial direction of the pull [rad]. Default: drawn from the seed.")
-    position_noise: float = Field(1e-3, ge=0, description="Noise of the observed points [m].")
-    force_noise: float = Field(
-        0.02, ge=0, description="Noise of the force as a fraction of its largest value.")
-    gravity: bool = Field(
-        True, description="The branch carries its own weight, as when it was scanned.")
-    own_weight: bool = Field(
-        False, description="The shape is unloaded, as drawn. Gravity then bends the branch, as "
-        "for `limber import-pull --own-weight`.")
-    shape: Literal["likely", "fitted"] = Field(
-        "likely", description="Branch that is pulled if only a scan is known. likely: a posterior "
-        "sample of the shape given the scan, drawn from the seed. fitted: the reconstructed "
-        "shape.")
     camera: bool = Field(
         False, description="Record depth images of a simulated D455 instead of points.")
     cell_errors: str = Field(
@@ -248,22 +212,45 @@ class VirtualPullSettings(Settings):
     def frame_count(self) -> int:
         return self.frames or (60 if self.motion == "dynamic" else 24)
 
-    @property
-    def times(self) -> "np.ndarray":
-        """Time stamps [s], shape [frame_count]."""
-        import numpy as np
-
-        duration = self.duration or (1.5 if self.motion == "dynamic" else 6.0)
-        return np.linspace(0.0, duration, self.frame_count)
-
     _young = field_validator("young")(possible_young)
-    _density = field_validator("density")(possible_density)
-    _force = field_validator("weight")(possible_force)
 
 
 class PullSpec(VirtualPullSettings):
     """A simulated pull, with what only Python sets."""
 
+    poisson: float = Field(0.35, ge=0, lt=0.5, description="True Poisson's ratio.")
+    density: float = Field(900.0, gt=0, description="True density [kg/m^3].")
+    duration: float | None = Field(
+        None, gt=0, description="Duration of the recording [s]. Default: 6, or 1.5 for a dynamic "
+        "pull.")
+    grasp_fraction: float = Field(
+        0.92, gt=0, le=1, description="Position of the grasp as a fraction of the main path. It "
+        "must be beyond the last control point: the branch does not bend beyond the grasp, so its "
+        "modulus there cannot be estimated.")
+    mode: GraspMode = Field(
+        "point", description="point: a loop holds the branch and lets it turn. rigid: "
+        "the gripper turns the branch less than it would turn freely, so that a torque "
+        "acts.")
+    reach: float = Field(
+        0.35, gt=0, le=0.8, description="Sideways travel of the grasp as a fraction of its arc "
+            "length.")
+    phase: float | None = Field(
+        None, description="Initial direction of the pull [rad]. Default: drawn from the seed.")
+    position_noise: float = Field(1e-3, ge=0, description="Noise of the observed points [m].")
+    force_noise: float = Field(
+        0.02, ge=0, description="Noise of the force as a fraction of its largest value.")
+    gravity: bool = Field(
+        True, description="The branch carries its own weight, as when it was scanned.")
+    own_weight: bool = Field(
+        False, description="The shape is unloaded, as drawn. Gravity then bends the branch, as "
+        "for `limber import-pull --own-weight`.")
+    shape: Literal["likely", "fitted"] = Field(
+        "likely", description="Branch that is pulled if only a scan is known. likely: a posterior "
+        "sample of the shape given the scan, drawn from the seed. fitted: the reconstructed "
+        "shape.")
+    weight: float | None = Field(
+        None, gt=0, description="Instead of pulling sideways, hang a weight on the grasp that "
+        "grows to this value [N]. The pull is slow and force-driven.")
     damping: tuple[float, float] = Field(
         (0.5, 0.002), description="True Rayleigh damping of a dynamic pull [1/s, s].")
     torque_noise: float = Field(
@@ -289,6 +276,17 @@ class PullSpec(VirtualPullSettings):
         "point [m].")
     clock_sigma: float | None = Field(
         None, ge=0, description="Offset of the observer's clock from the robot's [s].")
+
+    _density = field_validator("density")(possible_density)
+    _force = field_validator("weight")(possible_force)
+
+    @property
+    def times(self) -> "np.ndarray":
+        """Time stamps [s], shape [frame_count]."""
+        import numpy as np
+
+        duration = self.duration or (1.5 if self.motion == "dynamic" else 6.0)
+        return np.linspace(0.0, duration, self.frame_count)
 
     @property
     def calibration(self) -> "CalibrationEntry":

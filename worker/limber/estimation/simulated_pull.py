@@ -197,7 +197,7 @@ def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random
             return shape, moved
     raise WorkError(f"None of {SHAPE_TRIES} posterior samples of the shape can be pulled.",
                     "The scan is so uncertain that their tetrahedra are inverted.",
-                    "Scan with less noise, or give ", Option("shape", "fitted"), ".")
+                    "Scan with less noise.")
 
 
 def simulate_pull(truth: TrueBranch, name: str, settings: PullSpec, *,

@@ -1,10 +1,9 @@
 """Settings of reconstruction from scans and surfaces; this module imports nothing heavy."""
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
-from limber.core.errors import Option, Text
 from limber.core.settings import (
     Direction,
     Groups,
@@ -17,20 +16,20 @@ from limber.geometry.radius_estimators import estimator_names
 
 GRASP_FRACTION = 2.0 / 3.0
 """Position along the main path at which a branch is held by default."""
+DENSITY_SIGMA = 0.1
+"""Relative standard deviation of the density of wood that nobody weighed."""
 
 
 class PreparationSettings(Settings):
     """Settings of the cloud's cleaning."""
 
     groups: ClassVar[Groups] = {
-        "input": ("crop_low", "crop_high", "camera_at"),
+        "input": ("crop", "camera_at"),
         "shape": ("keep",),
     }
 
-    crop_low: tuple[float, float, float] | None = Field(
-        None, description="Lower corner of the box to keep, in the file's coordinates.")
-    crop_high: tuple[float, float, float] | None = Field(
-        None, description="Upper corner of the box to keep.")
+    crop: tuple[float, float, float, float, float, float] | None = Field(
+        None, description="Box to keep: lower corner, upper corner, in the file's coordinates.")
     camera_at: tuple[float, float, float] | None = Field(
         None, description="Position of the depth camera, in the file's coordinates. Default: the "
         "origin, if the cloud is an image seen from there.")
@@ -46,7 +45,7 @@ class SkeletonSettings(Settings):
     groups: ClassVar[Groups] = {
         "shape": ("plants",),
         "the paper's equations": ("contraction_weight", "gap_factor", "radii",
-                                  "radius_neighbours", "radius_low", "radius_high"),
+                                  "radius_neighbours", "radius_range"),
     }
 
     plants: Literal["refuse", "largest", "joined"] = Field(
@@ -64,23 +63,23 @@ class SkeletonSettings(Settings):
     radius_neighbours: int = Field(
         24, ge=1, le=10_000, description="Number of nearest points for --radii paper: the paper's "
         "k.")
-    radius_low: float = Field(
-        5e-4, gt=0, lt=1, description="Smallest radius, as a fraction of the cloud's diagonal D: "
-        "the paper's alpha.")
-    radius_high: float = Field(
-        0.1, gt=0, le=1, description="Largest radius, as a fraction of the cloud's diagonal D: "
-        "the paper's beta.")
+    radius_range: tuple[float, float] = Field(
+        (5e-4, 0.1), description="Smallest and largest radius, as fractions of the cloud's "
+        "diagonal D: the paper's alpha and beta.", json_schema_extra={"metavar": "LOW HIGH"})
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.radius_low >= self.radius_high:
-            raise ValueError(Text(Option("radius_low"), f" {self.radius_low:g} is not below ",
-                                  Option("radius_high"), f" {self.radius_high:g}"))
-        return self
+    @field_validator("radius_range")
+    @classmethod
+    def _ordered(cls, limits: tuple[float, float]) -> tuple[float, float]:
+        low, high = limits
+        if not 0 < low < high <= 1:
+            raise ValueError("the smallest radius must be above 0 and below the largest, which is "
+                             "at most 1")
+        return limits
 
     def radius_limits(self, diagonal: float) -> tuple[float, float]:
         """Return the smallest and the largest radius [m] in a cloud of this diagonal [m]."""
-        return self.radius_low * diagonal, self.radius_high * diagonal
+        low, high = self.radius_range
+        return low * diagonal, high * diagonal
 
 
 class MeshSettings(Settings):
@@ -103,7 +102,7 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
         "shape": ("twig_radius", "leaves", "unexplained", "leave_out"),
-        "material": ("young", "poisson", "density"),
+        "material": ("young", "poisson", "density", "density_sigma"),
         "mesh": ("grasp_fraction",),
     }
     common = ("unit", "up", "root", "leaves")
@@ -136,6 +135,9 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
     density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
+    density_sigma: float = Field(
+        DENSITY_SIGMA, ge=0, le=1, description="Relative standard deviation of the density: 0.02 "
+        "where a piece of the branch was weighed.")
     grasp_fraction: float = Field(
         GRASP_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the main "
             "path.")
@@ -150,7 +152,7 @@ class MeshSurfaceSettings(Settings):
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
         "mesh": ("grasp_fraction",),
-        "material": ("young", "poisson", "density"),
+        "material": ("young", "poisson", "density", "density_sigma"),
     }
     common = ("unit",)
 
@@ -164,6 +166,8 @@ class MeshSurfaceSettings(Settings):
     young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
     density: float = Field(900.0, gt=0, description="Density [kg/m^3].")
+    density_sigma: float = Field(
+        DENSITY_SIGMA, ge=0, le=1, description="Relative standard deviation of the density.")
     grasp_fraction: float = Field(
         GRASP_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the axis.")
 
@@ -176,7 +180,7 @@ class GeneratedSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "shape": ("length", "radius_root", "fork_count"),
-        "scan": ("noise", "point_spacing", "occlusion", "view", "gap_count"),
+        "scan": ("noise", "point_spacing", "view"),
     }
 
     length: float = Field(0.9, gt=0.05, description="Length of the main axis [m].")
@@ -184,16 +188,16 @@ class GeneratedSettings(Settings):
     fork_count: int = Field(3, ge=0, le=12, description="Number of side twigs.")
     noise: float = Field(0.001, ge=0, description="Standard deviation of the points [m].")
     point_spacing: float = Field(0.002, gt=0, description="Mean distance of the points [m].")
-    occlusion: float = Field(0.1, ge=0, lt=0.6, description="Fraction of the surface that is "
-        "missing.")
     view: Literal["round", "one-sided"] = Field(
         "round", description="Scanned from all around, or from one side as a depth camera does.")
-    gap_count: int = Field(0, ge=0, le=5, description="Number of stretches of 2 cm without points.")
 
 
 class BranchSpec(GeneratedSettings):
     """A generated branch, with what only Python sets."""
 
+    occlusion: float = Field(0.1, ge=0, lt=0.6, description="Fraction of the surface that is "
+        "missing.")
+    gap_count: int = Field(0, ge=0, le=5, description="Number of stretches of 2 cm without points.")
     radius_tip: float = Field(0.004, gt=0, description="Radius at the tip [m].")
     bend: float = Field(0.6, ge=0, description="Turn of the main axis from root to tip [rad].")
     unevenness: float = Field(0.4, ge=0, lt=1, description="Variation of the point density, 0 to "

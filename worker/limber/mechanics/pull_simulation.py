@@ -210,9 +210,9 @@ def motion_of(case: LoadCase, settings: SimulateSettings,
     if settings.kind == "static":
         return static_motion(case, progress)
     scheme: MotionSettings = EnergyMomentumSettings(max_step=settings.step)
-    if settings.scheme == "newmark":
-        scheme = NewmarkSettings(max_step=settings.step, beta=settings.newmark_beta,
-                                 gamma=settings.newmark_gamma)
+    if settings.newmark is not None:
+        beta, gamma = settings.newmark
+        scheme = NewmarkSettings(max_step=settings.step, beta=beta, gamma=gamma)
     return dynamic_motion(case, scheme, progress)
 
 

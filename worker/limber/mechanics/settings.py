@@ -1,11 +1,20 @@
 """Settings of a simulated pull, without heavy imports."""
 
+import math
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
 from limber.core.constants import STANDARD_GRAVITY
-from limber.core.settings import GraspMode, Groups, OneOf, Settings, possible_force, possible_young
+from limber.core.settings import (
+    GraspMode,
+    Groups,
+    OneOf,
+    Settings,
+    possible_force,
+    possible_young,
+    within,
+)
 from limber.mechanics.materials.laws import material_names
 
 GRASP_RADIUS_M = 0.01
@@ -25,9 +34,8 @@ class SimulateSettings(Settings):
         "motion": ("kind", "move", "turn", "grasp_force", "duration", "hold"),
         "grasp and loads": ("grasp_point", "grasp_mode", "hold_at", "load_at",
                             "mass_at"),
-        "material": ("young", "material", "gravity", "rest_shape", "damping_mass",
-                     "damping_stiffness"),
-        "solver": ("step", "scheme", "newmark_beta", "newmark_gamma"),
+        "material": ("young", "material", "gravity", "damping"),
+        "solver": ("step", "newmark"),
     }
     common = ("name", "move", "grasp_force", "young")
 
@@ -60,26 +68,20 @@ class SimulateSettings(Settings):
     hold: float = Field(0.5, ge=0, description="Duration of the hold at the end of the pull [s] "
         "(dynamic).")
     step: float = Field(1 / 60, gt=0, description="Longest time step [s] (dynamic).")
-    scheme: Literal["energy_momentum", "newmark"] = Field(
-        "energy_momentum", description="Time integration (dynamic). energy_momentum: conserves "
-        "the energy at any amplitude. newmark: the paper's.")
-    newmark_beta: float = Field(
-        0.25, gt=0, le=0.5, description="Beta of --scheme newmark.")
-    newmark_gamma: float = Field(
-        0.5, ge=0.5, le=1, description="Gamma of --scheme newmark; above 1/2 it damps high "
-        "frequencies.")
+    newmark: Annotated[tuple[float, float] | None, within((1e-3, 0.5), (0.5, 1))] = Field(
+        None, description="Integrate over time by the paper's implicit Newmark scheme with these "
+        "beta (the paper's: 0.25) and gamma (0.5; above it damps high frequencies). Default: an "
+        "energy-momentum scheme, which conserves the energy at any amplitude.",
+        json_schema_extra={"metavar": "BETA GAMMA"})
     young: float | None = Field(
         None, gt=0, description="Young's modulus of the whole branch [Pa]. Default: the mesh's.")
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
-    rest_shape: bool = Field(
-        True, description="The scanned shape already sags under gravity. Otherwise gravity bends "
-            "it further.")
     material: Annotated[str, OneOf(material_names)] = Field(
         "st_venant_kirchhoff", description="Material law.")
-    damping_mass: float = Field(0.5, ge=0, description="Mass-proportional Rayleigh damping [1/s].")
-    damping_stiffness: float = Field(0.002, ge=0, description="Stiffness-proportional Rayleigh "
-        "damping [s].")
+    damping: Annotated[tuple[float, float], within((0, math.inf), (0, math.inf))] = Field(
+        (0.5, 0.002), description="Rayleigh damping: mass-proportional [1/s] and "
+        "stiffness-proportional [s].", json_schema_extra={"metavar": "MASS STIFFNESS"})
     vtu: bool = Field(False, description="Also write a VTU series for ParaView.")
 
     _force = field_validator("grasp_force")(possible_force)
@@ -90,6 +92,13 @@ class SimulateSettings(Settings):
     def _possible_loads(cls, values: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...],
                                                                              ...]:
         for placed in values:
-            force = placed[3:] if len(placed) > 4 else (placed[3] * STANDARD_GRAVITY,)
-            possible_force(force)
+            possible_force(placed[3:] if len(placed) > 4 else (placed[3] * STANDARD_GRAVITY,))
         return values
+
+
+class SimulateSpec(SimulateSettings):
+    """A simulation, with what only Python sets."""
+
+    rest_shape: bool = Field(
+        True, description="The scanned shape already sags under gravity. Otherwise gravity bends "
+        "it further.")

@@ -17,10 +17,12 @@ from limber.core.optional import exports
 _PLACES = {
     "EnergyField": "field.energy_field",
     "EnergySettings": "settings",
+    "EnergySpec": "settings",
     "GraspGoal": "goals.goal_kinds",
     "GraspModel": "field.grasp_model",
     "GraspSamples": "field.energy_field",
     "PlanSettings": "settings",
+    "PlanSpec": "settings",
     "PlannedMotion": "make_plan",
     "TargetGoal": "goals.goal_kinds",
     "fit_field": "field.energy_field",

@@ -190,8 +190,8 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         goals, nobody = np.empty((0, 3)), error
     # Scales by the goal's centre, not by a random point in it: costs of two seeds compare.
     weighed = CostWeights.between(field, start, goal.centre(field),
-                                  deformation=settings.deformation_weight,
-                                  distance=settings.distance_weight)
+                                  deformation=settings.weights[0],
+                                  distance=settings.weights[1])
     problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond,
                             errors=errors or {}, asked_goal=asked_goal)
     trees = _trees(problem, goals, settings, weighed, {} if before is None else before.trees,
@@ -241,9 +241,9 @@ def _chosen(problem: GentleProblem, gentle: GentlePath, trees: dict[str, FoundPa
             {"iteration": number + 1, "cost": level["upper"]}
             for number, level in enumerate(certificate.levels)], engine="eikonal"), certificate
     if "D-RRT*" not in trees:
-        raise NoPathError(f"D-RRT* found no path in {settings.iterations} iterations, but a path "
-                          "exists.", "The eikonal planner found it.", "Allow more ",
-                          Option("iterations"), ", or omit ", Option("planner"), ".")
+        raise NoPathError(f"D-RRT* found no path in {settings.effort.iterations} iterations, but a "
+                          "path exists.", "The eikonal planner found it.", "Omit ",
+                          Option("planner"), ".")
     plan = trees["D-RRT*"]
     return plan, replace(certificate, upper=problem.cost(plan.points))
 
@@ -252,8 +252,8 @@ def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSe
              limits: FieldArrays, beyond: FieldArrays | None) -> PathPair:
     """Return the plan if the start is in the goal: both paths stay there."""
     weighed = CostWeights.between(field, start, goal.centre(field),
-                                  deformation=settings.deformation_weight,
-                                  distance=settings.distance_weight)
+                                  deformation=settings.weights[0],
+                                  distance=settings.weights[1])
     problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond)
     path = FoundPath(np.stack([start, start]), 0.0, 0.0, engine=NOTHING_ASKED)
     return PathPair(path, path, _approach(problem, settings), weighed, Certificate(0.0, 0.0),
@@ -293,8 +293,8 @@ def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,
            weighed: CostWeights, before: dict[str, FoundPath], progress: Progress,
            ) -> dict[str, FoundPath]:
     """Return the results of RRT* and D-RRT*, new or from before: either, both or none."""
-    engine = chosen_engine(settings.engine)
-    search = Search(iterations=settings.iterations, seed=settings.seed)
+    engine = chosen_engine(settings.effort.engine)
+    search = Search(iterations=settings.effort.iterations, seed=settings.seed)
     shortest = replace(weighed, deformation=0.0, distance=1.0)
     found = {}
     for number, (name, cost) in enumerate([("RRT*", shortest), ("D-RRT*", weighed)]):
@@ -336,8 +336,8 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
     field, start = problem.energy_field, problem.start
     if np.linalg.norm(start - field.rest) < STEP:
         return field.rest[None]
-    cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight,
-                               deformation=settings.deformation_weight)
+    cost = CostWeights.between(field, field.rest, start, distance=settings.weights[1],
+                               deformation=settings.weights[0])
     goal = near(start, _AT_START)
     path = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), goal,
                          beyond=problem.beyond, errors=problem.errors)

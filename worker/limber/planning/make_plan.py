@@ -327,7 +327,7 @@ class _Rounds:
             self.risks.append(risk)
             broken = risk.exceeded_limits()
             self._tighten(risk.excess)
-        if self.settings.inertia and not broken and is_near and self.limits.asked():
+        if self.settings.effort.inertia and not broken and is_near and self.limits.asked():
             limits = self.risks[-1].left(self.limits, plan) if self.risks else self.limits
             self.moving = check_motion(
                 self.grasp_model, plan, limits, self.pace, slowings=_SLOWINGS,

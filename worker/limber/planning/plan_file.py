@@ -368,7 +368,7 @@ def summary_of(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair
     return {
         "goal": goal.describe() | {"chosen": not asked_kinds(settings)},
         "start_m": start, "seed": settings.seed, "planner": settings.planner,
-        "engine": chosen_engine(settings.engine),
+        "engine": chosen_engine(settings.effort.engine),
         "certificate": pair.certificate.describe() | {"full_model": _on_full_model(
             field, goal, pair, after)},
         "paths_on_field": {name: asdict(_on_field(field, points)) | {

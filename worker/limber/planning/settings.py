@@ -1,10 +1,11 @@
 """Settings of the energy field and of paths; they import nothing heavy."""
 
-from typing import ClassVar, Literal
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import BOX, POSITION, Groups, Settings
+from limber.core.settings import BOX, POSITION, Groups, Settings, within
 
 
 class EnergySettings(Settings):
@@ -12,7 +13,6 @@ class EnergySettings(Settings):
 
     groups: ClassVar[Groups] = {
         "samples": ("samples", "field_error", "deflection", "seed"),
-        "material": ("gravity",),
         "solver": ("forward",),
     }
     samples: int = Field(225, ge=30, description=(
@@ -24,8 +24,6 @@ class EnergySettings(Settings):
     deflection: float = Field(0.4, gt=0, le=1.0, description=(
         "Largest distance from the rest position, as a fraction of the branch's length up to the "
         "grasp."))
-    gravity: bool = Field(True, description=(
-        "The branch carries its own weight, as when it was scanned. Otherwise it has no weight."))
     seed: int = Field(0, ge=0, description="Seed of the sampled positions.")
     forward: Literal["full", "reduced"] = Field("full", description=(
         "full: solve every pose on the full model. reduced: use the reduced model of `limber "
@@ -33,18 +31,41 @@ class EnergySettings(Settings):
         "each state once and solves uncertain ones."))
 
 
+class EnergySpec(EnergySettings):
+    """Sampling, with what only Python sets."""
+
+    gravity: bool = Field(True, description=(
+        "The branch carries its own weight, as when it was scanned. Otherwise it has no weight."))
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How thoroughly a plan is searched and checked.
+
+    Attributes:
+        iterations: Number of samples of RRT* and D-RRT*.
+        engine: Implementation of both: OMPL's or our own. auto: OMPL if it is installed.
+        inertia: Also check the limits in motion, with the branch's inertia, and slow the motion
+            down until they hold. Otherwise they are checked at every pose at rest.
+    """
+
+    iterations: int = 3000
+    engine: Literal["auto", "ompl", "own"] = "auto"
+    inertia: bool = True
+
+
 class PlanSettings(Settings):
     """Start, goal, cost and limits of a plan."""
 
     groups: ClassVar[Groups] = {
-        "start and goal": ("goal", "tip_goal", "target", "target_box", "in_view", "second_arm",
+        "start and goal": ("goal", "tip_goal", "target", "target_box", "goal_in",
                            "goal_seed", "goal_tolerance", "start", "start_seed"),
-        "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
+        "weights and limits": ("weights", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "wood", "max_damage", "max_stress", "workspace",
                                "clearance", "turn_slack", "confidence"),
-        "timing": ("speed", "hold", "inertia"),
-        "solver": ("planner", "iterations", "engine", "seed"),
+        "timing": ("speed", "hold"),
+        "solver": ("planner", "seed"),
     }
     common: ClassVar[tuple[str, ...]] = ("goal", "tip_goal", "target", "max_force", "max_strain")
 
@@ -56,16 +77,15 @@ class PlanSettings(Settings):
         "Goal position of the branch's tip, or of --target, in the branch's frame [m]."),
                                                         json_schema_extra=POSITION)
     target: str | None = Field(None, description=(
-        "Named target (`limber target`) for --tip-goal, --target-box, --in-view and "
-        "--second-arm. Default: the tip."))
+        "Named target (`limber target`) for --tip-goal, --target-box and --goal-in. Default: the "
+        "tip."))
     target_box: tuple[float, float, float, float, float, float] | None = Field(None, description=(
         "Box that the target must reach: lower corner, upper corner, in the branch's frame [m]."),
         json_schema_extra=BOX)
-    in_view: bool = Field(False, description=(
-        "The target must be visible to the cell's camera: inside its image, within its range, and "
-        "not hidden by the branch, nor by what a connected RealSense camera sees now."))
-    second_arm: bool = Field(False, description=(
-        "The target must be within reach of the cell's second arm."))
+    goal_in: Literal["view", "second_arm"] | None = Field(None, description=(
+        "Region of the cell that the target must reach. view: visible to the camera, which is "
+        "inside its image, within its range, and not hidden by the branch, nor by what a "
+        "connected RealSense camera sees now. second_arm: within reach of the second arm."))
     goal_seed: int | None = Field(None, ge=0, description=(
         "Seed of a random goal in the paper's hemisphere: above the base, within the branch's "
         "length, among sampled poses that are allowed and far from rest."))
@@ -75,11 +95,10 @@ class PlanSettings(Settings):
                                                      json_schema_extra=POSITION)
     start_seed: int | None = Field(None, ge=0, description=(
         "Seed of a random deformed start configuration, as in the paper's trials."))
-    deformation_weight: float = Field(1.0, gt=0, description=(
-        "Weight of deformation, the paper's alpha_def; the path depends on its ratio to the weight "
-        "of distance."))
-    distance_weight: float = Field(1.5, gt=0, description=(
-        "Weight of distance, the paper's alpha_dis."))
+    weights: Annotated[tuple[float, float], within((1e-9, 1e9), (1e-9, 1e9))] = Field(
+        (1.0, 1.5), description="Weights of deformation and of distance, the paper's alpha_def and "
+        "alpha_dis; the path depends on their ratio.",
+        json_schema_extra={"metavar": "DEFORMATION DISTANCE"})
     max_detour: float | None = Field(None, ge=0, le=1000, description=(
         "Largest extra length over the shortest path [%]. The weight of distance is set so that "
         "the gentlest such path is found."))
@@ -122,14 +141,23 @@ class PlanSettings(Settings):
     speed: float = Field(0.02, gt=0, le=0.25, description="Largest speed of the gripper [m/s].")
     hold: float = Field(2.0, ge=0, le=3600, description=(
         "Time to hold the branch at the path's end [s]."))
-    inertia: bool = Field(True, description=(
-        "Also check the limits in motion, with the branch's inertia, and slow the motion down "
-        "until they hold. Otherwise they are checked at every pose at rest."))
     planner: Literal["eikonal", "d-rrt-star"] = Field("eikonal", description=(
         "eikonal: the least-cost path on a grid, refined; mostly within 1 % of the best possible "
         "path. d-rrt-star: the paper's D-RRT*. Both state a proven lower bound."))
-    iterations: int = Field(3000, ge=100, le=200_000, description="Number of samples of RRT* and "
-        "D-RRT*.")
-    engine: Literal["auto", "ompl", "own"] = Field("auto", description=(
-        "Implementation of RRT* and D-RRT*: OMPL's or our own. auto: OMPL if it is installed."))
     seed: int = Field(0, ge=0, description="Seed of both planners.")
+
+    @property
+    def effort(self) -> Effort:
+        return Effort()
+
+
+class PlanSpec(PlanSettings):
+    """A plan, with what only Python sets: the fields of :class:`Effort`."""
+
+    iterations: int = Field(Effort.iterations, ge=100, le=200_000)
+    engine: Literal["auto", "ompl", "own"] = Effort.engine
+    inertia: bool = Effort.inertia
+
+    @property
+    def effort(self) -> Effort:
+        return Effort(self.iterations, self.engine, self.inertia)

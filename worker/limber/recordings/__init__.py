@@ -13,6 +13,7 @@ from limber.core.optional import exports
 _PLACES = {
     "GraspEntry": "recording",
     "ImportSettings": "settings",
+    "ImportSpec": "settings",
     "Observations": "recording",
     "Pull": "recording",
     "PullEntry": "recording",

@@ -26,7 +26,7 @@ from limber.recordings.recording import (
     entry_with,
 )
 from limber.recordings.registration import read_nominal, register
-from limber.recordings.settings import ImportSettings
+from limber.recordings.settings import ImportSpec
 from limber.recordings.time_series import Stream
 
 JointPoses = Callable[[tuple[str, ...], np.ndarray], np.ndarray]
@@ -157,7 +157,7 @@ class ImportRequest:
     source: Path
     folder: Path = Path()
     name: str = ""
-    settings: ImportSettings = field(default_factory=ImportSettings)
+    settings: ImportSpec = field(default_factory=ImportSpec)
     branch: BranchFrame = field(default_factory=BranchFrame)
     robot: RobotKnown | None = None
     progress: Progress = SILENT
@@ -165,7 +165,7 @@ class ImportRequest:
     @property
     def stated(self) -> set[str]:
         """Names of the settings that differ from their defaults."""
-        return {name for name, field in ImportSettings.model_fields.items()
+        return {name for name, field in ImportSpec.model_fields.items()
                 if getattr(self.settings, name) != field.default}
 
     def in_branch(self, points: np.ndarray) -> np.ndarray:

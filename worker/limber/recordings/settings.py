@@ -22,13 +22,13 @@ class ImportSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("kind", "robot", "unit", "force_unit", "rate_hz", "nominal", "marker_frame",
-                  "coordinates", "time_offset", "recorded", "yolo_weights", "yolo_prompt"),
+                  "coordinates", "time_offset", "yolo_weights", "yolo_prompt"),
         "bags and robot logs": ("cell", "frame_pose", "wrench_topic", "pose_topic",
                                 "points_topic", "bag_clock"),
         "grasp and loads": ("grasp_point", "grasp_distance", "grasp_radius", "grasp_mode",
                             "direction", "weight", "load", "own_weight"),
-        "simulation": ("drive", "motion", "swing_start"),
-        "noise": ("position_sigma", "force_sigma", "torque_sigma", "pull_toml"),
+        "simulation": ("motion", "swing_start"),
+        "noise": ("force_sigma", "torque_sigma", "pull_toml"),
     }
     common = ("unit", "grasp_point", "cell")
 
@@ -79,23 +79,16 @@ class ImportSettings(Settings):
     own_weight: bool = Field(
         False, description="The scanned shape does not include the sag under the branch's own "
         "weight (it was held up, or scanned lying), so the weight acts as well.")
-    drive: Literal["pose", "force"] = Field(
-        "pose", description="Quantity that drives the simulation. The other one is compared with "
-        "the recording.")
     motion: Literal["quasi_static", "dynamic", "swing"] = Field(
-        "quasi_static", description="dynamic: inertia matters. swing: released without a robot "
-        "(with --weight or --load), for `limber swing`.")
+        "quasi_static", description="dynamic: inertia matters. swing: released without a robot. "
+        "Markers with --weight or --load become a pull for `limber swing`; other records "
+        "(accelerometer, strain gauge, video track, markers of a plucked branch) are evaluated "
+        "by `limber vibration`.")
     swing_start: Literal["held", "loaded"] = Field(
         "held", description="Start of a swing. held: in the rest shape, until weight and load "
         "act. loaded: bent by the load until it is removed.")
     time_offset: float | None = Field(
         None, description="Added to SOURCE's time stamps [s]. Default: estimated.")
-    recorded: str | None = Field(
-        None, description="When it was recorded: 2026-05-01 or 2026-05-01T14:00. With pulls of "
-        "several days, the estimate states the change of the modulus per day.")
-    position_sigma: float | None = Field(
-        None, gt=0, description="Noise of positions [m]. Default: 1 mm; under a steady load, the "
-        "noise measured in the recording.")
     force_sigma: float = Field(0.1, gt=0, description="Noise of forces [N].")
     torque_sigma: float | None = Field(
         None, gt=0, description="Noise of torques about the pose's position [N m]. A clamped "
@@ -123,4 +116,19 @@ class ImportSettings(Settings):
         "of a class of another.")
 
     _force = field_validator("weight", "load")(possible_force)
+
+
+class ImportSpec(ImportSettings):
+    """An import, with what only Python sets; a user states it in ``pull_toml``."""
+
+    drive: Literal["pose", "force"] = Field(
+        "pose", description="Quantity that drives the simulation. The other one is compared with "
+        "the recording.")
+    recorded: str | None = Field(
+        None, description="When it was recorded: 2026-05-01 or 2026-05-01T14:00. With pulls of "
+        "several days, the estimate states the change of the modulus per day.")
+    position_sigma: float | None = Field(
+        None, gt=0, description="Noise of positions [m]. Default: 1 mm; under a steady load, the "
+        "noise measured in the recording.")
+
     _recorded = field_validator("recorded")(possible_time)

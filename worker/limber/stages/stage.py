@@ -207,17 +207,16 @@ class PlacedStage(BranchStage):
 class KeptStage(Stage):
     """A stage whose result is kept, and made again only if something has changed."""
 
+    def is_kept(self, branch: "Branch", key: str = "", **inputs: Any) -> bool:
+        """Whether its result in a branch holds, as :meth:`limber.store.Branch.is_current` takes
+        ``inputs``."""
+        return branch.is_current(key or self.entry, self, **inputs)
+
+
+class Repeatable(KeptStage):
+    """Such a stage that takes long, or whose result differs from run to run."""
+
     force: bool = option("Run again even if nothing has changed.", False, switch=True)
 
     def is_kept(self, branch: "Branch", key: str = "", **inputs: Any) -> bool:
-        """Whether its result in a branch holds, as :meth:`limber.store.Branch.is_current` takes
-        ``inputs``; never with ``force``."""
-        return not self.force and branch.is_current(key or self.entry, self, **inputs)
-
-
-class ParallelStage(KeptStage):
-    """A stage that uses several processes."""
-
-    workers: int | None = option(
-        "Largest number of parallel processes. Default: one per core (LIMBER_CORES). The result "
-        "does not depend on it.", limits={"ge": 1})
+        return not self.force and super().is_kept(branch, key, **inputs)

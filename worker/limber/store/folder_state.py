@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from limber.core.errors import BranchFolderError, Command, InputError, Option
+from limber.core.errors import BranchFolderError, Command, InputError
 from limber.core.files import safe_names
 from limber.core.files.atomic import (
     file_digest,
@@ -186,7 +186,7 @@ def damage_error(folder: Path, damages: list[Damage], shown_count: int = 4) -> B
     stages = sorted({d.stage for d in damages})
     return BranchFolderError(f"Damaged files in {folder}: {listed}{more}.", "They differ from the "
                              "checksums written when they were made.", "Restore them from a copy, "
-                             "or run again with ", Option("force", True), f": {', '.join(stages)}.")
+                             f"or run again: {', '.join(stages)}.")
 
 
 def unlisted(folder: Path, manifest: Manifest) -> list[str]:

@@ -19,8 +19,9 @@ from limber.core.errors import Command, InputError
 from limber.core.files.reading import FileContent, read_json_as
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, observed, subject_of
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import EstimateSettings, FitSpec
 from limber.geometry.io.skeletons import read_cylinders, read_skeleton, read_swc
+from limber.geometry.settings import DENSITY_SIGMA
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import HungTwig, PointMass
@@ -236,7 +237,26 @@ def load_grasp_model(branch: Branch, *, gravity: bool, progress: Progress = SILE
                           load_skeleton(branch))
 
 
-def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
+def density_sigma(branch: Branch) -> float:
+    """Return the relative standard deviation of the density with which the branch was made."""
+    return branch.made.settings.get("density_sigma", DENSITY_SIGMA) if branch.made else (
+        DENSITY_SIGMA)
+
+
+def density_digest(branch: Branch) -> dict[str, str]:
+    """Return what a result depends on besides, where that deviation is another than usual."""
+    sigma = density_sigma(branch)
+    return {} if sigma == DENSITY_SIGMA else {"density_sigma": repr(sigma)}
+
+
+def fit_spec(branch: Branch, settings: EstimateSettings) -> FitSpec:
+    """Return what an estimate of the branch does; what Python gives whole stays as it is."""
+    spec = FitSpec.of(settings)
+    return spec if isinstance(settings, FitSpec) else spec.model_copy(
+        update={"density_sigma": density_sigma(branch)})
+
+
+def load_subject(branch: Branch, settings: FitSpec) -> Subject:
     """Return the branch to estimate, with a uniform initial modulus. BranchFolderError if a file is
     missing, InputError if its moduli are not positive."""
     return subject_of(load_mesh(branch), load_skeleton(branch), load_point_masses(branch),
@@ -246,10 +266,13 @@ def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
 def load_estimated_subject(branch: Branch, known: dict[str, Any], *, gravity: bool) -> Subject:
     """Return the branch as the estimate ``known``, content of ``estimate.json``, used it: its
     results have the same meaning. Without weight if that had to leave it out."""
-    return load_subject(branch, EstimateSettings(
+    section = known.get("section", {})
+    return load_subject(branch, FitSpec(
         fractions=tuple(known["fractions"]), gravity=gravity and not known.get("is_weightless"),
         field="open" if known.get("field_form") else "inverse_distance",
-        also=("orders",) if known.get("orders") else (), **known.get("section", {})))
+        also=("orders",) if known.get("orders") else (),
+        pith_radius=section.get("pith_radius", 0.0),
+        bark=(section["bark_thickness"], section["bark_modulus"]) if section else None))
 
 
 def known_pulls(branch: Branch) -> list[str]:
@@ -281,7 +304,7 @@ def pulls_digest(branch: Branch, names: list[str]) -> str:
     return joined.hexdigest()
 
 
-def load_pulls(branch: Branch, names: list[str], subject: Subject, settings: EstimateSettings,
+def load_pulls(branch: Branch, names: list[str], subject: Subject, settings: FitSpec,
                progress: Progress = SILENT) -> list[Pull]:
     """Read and clean pulls; find control points in their images if there are no markers."""
     pulls = []

@@ -159,8 +159,6 @@ _option = functools.partial(click.option, cls=GroupedOption, group="demo")
 @click.argument("cloud", required=False, type=click.Path(path_type=Path))
 @_option("-o", "--output", type=click.Path(path_type=Path),
          help="Folder of the results.  [default: out/NAME]")
-@_option("--crop", type=float, nargs=6, metavar="X Y Z X Y Z",
-         help="Lower and upper corner of the box to keep, in the cloud's coordinates.")
 @_option("--skeleton", type=click.Path(path_type=Path),
          help="Your own skeleton in the cloud's coordinates, as of `limber reconstruct`.")
 @_option("--edits", type=click.Path(path_type=Path),
@@ -287,11 +285,7 @@ def _tip_goal(branch: Path) -> list[object]:
 
 def _scan_options(chosen: Mapping[str, Any]) -> list[object]:
     """Known properties of the scan, as options of `limber reconstruct`."""
-    scan = chosen["scan"]
-    if chosen["crop"]:
-        scan = scan.model_copy(update={"crop_low": chosen["crop"][:3],
-                                       "crop_high": chosen["crop"][3:]})
-    options: list[object] = list(command_line(scan))
+    options: list[object] = list(command_line(chosen["scan"]))
     for name in ("skeleton", "edits"):
         if chosen[name]:
             options += [f"--{name}", chosen[name]]

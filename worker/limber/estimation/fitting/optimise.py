@@ -327,7 +327,7 @@ def _required(objective: Objective, free: np.ndarray) -> Evaluation:
         young = ", ".join(f"{value:.3g}" for value in values.young)
         raise WorkError(f"The simulation finds no equilibrium with E = {young} Pa.", "This branch "
                         "may not be able to reach the recorded poses.", "Check the grasp point and "
-                        "the poses, or give another ", Option("young"), " to start from.")
+                        "the poses, or make the branch with another ", Option("young"), ".")
     return found
 
 

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 import scipy
 
-from limber.core.errors import Option, WorkError
+from limber.core.errors import WorkError
 from limber.core.numerics.rigid import any_normal, rotation_matrix
 from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.forward_model import compliance
@@ -148,7 +148,7 @@ def _require(result: DynamicResult) -> None:
     if not result.converged:
         raise WorkError("The motion of the simulated branch cannot be computed.",
                         "It is too fast or too far for this branch.",
-                        "Reduce ", Option("reach"), ", or increase ", Option("duration"), ".")
+                        "Reduce the reach, or increase the duration.")
 
 
 def _poses(model: BranchModel, grasp: Grasp, point: np.ndarray,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.core.errors import Cancelled, Command, InputError, Option, Text
+from limber.core.errors import Cancelled, Command, InputError, Text
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, forwards_of
 from limber.estimation.fitting.initial_modulus import scaled_start
@@ -167,7 +167,7 @@ def begin(pull: Pull, subject: Subject, settings: FitSpec, progress: Progress,
             deviation, spread = BLIND_DEVIATION, 4.0
             progress.warn(
                 f"{pull.name}: nothing has moved yet. The reduced model is built for a uniform E = "
-                f"{start.young[0] / 1e6:.3g} MPa (use ", Option("young"), " for another value).")
+                f"{start.young[0] / 1e6:.3g} MPa (that of the branch's mesh).")
         else:
             start = rough
     grasp = grasp_on(subject.mesh, pull.entry.grasp)

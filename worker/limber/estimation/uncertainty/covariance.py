@@ -237,16 +237,15 @@ ADVICE = {
     "clock": "record all sensors with one clock",
     "slip of the grasp": "grasp without slip, or put a marker at the grasp",
     "modulus between the control points": "add markers along the branch, or pull at another point",
-    "Poisson's ratio": Text("give it (", Option("poisson"), ", ", Option("poisson_sigma"), "); "
-                            "pulls do not determine it"),
+    "Poisson's ratio": Text("give it (", Option("poisson"), " of reconstruct); pulls do not "
+                            "determine it"),
     "density": Text("weigh a piece of the branch (", Option("density"), ", ",
-                    Option("density_sigma"), ")"),
+                    Option("density_sigma"), " of reconstruct)"),
     "moduli that the pulls do not determine": "pull at a point farther out",
     "shape of the scan": "scan from more sides, or with less noise",
     "skeleton of the scan": Text("look at the alternatives (", Command("skeleton"), "), and "
                                  "confirm or edit the doubtful parts"),
-    "mass of twigs and leaves": Text("weigh the twigs and leaves, and state the uncertainty (",
-                                     Option("hung_sigma"), "); or mesh more twigs (",
+    "mass of twigs and leaves": Text("mesh more twigs (",
                                      Option("twig_radius"), " of reconstruct)"),
     "length in the gripper": "measure it, and state it under [grasp] (radius_m: half of it) and "
                              "[calibration] (held_length_sigma_m) in pull.toml",

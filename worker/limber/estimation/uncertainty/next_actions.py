@@ -64,7 +64,8 @@ _MEASUREMENTS = (
                                          Option("nominal"), " of import-pull, point_sigma_m)"),
                  {"position of point": 5e-4}),
     _Measurement("weigh a piece of the branch", Text("to 2 % (", Option("density"), ", ",
-                                                     Option("density_sigma", 0.02), ")"),
+                                                     Option("density_sigma", 0.02), " of "
+                                                     "reconstruct)"),
                  {"density": 0.02}))
 
 

@@ -99,17 +99,16 @@ def voxel_thinned(points: np.ndarray, size: float) -> np.ndarray:
     if float(extent[0]) * float(extent[1]) * float(extent[2]) > 2.0**62:
         raise InputError(f"Cells of {size:g} m are too small for this cloud.", "There would be too "
                          "many of them to count.", "Check the unit (", Option("unit"), "), or crop "
-                         "stray points (", Option("crop_low"), ", ", Option("crop_high"), ").")
+                         "stray points (", Option("crop"), ").")
     key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
     return np.sort(np.unique(key, return_index=True)[1])
 
 
 def _cropped(cloud: Cloud, settings: PreparationSettings) -> Cloud:
-    keep = np.ones(len(cloud), bool)
-    if settings.crop_low is not None:
-        keep &= (cloud.points >= np.array(settings.crop_low)).all(axis=1)
-    if settings.crop_high is not None:
-        keep &= (cloud.points <= np.array(settings.crop_high)).all(axis=1)
+    if settings.crop is None:
+        return cloud
+    low, high = np.reshape(settings.crop, (2, 3))
+    keep = ((cloud.points >= low) & (cloud.points <= high)).all(axis=1)
     if not keep.any():
         low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
         raise InputError("The crop box holds no points.",

@@ -77,7 +77,7 @@ def supports_text(supports: list[Support], count: int, where: Callable[[np.ndarr
     named = [f"a {each.kind} ({100 * len(each.points) / count:.0f} % of the points) at ("
              + ", ".join(f"{value:.3f}" for value in where(each.at)) + ")" for each in supports]
     return Text(f"The scan shows {' and '.join(named)}: remove such points from the scan (",
-                Option("crop_low"), ", ", Option("crop_high"), ", or in another program), or they "
+                Option("crop"), ", or in another program), or they "
                 "count as the plant's.")
 
 

@@ -21,8 +21,8 @@ _MOST_OFF = 0.5  # fraction of points off all axes above which these do not desc
 OPEN = 0.8
 """Probability below which a decision is an open question."""
 _NAMED = 3  # gaps and loops named one by one
-_FIX = Text("Crop the scan to one branch (", Option("crop_low"), ", ", Option("crop_high"), "), or "
-            "provide a skeleton (", Option("skeleton"), ").")
+_FIX = Text("Crop the scan to one branch (", Option("crop"), "), or provide a "
+            "skeleton (", Option("skeleton"), ").")
 
 
 def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
@@ -156,8 +156,8 @@ def _doubt_texts(result: Any, where: Where) -> list[str]:
     if result.second_base is not None:
         texts.append(Text("The plant has a second base at "
                           f"{_position_text(where(result.second_base))}. Do two plants touch? Then "
-                          "crop the scan to one of them (", Option("crop_low"), ", ",
-                          Option("crop_high"), ").").at(where(result.second_base)))
+                          "crop the scan to one of them (", Option("crop"), ").").at(
+                              where(result.second_base)))
     if len(result.root_ends) > 1:
         texts.append(Text("Which end is the root is uncertain: "
                           f"{_ends_text(result.root_ends, where)}. The first was taken. If it is "
@@ -236,9 +236,9 @@ def check_explained(result: Any, limit: float, points: np.ndarray, where: Where,
                      f"{100 * limit:.0f} %), among them those at {_position_text(place)} in the "
                      "scan's coordinates.", "Leaves or a second plant would become rods, and the "
                      "radii there are unreliable. A pot, a stake or a wire counts too.", "Remove "
-                     "these points from the scan (", Option("crop_low"), ", ", Option("crop_high"),
-                     ", or in another program), remove leaves (", Option("leaves", "cut"), "), or "
-                     "accept the axes as they are (", Option("unexplained", 1), ").").at(place)
+                     "these points from the scan (", Option("crop"), ", or in another program), "
+                     "remove leaves (", Option("leaves", "cut"), "), or accept the axes as they "
+                     "are (", Option("unexplained", 1), ").").at(place)
 
 
 def _unexplained(result: Any) -> np.ndarray:

@@ -361,7 +361,7 @@ def _drawn(asked: GoalRequest, seed: int) -> GraspGoal:
 DRAWN = GoalKind("goal_seed", _drawn)
 
 
-# The target in a region that a robot's cell gives: ``--in-view``, ``--second-arm``.
+# The target in a region that a robot's cell gives: ``--goal-in``.
 #
 # The region is an outer bound: within it the arm may not reach every position, and the branch may
 # hide the target. Which grasp poses are valid is tested at poses of the field (for an arm, whose
@@ -521,23 +521,21 @@ def _far_apart(points: np.ndarray, count: int) -> np.ndarray:
     return np.array(chosen)
 
 
-def _kind(name: str, entry: str) -> GoalKind:
-    def made(asked: GoalRequest, _value: bool) -> CellGoal:
-        if name not in asked.cell:
-            raise InputError(f"--{name.replace('_', '-')} is given without a cell that has a "
-                             f"{entry}.", "The cell file states its position.", "Give ",
-                             Option("cell"), " with such a file.")
-        place = asked.cell[name]
-        return CellGoal(place.region, *target_of(asked), advice=place.advice, cell_place=place,
-                        grasp_model=asked.grasp_model).learnt(asked.field)
-    return GoalKind(name, made, is_of_target=True)
+_ENTRIES = {"view": "[camera] at a fixed position", "second_arm": "[second_arm]"}
 
 
-IN_VIEW = _kind("in_view", "[camera] at a fixed position")
-SECOND_ARM = _kind("second_arm", "[second_arm]")
+def _in_cell(asked: GoalRequest, name: str) -> CellGoal:
+    if name not in asked.cell:
+        raise InputError(Text(Option("goal_in", name), " is given without a cell that has a "
+                              f"{_ENTRIES[name]}."), "The cell file states its position.", "Give ",
+                         Option("cell"), " with such a file.")
+    place = asked.cell[name]
+    return CellGoal(place.region, *target_of(asked), advice=place.advice, cell_place=place,
+                    grasp_model=asked.grasp_model).learnt(asked.field)
 
 
-KINDS = [AT_PLACE, IN_BALL, IN_BOX, IN_VIEW, SECOND_ARM, DRAWN]
+IN_CELL = GoalKind("goal_in", _in_cell, is_of_target=True)
+KINDS = [AT_PLACE, IN_BALL, IN_BOX, IN_CELL, DRAWN]
 """An external kind is appended to it."""
 
 

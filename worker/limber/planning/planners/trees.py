@@ -50,8 +50,7 @@ class OmplRrtStar:
     def search(self, problem: PathProblem, search: Search, progress: Progress) -> Searched:
         if reason := self.missing():
             raise MissingDependencyError("OMPL is not installed.", "The import failed with: "
-                                         f"{reason}.", f"{how_to_install('planning')} Or use ",
-                                         Option("engine", "own"), ", which needs no other package.")
+                                         f"{reason}.", f"{how_to_install('planning')}")
         from ompl import base, geometric
         from ompl import util as ompl_util
 
@@ -211,8 +210,8 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
     if raw is None:
         raise NoPathError(f"{search.iterations} iterations found no allowed path to the goal "
                           "region.", f"{reached} poses were reached from the start. The limits or "
-                          "rejected poses may separate the start from the goal.", "Allow more ",
-                          Option("iterations"), ", or raise ", Option("max_energy"), " or ",
+                          "rejected poses may separate the start from the goal.", "Raise ",
+                          Option("max_energy"), " or ",
                           Option("max_force"), ".")
     tree_cost = float(path_cost(raw, problem.limits, problem.weights))
     points = shortcut(raw, problem.limits, problem.weights, attempts=search.shortcuts,

@@ -16,7 +16,7 @@ from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings, FitSpec
 from limber.stages.result import Numbers, Picture, Result, Table, filled, frozen, of_files, shown
-from limber.stages.stage import About, BranchStage, KeptStage, option
+from limber.stages.stage import About, BranchStage, Repeatable, option
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def _moduli_line(values: Mapping[str, Any]) -> str:
     return modulus_sentence(values, ASSUMED_PULL if pull and pull["young_assumed"] else "")
 
 
-class EstimateYoung(EstimateSettings, KeptStage, BranchStage):
+class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
     """Estimate Young's modulus along the branch from pulls."""
 
     about = About(
@@ -152,7 +152,6 @@ class EstimateYoung(EstimateSettings, KeptStage, BranchStage):
         switch=True)
     follow: bool = option(
         "Estimate frame by frame while a pull is recorded, or replay one.", False, switch=True)
-    pace: float = option("Speed of a replay; 0: as fast as possible.", 1.0, limits={"ge": 0})
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         """Estimate Young's modulus from the pulls of a branch folder.
@@ -205,26 +204,34 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
     from limber.estimation.fit_assessment import judge_model, require_result
     from limber.estimation.fitting.objective import EvaluationLog
     from limber.stages.moduli.other_skeletons import add_other_skeletons
-    from limber.store.loading import load_pulls, load_subject, pull_names, pulls_digest
+    from limber.store.loading import (
+        density_digest,
+        fit_spec,
+        load_pulls,
+        load_subject,
+        pull_names,
+        pulls_digest,
+    )
 
     names = pull_names(branch, asked)
-    subject = load_subject(branch, asked)
+    settings = fit_spec(branch, asked)
+    subject = load_subject(branch, settings)
     digests = {"mesh geometry": subject.mesh.geometry_digest(),
-               "pulls": pulls_digest(branch, names)}
+               "pulls": pulls_digest(branch, names)} | density_digest(branch)
     if asked.is_kept(branch, digests=digests):
         stored = branch.manifest.stages["estimate"].result
         if not stored.get("stopped"):
             return stored
     warnings: list[str] = []
     heard = progress.keeping(warnings)
-    pulls = load_pulls(branch, names, subject, asked, heard.part(0.0, 0.2))
+    pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
     tell_doubts(pulls, subject, heard)
     log_path = branch.folder / EVALUATIONS
     if asked.force or not asked.resume:
         log_path.unlink(missing_ok=True)
     bases = _finished_bases(branch)
     log = EvaluationLog(log_path, json.dumps([plain(asked), digests], sort_keys=True))
-    settings, initial, evidence = FitSpec.of(asked), subject, None
+    initial, evidence = subject, None
     if is_open(settings):
         pulls = _placed(pulls, initial)
         found, settings, subject, evidence = _with_supported_points(
@@ -330,19 +337,21 @@ def _finished_bases(branch: Branch) -> dict[str, str]:
     return kept
 
 
-def follow(asked: EstimateYoung, progress: Progress, training_count: int = 60) -> dict[str, Any]:
+def follow(asked: EstimateYoung, progress: Progress, training_count: int = 60,
+           pace: float = 1.0) -> dict[str, Any]:
     """Estimate frame by frame from the first named pull (or the only one), as it arrives, or
     replayed at ``pace`` times its speed (0: as fast as possible); writes ``estimate-online.json``
     after every frame, `limber estimate` then gives the final result. InputError without such a
     pull, or without markers."""
     from limber.estimation.online.follow import follow as follow_pull
-    from limber.store.loading import load_subject
+    from limber.store.loading import fit_spec, load_subject
 
     branch = Branch.open(asked.branch_folder)
     name, where = _followed(branch, asked)
-    subject = load_subject(branch, asked)
+    spec = fit_spec(branch, asked)
+    subject = load_subject(branch, spec)
     result, history = follow_pull(
-        where, name, subject, FitSpec.of(asked), pace=asked.pace,
+        where, name, subject, spec, pace=pace,
         training_count=training_count, progress=progress,
         axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None)
     with branch.stage("estimate-online", asked, digests={"pull": name}) as stage:

@@ -11,7 +11,7 @@ from limber.core.files.reading import read_json
 from limber.core.json_values import number_array
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
-from limber.estimation.settings import EstimateSettings, SwingSettings
+from limber.estimation.settings import FitSpec, SwingSettings
 from limber.stages.result import Interval, Picture, Result, frozen, kept, of_files, shown
 from limber.stages.stage import About, BranchStage, KeptStage
 from limber.store import Branch
@@ -91,14 +91,19 @@ class FitSwing(SwingSettings, KeptStage, BranchStage):
         from limber.estimation.forward.forward_model import under_its_weight
         from limber.estimation.vibration.free_swing import SwingSeen, fit_swing
         from limber.recordings.recording import grasp_on
-        from limber.store.loading import load_subject, pulls_digest
+        from limber.store.loading import (
+            density_digest,
+            density_sigma,
+            load_subject,
+            pulls_digest,
+        )
 
         branch = Branch.open(self.branch_folder)
         with branch.writing("limber swing"):
             pull = _pull(branch, self.pull)
-            subject = load_subject(branch, EstimateSettings())
+            subject = load_subject(branch, FitSpec())
             digests = {"mesh geometry": subject.mesh.geometry_digest(),
-                       "pulls": pulls_digest(branch, [pull.name])}
+                       "pulls": pulls_digest(branch, [pull.name])} | density_digest(branch)
             if self.is_kept(branch, digests=digests):
                 return branch.manifest.stages["swing"].result
             about = present(pull.entry.swing, "record of the branch's release")
@@ -112,7 +117,7 @@ class FitSwing(SwingSettings, KeptStage, BranchStage):
                 SwingSeen(seen.times, seen.positions - rest, rest,
                           about.start, pull.wrenches[0, :3], about.load_mass_kg, about.noise_m,
                           about.registration_m),
-                density_sigma=self.density_sigma,
+                density_sigma=density_sigma(branch),
                 progress=progress.keeping(warnings).part(0.0, 0.95))
             if not found.converged:
                 raise WorkError("The fit of the swing did not converge.",

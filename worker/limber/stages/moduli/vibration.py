@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 _MESH_DEVIATION = 0.02
 """Largest error of Young's modulus due to the mesh: quadratic tetrahedra are too stiff."""
+RADIUS_SIGMA = 0.02
+"""Relative standard deviation of the scan's radii as a whole."""
 _CLOSE = 1.15
 """Frequency ratio within which the observed mode may be another: two bending planes."""
 _ROUNDS = 8
@@ -71,8 +73,7 @@ class FitVibration(KeptStage, BranchStage):
         found=("Young's modulus, mean of the branch: {young_pa:Pa} ({young_interval_pa[0]:Pa} to "
                "{young_interval_pa[1]:Pa}), from a ringing at {frequencies_hz[0]:Hz}.",),
         then="limber energy {branch_folder}", step="estimate", label="Fit Natural Frequencies")
-    groups: ClassVar[Groups] = {"record": ("start", "sensor", "rate_hz"),
-                                "known": ("density_sigma", "radius_sigma")}
+    groups: ClassVar[Groups] = {"record": ("start", "sensor", "rate_hz")}
     common = ("sensor",)
 
     record: Path = argument("Table of times and readings (CSV), or C3D.")
@@ -83,10 +84,6 @@ class FitVibration(KeptStage, BranchStage):
         json_schema_extra={"metavar": "X Y Z KG"})
     rate_hz: float | None = Field(
         None, gt=0, description="Readings per second of the sensor. Default: by RECORD's times.")
-    density_sigma: float = Field(0.1, ge=0, le=1, description="Relative standard deviation of the "
-                                 "wood's density.")
-    radius_sigma: float = Field(0.02, ge=0, le=1, description="Relative standard deviation of the "
-                                "scan's radii as a whole.")
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         """Estimate one level of Young's modulus, and damping, from a record of free vibration.
@@ -105,7 +102,7 @@ class FitVibration(KeptStage, BranchStage):
             WorkError: no modulus has such a frequency.
         """
         from limber.estimation.vibration.ringing import identify, read_record
-        from limber.store.loading import load_branch, load_mesh
+        from limber.store.loading import density_digest, density_sigma, load_branch, load_mesh
 
         if not self.record.is_file():
             raise InputError(f"There is no file {self.record}.",
@@ -116,7 +113,8 @@ class FitVibration(KeptStage, BranchStage):
         branch = Branch.open(self.branch_folder)
         with branch.writing("limber vibration"):
             mesh = load_mesh(branch)
-            digests = {"record": file_digest(self.record), "mesh geometry": mesh.geometry_digest()}
+            digests = {"record": file_digest(self.record),
+                       "mesh geometry": mesh.geometry_digest()} | density_digest(branch)
             if self.is_kept(branch, digests=digests):
                 return branch.manifest.stages["vibration"].result
             seen = identify(rung.times, rung.values, self.start,
@@ -130,7 +128,7 @@ class FitVibration(KeptStage, BranchStage):
                                  "Name the unit in the title of the times: t_s, t_ms or t_us.")
             progress(0.3, "modulus of that frequency")
             model = load_branch(branch, progress=progress).model
-            fitted = young_of(_with_sensor(model, self), seen, self)
+            fitted = young_of(_with_sensor(model, self), seen, density_sigma(branch))
             young = fitted["young_factor"] * model.young
             result = _summary(seen, fitted, float(young.mean()))
             with branch.stage("vibration", self, digests=digests) as stage:
@@ -141,7 +139,7 @@ class FitVibration(KeptStage, BranchStage):
             return stage.result
 
 
-def young_of(model: BranchModel, seen: Ringing, settings: FitVibration) -> dict[str, Any]:
+def young_of(model: BranchModel, seen: Ringing, density_sigma: float) -> dict[str, Any]:
     """Return the factor on the modulus for which a model has the record's first frequency:
     ``young_factor``, ``deviation`` (of its logarithm), ``model_frequencies_hz``. WorkError if there
     is none."""
@@ -168,8 +166,8 @@ def young_of(model: BranchModel, seen: Ringing, settings: FitVibration) -> dict[
     is_parted = len(seen.frequencies) > 1 and seen.frequencies[1] < _CLOSE * target
     planes = 0.0 if is_parted else float(np.log(near[-1] / near[0])) / np.sqrt(3.0)
     deviation = np.sqrt((seen.frequency_deviations[0] / target / slope) ** 2
-                        + (planes / slope) ** 2 + settings.density_sigma**2
-                        + (2 * settings.radius_sigma) ** 2 + _MESH_DEVIATION**2)
+                        + (planes / slope) ** 2 + density_sigma**2
+                        + (2 * RADIUS_SIGMA) ** 2 + _MESH_DEVIATION**2)
     return {"young_factor": factor, "deviation": float(deviation), "model_frequencies_hz": found}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from limber.core.errors import Command, ConvergenceError, InputError, Option, Text
 from limber.core.files.atomic import write_atomically
 from limber.core.progress import SILENT, Progress
-from limber.mechanics.settings import FRAME_RATE, GRASP_RADIUS_M, SimulateSettings
+from limber.mechanics.settings import FRAME_RATE, GRASP_RADIUS_M, SimulateSettings, SimulateSpec
 from limber.stages.result import FORCE, Picture, Result, Vector, frozen, of_files, shown
 from limber.stages.stage import About, BranchStage, KeptStage, given
 from limber.store import Branch, OpenStage
@@ -184,8 +184,8 @@ def _model(branch: Branch, settings: SimulateSettings, progress: Progress) -> Br
 
     values: Overrides = {
         "young": settings.young, "material": settings.material,
-        "damping": RayleighDamping(settings.damping_mass, settings.damping_stiffness)}
-    if settings.rest_shape:
+        "damping": RayleighDamping(*settings.damping)}
+    if SimulateSpec.of(settings).rest_shape:
         return load_branch(branch, gravity=settings.gravity, loaded=bool(settings.mass_at),
                            progress=progress, **values).model
     return load_model(branch, gravity=settings.gravity, **values)

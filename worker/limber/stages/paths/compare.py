@@ -15,7 +15,7 @@ from limber.core.progress import Progress
 from limber.core.settings import POSITION, Groups
 from limber.planning.settings import PlanSettings
 from limber.stages.result import Result, Table, shown
-from limber.stages.stage import About, ParallelStage, PlacedStage, given
+from limber.stages.stage import About, KeptStage, PlacedStage, given
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def _saving(values: Mapping[str, Any]) -> str | None:
         for path, row in values["planners"].items() if path != BASELINE) + "."
 
 
-class ComparePlanners(ParallelStage, PlacedStage):
+class ComparePlanners(KeptStage, PlacedStage):
     """Compare RRT*, D-RRT* and the gentle path over random starts, as the paper does."""
 
     about = About(
@@ -112,7 +112,7 @@ class ComparePlanners(ParallelStage, PlacedStage):
         goal = (second_arm_goal(field) if self.goal is None
                 else near(np.array(self.goal), asked.goal_tolerance))
         with branch.stage(self.entry, self, reads=reads) as stage:
-            trials = run_trials(field, goal, asked, self.trials, workers=self.workers,
+            trials = run_trials(field, goal, asked, self.trials,
                                 progress=progress)
             good = [trial for trial in trials if trial.scores]
             if not good:

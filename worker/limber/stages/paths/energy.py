@@ -7,9 +7,9 @@ import numpy as np
 from limber.core.errors import Option
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
-from limber.planning.settings import EnergySettings
+from limber.planning.settings import EnergySettings, EnergySpec
 from limber.stages.result import FORCE, Picture, Result, frozen, of_files, shown
-from limber.stages.stage import About, BranchStage, ParallelStage
+from limber.stages.stage import About, BranchStage, Repeatable
 from limber.store import Branch
 
 _MOST_TIMES = 4  # multiple of the requested samples that --field-error may take
@@ -61,7 +61,7 @@ class EnergyField(Result):
         return self.field.force(np.asarray(points, float))
 
 
-class SampleEnergy(EnergySettings, ParallelStage, BranchStage):
+class SampleEnergy(EnergySettings, Repeatable, BranchStage):
     """Sample the deformation energy over grasp poses, and fit a field to it."""
 
     about = About(
@@ -84,7 +84,8 @@ class SampleEnergy(EnergySettings, ParallelStage, BranchStage):
         from limber.store.loading import load_grasp_model
 
         branch = Branch.open(self.branch_folder)
-        grasp_model = load_grasp_model(branch, gravity=self.gravity, progress=progress)
+        grasp_model = load_grasp_model(branch, gravity=EnergySpec.of(self).gravity,
+                                       progress=progress)
         digests = energy_inputs(grasp_model)
         if self.is_kept(branch, digests=digests):
             return branch.manifest.stages["energy"].result
@@ -93,7 +94,7 @@ class SampleEnergy(EnergySettings, ParallelStage, BranchStage):
                 grasp_model = LearntGraspModel.learnt(grasp_model,
                                                       progress=progress.part(0.0, 0.02))
             progress(0.0, "rest state")
-            sampled = sample_field(grasp_model, self, workers=self.workers,
+            sampled = sample_field(grasp_model, self,
                                    progress=progress.part(0.02, 0.7))
             field = fit_field(
                 sampled.samples,
@@ -103,7 +104,7 @@ class SampleEnergy(EnergySettings, ParallelStage, BranchStage):
             )
             if self.field_error is not None:
                 sampled, field = refined(grasp_model, sampled, field, self.field_error / 100.0,
-                                         _MOST_TIMES * self.samples, workers=self.workers,
+                                         _MOST_TIMES * self.samples,
                                          progress=progress.part(0.8, 1.0))
                 off = 100.0 * field.errors["energy_error"]
                 if off > self.field_error:

@@ -34,7 +34,7 @@ from limber.stages.result import (
     of_files,
     shown,
 )
-from limber.stages.stage import About, ParallelStage, PlacedStage, given
+from limber.stages.stage import About, PlacedStage, Repeatable, given
 from limber.store import Branch, OpenStage
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ def _found_lines(values: Mapping[str, Any]) -> str:
         "" if origin == "estimated" else f"All this holds for Young's modulus as {origin}.")))
 
 
-class PlanPaths(PlanSettings, ParallelStage, PlacedStage):
+class PlanPaths(PlanSettings, Repeatable, PlacedStage):
     """Plan the shortest and the gentlest path to a goal, and compare them.
 
     The field is used for the search only. All reported energies, forces and strains are computed by
@@ -244,8 +244,8 @@ class PlanPaths(PlanSettings, ParallelStage, PlacedStage):
         branch = Branch.open(self.branch_folder)
         field_path = branch.require("energy.npz", "energy")
         energy_stage = branch.manifest.stages["energy"]
-        grasp_model = load_grasp_model(branch, gravity=bool(energy_stage.settings["gravity"]),
-                                       progress=progress)
+        gravity = bool(energy_stage.settings.get("gravity", True))
+        grasp_model = load_grasp_model(branch, gravity=gravity, progress=progress)
         field = EnergyField.read(field_path)
         digests = energy_inputs(grasp_model)
         if any(energy_stage.reads.get(name) != digest for name, digest in digests.items()):
@@ -297,7 +297,6 @@ class PlanPaths(PlanSettings, ParallelStage, PlacedStage):
                     cell=None if in_cell is None else in_cell.positions,
                     uncertainty=uncertainty,
                     pace=pace,
-                    workers=self.workers,
                     progress=progress,
                 )
             except NoPathError as error:
@@ -367,7 +366,8 @@ class _InCell:
         nodes = grasp_model.mesh.nodes + grasp_model.rest.displacement
         clearance = clearance_in(cell, settings.clearance, obstacles, grasp_model.rest_position,
                                  nodes)
-        live = look(cell, nodes, progress) if settings.in_view and is_fixed(cell.camera) else None
+        is_seen = settings.goal_in == "view" and is_fixed(cell.camera)
+        live = look(cell, nodes, progress) if is_seen else None
         return cls(cell, obstacles, limits_in(cell, limits, obstacles, clearance),
                    cell_positions(cell, obstacles, live), clearance)
 

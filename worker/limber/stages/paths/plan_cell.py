@@ -53,7 +53,7 @@ def cell_positions(cell: Cell, obstacles: tuple[Obstacle, ...] = (),
     ``live``, what the connected camera sees now, and its second arm's reach."""
     found = {}
     if (view := _view_of(cell, live)) is not None:
-        found["in_view"] = CellPlace(
+        found["view"] = CellPlace(
             view, partial(hiding, view, obstacles, live=live), True, view.words,
             "The camera does not see {what}",
             "Move the camera in the cell file to a side without branch or obstacles")

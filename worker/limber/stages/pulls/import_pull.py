@@ -14,9 +14,9 @@ from limber.core.files.atomic import file_digest
 from limber.core.progress import SILENT, Progress
 from limber.geometry.io.formats import listed
 from limber.recordings.recording_formats import RECORDINGS, recording_format
-from limber.recordings.settings import ImportSettings
+from limber.recordings.settings import ImportSettings, ImportSpec
 from limber.stages.result import FORCE, POSE, Picture, Result, frozen, of_files, shown
-from limber.stages.stage import About, BranchStage, KeptStage, argument, given, required
+from limber.stages.stage import About, BranchStage, KeptStage, argument, required
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -101,11 +101,6 @@ class ImportPull(ImportSettings, KeptStage, BranchStage):
 
     source: Path = argument(f"A recording: {listed(RECORDINGS.readers())}.")
     name: str = required("Name of the pull.", "pull-1", group="output")
-    swing: bool = given(
-        "The branch is released without a robot. Markers with --weight or --load become a pull for "
-        "`limber swing`. Other records (accelerometer, strain gauge, video track, markers of a "
-        "plucked branch) are evaluated by `limber vibration`.", False, group="simulation",
-        switch=True)
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         """Import a recording into ``pulls/NAME`` of a branch folder.
@@ -118,15 +113,13 @@ class ImportPull(ImportSettings, KeptStage, BranchStage):
         Raises:
             InputError: the recording cannot be read as the stated kind.
         """
-        if not self.swing:
+        if self.motion != "swing" or self.weight is not None or self.load is not None:
             return _imported(self, progress)
-        if self.weight is not None or self.load is not None:
-            return _imported(self.model_copy(update={"motion": "swing"}), progress)
         # The load is unknown: the frequencies determine the modulus, positions do not.
         from limber.stages.moduli.vibration import FitVibration
 
         fitted = FitVibration(branch_folder=self.branch_folder, record=self.source,
-                              rate_hz=self.rate_hz, force=self.force)
+                              rate_hz=self.rate_hz)
         return fitted.run(progress) | {"kind": "ringing"}
 
 
@@ -156,7 +149,7 @@ def _imported(asked: ImportPull, progress: Progress) -> dict[str, Any]:
         folder = stage.path(prefix + "pull.toml").parent
         is_bare = is_force and not branch.has("mesh.vtu")
         frame = BranchFrame() if is_bare else _frame(branch, settings)
-        in_branch = settings.model_copy(update=_poses_in_branch(asked, branch))
+        in_branch = ImportSpec.of(settings.model_copy(update=_poses_in_branch(asked, branch)))
         stage.result.update(import_recording(kind, ImportRequest(
             source, folder, name, in_branch, frame, robot, progress)))
         stage.result |= {"pull": name, "kind": kind}

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.core.errors import Option, Text
+from limber.core.errors import InputError, Option, Text
 from limber.core.labels import table_of
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import FitSpec
 from limber.stages.result import Result, Table, Vector, filled
-from limber.stages.stage import About, BranchStage, ParallelStage, given
+from limber.stages.stage import About, BranchStage, KeptStage, given
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class SuggestedPulls(Result):
              [["yes" if plan["worth"] else "no"], [plan["why"]]]) if plan else ("", []))
 
 
-class SuggestPull(ParallelStage, BranchStage):
+class SuggestPull(KeptStage, BranchStage):
     """Suggest where to hold and how far to pull next to learn most.
 
     Pulls with several positions, directions and lengths are simulated on the branch as estimated.
@@ -83,10 +83,12 @@ class SuggestPull(ParallelStage, BranchStage):
                "by {best[travel_m]:m}, with up to {best[peak_force_n]:N}.",),
         then="limber record {branch_folder} --suggested --cell cell.toml", step="estimate",
         label="Suggest the Next Pull")
-    groups: ClassVar[Groups] = {"limits": ("max_strain", "max_force")}
+    groups: ClassVar[Groups] = {"limits": ("fractions", "max_strain", "max_force")}
 
     plan: str | None = given(
         "Name of a plan. The result states whether another pull is worthwhile for it.", common=True)
+    fractions: tuple[float, ...] = Field(CANDIDATES, min_length=1, description=(
+        "Candidate grasps as fractions of the main path: those that the arm reaches."))
     max_strain: float = Field(0.01, gt=0, lt=1, description=(
         "Largest principal strain during a pull (0.01 is 1 %)."))
     max_force: float | None = Field(None, gt=0, description="Largest force of the gripper [N].")
@@ -108,6 +110,10 @@ class SuggestPull(ParallelStage, BranchStage):
         """
         from limber.estimation.next_pull import suggest
 
+        if any(not 0.0 < fraction <= 1.0 for fraction in self.fractions):
+            raise InputError(Text(Option("fractions", self.fractions), "."),
+                             "Grasps are fractions of the main path's length.",
+                             "Give numbers greater than 0 and at most 1.")
         branch = Branch.open(self.branch_folder)
         branch.require("mesh.vtu", "reconstruct")
         reads = [file for file in ("mesh.vtu", "skeleton.swc", "estimate.json") if branch.has(file)]
@@ -120,8 +126,8 @@ class SuggestPull(ParallelStage, BranchStage):
             subject, values, known = _state(branch)
             cell = _cell(branch)
             most = np.inf if self.max_force is None else self.max_force
-            found = suggest(subject, values, known, cell, CANDIDATES, max_force=most,
-                            max_strain=self.max_strain, workers=self.workers,
+            found = suggest(subject, values, known, cell, self.fractions, max_force=most,
+                            max_strain=self.max_strain,
                             progress=progress.part(0.0, 0.8))
             stage.result.update(_summary(found, known) | {"instead": _instead(branch)})
             if self.plan is not None:
@@ -142,7 +148,7 @@ def _state(branch: Branch) -> tuple[Subject, Values, Known]:
     from limber.store.loading import load_estimated_subject, load_subject
 
     if not branch.has("estimate.json"):
-        subject = load_subject(branch, EstimateSettings())
+        subject = load_subject(branch, FitSpec())
         form = () if subject.field is None else subject.field.names
         return subject, subject.start, Known.nothing(len(subject.control_points), len(form))
     found = read_estimate(branch.path("estimate.json"))
@@ -206,7 +212,7 @@ def _for_plan(branch: Branch, name: str, now: Known, after: Known, progress: Pro
     if not limits.asked():
         return {"worth": False, "why": "The plan has no limits, so a better known modulus changes "
                 "nothing about it."}
-    gravity = bool(branch.manifest.stages["energy"].settings["gravity"])
+    gravity = bool(branch.manifest.stages["energy"].settings.get("gravity", True))
     grasp_model = load_grasp_model(branch, gravity=gravity, progress=progress)
     uncertainty = estimated_uncertainty(branch, grasp_model)
     if uncertainty is None:

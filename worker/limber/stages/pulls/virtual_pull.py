@@ -60,6 +60,11 @@ class VirtualPull(VirtualPullSettings, KeptStage, BranchStage):
         if self.is_kept(branch, reads=reads, digests=digests):
             return branch.manifest.stages[key].result
         spec = PullSpec.of(self)
+        if not isinstance(self, PullSpec) and branch.made is not None:
+            # The true branch is of the wood that the branch was made with.
+            made = branch.made.settings
+            spec = spec.model_copy(update={name: value for name, value in made.items()
+                                           if name in ("poisson", "density")})
         progress(0.02, "meshing the true branch")
         truth = load_truth(branch, spec)
         with branch.stage(key, self, reads=reads, digests=digests) as stage:

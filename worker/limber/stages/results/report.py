@@ -59,9 +59,9 @@ class WriteReport(KeptStage, BranchStage):
         calipers = [] if self.caliper is None else read_calipers(self.caliper)
         settings, digests = {"picture": bool(self.picture)}, _shown(
             branch, self.picture, self.caliper)
-        if not self.force and branch.is_current("report", settings, digests=digests):
+        if branch.is_current("report", settings, digests=digests):
             return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
-        if not self.force and png and branch.is_current(
+        if png and branch.is_current(
                 "report", {"picture": False}, digests=_shown(branch, None, self.caliper)):
             html = branch.path("report.html").read_text(encoding="utf-8")
             found = branch.manifest.stages["report"].result

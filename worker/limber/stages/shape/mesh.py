@@ -10,7 +10,7 @@ from limber.geometry.io.skeletons import SKELETONS, write_cylinders
 from limber.geometry.io.surfaces import SURFACES, usable_surface
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.stages.result import Interval, Result, kept, shown
-from limber.stages.stage import About, KeptStage, argument, required
+from limber.stages.stage import About, Repeatable, argument, required
 from limber.store import Branch
 
 
@@ -66,7 +66,7 @@ class Meshed(MeshNumbers, Shape):
     """A branch that has been meshed."""
 
 
-class Mesh(MeshSurfaceSettings, KeptStage):
+class Mesh(MeshSurfaceSettings, Repeatable):
     """Mesh a closed surface, a table of sections or a cylinder model."""
 
     about = About(

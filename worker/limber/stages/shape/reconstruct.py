@@ -29,7 +29,7 @@ from limber.geometry.io.formats import head_of, listed, suffixes_of
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton, read_swc, write_cylinders
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.shape.mesh import Meshed
-from limber.stages.stage import About, KeptStage, argument, given, required
+from limber.stages.stage import About, Repeatable, argument, given, required
 from limber.store import Branch, OpenStage
 from limber.store.manifest import MANIFEST
 
@@ -53,7 +53,7 @@ EDITS = "edits.json"
 """The edits that a branch keeps, in the coordinates of the scan's file."""
 
 
-class Reconstruct(ReconstructSettings, KeptStage):
+class Reconstruct(ReconstructSettings, Repeatable):
     """Reconstruct a scan: skeleton, radii, surface and tetrahedra."""
 
     about = About(
