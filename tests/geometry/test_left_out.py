@@ -83,10 +83,10 @@ COUNT = 150_000
 _RUN = """
 import json, resource, sys
 from limber.geometry.warm_up import warm_up
-from limber.stages.shape.reconstruct import reconstruct
+from limber.stages.shape.reconstruct import Reconstruct
 warm_up()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-result = reconstruct(sys.argv[1], sys.argv[2])
+result = Reconstruct(cloud=sys.argv[1], output=sys.argv[2]).run()
 after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 print(json.dumps({"taken": (after - before) / 1024, "length": result["length_m"],
                   "count": result["point_count"]}))

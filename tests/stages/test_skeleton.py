@@ -156,7 +156,8 @@ from limber.geometry.settings import ReconstructSettings
 from limber.stages.shape.reconstruct import Reconstruct
 reconstruction.mesh_skeleton = lambda *given: os._exit(9)
 scan, target = map(Path, sys.argv[1:3])
-reconstruct(scan, target, ReconstructSettings.model_validate_json(sys.argv[3]))
+settings = ReconstructSettings.model_validate_json(sys.argv[3])
+Reconstruct.of(settings, cloud=scan, output=target).run()
 """
 
 

@@ -212,10 +212,10 @@ _AT_ONCE = 1_000_000
 _RUN = """
 import json, resource, sys
 from limber.geometry.warm_up import warm_up
-from limber.stages.shape.reconstruct import reconstruct
+from limber.stages.shape.reconstruct import Reconstruct
 warm_up()
 before = resource.getrusage(resource.RUSAGE_SELF)
-result = reconstruct(sys.argv[1], sys.argv[2])
+result = Reconstruct(cloud=sys.argv[1], output=sys.argv[2]).run()
 after = resource.getrusage(resource.RUSAGE_SELF)
 print(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, after.ru_maxrss / 1e6,
       result["length_m"])
