@@ -160,7 +160,7 @@ def test_the_unit_of_the_file_is_that_of_the_branch(tmp_path, monkeypatch):
 
     monkeypatch.setattr("limber.geometry.reconstruction.reconstruct_cloud", stop)
     (tmp_path / "a.csv").write_text(table("x_mm,y_mm,z_mm"))
-    for settings in (None, ReconstructSettings(), ReconstructSettings(unit="cm")):
+    for settings in (ReconstructSettings(), ReconstructSettings(unit="cm")):
         with pytest.raises(InputError, match="enough"):
             Reconstruct.of(settings, cloud=tmp_path / "a.csv", output=tmp_path / "a.branch").run()
-    assert used == ["mm", "mm", "cm"]
+    assert used == ["mm", "cm"]

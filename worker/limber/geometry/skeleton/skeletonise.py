@@ -22,6 +22,7 @@ from limber.geometry.skeleton.contraction import (
 )
 from limber.geometry.skeleton.curve_graph import CurveGraph, curve_graph, rooted
 from limber.geometry.skeleton.joining import second_base
+from limber.geometry.skeleton.likeliest_tree import SEARCHED_POINTS, rival_tree
 from limber.geometry.skeleton.plausibility import (
     Where,
     check_no_sheet,
@@ -101,13 +102,15 @@ class _Search:
 
     def pruned(self, graph: CurveGraph, start: int) -> tuple[Skeleton, int]:
         """A skeleton with first radii and without spurs, and the number of dropped spurs."""
-        parent = rooted(graph.nodes, graph.edges, start)
-        keep, count = prune_spurs(graph.nodes, parent, graph.thickness, SPUR_REACH)
-        new_index = np.cumsum(keep) - 1
-        moved = np.where(parent[keep] < 0, -1, new_index[parent[keep]])
+        first = self.unpruned(graph, start)
+        keep, count = prune_spurs(first.nodes, first.parent, first.radius, SPUR_REACH)
+        return first.subset(keep), count
+
+    def unpruned(self, graph: CurveGraph, start: int) -> Skeleton:
+        """A skeleton with first radii and all spurs."""
         least = 1e-3 * float(np.median(graph.thickness)) + 1e-12
-        return Skeleton.from_edges(graph.nodes[keep], moved,
-                                   np.maximum(graph.thickness[keep], least)), count
+        return Skeleton.from_edges(graph.nodes, rooted(graph.nodes, graph.edges, start),
+                                   np.maximum(graph.thickness, least))
 
     def to_fit(self, graph: CurveGraph, thin: np.ndarray) -> np.ndarray:
         """Points for the fit [m]: points that the graph discarded must not attract the rest."""
@@ -163,9 +166,14 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
         (first, pruned), more = search.pruned(graph, start), 0
         skeleton = through_leaves(first, some, fitted.noise, fitted.radius_limits)
     skeleton, unlikely = likely(skeleton, twig_probability)
+    noise, count = fitted.noise, pruned + more
+    if view is None and not leafy and len(points) <= SEARCHED_POINTS:
+        rival = rival_tree(search.unpruned(graph, start), skeleton, some)
+        if rival is not None:
+            (skeleton, noise), unlikely, count = rival, [], 0
     if skeleton is not fitted.skeleton:
         segment, residual = nearest_cylinders(skeleton, points)
     progress(1.0, "skeleton", nodes=skeleton.node_count)
-    return SkeletonResult(skeleton, contraction, segment, residual, fitted.noise, graph.bridges,
-                          graph.split_off, graph.loops, pruned + more, second_base(skeleton, up),
-                          ends, leafy, unlikely)
+    return SkeletonResult(skeleton, contraction, segment, residual, noise, graph.bridges,
+                          graph.split_off, graph.loops, count, second_base(skeleton, up), ends,
+                          leafy, unlikely)

@@ -226,7 +226,7 @@ def normal_equations(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, 
     """Set up a round: points, smoothness of runs, constraints on bare nodes. ``positions`` [m, 3]
     are mean directions of true positions (None: the nearest), ``targets`` where points should lie
     (None: at the radius), ``across`` [m, 3] how firmly they hold the axis across (None: not)."""
-    data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, positions, targets,
+    data, right, per_node = data_terms(skeleton.parent, nodes, match, weight, positions, targets,
                                         across)
     smooth = smoothness(skeleton, nodes, radius, per_node, noise, stepped)
     state = np.column_stack([nodes, radius]).ravel()
@@ -293,7 +293,7 @@ def fit_with_steps(skeleton: Skeleton, points: np.ndarray) -> tuple[Skeleton, np
             covariance + more[:, None, None] * way[:, :, None] * way[:, None, :])
 
 
-def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
+def data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
                 positions: np.ndarray | None, targets: TargetDistances | None,
                 across: np.ndarray | None,
                 ) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:

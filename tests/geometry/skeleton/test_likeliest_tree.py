@@ -1,0 +1,114 @@
+"""The score of a tree given points, and the search for the likeliest tree of a thin scan."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from benchmarks.worlds.sources import bare_case
+from limber.geometry.skeleton.likeliest_tree import fitted, likeliest_tree
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.skeletonise import skeletonise
+from limber.geometry.skeleton.tree_likelihood import DIRECTIONS, PointLikelihood
+
+
+def rod(radius: float = 0.004, length: float = 0.3, nodes: int = 20) -> Skeleton:
+    """A straight axis along x [m]."""
+    places = np.zeros((nodes, 3))
+    places[:, 0] = np.linspace(0, length, nodes)
+    return Skeleton.from_edges(places, np.arange(nodes) - 1, np.full(nodes, radius))
+
+
+def skin(radius: float, noise: float, count: int = 600, half: bool = False) -> np.ndarray:
+    """Points on a rod of 0.3 m along x, or on its upper half [m]."""
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0, np.pi if half else 2 * np.pi, count)
+    points = np.column_stack([rng.uniform(0, 0.3, count), radius * np.cos(angle),
+                              radius * np.sin(angle)])
+    return points + rng.normal(0, noise, points.shape)
+
+
+@pytest.mark.parametrize("facing", [None, 1])
+@pytest.mark.parametrize(("radius", "noise"), [(0.004, 0.0005), (0.002, 0.004), (1e-6, 0.001)])
+def test_the_density_across_an_axis_integrates_to_one(radius, noise, facing):
+    scan = PointLikelihood(np.zeros((1, 3)), np.array([noise]), 1.0)
+    distance = np.linspace(1e-6, radius + 8 * noise, 4000)
+    angle = (np.arange(64) + 0.5) * 2 * np.pi / 64
+    total = np.mean([2 * np.pi * np.sum(distance * scan.across(
+        distance, np.full(4000, radius), None if facing is None else np.full(4000, np.cos(one)),
+    )[:, 0]) * (distance[1] - distance[0]) for one in (angle if facing else angle[:1])])
+    assert total == pytest.approx(1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("noise", [0.0005, 0.003])
+def test_a_cylinder_too_thick_or_too_thin_scores_less(noise):
+    scan = PointLikelihood.of(skin(0.004, noise))
+    scores = [scan.score(rod(radius)) for radius in (0.002, 0.004, 0.0065)]
+    assert scores[1] == max(scores)
+
+
+def test_the_side_that_was_seen_scores_most():
+    upper, round_ = (PointLikelihood.of(skin(0.004, 0.0005, half=half)) for half in (True, False))
+    up = [way for way in DIRECTIONS if way[2] > 0.99 * np.linalg.norm(way)]
+    below = upper.seen_from(-up[0]).score(rod())
+    assert upper.seen_from(up[0]).score(rod()) > upper.score(rod()) > below
+    assert round_.score(rod()) > round_.seen_from(up[0]).score(rod())
+
+
+def test_a_fit_finds_axis_and_radius_from_one_side():
+    """It starts from the middle of the points, as the contraction does."""
+    points = skin(0.004, 0.0004, half=True)
+    first = rod(0.0015).moved(rod().nodes + [0, 0, 0.0025])
+    scan = PointLikelihood.of(points).seen_from(np.array([0.0, 0.0, 1.0]))
+    found = fitted(first, scan, 25)
+    assert np.median(found.radius) == pytest.approx(0.004, rel=0.1)
+    assert np.median(found.nodes[:, 2]) == pytest.approx(0.0, abs=0.0006)
+
+
+def thin_scan(source: str = "monopodial") -> tuple[np.ndarray, Skeleton]:
+    """700 points of a plant with 2 mm of noise and some far off [m], and its true axes."""
+    case = bare_case(9102, source, "round")
+    rng = np.random.default_rng(3)
+    points = case.points[rng.choice(len(case.points), 700, replace=False)]
+    points = points + rng.normal(0, 0.002, points.shape)
+    points[:15] += rng.normal(0, 0.02, (15, 3))
+    return points, case.truth
+
+
+def along(skeleton: Skeleton) -> np.ndarray:
+    """Places on all axes [m], 20 between two nodes."""
+    share = (np.arange(20) + 0.5)[:, None, None] / 20
+    return (skeleton.nodes[1:] * share + skeleton.nodes[skeleton.parent[1:]] * (1 - share)
+            ).reshape(-1, 3)
+
+
+@pytest.mark.slow
+def test_a_thin_scan_shows_its_axes_and_hardly_changes_without_two_points():
+    points, truth = thin_scan()
+    found = [skeletonise(some, root=truth.nodes[0]).skeleton for some in (
+        points, np.delete(points, [40, 300], axis=0))]
+    for one in found:
+        assert (cKDTree(along(one)).query(along(truth))[0] < 0.01).mean() > 0.85
+        assert (cKDTree(along(truth)).query(along(one))[0] < 0.01).mean() > 0.95
+    assert found[0].length == pytest.approx(found[1].length, rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_twig_that_no_point_shows_is_left_out():
+    points = skin(0.004, 0.0005)
+    whole = rod()
+    twig = np.array([[0.15, 0.0, 0.02], [0.15, 0.0, 0.05]])
+    first = Skeleton.from_edges(np.vstack([whole.nodes, twig]), np.concatenate(
+        [whole.parent, [10, 20]]), np.full(22, 0.004))
+    found, side = likeliest_tree(first, points)
+    assert found.branch_count == 1
+    assert side is None
+
+
+@pytest.mark.slow
+def test_points_that_nothing_explains_become_a_twig():
+    rng = np.random.default_rng(1)
+    twig = np.column_stack([np.full(60, 0.15), np.zeros(60), rng.uniform(0.005, 0.08, 60)])
+    points = np.vstack([skin(0.004, 0.0005), twig + rng.normal(0, 0.001, twig.shape)])
+    found, _ = likeliest_tree(rod(), points)
+    assert found.branch_count == 2
+    assert found.length == pytest.approx(0.38, rel=0.05)
