@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from limber.stages.pulls.virtual_pull import VirtualPull
 from limber.store import Branch
 
 pytestmark = pytest.mark.usefixtures("whole_texts")
@@ -160,7 +161,7 @@ def test_the_expert_settings_are_shown_on_demand(bpy, panels):
 
 
 @pytest.mark.slow
-def test_a_step_says_how_far_it_is(bpy, panels, branch_folder):
+def test_a_step_says_how_far_it_is(bpy, panels, branch_folder, small):
     """Not run, done, out of date by its input or its settings, failed; and what comes next."""
     module = importlib.import_module("limber_addon.panels.steps")
     scene = bpy.context.scene
@@ -168,6 +169,8 @@ def test_a_step_says_how_far_it_is(bpy, panels, branch_folder):
     def state(name):
         return module.state_of(scene, name)[0]
     assert state("virtual-pull") is module.StepState.NOT_RUN
+    VirtualPull(branch_folder=branch_folder, name="pull-1", young=small.young, frames=12,
+                seed=4).run()
     scene.limber.branch_folder = str(branch_folder)
     # The panels still have defaults, the pull was made with others.
     assert state("virtual-pull") is module.StepState.CHANGED
@@ -178,9 +181,9 @@ def test_a_step_says_how_far_it_is(bpy, panels, branch_folder):
     assert module.step_state(scene, _step(bpy, "pulls").step) is module.StepState.DONE
     texts = _draw_step(bpy, "pulls").names("label")
     assert any(text.endswith(" N") for text in texts), texts
-    scene.limber.virtual_pull.reach = 0.5
+    scene.limber.virtual_pull.frames = 20
     assert state("virtual-pull") is module.StepState.CHANGED
-    scene.limber.virtual_pull.reach = 0.35
+    scene.limber.virtual_pull.frames = 12
     with Branch.open(branch_folder).stage("reconstruct") as stage:
         stage.path("skeleton.swc").write_text(
             (branch_folder / "skeleton.swc").read_text() + "# edited\n")

@@ -53,12 +53,12 @@ def recorded(folder, truth, first=0, offset=0.0):
     return pull
 
 
-def estimated(folder, branch, pull, capsys, *options, tables=""):
+def estimated(folder, branch, pull, capsys, *options, sensor=""):
     """The result of import-pull and estimate, or None if they refuse."""
     entry, stated = pull.entry, folder / "cell.toml"
     stated.write_text("[calibration]\npose_sigma_m = 2e-4\npose_sigma_rad = 3.5e-3\n"
-                      f"force_bias_sigma_n = 0.02\nforce_drift_sigma_n = 0.02\n{tables}"
-                      f"[sensor]\nposition_sigma_m = {entry.sensor.position_sigma_m}\n")
+                      f"force_bias_sigma_n = 0.02\nforce_drift_sigma_n = 0.02\n"
+                      f"[sensor]\nposition_sigma_m = {entry.sensor.position_sigma_m}\n{sensor}")
     assert call(["import-pull", str(branch), str(folder / "markers.csv"), "--name", "pull-2",
                  "--robot", str(folder / "robot.csv"), "--time-offset", "0",
                  "--grasp-point", *map(str, entry.grasp.point_m),
@@ -116,7 +116,7 @@ def test_a_stated_missing_tare_is_fitted(branch_of, branch_folder, tmp_path, cap
     Not stated, a zero many times the stated one gives no interval that excludes the truth.
     """
     pull = recorded(tmp_path, branch_of((0.0, 0.0, 0.0)), first=8, offset=OFFSET_N)
-    found = estimated(tmp_path, branch_folder, pull, capsys, tables="[sensor]\ntared = false\n")
+    found = estimated(tmp_path, branch_folder, pull, capsys, sensor="tared = false\n")
     assert holds(found["young_interval_pa"], YOUNG).all()
     zeros = [each for each in found["cell_errors"] if each["name"].startswith("force zero")]
     assert holds([each["interval"] for each in zeros], OFFSET_N).all()

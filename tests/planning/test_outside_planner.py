@@ -8,12 +8,13 @@ import pytest
 
 from limber.planning.planners.rrt_star import Searched
 from limber.planning.planners.trees import PLANNERS, chosen_engine
+from limber.planning.settings import PlanSpec
 from limber.stages.paths.plan import PlanPaths
 
 pytestmark = pytest.mark.usefixtures("rough_plan")
 
 
-class LinePaths(PlanPaths):
+class LinePaths(PlanSpec, PlanPaths):
     """Those of a plan, with one more planner."""
 
     engine: Literal["auto", "ompl", "own", "line"] = "line"
