@@ -99,8 +99,8 @@ def test_a_twig_that_no_point_shows_is_left_out():
     twig = np.array([[0.15, 0.0, 0.02], [0.15, 0.0, 0.05]])
     first = Skeleton.from_edges(np.vstack([whole.nodes, twig]), np.concatenate(
         [whole.parent, [10, 20]]), np.full(22, 0.004))
-    found, side = likeliest_tree(first, points)
-    assert found.branch_count == 1
+    found, side, count = likeliest_tree(first, points)
+    assert found.branch_count == count == 1
     assert side is None
 
 
@@ -109,6 +109,6 @@ def test_points_that_nothing_explains_become_a_twig():
     rng = np.random.default_rng(1)
     twig = np.column_stack([np.full(60, 0.15), np.zeros(60), rng.uniform(0.005, 0.08, 60)])
     points = np.vstack([skin(0.004, 0.0005), twig + rng.normal(0, 0.001, twig.shape)])
-    found, _ = likeliest_tree(rod(), points)
+    found, _, _ = likeliest_tree(rod(), points)
     assert found.branch_count == 2
     assert found.length == pytest.approx(0.38, rel=0.05)

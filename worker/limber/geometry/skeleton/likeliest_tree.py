@@ -17,16 +17,17 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 from scipy.special import ive, ndtr
 
+from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.confidence import assessed, doubted
 from limber.geometry.skeleton.radii.axis_fit import TargetDistances, data_terms
 from limber.geometry.skeleton.radii.fit_kernels import Match, match_cylinders, nearest_cylinders
 from limber.geometry.skeleton.radii.wood import Bends, Wood
 from limber.geometry.skeleton.repair import PointSpacing, resampled, without_kinks
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.tree_likelihood import DIRECTIONS, PointLikelihood, Scatter
+from limber.geometry.skeleton.tree_likelihood import DIRECTIONS, HIDDEN, PointLikelihood, Scatter
 
 SEARCHED_POINTS = 1_500
-"""Most points of a scan that are searched so: more show their skin, and would take long."""
+"""Most points of a scan that is searched so: a limit of time."""
 _SPACING = 1.5  # radii between nodes
 _PASSES, _STEPS, _LAST_STEPS = 4, 6, 10  # rounds of proposals; steps of a fit between and after
 # Length of the main path over the radius at its base, and the deviation of its logarithm, where
@@ -39,44 +40,47 @@ _TWIG = 0.6  # radius of a new twig over that of its carrier
 _FURTHER = 4.0  # numbers that an axis to a further point costs
 _TIPS = 2  # of the nearest ends that may go on to a point
 _SIDE_POINTS, _SIDE_STEPS = 600, 3  # points and steps that show from which side a scan was seen
-_RING = 48  # positions around an axis
-_ANGLE = 2 * np.pi * (np.arange(_RING) + 0.5) / _RING
+_ANGLE = 2 * np.pi * (np.arange(48) + 0.5) / 48  # of positions around an axis
 _EDGE = 8.0  # sharpness of the border between seen and hidden half
 _SHARP = 60.0  # concentration from which a point's place on the skin is known
 
 
-def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray,
-               ) -> tuple[Skeleton, float] | None:
+def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, progress: Progress = SILENT,
+               ) -> tuple[Skeleton, float, int] | None:
     """Return the likeliest tree found from the ``first``, that of the contracted points with all
-    its spurs, and the noise [m], if it scores more than the ``known``; ``points`` [m, 3] [m] are
-    the scan's."""
-    skeleton, side = likeliest_tree(first, points)
+    its spurs, the noise [m] and the number of twigs left out, if it scores more than the ``known``;
+    ``points`` [m, 3] [m] are the scan's."""
+    skeleton, side, count = likeliest_tree(first, points, progress)
     residual = nearest_cylinders(skeleton, points)[1]
     noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
     found = assessed(skeleton, points, noise, one_sided=side is not None)
-    even, count = without_kinks(found)
-    if count:
-        found = doubted(even, points, noise)
+    even, kinks = without_kinks(found)
+    found = doubted(even, points, noise) if kinks else found
     scan = PointLikelihood.of(points)
-    return (found, noise) if scan.best(found) > scan.best(known) else None
+    return (found, noise, count) if scan.best(found) > scan.best(known) else None
 
 
-def likeliest_tree(first: Skeleton, points: np.ndarray) -> tuple[Skeleton, np.ndarray | None]:
-    """The likeliest tree found from the ``first``, and the direction [3] from which the scan saw
-    it; None: from all around."""
+def likeliest_tree(first: Skeleton, points: np.ndarray, progress: Progress = SILENT,
+                   ) -> tuple[Skeleton, np.ndarray | None, int]:
+    """The likeliest tree found from the ``first``, the direction [3] from which the scan saw it
+    (None: from all around), and the number of twigs left out."""
     scan, apart = PointLikelihood.of(points), PointSpacing.of(points)
-    skeleton = first
-    for _ in range(_PASSES):
+    skeleton, count = first, 0
+    for number in range(_PASSES):
+        progress(number / (_PASSES + 1), "comparing trees")
         skeleton = resampled(skeleton, _SPACING, apart.at(skeleton.nodes))
         state = State.of(fitted(skeleton, scan, _STEPS), scan)
-        after = grown(drawn_back(pruned(state)), apart)
+        rest = pruned(state)
+        count += state.skeleton.branch_count - rest.skeleton.branch_count
+        after = grown(drawn_back(rest), apart)
         skeleton = after.skeleton
         if after is state:
             break
     skeleton = fitted(resampled(skeleton, _SPACING, apart.at(skeleton.nodes)), scan, _STEPS)
+    progress(_PASSES / (_PASSES + 1), "which side was seen")
     side = _side(skeleton, points)
     return (skeleton if side is None else fitted(skeleton, scan.seen_from(side), _LAST_STEPS),
-            side)
+            side, count)
 
 
 def _side(skeleton: Skeleton, points: np.ndarray) -> np.ndarray | None:
@@ -105,17 +109,18 @@ def fitted(skeleton: Skeleton, scan: PointLikelihood, steps: int) -> Skeleton:
 def _step(skeleton: Skeleton, scan: PointLikelihood, prior: "_Prior") -> Skeleton:
     match = scan.match(skeleton)
     distance = np.maximum(match.residual + match.thick, 1e-12)
-    density = scan.across(distance, match.thick, scan.facing(skeleton, match))
+    density = scan.across(distance, match.thick, scan.facing(skeleton, match, match.normal))
     scatter = scan.scattered(skeleton, match, density)
     share = density * scatter.shares / skeleton.length
     share /= (share.sum(axis=1) + scatter.background / scan.volume)[:, None]
     weight = (share / scan.noises**2).sum(axis=1)
-    place = _places(skeleton, match, distance * match.thick * weight, scan.side)
+    across = np.cross(scan.axes(skeleton, match), match.normal)
+    place = _places(skeleton, match, distance * match.thick * weight, scan, across)
     outwards = np.einsum("mj,mj->m", place, match.normal)
     firm = np.maximum(1 - match.thick * outwards / distance, _FIRM)
     own, right, _ = data_terms(skeleton.parent, skeleton.nodes, match, weight, place,
                                TargetDistances(match.thick, match.thick),
-                               np.sqrt(firm)[:, None] * _across(skeleton, match))
+                               np.sqrt(firm)[:, None] * across)
     # In logarithms of radii.
     unit = np.column_stack([np.ones_like(skeleton.nodes), skeleton.radius]).ravel()
     step = prior.solved(own.multiply(unit).T.multiply(unit), unit * right,
@@ -175,25 +180,17 @@ def _padded(matrix: sparse.csr_matrix, more: int) -> sparse.csr_matrix:
         matrix.indptr, np.full(more, matrix.indptr[-1]))), (size, size))
 
 
-def _across(skeleton: Skeleton, match: Match) -> np.ndarray:
-    """Direction around the axis at each point, a unit vector [m, 3]."""
-    axis = skeleton.nodes[match.segment] - skeleton.nodes[skeleton.parent[match.segment]]
-    return np.cross(axis / np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None], match.normal)
-
-
-def _places(skeleton: Skeleton, match: Match, sharpness: np.ndarray, side: np.ndarray | None,
-            ) -> np.ndarray:
+def _places(skeleton: Skeleton, match: Match, sharpness: np.ndarray, scan: PointLikelihood,
+            across: np.ndarray) -> np.ndarray:
     """Mean direction [m, 3] from the axis to where each point is on the skin, given where it was
-    measured: a von Mises distribution of this ``sharpness``, and the half that was seen."""
-    if side is None:
+    measured: a von Mises distribution of this ``sharpness``, and the half that was seen. ``across``
+    [m, 3] is the direction around the axis."""
+    facing, aside = (scan.facing(skeleton, match, ways) for ways in (match.normal, across))
+    if facing is None or aside is None:
         return (ive(1, sharpness) / ive(0, sharpness))[:, None] * match.normal
-    across = _across(skeleton, match)
-    facing, aside = match.normal @ side, across @ side
-    size = np.hypot(facing, aside)
-    seen = ndtr(_EDGE * (facing[:, None] * np.cos(_ANGLE) + aside[:, None] * np.sin(_ANGLE))
-                / np.maximum(size, 0.2)[:, None])
-    density = np.exp(np.minimum(sharpness, 400.0)[:, None] * (np.cos(_ANGLE) - 1)) * (0.1 + 1.8
-                                                                                    * seen)
+    seen = ndtr(_EDGE * (facing[:, None] * np.cos(_ANGLE) + aside[:, None] * np.sin(_ANGLE)))
+    density = (HIDDEN + (1 - HIDDEN) * 2 * seen) * np.exp(
+        np.minimum(sharpness, _SHARP)[:, None] * (np.cos(_ANGLE) - 1))
     density /= density.sum(axis=1)[:, None]
     known = sharpness > _SHARP
     out = np.where(known, 1 - 0.5 / np.maximum(sharpness, 1.0), density @ np.cos(_ANGLE))
@@ -331,11 +328,8 @@ def _longer(state: State, to: np.ndarray, starts: list[int], apart: PointSpacing
     """The state with an axis ``to`` a point [m] from the best of the ``starts``; None if the score
     does not rise."""
     skeleton, children = state.skeleton, state.skeleton.child_counts()
-
-    def radius(node: int) -> float:
-        return float(skeleton.radius[node]) * (_TWIG if children[node] else 1.0)
-
-    scores = [state.with_cylinder(skeleton.nodes[node], to, radius(node), int(children[node] > 0))
+    radius = skeleton.radius * np.where(children > 0, _TWIG, 1.0)
+    scores = [state.with_cylinder(skeleton.nodes[node], to, radius[node], int(children[node] > 0))
               for node in starts]
     best = int(np.argmax(scores))
     if scores[best] <= state.log + _FURTHER / 2 * np.log(len(state.scan.points)):
@@ -348,4 +342,4 @@ def _longer(state: State, to: np.ndarray, starts: list[int], apart: PointSpacing
     parent = np.concatenate([[node], skeleton.node_count + np.arange(count - 1)])
     return state.after(Skeleton.from_edges(
         np.vstack([skeleton.nodes, added]), np.concatenate([skeleton.parent, parent]),
-        np.concatenate([skeleton.radius, np.full(count, radius(node))])))
+        np.concatenate([skeleton.radius, np.full(count, radius[node])])))

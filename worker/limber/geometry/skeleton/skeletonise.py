@@ -168,9 +168,9 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     skeleton, unlikely = likely(skeleton, twig_probability)
     noise, count = fitted.noise, pruned + more
     if view is None and not leafy and len(points) <= SEARCHED_POINTS:
-        rival = rival_tree(search.unpruned(graph, start), skeleton, some)
+        rival = rival_tree(search.unpruned(graph, start), skeleton, some, progress.part(0.95, 1.0))
         if rival is not None:
-            (skeleton, noise), unlikely, count = rival, [], 0
+            (skeleton, noise, count), unlikely = rival, []
     if skeleton is not fitted.skeleton:
         segment, residual = nearest_cylinders(skeleton, points)
     progress(1.0, "skeleton", nodes=skeleton.node_count)

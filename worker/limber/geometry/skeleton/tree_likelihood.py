@@ -24,7 +24,8 @@ _NOISES = np.geomspace(2e-4, 0.03, 24)  # fractions of the scan's diagonal
 _FREEDOM = 4.0  # of Student's distribution of the noise
 _BACKGROUND, _ROUNDS = 0.05, 4  # first share of the background; rounds that find it
 _MARGIN = 0.02  # [m] around the scan where background may be
-_HIDDEN = 0.1  # density of the hidden half, as a fraction of that all around
+HIDDEN = 0.1
+"""Density of the hidden half, as a fraction of that all around."""
 _OPEN = 0.2  # sine of the angle between axis and sight under which an axis has no seen half
 # A twig's fork, direction (2), length, radius and bend: each costs half the logarithm of the points
 # (Schwarz 1978, Bayes' information criterion).
@@ -84,23 +85,28 @@ class PointLikelihood:
         # it is flat, and where it is sharp.
         flat = np.sqrt(2 / np.pi)
         seen = ndtr(facing[:, None] * flat * sharpness / np.sqrt(1 + flat**2 * sharpness))
-        return density * (_HIDDEN + (1 - _HIDDEN) * 2 * seen)
+        return density * (HIDDEN + (1 - HIDDEN) * 2 * seen)
 
-    def facing(self, skeleton: Skeleton, match: Match) -> np.ndarray | None:
-        """Cosine of the angle around the axis between each point and the sensor [m]; 0 where the
-        sensor looks along the axis; None: all around."""
+    @staticmethod
+    def axes(skeleton: Skeleton, match: Match) -> np.ndarray:
+        """Unit vector along the axis of each point's cylinder, shape [m, 3]."""
+        axis = skeleton.nodes[match.segment] - skeleton.nodes[skeleton.parent[match.segment]]
+        return axis / np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
+
+    def facing(self, skeleton: Skeleton, match: Match, ways: np.ndarray) -> np.ndarray | None:
+        """Cosine of the angle around the axis between the sensor and ``ways`` across the axis at
+        each point [m, 3], shape [m]; 0 where the sensor looks along it; None: all around."""
         if self.side is None:
             return None
-        axis = skeleton.nodes[match.segment] - skeleton.nodes[skeleton.parent[match.segment]]
-        axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
+        axis = self.axes(skeleton, match)
         sight = self.side - (axis @ self.side)[:, None] * axis
         size = np.linalg.norm(sight, axis=1)
-        return np.where(size > _OPEN, np.einsum("mj,mj->m", match.normal, sight)
+        return np.where(size > _OPEN, np.einsum("mj,mj->m", ways, sight)
                         / np.maximum(size, _OPEN), 0.0)
 
     def scattered(self, skeleton: Skeleton, match: Match, density: np.ndarray) -> Scatter:
         """The likeliest scatter for densities [m, k] across the axes of a tree."""
-        best, found = -np.inf, None
+        found = []
         along, elsewhere = density / skeleton.length, 1 / self.volume
         for scale in self.noises:
             ratio = (scale / self.noises)**2
@@ -111,10 +117,8 @@ class PointLikelihood:
                 off = background * elsewhere
                 background = float(np.mean(off / ((1 - background) * wood + off)))
             log = float(np.log((1 - background) * wood + background * elsewhere).sum())
-            if found is None or log > best:
-                best, found = log, Scatter(float(scale), (1 - background) * shares, background)
-        assert found is not None
-        return found
+            found.append((log, Scatter(float(scale), (1 - background) * shares, background)))
+        return max(found, key=lambda one: one[0])[1]
 
     def log(self, wood: np.ndarray, scatter: Scatter, length: float, runs: int) -> float:
         """Logarithm of the likelihood of a tree of ``length`` [m] and so many ``runs``, given the
@@ -127,7 +131,7 @@ class PointLikelihood:
         with the likeliest scatter. Only differences between trees of one scan mean something."""
         match = self.match(skeleton)
         density = self.across(np.maximum(match.residual + match.thick, 0.0), match.thick,
-                              self.facing(skeleton, match))
+                              self.facing(skeleton, match, match.normal))
         scatter = self.scattered(skeleton, match, density)
         return self.log(density @ scatter.shares, scatter, skeleton.length, skeleton.branch_count)
 
