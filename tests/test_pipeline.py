@@ -4,8 +4,6 @@ The commands run in this process, which loads the kernels once; as processes the
 what is tested, here and in tests/planning/test_killed.py, tests/batch and tests/core/processes.
 """
 
-import contextlib
-import io
 import json
 import os
 import shutil
@@ -16,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.subjects.commands import answer
 
 from limber.cli.main import call
 from limber.store import Branch
@@ -26,11 +25,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
 def result_of(*arguments: object) -> dict:
     """Run a command line; returns its JSON result."""
-    told = io.StringIO()
-    with contextlib.redirect_stdout(told):
-        code = call([*map(str, arguments), "--json"])
-    assert code == 0, told.getvalue()
-    return json.loads(told.getvalue().splitlines()[-1])
+    code, told = answer(*arguments)
+    assert code == 0, told
+    return told
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +84,6 @@ def test_report_is_whole_and_self_contained(done):
     assert "This pull was simulated" in html
 
 
-@pytest.mark.slow
 def test_picture_shows_something(done):
     """The render is a PNG with many colours: a branch, not an empty background."""
     from PIL import Image
@@ -99,7 +95,6 @@ def test_picture_shows_something(done):
     assert len(colours) > 500
 
 
-@pytest.mark.slow
 def test_second_run_computes_nothing(done):
     """A stage whose input and settings have not changed is skipped and gives the same result."""
     branch, results = done
@@ -111,7 +106,6 @@ def test_second_run_computes_nothing(done):
     Branch.open(branch, verify=True)
 
 
-@pytest.mark.slow
 def test_folder_can_be_moved(done, tmp_path):
     """A copy elsewhere verifies, is up to date, and goes on from where it was."""
     branch, results = done
@@ -125,7 +119,6 @@ def test_folder_can_be_moved(done, tmp_path):
     assert result_of("predict", moved, "--weight", 0.1)["drop_m"] > 0
 
 
-@pytest.mark.slow
 def test_bad_cloud_costs_no_result(done, tmp_path):
     """A truncated cloud on an existing folder ends with 2 and leaves every file as it was."""
     branch, _ = done
@@ -136,7 +129,6 @@ def test_bad_cloud_costs_no_result(done, tmp_path):
     assert {p: p.read_bytes() for p in branch.rglob("*") if p.is_file()} == before
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 @pytest.mark.parametrize(("stage", "options"), [("estimate", ["--force"]), pytest.param(
     "energy", ["--force", "--samples", "200"], marks=pytest.mark.campaign)])

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import psutil
 import pytest
+from tests.subjects.commands import answer
 
 from limber.batch.batch_progress import Records, numbers_of, path_of_page, write_page
 from limber.batch.job_file import read_jobs
 from limber.batch.run import run_jobs
-from limber.cli import main
 from limber.core.errors import BranchFolderError
 from limber.stages.shape.target import SetTarget
 from limber.store import Branch
@@ -44,11 +44,6 @@ def orchard(two_branches):
     return two_branches
 
 
-def call(capsys, *arguments) -> tuple[int, dict]:
-    code = main.call([*map(str, arguments), "--json"])
-    return code, json.loads(capsys.readouterr().out.splitlines()[-1])
-
-
 def states(path: Path) -> list[list[str]]:
     jobs = read_jobs(path)
     records = Records(jobs)
@@ -62,20 +57,20 @@ def test_run_fail_mend_and_resume(orchard, capsys):
     mesh = orchard / "two.branch" / "mesh.vtu"
     good = mesh.read_bytes()
     mesh.write_bytes(b"broken")
-    code, told = call(capsys, "batch", jobs, "--dry-run")
+    code, told = answer("batch", jobs, "--dry-run")
     assert code == 0 and [row[2] for row in told["planned"]] == ["to run"] * 4
-    code, told = call(capsys, "batch", jobs, "--workers", "1")
+    code, told = answer("batch", jobs, "--workers", "1")
     assert code == 3 and "1 of 2 branches failed: two; two: target:flower" in told["error"]
     assert states(jobs) == [["done", "done"], ["failed", "waiting"]]
     rows = list(csv.DictReader((orchard / "results/jobs.csv").open()))
     assert Branch.open(orchard / "one.branch").has("pulls/pull-2/pull.toml")
-    code, told = call(capsys, "status", jobs)
+    code, told = answer("status", jobs)
     assert (told["done"], told["failed"], told["failures"][0][0]) == (1, 1, "two")
     # Mended, it is not tried again unasked; then it is, and the other one is kept as it is.
     mesh.write_bytes(good)
     before = (orchard / "one.branch" / "branch.json").read_bytes()
-    assert call(capsys, "batch", jobs, "--workers", "1")[0] == 3
-    code, told = call(capsys, "batch", jobs, "--workers", "1", "--retry-failed")
+    assert answer("batch", jobs, "--workers", "1")[0] == 3
+    code, told = answer("batch", jobs, "--workers", "1", "--retry-failed")
     assert code == 0 and told["done"] == 2, told
     assert states(jobs)[0][1] == "up to date" and states(jobs)[1] == ["done", "done"]
     rows_before, rows = rows, list(csv.DictReader((orchard / "results/jobs.csv").open()))
@@ -133,7 +128,7 @@ def test_what_is_written_beside_the_branch_is_not_written_again(orchard, here, c
                 SetTarget(branch_folder=orchard / "two.branch", name="leaf",
                           at=(0.0, 0.0, 0.1)).run()
             ran.clear()
-            assert call(capsys, "batch", jobs)[0] == 0
+            assert answer("batch", jobs)[0] == 0
             assert [one.split()[0] for one in ran if "export" in one] == exported, change
             assert [row[-1] for row in states(jobs)] == [
                 "done" if name in exported else "up to date" for name in ("one", "two")]
@@ -199,7 +194,7 @@ def test_text_of_files_is_no_page_and_no_formula(orchard, here, capsys):
     (orchard / f"{name}.branch" / "mesh.vtu").write_bytes(b"")
     jobs = orchard / "jobs.toml"
     jobs.write_text(JOBS.replace('["*.branch"]', f'["{name}.branch"]'))
-    assert call(capsys, "batch", jobs, "--workers", "1")[0] == 3
+    assert answer("batch", jobs, "--workers", "1")[0] == 3
     row = next(csv.DictReader((orchard / "results/jobs.csv").open()))
     assert row["branch"] == f"'{name}"
     page = (orchard / "results/jobs.html").read_text()

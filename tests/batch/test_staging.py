@@ -9,6 +9,7 @@ import fsspec
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 from fsspec.utils import infer_storage_options
+from tests.subjects.commands import answer
 
 from limber.batch.batch_progress import Records
 from limber.batch.job_file import BranchJob, JobFile, read_jobs
@@ -16,7 +17,6 @@ from limber.batch.remote_files import checked_address, fetch, is_address, matchi
 from limber.batch.run import run_jobs
 from limber.batch.scheduler_scripts import write_script
 from limber.batch.staging import bring_in, put_out
-from limber.cli import main
 from limber.core.errors import BranchFolderError, Cancelled, InputError, WorkError
 from limber.core.files.atomic import file_digest
 from limber.store import Branch
@@ -36,11 +36,6 @@ def memory():
 
 def on() -> None:
     """Nobody wants it to stop."""
-
-
-def call(capsys, *arguments) -> tuple[int, dict]:
-    code = main.call([*map(str, arguments), "--json"])
-    return code, json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
 def test_what_is_an_address():
@@ -264,13 +259,13 @@ at = [0.0, 0.0, 0.1]
     assert two[0].status == "failed" and "memory://scans/two.csv does not exist" in two[0].error
     assert not memory.exists("/night/two.branch")
     memory.pipe_file("/scans/two.csv", BODY.encode())
-    code, told = call(capsys, "batch", jobs, "--workers", "1", "--retry-failed")
+    code, told = answer("batch", jobs, "--workers", "1", "--retry-failed")
     assert code == 0 and told["done"] == 2, told
     manifest = json.loads(memory.cat("/night/one.branch/branch.json"))
     assert {"mesh", "target:flower"} <= set(manifest["stages"])
     assert b"2 done" in memory.cat("/night/jobs.html") and memory.isfile("/night/jobs.csv")
     shutil.rmtree(tmp_path / "scratch")
-    code, told = call(capsys, "batch", jobs, "--workers", "1")
+    code, told = answer("batch", jobs, "--workers", "1")
     assert code == 0 and told["done"] == 2, told
     again = json.loads(memory.cat("/night/one.branch/branch.json"))
     assert again["stages"]["mesh"] == manifest["stages"]["mesh"]

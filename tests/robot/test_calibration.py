@@ -1,6 +1,5 @@
 """The base from touched points: by the controller's own pose, and no mirrored frame passes."""
 
-import json
 import socket
 import struct
 import threading
@@ -8,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.commands import robot_answer
 
 from limber.cell.cell_file import Cell, read_cell, write_cell
 from limber.cell.ur_arms import ARMS
-from limber.cli.commands.robot import command
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.core.numerics.rigid_kernels import pose_of
@@ -121,10 +120,8 @@ def test_the_command_states_each_points_residual(branch_folder, tmp_path, capfd)
         rows = np.hstack([ON_BRANCH, touched, np.zeros((5, 3))])[:count]
         (tmp_path / "points.csv").write_text("".join(
             ",".join([f"p{k}", *map(str, row)]) + "\n" for k, row in enumerate(rows)))
-        with pytest.raises(SystemExit) as stop:
-            command.main(["calibrate", str(tmp_path / "cell.toml"), str(branch_folder), "--points",
-                          str(tmp_path / "points.csv"), "--json"], standalone_mode=False)
-        return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
+        return robot_answer(capfd, "calibrate", tmp_path / "cell.toml", branch_folder, "--points",
+                            tmp_path / "points.csv")
     code, told = run(5)
     assert code == 0 and [point["name"] for point in told["points"]] == [f"p{k}" for k in range(5)]
     off = np.array([point["residual_m"] for point in told["points"]])

@@ -1,14 +1,13 @@
 """The drawing of a cell: what a cell file states is where the picture shows it."""
 
-import json
 
 import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
+from tests.subjects.commands import robot_answer
 
 from limber.cell.cell_file import Cell, write_cell
 from limber.cell.obstacles import Box
-from limber.cli.commands.robot import command
 from limber.core.numerics.rigid import matrices
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.results.cell_picture import cell_picture
@@ -50,10 +49,7 @@ def test_the_command_writes_a_picture_without_a_robot(tmp_path, capfd):
     write_cell(tmp_path / "cell.toml", CELL)
 
     def run(*arguments: str) -> tuple[int, dict]:
-        with pytest.raises(SystemExit) as stop:
-            command.main(["draw", str(tmp_path / "cell.toml"), *arguments, "--json"],
-                         standalone_mode=False)
-        return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
+        return robot_answer(capfd, "draw", tmp_path / "cell.toml", *arguments)
     picture = tmp_path / "cell.png"
     code, told = run("-o", str(picture), "--joints", ",".join(map(str, HOME)))
     assert code == 0 and told["obstacles"] == 1

@@ -1,13 +1,12 @@
 """A camera found from a board or marker seen in several poses of the arm, and the base from it."""
 
-import json
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.subjects.commands import robot_answer
 
 from limber.cell.cell_file import Cell, read_cell, write_cell
-from limber.cli.commands.robot import command
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
 from limber.robot.calibration import base_from_camera, fit_camera
@@ -102,13 +101,6 @@ def test_what_cannot_be_told_is_refused():
                          "gripper", None, np.zeros(3))
 
 
-def run(capfd, *arguments: object) -> tuple[int, dict]:
-    """Run `limber robot`; return its exit code and its last JSON line."""
-    with pytest.raises(SystemExit) as stop:
-        command.main([*map(str, arguments), "--json"], standalone_mode=False)
-    return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
-
-
 def test_the_command_writes_the_base_and_the_camera(branch_folder, tmp_path, capfd):
     """The scan in the standing camera's frame: base and camera come into the branch's."""
     write_cell(tmp_path / "cell.toml", Cell(
@@ -119,7 +111,7 @@ def test_the_command_writes_the_base_and_the_camera(branch_folder, tmp_path, cap
     np.savetxt(tmp_path / "views.csv", np.hstack([robot, seen]), delimiter=",", header=header,
                comments="")
     given = ["calibrate", tmp_path / "cell.toml", branch_folder]
-    code, told = run(capfd, *given, "--views", tmp_path / "views.csv")
+    code, told = robot_answer(capfd, *given, "--views", tmp_path / "views.csv")
     assert code == 0
     cell, branch = read_cell(tmp_path / "cell.toml"), Branch.open(branch_folder)
     assert cell.branch == branch.uuid and cell.base.residual_m == told["residual_m"] < 1e-3
@@ -130,5 +122,5 @@ def test_the_command_writes_the_base_and_the_camera(branch_folder, tmp_path, cap
     assert cell.camera.mount == "branch"
     held = matrices(np.array(cell.base.pose)) @ matrices(STANDING)
     assert np.abs(held - matrices(np.array(cell.camera.pose))).max() < 5e-3
-    code, told = run(capfd, *given)
+    code, told = robot_answer(capfd, *given)
     assert code == 2 and "Exactly one of --points, --views and --images" in told["error"]

@@ -1,16 +1,15 @@
 """Motions of the arm by itself: past what is in its way, slow near the branch, dry by default."""
 
-import json
 
 import numpy as np
 import pytest
+from tests.subjects.commands import robot_answer
 
 from benchmarks.robot_cells import cell_file, standing_at
 from benchmarks.robot_faults import cell_for, set_off, straight
 from limber.cell.cell_file import Cell, WorkspaceEntry
 from limber.cell.obstacles import Box
 from limber.cell.reach_and_collision import ArmSurroundings
-from limber.cli.commands.robot import command
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -99,12 +98,6 @@ def test_times_on_a_bounded_way_keep_speeds_and_acceleration():
     assert along_bounded(np.array([0.01]), np.full(2, 0.05), 0.1)[1] > 0
 
 
-def run(arguments: list[str], capfd) -> tuple[int, dict]:
-    with pytest.raises(SystemExit) as stop:
-        command.main([*arguments, "--json"], standalone_mode=False)
-    return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
-
-
 @pytest.mark.slow
 def test_home_and_retreat_move_only_when_armed(stepped, tmp_path, capfd):
     """Back along the way of a killed program; then home from there, joints exact."""
@@ -120,15 +113,15 @@ def test_home_and_retreat_move_only_when_armed(stepped, tmp_path, capfd):
     while np.linalg.norm(stepped.state["tool_speed"]) > 1e-3:
         stepped.rest(0.02)
     before = stepped.state["joints"]
-    code, told = run(["retreat", path], capfd)
+    code, told = robot_answer(capfd, "retreat", path)
     assert code == 0 and not told["armed"] and told["way_m"] > 0.002 and told["tare_known"]
-    code, told = run(["retreat", path, "--arm", "--confirm", "nothing"], capfd)
+    code, told = robot_answer(capfd, "retreat", path, "--arm", "--confirm", "nothing")
     assert code == 2 and stepped.state["joints"] == before
-    code, told = run(["retreat", path, "--arm", "--confirm", "retreat"], capfd)
+    code, told = robot_answer(capfd, "retreat", path, "--arm", "--confirm", "retreat")
     assert code == 0 and told["retreated"] and not told["gripper_opened"]
     assert np.allclose(stepped.state["pose"][:3], begin[:3], atol=2e-3)
     stepped.ask("stand", joints=list(np.array(cell.arm.home) + [0.1, 0, 0, 0.1, 0, 0]))
-    code, told = run(["home", path, "--arm", "--confirm", "home"], capfd)
+    code, told = robot_answer(capfd, "home", path, "--arm", "--confirm", "home")
     assert code == 0 and told["reached"]
     assert stepped.state["joints"] == pytest.approx(cell.arm.home, abs=1e-4)
 
@@ -144,9 +137,9 @@ def test_release_opens_the_gripper_and_goes_away_from_the_branch(stepped, tmp_pa
     path = str(cell_file(cell, tmp_path))
     stepped.ask("outputs", value=1)
     begin = matrices(np.array(stepped.state["pose"]))
-    code, told = run(["release", path], capfd)
+    code, told = robot_answer(capfd, "release", path)
     assert code == 0 and not told["armed"] and stepped.state["outputs"] == 1
-    code, told = run(["release", path, "--arm", "--confirm", "release"], capfd)
+    code, told = robot_answer(capfd, "release", path, "--arm", "--confirm", "release")
     assert code == 0 and told["reached"] and stepped.state["outputs"] == 0
     moved = np.array(stepped.state["pose"][:3]) - begin[:3, 3]
     assert moved == pytest.approx(-0.02 * begin[:3, 2], abs=2e-4)
@@ -157,12 +150,12 @@ def test_goto_start_ends_where_execute_begins(stepped, planned_folder, tmp_path,
     """Slow: two dry runs of the plan."""
     cell = standing_at(Branch.open(planned_folder), stepped.address, grip_seconds=0.1)
     path = str(cell_file(cell, tmp_path))
-    code, told = run(["goto-start", path, str(planned_folder)], capfd)
+    code, told = robot_answer(capfd, "goto-start", path, str(planned_folder))
     assert code == 0 and not told["armed"], told
     goal = np.array(told["end_joints_rad"])
     stepped.ask("stand", joints=list(goal + [0.03, 0, 0, 0, 0, 0.05]))
-    code, told = run(["goto-start", path, str(planned_folder), "--arm", "--confirm",
-                      "goto-start"], capfd)
+    code, told = robot_answer(capfd, "goto-start", path, str(planned_folder), "--arm", "--confirm",
+                      "goto-start")
     assert code == 0 and told["reached"], told
     assert stepped.state["joints"] == pytest.approx(goal, abs=1e-4)
 
@@ -176,7 +169,7 @@ def test_the_gripper_opens_while_the_robot_is_stopped(stepped, tmp_path, capfd):
     path = str(cell_file(cell, tmp_path))
     stepped.ask("outputs", value=0b1001)
     stepped.ask("emergency_stop")
-    code, told = run(["open", path], capfd)
+    code, told = robot_answer(capfd, "open", path)
     assert code == 0 and stepped.state["outputs"] == 0b1001
-    code, told = run(["open", path, "--arm", "--confirm", "open"], capfd)
+    code, told = robot_answer(capfd, "open", path, "--arm", "--confirm", "open")
     assert code == 0 and told["armed"] and stepped.state["outputs"] == 0b0001

@@ -1,19 +1,15 @@
 """`limber robot check --offline`: the files of a cell, without a robot."""
 
-import json
 
-import pytest
+from tests.subjects.commands import robot_answer
 
 from benchmarks.robot_cells import cell_file, standing_at
 from limber.cell.cell_file import Cell
-from limber.cli.commands.robot import command
 from limber.store import Branch
 
 
 def checked(capfd, *arguments: str) -> tuple[int, dict]:
-    with pytest.raises(SystemExit) as stop:
-        command.main(["check", *map(str, arguments), "--json"], standalone_mode=False)
-    return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
+    return robot_answer(capfd, "check", *arguments)
 
 
 def test_files_alone_are_checked_without_a_robot(branch_folder, tmp_path, capfd):

@@ -1,15 +1,14 @@
 """A RealSense camera: the small part of its package that is used, from a fake of it."""
 
-import json
 import sys
 import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.subjects.commands import robot_answer
 
 from limber.cell.cell_file import Cell, write_cell
-from limber.cli.commands.robot import command
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress
 from limber.geometry.io.clouds import read_cloud
@@ -106,9 +105,7 @@ def test_points_are_in_the_branchs_frame(library, mount):
 
 
 def run(arguments: list[str], capfd) -> tuple[int, dict]:
-    with pytest.raises(SystemExit) as stop:
-        command.main(["scan", *arguments, "--json"], standalone_mode=False)
-    return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
+    return robot_answer(capfd, "scan", *arguments)
 
 
 def test_the_command_writes_a_cloud_and_names_what_is_missing(library, tmp_path, capfd,

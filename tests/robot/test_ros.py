@@ -2,7 +2,6 @@
 
 import ast
 import base64
-import json
 import threading
 import time
 from pathlib import Path
@@ -11,10 +10,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from tests.robot.conftest import ROS_CELL
+from tests.subjects.commands import robot_answer
 
 from benchmarks.robot_rosbridge import RosBridge
 from limber.cell.cell_file import Cell, write_cell
-from limber.cli.commands.ros import command
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.motion.joint_path import joint_path
@@ -329,10 +328,8 @@ def test_a_gripper_moves_by_its_action_and_tells_that_it_holds(tmp_path, capfd):
     write_cell(path, CELL)
 
     def run(*arguments: str) -> tuple[int, dict]:
-        with pytest.raises(SystemExit) as stop:
-            command.main(["gripper", str(path), "--position", "0.8", "--effort", "20", *arguments,
-                          "--url", server.url, "--json"], standalone_mode=False)
-        return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
+        return robot_answer(capfd, "gripper", path, "--position", "0.8", "--effort", "20",
+                            *arguments, "--url", server.url)
     with RosBridge(HOME) as server:
         assert run()[0] == 0 and run("--arm")[0] == 2 and not server.heard
         code, told = run("--arm", "--confirm", "gripper")

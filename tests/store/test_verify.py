@@ -1,11 +1,11 @@
 """`limber verify`: names each damaged file, and what is there beside."""
 
-import json
+from functools import partial
 from pathlib import Path
 
 import pytest
+from tests.subjects.commands import answer
 
-from limber.cli.main import call
 from limber.store import Branch
 
 
@@ -19,12 +19,9 @@ def branch(tmp_path: Path) -> Branch:
 
 
 @pytest.fixture
-def verify(capsys):
+def verify():
     """The command's exit code and what it says."""
-    def verified(folder: Path) -> tuple[int, dict]:
-        code = call(["verify", str(folder), "--json"])
-        return code, json.loads(capsys.readouterr().out.splitlines()[-1])
-    return verified
+    return partial(answer, "verify")
 
 
 def test_a_whole_folder_verifies(branch: Branch, verify):
