@@ -1,6 +1,5 @@
 """The Python interface: every verb, its result, and that it is the same as the command."""
 
-import contextlib
 import doctest
 import importlib.util
 import inspect
@@ -16,11 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.golden.references import small_parts
+from tests.subjects.commands import answer
 
 import limber
 from benchmarks.robot_cells import cell_file, standing_at
 from limber.api import branch, settings_table, verbs
-from limber.cli.main import call
 from limber.core.errors import BranchFolderError, InputError, MissingDependencyError, WorkError
 from limber.core.progress import LineSink
 from limber.geometry.io.clouds import read_cloud
@@ -36,11 +36,9 @@ RESULTS = [getattr(limber, name) for name in limber.__all__
 
 def told_by_command(*arguments: object) -> dict:
     """The JSON result of a command line, without what is of its run."""
-    told = io.StringIO()
-    with contextlib.redirect_stdout(told):
-        assert call([*map(str, arguments), "--json"]) == 0
-    result = json.loads(told.getvalue().splitlines()[-1])
-    return {name: value for name, value in result.items() if name not in PROCESS}
+    code, told = answer(*arguments)
+    assert code == 0, told
+    return {name: value for name, value in told.items() if name not in PROCESS}
 
 
 @pytest.fixture(scope="module")
@@ -387,8 +385,15 @@ def test_surfaces_become_branches(tmp_path):
     assert limber.mesh(path, tmp_path / "rod.branch").mesh.tet_count > 100
 
 
+@pytest.fixture
+def small():
+    """Stages have few frames, samples and cells."""
+    with small_parts():
+        yield
+
+
 @pytest.mark.slow
-@pytest.mark.usefixtures("unpainted")
+@pytest.mark.usefixtures("small")
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_verbs_are_the_commands(own, tmp_path):
     """A command with the same settings finds all done, and prints what the verb returned."""

@@ -1,6 +1,8 @@
 """The scripts that users copy, and the README's Python, do what they say."""
 
+import contextlib
 import importlib.util
+import io
 import json
 import os
 import re
@@ -8,9 +10,11 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
+from tests.golden.references import small_parts
 
 import limber
 from limber.batch.job_file import read_jobs
@@ -30,6 +34,14 @@ def run(*command: object, **environment: str) -> str:
                           timeout=250, env=LIMBER | environment)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
+
+
+def run_here(code: str, folder: Path) -> str:
+    """Run Python as a script in a folder, with few samples and cells; returns what it prints."""
+    told = io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(told), small_parts():
+        exec(code, {"__name__": "__main__"})
+    return told.getvalue()
 
 
 def test_all_are_run_here():
@@ -54,8 +66,7 @@ def test_the_guides_lines_for_mujoco(tmp_path):
     text = (ROOT / "worker/docs/howto/exchange.md").read_text(encoding="utf-8")
     block, = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     limber.open(shutil.copytree(EXAMPLE, tmp_path / "a.branch")).export(tmp_path / "apple.xml")
-    told = subprocess.run([sys.executable, "-c", block], cwd=tmp_path, check=True,
-                          capture_output=True, text=True).stdout
+    told = run_here(block, tmp_path)
     place = [float(part) for part in told.strip("[]\n ").split()]
     assert len(place) == 3 and 0.05 < np.linalg.norm(place) < 1
 
@@ -64,8 +75,9 @@ def test_the_guides_lines_for_mujoco(tmp_path):
 def test_the_core_in_ten_lines(tmp_path):
     """Further out it holds more energy and pulls harder."""
     folder = shutil.copytree(EXAMPLE, tmp_path / "a.branch")
-    told = re.findall(r"(\d+) mm: (\S+) J, \[(.+)\] N", run(sys.executable, SCRIPTS / "bend.py",
-                                                            folder))
+    with patch.object(sys, "argv", ["bend.py", str(folder)]):
+        told = run_here((SCRIPTS / "bend.py").read_text(encoding="utf-8"), tmp_path)
+    told = re.findall(r"(\d+) mm: (\S+) J, \[(.+)\] N", told)
     energies = [float(energy) for _, energy, _ in told]
     forces = [float(np.linalg.norm([float(part) for part in force.split()]))
               for _, _, force in told]
@@ -86,22 +98,19 @@ def notebook_code() -> list[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
 def test_the_notebook(tmp_path):
     """From a scan to a plan with a picture in eight lines; the modulus is about the true one."""
     first, *others = notebook_code()
     assert len([line for line in first.splitlines() if line.strip()]) <= 8
     first = first.replace("length=0.4, fork_count=1", "length=0.3, fork_count=0")  # half the time
     assert "fork_count=0" in first
-    script = tmp_path / "cells.py"
     # A cell's last line is what a notebook shows.
-    script.write_text("\n".join(
+    told = run_here("\n".join(
         f"{cell.rpartition(chr(10))[0]}\n({cell.rpartition(chr(10))[2]}).savefig('{number}.png')"
-        for number, cell in enumerate((first, *others))))
-    done = subprocess.run([sys.executable, "-W", "ignore", script], cwd=tmp_path, check=False,
-                          capture_output=True, text=True, timeout=250)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("Estimate(Young's modulus ") and ") MPa, " in done.stdout
-    assert "% above the best" in done.stdout
+        for number, cell in enumerate((first, *others))), tmp_path)
+    assert told.startswith("Estimate(Young's modulus ") and ") MPa, " in told
+    assert "% above the best" in told
     for number in range(len(others) + 1):
         assert (tmp_path / f"{number}.png").read_bytes().startswith(b"\x89PNG")
     true = json.loads((tmp_path / "scan" / "truth.json").read_text())["young_pa"]
@@ -110,6 +119,7 @@ def test_the_notebook(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
 def test_the_python_of_readme_and_guide(tmp_path):
     """Its block is the notebook's, run above; the guide's run in a folder with their branch."""
     def blocks_of(path):
@@ -119,12 +129,7 @@ def test_the_python_of_readme_and_guide(tmp_path):
     blocks = blocks_of("worker/docs/reference/python.md")
     assert blocks
     shutil.copytree(EXAMPLE, tmp_path / "apple.branch")
-    script = tmp_path / "readme.py"
-    script.write_text("if __name__ == '__main__':\n" + "\n".join(
-        f"    {line}" for block in blocks for line in block.splitlines()) + "\n")
-    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True,
-                          check=False, timeout=250)
-    assert done.returncode == 0, done.stderr
+    run_here("\n".join(blocks), tmp_path)
 
 
 @pytest.mark.slow

@@ -147,7 +147,7 @@ def python_reference() -> dict[str, dict]:
 def _workplace():
     """A folder to work in with the example and other inputs."""
     at = Path.cwd()
-    with (tempfile.TemporaryDirectory() as folder, _small(),
+    with (tempfile.TemporaryDirectory() as folder, small_parts(),
           patch.dict(os.environ, LIMBER_CORES="1")):
         os.chdir(folder)
         try:
@@ -177,7 +177,7 @@ def _workplace():
 
 
 @contextlib.contextmanager
-def _small():
+def small_parts():
     """Every part of a stage, of few frames, shapes, samples and cells; pictures without pixels."""
     from matplotlib import pyplot
 
