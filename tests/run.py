@@ -14,9 +14,11 @@ import tempfile
 import time
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -27,6 +29,15 @@ NO_TESTS = 5
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 # As many tests at once as there are cores to run them: tests of the robot wait 5 s for a process.
 SIDE_BY_SIDE = ["-n", str(min(CORES, 2)), "--dist", "worksteal"]
+# The robots' loops have real-time priority, so these follow their clocks of 2 and 8 ms beside
+# others, which are nice. What fails all the same is tried once more, alone.
+REAL_TIME = ["tests/robot", "-m", "real_time and not campaign", "--durations", "5",
+             "-o", "cache_dir=.pytest_cache/real_time"]
+# They mostly wait: for a window, for a click's effect.
+REAL_BLENDER = ["tests/addon", "-m", "real_blender and not campaign", "--durations", "5",
+                "-o", "cache_dir=.pytest_cache/real_blender"]
+CHECKS = {"types": [BIN / "mypy"], "layers": [BIN / "lint-imports", "--no-cache", "--no-logo"],
+          "packages": [sys.executable, ROOT / "scripts/check_dependencies"]}
 DURATIONS = ROOT / "tests" / "durations.json"
 """Seconds of each test over 1 s, longest first, as the last whole run measured them."""
 LONG_SECONDS = 5.0
@@ -61,14 +72,7 @@ def main(arguments: list[str]) -> int:
     if asked.ci:
         parts.append(provided_blender())
     parts.append(command("style", [BIN / "ruff", "check", "addon", "worker", "tests", "scripts"]))
-    if asked.fast or not (others or asked.campaign):
-        parts.append(command("types", [BIN / "mypy"]))
-        parts.append(command("layers", [BIN / "lint-imports", "--no-cache", "--no-logo"]))
-        parts.append(command("packages", [sys.executable, ROOT / "scripts/check_dependencies"]))
-    if asked.campaign:
-        parts.append(pytest_part("campaign", ["-m", "campaign", "--timeout", "3600", *others]))
-    else:
-        parts.extend(tests(asked.fast, others))
+    parts.extend(tests(asked.fast, asked.campaign, others))
     parts.extend(unmarked_parts(parts))
     if not (asked.fast or asked.campaign or others):
         write_durations(parts)
@@ -79,34 +83,45 @@ def main(arguments: list[str]) -> int:
     return int(any(part.failed for part in parts))
 
 
-def command(name: str, words: list) -> Part:
-    """Run a program as one part."""
-    print(f"\n=== {name} ===", flush=True)
+def command(name: str, words: list, output: Path | None = None) -> Part:
+    """Run a program as one part; with a file for its output it runs beside others."""
     began = time.monotonic()
-    code = subprocess.run([str(word) for word in words], cwd=ROOT, check=False).returncode
-    return Part(name, time.monotonic() - began, code != 0)
+    failed = _run(name, words, output) != 0
+    return Part(name, time.monotonic() - began, failed)
 
 
-def tests(fast: bool, others: list[str]) -> list[Part]:
-    """The tests: those chosen by pytest's own arguments, the quick ones, or all."""
-    if fast:
-        return [pytest_part("tests", [*SIDE_BY_SIDE, "-m",
-                                      "not slow and not campaign and not real_time "
-                                      "and not real_blender", *others])]
-    if others:
+def tests(fast: bool, campaign: bool, others: list[str]) -> list[Part]:
+    """The tests, and what runs beside them: those chosen by pytest's own arguments, the quick
+    ones, the campaigns, or all.
+    """
+    if campaign:
+        return [pytest_part("campaign", ["-m", "campaign", "--timeout", "3600", *others])]
+    if others and not fast:
         return [pytest_part("tests", ["-m", "not campaign", *others])]
-    # The robots' loops have real-time priority, so these follow their clocks of 2 and 8 ms beside
-    # the others, which are nice. What fails all the same is tried once more, alone.
-    alone = ["tests/robot", "-m", "real_time and not campaign",
-             "-o", "cache_dir=.pytest_cache/real_time"]
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as beside:
-        output = Path(folder) / "output.txt"
-        first = beside.submit(pytest_part, "real time", [*alone, "--durations", "5"], output)
-        rest = pytest_part("tests", ["-m", "not real_time and not campaign",
-                                     "--durations", "20", *SIDE_BY_SIDE])
-        part = first.result()
-        print(f"\n=== real time ===\n{output.read_text(encoding='utf-8')}", flush=True)
-    return [rest, tried_again(part, alone) if part.failed else part]
+    asides = [partial(command, name, words) for name, words in CHECKS.items()]
+    apart = "not real_time and not real_blender and not campaign"
+    if fast:
+        chosen = ["-m", f"not slow and {apart}", *others]
+    else:
+        asides += [partial(pytest_part, "real time", REAL_TIME),
+                   partial(pytest_part, "Blender", REAL_BLENDER)]
+        chosen = ["-m", apart, "--durations", "20"]
+    parts = beside(partial(pytest_part, "tests", [*SIDE_BY_SIDE, *chosen]), asides)
+    return [tried_again(part, REAL_TIME) if part.failed and part.name == "real time" else part
+            for part in parts]
+
+
+def beside(main: Callable[[], Part], asides: list[Callable[..., Part]]) -> list[Part]:
+    """Run a part, and others one after another beside it; what they print follows."""
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as second:
+        outputs = [Path(folder) / f"{number}.txt" for number in range(len(asides))]
+        running = [second.submit(aside, output=output)
+                   for aside, output in zip(asides, outputs, strict=True)]
+        parts = [main()]
+        for each, output in zip(running, outputs, strict=True):
+            parts.append(each.result())
+            print(f"\n=== {parts[-1].name} ===\n{output.read_text(encoding='utf-8')}", flush=True)
+    return parts
 
 
 def unmarked_parts(parts: list[Part]) -> list[Part]:
@@ -145,24 +160,25 @@ def tried_again(part: Part, arguments: list[str]) -> Part:
 
 def pytest_part(name: str, arguments: list[str], output: Path | None = None) -> Part:
     """Run pytest as one part; with a file for its output it runs beside others."""
-    if output is None:
-        print(f"\n=== {name} ===", flush=True)
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
-        code = _pytest(arguments, report, output)
+        code = _run(name, [*PYTEST, *arguments, "--junit-xml", report,
+                           "-o", "junit_duration_report=call"], output)
         counts, skips = _counted(report)
         seconds_of, unmarked = _timed(report)
     return Part(name, time.monotonic() - began, code not in (0, NO_TESTS), counts, skips,
                 seconds_of, unmarked)
 
 
-def _pytest(arguments: list[str], report: Path, output: Path | None) -> int:
-    polite = ["nice"] if SIDE_BY_SIDE[0] in arguments and shutil.which("nice") else []
+def _run(name: str, words: list, output: Path | None) -> int:
+    """Run a program; all but the robots' tests let others go first. Returns its exit code."""
+    if output is None:
+        print(f"\n=== {name} ===", flush=True)
+    polite = ["nice"] if name != "real time" and shutil.which("nice") else []
     with output.open("w") if output else nullcontext() as file:
-        return subprocess.run([*polite, *PYTEST, *arguments, "--junit-xml", str(report),
-                               "-o", "junit_duration_report=call"], cwd=ROOT,
-                              stdout=file, stderr=file, check=False).returncode
+        return subprocess.run([*polite, *map(str, words)], cwd=ROOT, stdout=file, stderr=file,
+                              check=False).returncode
 
 
 def _counted(report: Path) -> tuple[Counter[str], Counter[str]]:

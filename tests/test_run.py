@@ -13,66 +13,76 @@ FAILURE = '<testcase classname="a" name="fails"><failure message="no">no</failur
 
 
 @pytest.fixture
-def pytest_runs(monkeypatch, tmp_path):
-    """Calls of pytest that write what a list says of their part: True fails, False passes."""
-    outcomes, calls = {"real_time": [False], "not real_time": [False]}, []
+def runs(monkeypatch, tmp_path):
+    """Programs that do what a list says of their part: True fails, False passes. Parts of pytest
+    that are in none have no tests."""
+    outcomes, calls = {"real time": [False], "tests": [False]}, []
 
-    def called(arguments, report, output):
-        calls.append(arguments)
-        part = arguments[arguments.index("-m") + 1].removesuffix(" and not campaign")
-        part = part if part in outcomes else "not real_time"
-        failed = outcomes[part].pop(0)
-        report.write_text(REPORT.format(FAILURE if failed else ""))
+    def ran(name, words, output):
+        calls.append((name, words))
         if output is not None:
-            output.write_text("said by pytest")
+            output.write_text(f"said by {name}")
+        failed = outcomes[name].pop(0) if name in outcomes else False
+        if name in outcomes and "--junit-xml" in words:
+            words[words.index("--junit-xml") + 1].write_text(
+                REPORT.format(FAILURE if failed else ""))
         return int(failed)
 
-    monkeypatch.setattr(run, "_pytest", called)
+    monkeypatch.setattr(run, "_run", ran)
     monkeypatch.setattr(run, "DURATIONS", tmp_path / "durations.json")
-    monkeypatch.setattr(run, "command", lambda name, words: run.Part(name, 0.1, False))
     return outcomes, calls
 
 
-def test_a_failed_part_hides_no_other(pytest_runs, capsys):
-    outcomes, calls = pytest_runs
-    outcomes["not real_time"] = [True]
+def test_a_failed_part_hides_no_other(runs, capsys):
+    outcomes, calls = runs
+    outcomes["tests"] = [True]
     assert run.main([]) == 1
-    assert len(calls) == 2
+    assert {name for name, _ in calls} == {
+        "style", "types", "layers", "packages", "tests", "real time", "Blender"}
     printed = capsys.readouterr().out
-    assert "said by pytest" in printed
+    assert "said by real time" in printed and "said by types" in printed
     assert printed.rstrip().endswith("2 passed, 1 failed, 2 skipped")
 
 
-def test_real_time_tests_are_tried_once_more(pytest_runs, capsys):
+def test_the_quick_run_has_no_slow_part(runs):
+    """Checks go beside the quick tests of every package."""
+    assert run.main(["--fast"]) == 0
+    assert {name for name, _ in runs[1]} == {"style", "types", "layers", "packages", "tests"}
+
+
+def test_real_time_tests_are_tried_once_more(runs, capsys):
     """Only those that failed; what passes then counts as passed."""
-    outcomes, calls = pytest_runs
-    outcomes["real_time"] = [True, False]
+    outcomes, calls = runs
+    outcomes["real time"] = [True, False]
     assert run.main([]) == 0
-    assert "--last-failed" in calls[2]
+    assert calls[-1][0] == "real time" and "--last-failed" in calls[-1][1]
     printed = capsys.readouterr().out
     assert "3 passed, 0 failed, 2 skipped" in printed and "2  wants ccx" in printed
 
 
-def test_what_fails_twice_fails(pytest_runs, capsys):
+def test_what_fails_twice_fails(runs, capsys):
     """And is counted once."""
-    pytest_runs[0]["real_time"] = [True, True]
+    runs[0]["real time"] = [True, True]
     assert run.main([]) == 1
     assert "2 passed, 1 failed, 2 skipped" in capsys.readouterr().out
 
 
-def test_a_failed_style_check_fails_the_run(pytest_runs, monkeypatch, capsys):
-    monkeypatch.setattr(run, "command", lambda name, words: run.Part(name, 0.1, name == "style"))
+@pytest.mark.parametrize("check", ["style", "types", "layers", "packages"])
+def test_a_failed_check_fails_the_run(runs, check, capsys):
+    runs[0][check] = [True]
     assert run.main([]) == 1
     assert "2 passed, 1 failed" in capsys.readouterr().out
 
 
-def test_arguments_go_to_pytest(pytest_runs):
-    _, calls = pytest_runs
+def test_arguments_go_to_pytest(runs):
+    _, calls = runs
     assert run.main(["tests/geometry", "-k", "skeleton"]) == 0
-    assert calls == [["-m", "not campaign", "tests/geometry", "-k", "skeleton"]]
+    (style, _), (tests, words) = calls
+    assert (style, tests) == ("style", "tests")
+    assert words[3:8] == ["-m", "not campaign", "tests/geometry", "-k", "skeleton"]
 
 
-def test_durations_are_kept_and_a_new_long_test_wants_a_mark(pytest_runs, monkeypatch, capsys):
+def test_durations_are_kept_and_a_new_long_test_wants_a_mark(runs, monkeypatch, capsys):
     """A whole run writes them; what was there before, or is marked, may take its time."""
     case = '<testcase classname="a" name="{}" time="{}">{}</testcase>'
     mark = '<properties><property name="long" value="yes"/></properties>'
@@ -81,9 +91,9 @@ def test_durations_are_kept_and_a_new_long_test_wants_a_mark(pytest_runs, monkey
     assert run.main([]) == 0, "there are no durations to compare with yet"
     kept = run.DURATIONS.read_text()
     assert list(json.loads(kept).items()) == [("a::c", 9.5), ("a::b", 7.0)]
-    pytest_runs[0].update({"real_time": [False], "not real_time": [False]})
+    runs[0].update({"real time": [False], "tests": [False]})
     assert run.main([]) == 0
     run.DURATIONS.write_text("{}")
-    pytest_runs[0].update({"real_time": [False], "not real_time": [False]})
+    runs[0].update({"real time": [False], "tests": [False]})
     assert run.main([]) == 1
     assert "without the mark slow or campaign: a::c (9 s)" in capsys.readouterr().out
