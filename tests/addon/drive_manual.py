@@ -20,6 +20,8 @@ def jobs():
 
 def begin():
     clear()
+    system = bpy.context.preferences.system
+    system.viewport_aa, system.use_overlay_smooth_wire = "8", True
     return True
 
 

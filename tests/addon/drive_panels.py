@@ -48,9 +48,9 @@ def begin():
     preferences.view.font_path_ui = str(FOLDER / "cut.ttf")
     view()[1].spaces.active.show_region_ui = True
     # Only the sidebar is looked at: the view beside it is drawn as fast as it can be.
-    preferences.system.viewport_aa = "OFF"
-    view()[1].spaces.active.shading.type = "WIREFRAME"
-    view()[1].spaces.active.overlay.show_overlays = False
+    space = view()[1].spaces.active
+    space.shading.type, space.overlay.show_overlays = "WIREFRAME", False
+    space.show_object_viewport_mesh = space.show_object_viewport_curve = False
     seen["panels"] = len(PANELS)
     return True
 
@@ -165,6 +165,7 @@ def measure_errors():
     told = json.loads((FOLDER / "errors.json").read_text())
     stages = part("stages").stages()
     window, area, region = view("UI")
+    seen["sidebar"] = [region.x, region.y, region.width, region.height]
     with bpy.context.temp_override(window=window, area=area, region=region):
         room = lines.room(bpy.context)
     seen["room"], seen["error_count"] = room, len(told)

@@ -11,7 +11,8 @@ from limber.geometry.generated import generate_branch
 pytestmark = [pytest.mark.real_blender, pytest.mark.slow]
 
 
-@pytest.mark.parametrize("size", [(1280, 720), (1600, 900)])
+@pytest.mark.parametrize("size", [
+    (1280, 720), pytest.param((1600, 900), marks=pytest.mark.campaign)])
 def test_four_clicks_to_a_bent_branch(run, blender, environment, has_kernels, tmp_path, size):
     """The tab, the example, the grab, the press on the branch; the branch bends under the mouse.
     Then the goal is dragged by its handle: it is the plan's."""
