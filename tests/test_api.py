@@ -53,6 +53,13 @@ def own(tmp_path):
     return limber.open(shutil.copytree(EXAMPLE, tmp_path / "a.branch"))
 
 
+@pytest.fixture
+def small_stages():
+    """Stages have few frames, samples and cells."""
+    with small_parts():
+        yield
+
+
 def test_importing_it_loads_nothing_heavy():
     """`import limber` and the names of what it has cost no numerical package."""
     code = ("import limber, sys; assert 'plan' not in dir(limber) and 'Plan' in dir(limber); "
@@ -110,7 +117,7 @@ def test_names_for_programs_are_those_for_type_checkers():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("unpainted")
+@pytest.mark.usefixtures("small_stages")
 @pytest.mark.filterwarnings("ignore:A gap")
 def test_the_docstrings_examples(own, tmp_path, monkeypatch):
     """They run as they stand, in a folder with a scan and a branch."""
@@ -385,15 +392,8 @@ def test_surfaces_become_branches(tmp_path):
     assert limber.mesh(path, tmp_path / "rod.branch").mesh.tet_count > 100
 
 
-@pytest.fixture
-def small():
-    """Stages have few frames, samples and cells."""
-    with small_parts():
-        yield
-
-
 @pytest.mark.slow
-@pytest.mark.usefixtures("small")
+@pytest.mark.usefixtures("small_stages")
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_verbs_are_the_commands(own, tmp_path):
     """A command with the same settings finds all done, and prints what the verb returned."""
