@@ -42,13 +42,19 @@ def _known() -> dict[str, set[str]]:
     return dict(_commands(main))
 
 
+@functools.cache
+def _all_calls() -> list[tuple[str, ast.Call, str]]:
+    """The calls in the source, each with its place and the name after the last dot."""
+    return [(f"{path.relative_to(ROOT)}:{node.lineno}", node, _name(node))
+            for path, tree in _source() for node in ast.walk(tree) if isinstance(node, ast.Call)]
+
+
+def _name(call: ast.Call) -> str:
+    return getattr(call.func, "attr", getattr(call.func, "id", ""))
+
+
 def _calls(*names: str):
-    """The calls of these names in the source, each with its place and the name."""
-    for path, tree in _source():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Call) and (
-                    name := ast.unparse(node.func).split(".")[-1]) in names:
-                yield f"{path.relative_to(ROOT)}:{node.lineno}", node, name
+    return [each for each in _all_calls() if each[2] in names]
 
 
 def _values(node: ast.Call) -> list:
@@ -79,7 +85,7 @@ def test_options_and_commands_of_messages_exist():
     wrong = [place for place, node, name in _calls("Option", "Command") if (known := _values(node))
              and not (known[0] in commands and commands[known[0]].issuperset(
                  str(Option(*_values(each)[:1])) for each in node.args if isinstance(each, ast.Call)
-                 and ast.unparse(each.func) == "Option")
+                 and _name(each) == "Option")
                  if name == "Command" else _is_taken(Option(*known)))]
     assert not wrong
 
@@ -87,10 +93,10 @@ def test_options_and_commands_of_messages_exist():
 @pytest.mark.slow
 def test_no_error_or_warning_names_an_option_in_its_text():
     """Only as data, which each interface shows in its own way."""
-    names = {ast.unparse(node.exc.func) for _, tree in _source() for node in ast.walk(tree)
+    names = {_name(node.exc) for _, tree in _source() for node in ast.walk(tree)
              if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call)}
     found = []
-    for place, node, _name in _calls(*names, "warn", "warned", "Text"):
+    for place, node, _ in _calls(*names, "warn", "warned", "Text"):
         for each in (*node.args, *(keyword.value for keyword in node.keywords)):
             text = "".join(part.value for part in ast.walk(each)
                            if isinstance(part, ast.Constant) and isinstance(part.value, str))
