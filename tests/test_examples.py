@@ -18,7 +18,7 @@ from tests.golden.references import small_parts
 
 import limber
 from limber.batch.job_file import read_jobs
-from limber.batch.stage_task import run_task
+from limber.batch.machines import run_task
 from limber.core.progress import SILENT
 from limber.recordings.recording import read_pull
 from limber.stages.pulls.export_pull import ExportPull
@@ -184,7 +184,7 @@ def test_the_job_file(tmp_path):
     assert apple.tasks[-1].render == tmp_path / "results" / "apple.png"
     shutil.copytree(ROOT / "blend_files" / "mature", apple.folder)
     for task in apple.tasks[1:3]:
-        outcome = run_task(task, apple.folder, SILENT)
-        assert not outcome["error"] and outcome["result"]["frame_count"] == 24
+        record = run_task(task, apple.folder, SILENT)
+        assert not record.error and record.numbers["frame_count"] == 24
     pull = read_pull(apple.folder / "pulls" / "two")
     assert np.isfinite(pull.wrenches[:, :3]).all() and pull.observations.point_count == 4

@@ -8,29 +8,28 @@ from concurrent.futures import Future
 import pytest
 
 from limber.batch import run
-from limber.batch.stage_task import run_task
 from limber.core.progress import SILENT
 
 
 class Here:
-    """Runs tasks in this process; ``before`` is called before each."""
+    """A pool that runs tasks in this process; ``before`` is called before each."""
 
-    count = 1
+    worker_count = 1
     before = staticmethod(lambda task, folder: None)
 
-    def __init__(self, *_given):
+    def __init__(self, *_given, **_named):
         pass
 
-    def submit(self, task, folder):
+    def submit(self, function, task, folder, *, limits):
         future = Future()
         Here.before(task, folder)
         try:
-            future.set_result(run_task(task, folder, SILENT))
+            future.set_result(function(task, folder, SILENT))
         except Exception as error:
             future.set_exception(error)
         return future
 
-    def cancel(self):
+    def cancel(self, *, wait_for_end):
         pass
 
     def __enter__(self):
@@ -43,7 +42,7 @@ class Here:
 @pytest.fixture
 def here(monkeypatch):
     """Batches run in this process; returns what runs their tasks."""
-    monkeypatch.setattr(run, "_ThisProcess", Here)
+    monkeypatch.setattr(run, "Pool", Here)
     return Here
 
 

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import psutil
@@ -177,9 +178,9 @@ def test_records_and_log_stay_short(orchard, monkeypatch):
         assert len(held.path.read_text().splitlines()) == 2
     assert Records(jobs).of(branch, branch.tasks[0]).seconds == 39.0
     monkeypatch.setattr(batch_progress, "MOST_BYTES", 500)
-    with batch_progress.BatchLog(jobs) as lines:
+    with closing(batch_progress.log_of(jobs)) as log:
         for number in range(100):
-            lines.tell("one", f"line {number}\nof %s text")
+            batch_progress.tell(log, "one", f"line {number}\nof %s text")
     files = sorted(jobs.out.glob("jobs.log*"))
     assert [path.name for path in files] == ["jobs.log", *(f"jobs.log.{n}" for n in (1, 2, 3))]
     assert all(path.stat().st_size <= 500 for path in files)

@@ -20,7 +20,7 @@ import psutil
 
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.worker_branch_files import TEMPLATE
-from limber.batch.stage_task import run_task
+from limber.batch.machines import run_task
 from limber.core.processes import Pool
 from limber.stages.motion.load import ApplyLoads
 from limber.stages.shape.generate import Generate
@@ -105,10 +105,10 @@ def memory(setting: Setting) -> list[Row]:
         for number in setting.budget.seeds(0, jobs, at_least=20):
             setting.progress(number / jobs, f"job {number + 1}")
             task = ApplyLoads(branch_folder=folder, wind=(3.0 + 0.01 * number, 0.0, 0.0))
-            outcome = pool.submit(run_task, task, folder).result()
-            if outcome["error"]:
-                return [Row(*MEMORY_ROW, outcome["error"], False, number)]
-            used.append(outcome["memory_mb"])
+            record = pool.submit(run_task, task, folder).result()
+            if record.error:
+                return [Row(*MEMORY_ROW, record.error, False, number)]
+            used.append(record.memory_mb)
     grown = float(np.median(used[-5:]) / np.median(used[9:14]) - 1)
     return [Row(*MEMORY_ROW, f"{100 * grown:+.1f} % ({used[-1]:.0f} MB)", grown < 0.05,
                 len(used))]

@@ -151,30 +151,19 @@ LOGS_KEPT = 3
 """Older files that are kept besides the newest: ``JOBS.log.1`` ..."""
 
 
-def path_of_log(jobs: JobFile) -> Path:
-    """Return the path of the newest lines."""
-    return jobs.out / f"{jobs.path.stem}.log"
+def log_of(jobs: JobFile) -> logging.Handler:
+    """Return the batch's log, to be closed; a line that cannot be written, on a full disk, is
+    printed on standard error."""
+    handler = RotatingFileHandler(jobs.out / f"{jobs.path.stem}.log", maxBytes=MOST_BYTES,
+                                  backupCount=LOGS_KEPT, encoding="utf-8", delay=True)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    return handler
 
 
-class BatchLog:
-    """Appends lines with their time to a batch's log, in a ``with``; one that cannot be written, on
-    a full disk, is printed on standard error."""
-
-    def __init__(self, jobs: JobFile):
-        self._handler = RotatingFileHandler(path_of_log(jobs), maxBytes=MOST_BYTES,
-                                            backupCount=LOGS_KEPT, encoding="utf-8", delay=True)
-        self._handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
-
-    def tell(self, *parts: str) -> None:
-        """Append a line made of these parts."""
-        text = " ".join(" ".join(filter(None, parts)).split())
-        self._handler.handle(logging.makeLogRecord({"msg": "%s", "args": (text,)}))
-
-    def __enter__(self) -> "BatchLog":
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._handler.close()
+def tell(log: logging.Handler, *parts: str) -> None:
+    """Append a line made of these parts, with the time."""
+    text = " ".join(" ".join(filter(None, parts)).split())
+    log.handle(logging.makeLogRecord({"msg": "%s", "args": (text,)}))
 
 
 # The summary of a batch: a table with one row per branch, and an HTML page.

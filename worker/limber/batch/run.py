@@ -1,26 +1,19 @@
 """Runs a job file: branches side by side, the stages of each one after the other."""
 
+import logging
 import time
 from collections import deque
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import Any
 
-from limber.batch.batch_progress import (
-    DONE,
-    FAILED,
-    KEPT,
-    RUNNING,
-    BatchLog,
-    Record,
-    Records,
-    numbers_of,
-)
-from limber.batch.cluster import Cluster, ClusterLostError
+from limber.batch.batch_progress import FAILED, KEPT, RUNNING, Record, Records, log_of, tell
 from limber.batch.job_file import BranchJob, JobFile
-from limber.batch.stage_task import is_shown, run_task
-from limber.batch.staging import AT_ONCE, Staging
+from limber.batch.machines import Cluster, ClusterLostError, is_shown, run_task
+from limber.batch.staging import AT_ONCE, bring_in, put_out
 from limber.core.errors import Cancelled, Command, LimberError, WorkError
 from limber.core.processes import Pool, worker_count
 from limber.core.progress import SILENT, Progress
@@ -47,41 +40,22 @@ def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
     kind = None if scheduler else cluster or jobs.cluster
     with records.writing(), (
             Cluster(jobs, kind, address=scheduler, workers=workers, progress=progress)
-            if kind or scheduler else _ThisProcess(jobs, workers)) as machines, (
-            Staging(jobs)) as staging, BatchLog(jobs) as log:
-        log.tell(f"{jobs.path.name}: {len(jobs.branches)} branches, Limber {VERSION}")
-        _Course(jobs, records, machines, staging, log, progress, retry_failed=retry_failed).run()
-
-
-class _ThisProcess:
-    """The pool of this process."""
-
-    def __init__(self, jobs: JobFile, workers: int | None):
-        self.count = worker_count(len(jobs.branches), requested=workers or jobs.workers,
-                                  memory_mb_each=_MEMORY_MB_EACH)
-        self._limits = jobs.limits
-        self._pool = Pool(self.count, name="a stage of the batch")
-
-    def submit(self, task: Stage, folder: Path) -> Future:
-        return self._pool.submit(run_task, task, folder, limits=self._limits)
-
-    def cancel(self) -> None:
-        self._pool.cancel(wait_for_end=True)
-
-    def __enter__(self) -> "_ThisProcess":
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._pool.close()
+            if kind or scheduler else Pool(
+                worker_count(len(jobs.branches), requested=workers or jobs.workers,
+                             memory_mb_each=_MEMORY_MB_EACH),
+                name="a stage of the batch")) as machines, closing(log_of(jobs)) as log:
+        _Course(jobs, records, machines, log, progress, retry_failed=retry_failed).run()
 
 
 class _Course:
-    """Runs the tasks of all branches; each branch may be fetched before and uploaded after."""
+    """Runs the tasks of all branches; each branch may be fetched before and uploaded after, in
+    threads."""
 
-    def __init__(self, jobs: JobFile, records: Records, machines: Cluster | _ThisProcess,
-                 staging: Staging, log: BatchLog, progress: Progress, *, retry_failed: bool):
+    def __init__(self, jobs: JobFile, records: Records, machines: Cluster | Pool,
+                 log: logging.Handler, progress: Progress, *, retry_failed: bool):
         self.jobs, self.records, self.machines, self.progress = jobs, records, machines, progress
-        self.staging, self.log, self.retry_failed = staging, log, retry_failed
+        self.log, self.retry_failed = log, retry_failed
+        self.transfers, self.closing = ThreadPoolExecutor(AT_ONCE, "staging"), Event()
         self.waiting = deque(jobs.branches)
         self.running: dict[Future, tuple[BranchJob, int, float]] = {}
         self.earlier: dict[Future, Record] = {}
@@ -93,20 +67,24 @@ class _Course:
     def run(self) -> None:
         total = max(len(self.jobs.branches), 1)
         started = time.monotonic()
+        self.tell(f"{self.jobs.path.name}: {len(self.jobs.branches)} branches, Limber {VERSION}")
         try:
             while self.waiting or self.running:
                 # A branch is completed before another is started, so results come early.
-                while self.waiting and len(self.running) < self.machines.count + self.ahead:
+                while self.waiting and len(self.running) < self.machines.worker_count + self.ahead:
                     self.begin(self.waiting.popleft())
                 done, _ = wait(self.running, _TICK_SECONDS, FIRST_COMPLETED)
                 for future in done:
                     self.take(future)
                 self.report(total, time.monotonic() - started)
         except BaseException as error:
-            self.machines.cancel()
-            self.log.tell(f"stopped: {error!r}")
+            self.machines.cancel(wait_for_end=True)
+            self.tell(f"stopped: {error!r}")
             raise
-        self.log.tell(f"{self.ended} branches ended in {time.monotonic() - started:.0f} s")
+        finally:
+            self.closing.set()
+            self.transfers.shutdown(cancel_futures=True)
+        self.tell(f"{self.ended} branches ended in {time.monotonic() - started:.0f} s")
 
     def report(self, total: int, seconds: float) -> None:
         numbers: dict[str, Any] = {"branches_done": self.ended}
@@ -121,7 +99,12 @@ class _Course:
         if not branch.is_moved or self.is_given_up(branch, 0):
             self.submit(branch, 0)
         else:
-            self.running[self.staging.fetch(branch)] = branch, _FETCH, time.monotonic()
+            future = self.transfers.submit(bring_in, branch, self.stop_transfer)
+            self.running[future] = branch, _FETCH, time.monotonic()
+
+    def stop_transfer(self) -> None:
+        if self.closing.is_set():
+            raise Cancelled
 
     def is_given_up(self, branch: BranchJob, number: int) -> bool:
         """Whether a task has failed before and is not to be tried again."""
@@ -144,7 +127,7 @@ class _Course:
             self.submit(branch, number + 1)
             return
         self.records.begin(branch, task)
-        future = self.machines.submit(task, branch.folder)
+        future = self.machines.submit(run_task, task, branch.folder, limits=self.jobs.limits)
         self.earlier[future] = record
         self.running[future] = branch, number, time.monotonic()
 
@@ -163,8 +146,8 @@ class _Course:
     def end(self, branch: BranchJob) -> None:
         """Upload the results of a branch, or count it as ended."""
         if branch.home or self.jobs.home:
-            self.running[self.staging.put(branch)] = (
-                branch, len(branch.tasks), time.monotonic())
+            future = self.transfers.submit(put_out, self.jobs, branch)
+            self.running[future] = branch, len(branch.tasks), time.monotonic()
         else:
             self.ended += 1
 
@@ -180,7 +163,7 @@ class _Course:
         # Warnings and cost are those of the run that made it.
         self.records.end(branch, task, replace(earlier, status=KEPT, numbers=record.numbers)
                          if is_kept else record)
-        self.log.tell(branch.name, task.label, f"{record.status} after {record.seconds or 0:.1f} s",
+        self.tell(branch.name, task.label, f"{record.status} after {record.seconds or 0:.1f} s",
                       f"with {record.memory_mb:.0f} MB" if record.memory_mb else "")
         for warning in record.warnings:
             self.warn(f"{branch.name} {task.label}: {warning}")
@@ -192,7 +175,10 @@ class _Course:
 
     def warn(self, message: str) -> None:
         self.progress.warn(message)
-        self.log.tell(message)
+        self.tell(message)
+
+    def tell(self, *parts: str) -> None:
+        tell(self.log, *parts)
 
     def moved(self, future: Future, branch: BranchJob, number: int, seconds: float) -> None:
         """Continue after a branch was fetched, or end with it; a failure counts for the next task,
@@ -216,7 +202,7 @@ class _Course:
 
     def outcome(self, future: Future, branch: BranchJob, seconds: float) -> Record:
         try:
-            outcome = future.result()
+            return future.result()
         except (Cancelled, ClusterLostError):
             raise
         except LimberError as error:
@@ -228,10 +214,6 @@ class _Course:
             report = Command("bug-report", str(branch.folder))
             return Record(FAILED, f"internal error: {error!r}; please report it ({report}). "
                           f"{notes}", round(seconds, 3))
-        status = FAILED if outcome["error"] else KEPT if outcome["is_kept"] else DONE
-        return Record(status, outcome["error"], outcome["seconds"], outcome["memory_mb"],
-                      tuple(outcome["warnings"]), numbers_of(outcome["result"]),
-                      outcome.get("content", ""))
 
 
 def _identity(folder: Path) -> tuple[int, int]:

@@ -8,9 +8,7 @@ wrong checksum that reveals an interrupted transfer, which the next run complete
 import hashlib
 import json
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from threading import Event
 
 from limber.batch.batch_progress import path_of_page, path_of_table
 from limber.batch.job_file import BranchJob, JobFile
@@ -22,7 +20,7 @@ from limber.batch.remote_files import (
     remove,
     take_away,
 )
-from limber.core.errors import BranchFolderError, Cancelled, InputError, WorkError
+from limber.core.errors import BranchFolderError, InputError, WorkError
 from limber.core.files.atomic import file_digest, owned_name, sweep_beside, write_atomically
 from limber.core.files.reading import read_json
 from limber.store.folder_state import settled_manifest
@@ -30,34 +28,6 @@ from limber.store.manifest import MANIFEST, Manifest, checked_name, read_manifes
 
 AT_ONCE = 2
 """Number of parallel transfers."""
-
-
-class Staging:
-    """Transfers inputs and results of branches, in threads; use it in a ``with``."""
-
-    def __init__(self, jobs: JobFile):
-        self._jobs = jobs
-        self._closing = Event()
-        self._threads = ThreadPoolExecutor(AT_ONCE, "staging")
-
-    def fetch(self, branch: BranchJob) -> Future:
-        """Fetch a branch's inputs, and the branch itself from its address."""
-        return self._threads.submit(bring_in, branch, self._stop)
-
-    def put(self, branch: BranchJob) -> Future:
-        """Upload a branch's files to its address."""
-        return self._threads.submit(put_out, self._jobs, branch)
-
-    def __enter__(self) -> "Staging":
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._closing.set()
-        self._threads.shutdown(cancel_futures=True)
-
-    def _stop(self) -> None:
-        if self._closing.is_set():
-            raise Cancelled
 
 
 def bring_in(branch: BranchJob, stop: Callable[[], None]) -> None:

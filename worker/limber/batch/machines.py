@@ -1,28 +1,205 @@
-"""Machines beyond this process, by Dask: a cluster started here, by a queue, or already running.
+"""Where the tasks of a batch run: a process of a pool, or machines that Dask reaches.
 
-Stages are sent out as JSON, outcomes are returned; branch folders are where all machines see them.
-Messages are encrypted and both ends are authenticated (TLS); only a scheduler that another user has
-started on this computer may do without.
+A Dask cluster is started here, by a queue, or already running. Stages are sent out as JSON, their
+records are returned; branch folders are where all machines see them. Messages are encrypted and
+both ends are authenticated (TLS); only a scheduler that another user has started on this computer
+may do without.
 """
 
 import ipaddress
+import os
 import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import partial
+from multiprocessing import current_process
 from pathlib import Path
 from typing import Any
 
+from limber.batch.batch_progress import DONE, FAILED, KEPT, Record, numbers_of
 from limber.batch.job_file import JobFile
-from limber.batch.stage_task import run_remotely, stop_stages, unfit
-from limber.core.errors import Cancelled, InputError, Option, WorkError
+from limber.core.errors import (
+    BranchBusyError,
+    Cancelled,
+    InputError,
+    LimberError,
+    Option,
+    WorkError,
+)
+from limber.core.json_values import plain
+from limber.core.machine_errors import machine_error
 from limber.core.not_none import present
 from limber.core.optional import require_extra
-from limber.core.processes import worker_count
-from limber.core.processes.process_limits import CORES, core_budget
+from limber.core.processes import Limits, Pool, worker_count
+from limber.core.processes.process_limits import CORES, core_budget, memory_mb
 from limber.core.progress import Progress
+from limber.stages.registry import stage_class
 from limber.stages.stage import Stage
+from limber.store.manifest import read_manifest
 from limber.version import VERSION
+
+_SAMPLE_SECONDS = 0.2
+
+
+def run_task(task: Stage, folder: Path, progress: Progress) -> Record:
+    """Run a stage; return its record, also if it failed: KEPT if the branch had the result from
+    this input and settings. BranchBusyError if another program writes to the branch; Cancelled."""
+    warnings: list[str] = []
+    before, started = _finished(task, folder), time.perf_counter()
+    error, result = "", {}
+    with _most_memory() as most_mb:
+        try:
+            result = plain(task.run(progress.keeping(warnings)))
+        except (BranchBusyError, Cancelled):
+            raise
+        except LimberError as failure:
+            error = str(failure)
+        except (OSError, MemoryError) as failure:
+            translated = machine_error(failure, folder)
+            if translated is None:
+                raise
+            error = str(translated)
+    is_kept = before is not None and before == _finished(task, folder)
+    return Record(FAILED if error else KEPT if is_kept else DONE, error,
+                  round(time.perf_counter() - started, 3), round(most_mb[0], 1), tuple(warnings),
+                  numbers_of(result), _content(task, folder))
+
+
+def is_shown(task: Stage, folder: Path, content: str) -> bool:
+    """Whether a stage that stores no results in the branch, such as a scene, is up to date;
+    ``content``: digest of the branch that it has shown, or ""."""
+    outputs = _outputs(task)
+    return bool(content and outputs) and content == _content(task, folder) and all(
+        path.exists() for path in outputs)
+
+
+def _content(task: Stage, folder: Path) -> str:
+    """Digest of branch and Limber version for a stage that stores no results; else empty."""
+    if task.about.key or not _outputs(task):
+        return ""
+    try:
+        return f"{VERSION} {read_manifest(folder).content_digest()}"
+    except (LimberError, OSError):
+        return ""
+
+
+def _outputs(task: Stage) -> list[Path]:
+    """The files that a stage writes beside the branch; none if it reads any beside it."""
+    paths = [name for name in task.parts()["inputs"] if isinstance(getattr(task, name), Path)
+             and name != "branch_folder"]
+    outputs = task.outputs()
+    return outputs if len(outputs) == len(paths) else []
+
+
+def _finished(task: Stage, folder: Path) -> str | None:
+    """Return when the branch's entry of the task was made; None if there is none."""
+    if not task.entry or not folder.is_dir():
+        return None
+    try:
+        entry = read_manifest(folder).stages.get(task.entry)
+    except (LimberError, OSError):
+        # The stage reports what is wrong.
+        return None
+    return entry.finished + str(entry.seconds) if entry else None
+
+
+@contextmanager
+def _most_memory() -> Iterator[list[float]]:
+    """Keep the largest memory [MB] of this process and its children meanwhile."""
+    most, closing = [0.0], threading.Event()
+
+    def watch() -> None:
+        while True:
+            most[0] = max(most[0], memory_mb(os.getpid()))
+            if closing.wait(_SAMPLE_SECONDS):
+                return
+    watcher = threading.Thread(target=watch, name="memory watch", daemon=True)
+    watcher.start()
+    try:
+        yield most
+    finally:
+        closing.set()
+        watcher.join()
+
+
+# The work of a Dask worker for a batch: it runs stages in processes of its own pool.
+#
+# Crash, memory and time are then confined to the stage, and imported modules remain for the next
+# one. A lost worker takes its processes with it.
+
+_BUSY_SECONDS = 600.0
+"""Time that a stage waits for a branch: a worker that was taken for lost may still finish it."""
+_TICK_SECONDS = 1.0
+
+_guard = threading.Lock()
+_pool: Pool | None = None
+
+
+def unfit(version: str) -> str:
+    """Return why this process cannot be a worker of a batch of this version; empty if it can."""
+    if version != VERSION:
+        return (f"it has Limber {VERSION}, but the batch has {version}; install the same version "
+                "on all machines")
+    if current_process().daemon:
+        return ("it is not allowed to start processes; start Dask workers with --no-nanny, or "
+                "with DASK_DISTRIBUTED__WORKER__DAEMON=False in their environment")
+    return ""
+
+
+def run_remotely(function: Callable[..., Record], name: str, stated: dict[str, Any],
+                 directory: str, folder: str, limits: Limits, version: str) -> Record:
+    """Run a stage with values as of :meth:`limber.stages.stage.Stage.stated`, paths relative to
+    ``directory``, by :func:`run_task` in a process of this worker's pool, within limits on time and
+    memory, for a batch of this version. WorkError if it crashed or exceeded them, or the worker
+    cannot run it; Cancelled if the batch was."""
+    if reason := unfit(version):
+        raise WorkError(f"The worker {os.getpid()} cannot run this stage: {reason}.")
+    return _workers_pool().submit(_run, function, name, stated, directory, folder,
+                                  limits=limits).result()
+
+
+def stop_stages() -> None:
+    """End the running stages of this worker; the folders stay as they were before them."""
+    global _pool
+    with _guard:
+        pool, _pool = _pool, None
+    if pool is not None:
+        pool.close()
+
+
+def _workers_pool() -> Pool:
+    global _pool  # noqa: PLW0603
+    from distributed import get_worker
+
+    with _guard:
+        if _pool is None:
+            # Dask makes its workers return memory at once. Stages would then allocate it again all
+            # the time, which took a sixth of their time.
+            os.environ.pop("MALLOC_TRIM_THRESHOLD_", None)
+            _pool = Pool(get_worker().state.nthreads, name="a stage of the batch")
+        return _pool
+
+
+def _run(function: Callable[..., Record], name: str, stated: dict[str, Any], directory: str,
+         folder: str, progress: Progress) -> Record:
+    # Paths are relative to the start folder of the batch, on every machine.
+    os.chdir(directory)
+    task = stage_class(name).checked(stated)
+    end = time.monotonic() + _BUSY_SECONDS
+    while True:
+        try:
+            return function(task, Path(folder), progress)
+        except BranchBusyError:
+            if time.monotonic() > end:
+                raise
+        progress(0.0, "waiting for the branch")
+        time.sleep(_TICK_SECONDS)
+
+
+# The cluster, as the batch sees it.
 
 _QUEUES = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "lsf": "LSFCluster", "sge": "SGECluster",
           "oar": "OARCluster", "moab": "MoabCluster", "htcondor": "HTCondorCluster"}
@@ -49,7 +226,7 @@ class ClusterLostError(WorkError):
 
 
 class Cluster:
-    """Runs tasks of a job file, within its limits for each stage, on a Dask cluster, in a ``with``:
+    """Runs tasks of a job file as a pool does, on a Dask cluster, in a ``with``:
     one of :data:`~limber.batch.job_file.CLUSTERS` with that many workers or queued jobs, or a
     scheduler's ``tls://HOST:PORT``, or ``tcp://`` on loopback; ``progress`` reports the wait for
     the first worker. InputError for an unsafe address, or no number of jobs; MissingDependencyError
@@ -60,36 +237,36 @@ class Cluster:
                  workers: int | None = None, progress: Progress):
         packages = ("distributed", "cryptography", *(["dask_jobqueue"] if kind in _QUEUES else []))
         require_extra("cluster", packages, "A batch on a cluster")
-        self._limits, self._directory = jobs.limits, str(Path.cwd())
-        self._requested = workers
-        self._is_cancelled = False
+        self._directory = str(Path.cwd())
+        self._requested, self._is_cancelled = workers, False
         with ExitStack() as stack:
             self._client = stack.enter_context(self._connected(stack, jobs, kind, address))
             self._wait(kind or present(address, "kind of cluster"), progress)
             self._closing = stack.pop_all()
 
     @property
-    def count(self) -> int:
+    def worker_count(self) -> int:
         """Number of tasks to run at a time."""
         return self._requested or max(sum(self._client.nthreads().values()), 1)
 
-    def submit(self, task: Stage, folder: Path) -> Future:
-        """Submit a task; its future holds the result of :func:`~limber.batch.stage_task.run_task`.
-        If a worker is lost, another runs this stage again."""
+    def submit(self, function: Callable[..., Record], task: Stage, folder: Path, *,
+               limits: Limits) -> Future:
+        """Submit ``function(task, folder)``, as to a pool. If a worker is lost, another runs it
+        again."""
         from distributed.utils import TimeoutError as NoAnswer
 
         future: Future = Future()
         future.set_running_or_notify_cancel()
         try:
             remote = self._client.submit(
-                run_remotely, task.about.name, task.stated(), self._directory, str(folder),
-                self._limits, VERSION, pure=False)
+                run_remotely, function, task.about.name, task.stated(), self._directory,
+                str(folder), limits, VERSION, pure=False)
         except (OSError, NoAnswer) as error:
             raise _lost(error) from error
         remote.add_done_callback(partial(self._pass_on, future))
         return future
 
-    def cancel(self) -> None:
+    def cancel(self, **_waiting: bool) -> None:
         """Stop all tasks and their child processes."""
         self._is_cancelled = True
         self._client.cancel(list(self._client.futures.values()), force=True)
@@ -197,13 +374,9 @@ class Cluster:
                 self._client.wait_for_workers(1, timeout=_WAIT_SECONDS)
             except TimeoutError:
                 continue
-        for worker, reason in self._client.run(_unfit_here, VERSION).items():
+        for worker, reason in self._client.run(unfit, VERSION).items():
             if reason:
                 raise WorkError(f"The worker {worker} cannot run this batch: {reason}.", "", "")
-
-
-def _unfit_here(version: str) -> str:
-    return unfit(version)
 
 
 def _lost(error: Exception | None) -> ClusterLostError:
