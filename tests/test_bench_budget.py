@@ -188,9 +188,9 @@ def test_the_last_line_is_the_table_as_json(monkeypatch, tmp_path, capsys):
     def run(setting: Setting) -> list[Row]:
         seen.append((setting.seed, setting.quick, 85 < setting.budget.remaining <= 90))
         return [Row("a", "1 %", "0.5 %", True, 7)]
-    monkeypatch.setattr(importlib.import_module("benchmarks.geometry"), "PARTS", {
+    monkeypatch.setattr(importlib.import_module("benchmarks.scans"), "PARTS", {
         "one": _part(5, "a", grows=True, run=run), "two": _part(1e4, "b")})
-    assert table.main(["geometry", "--budget", "90s", "--quick", "--json", "--seed", "12",
+    assert table.main(["scans", "--budget", "90s", "--quick", "--json", "--seed", "12",
                        "--out", str(tmp_path / "out")]) == 0
     assert seen == [(12, True, True)] and (tmp_path / "out").is_dir()
     told = capsys.readouterr().out.splitlines()
@@ -198,19 +198,19 @@ def test_the_last_line_is_the_table_as_json(monkeypatch, tmp_path, capsys):
     record = json.loads(told[-1])
     assert record.pop("date").count("-") == 2 and "commit" in record
     assert {key: record[key] for key in ("bench", "seed", "budget_s")} == {
-        "bench": "geometry", "seed": 12, "budget_s": 90}
+        "bench": "scans", "seed": 12, "budget_s": 90}
     assert record["rows"] == [
         {"measure": "a", "asked": "1 %", "measured": "0.5 %", "met": True, "count": 7},
         {"measure": "b", "asked": "1 %", "measured": "not shown", "met": None, "count": 0}]
 
 
-@pytest.mark.parametrize("arguments", [["geometry", "--budget", "soon"],
-                                       ["geometry", "--only", "nothing"]])
+@pytest.mark.parametrize("arguments", [["scans", "--budget", "soon"],
+                                       ["scans", "--only", "nothing"]])
 def test_wrong_arguments_are_said(arguments, capsys):
     with pytest.raises(SystemExit):
         table.main(arguments)
     told = capsys.readouterr().err
-    assert "90s, 15m or 1h" in told or "it has: generated" in told
+    assert "90s, 15m or 1h" in told or "it has: sparse" in told
 
 
 @pytest.mark.parametrize("name", table.NAMES)

@@ -18,7 +18,7 @@ _SCORES = {"forks": 2, "forks_found": 2, "forks_false": 0, "centre_radii": 0.1, 
            "radius_error": 0.01, "radius_bias": 0.01, "covered": 0.95, "volume": 0.01, "shown": 1.0,
            "root_diameters": 0.1, "main_axis_radii": 0.3, "length_held": True, "volume_held": True,
            "told_forks": [[0.95, 1.0]], "told_bridges": [[0.7, 1.0]],
-           "told_nodes": [[1.0, 0.9, 1.0, 1.0]] * 10}
+           "told_nodes": [[1.0, 0.9, 1.0, 1.0]] * 10, "paper": 0.08, "watertight": True}
 
 
 def test_parts_take_what_other_parts_kept(monkeypatch, tmp_path) -> None:

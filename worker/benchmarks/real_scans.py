@@ -28,7 +28,8 @@ from limber.geometry.io.clouds import read_points
 from limber.geometry.reconstruction import Reconstruction, ReconstructSettings, reconstruct_cloud
 from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+DATA = Path(os.environ.get("LIMBER_SCANS") or (
+    Path(__file__).resolve().parents[2].parent / "shared" / "data"))
 AS_IT_IS = "as it is"
 Back = Callable[[np.ndarray], np.ndarray]
 
@@ -70,7 +71,7 @@ def _tree(name: str) -> np.ndarray:
         return np.stack([tree["nodes"][tree["par"][1:]], tree["nodes"][1:]], axis=1) / 1000
 
 
-_PUU = "reports/09-puu933-bare-branch/"
+_PUU, _CHAOS = "reports/09-puu933-bare-branch/", "reports/47-sparse-real-twig-chaos/"
 _MM, _DOWN = {"unit": "mm"}, {"unit": "mm", "up": (0.0, -1.0, 0.0)}
 _CUT = {"unexplained": 1.0, "leaves": "cut"}
 _KEEP = {"leaves": "keep"}  # the others' skeletons go through leaves
@@ -84,11 +85,13 @@ SCANS = {
     "tomato": Scan(f"{_TOMATO}.xyz", _MM | _CUT, False, partial(_graph, f"{_TOMATO}.graph.txt")),
     "maize": Scan(f"{_MAIZE}.ply", _MM | _CUT, False, partial(_graph, f"{_MAIZE}.graph.txt")),
     "puu": Scan(_PUU + "puu_933.xyz", _MM | {"root": (-900.0, 793.0, 2060.0)}, True,
-                partial(_tree, _PUU + "reference_skeleton.npz"))}
-_WHOLE = {"tomato in leaf": Scan(f"{_TOMATO}.xyz", _MM | _KEEP, False, SCANS["tomato"].reference),
+                partial(_tree, _PUU + "reference_skeleton.npz")),
+    "puu-670": Scan(_CHAOS + "puu_670.xyz", _MM, True, partial(_tree, _CHAOS + "puu_670_ref.npz"))}
+WHOLE = {"tomato in leaf": Scan(f"{_TOMATO}.xyz", _MM | _KEEP, False, SCANS["tomato"].reference),
           "maize in leaf": Scan(f"{_MAIZE}.ply", _MM | _KEEP, False, SCANS["maize"].reference)}
-_REAL = SCANS | _WHOLE
-_COMPARED = ("puu", "tomato in leaf", "tree", "coffee", "maize in leaf", "apple-25", "apple-125")
+_REAL = SCANS | WHOLE
+_COMPARED = ("puu", "puu-670", "tomato in leaf", "tree", "coffee", "maize in leaf", "apple-25",
+             "apple-125")
 """Scans of the rows on lengths, in their order."""
 
 
@@ -109,7 +112,7 @@ def reference_length(name: str) -> float | None:
 
 def _half(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
     chosen = np.sort(rng.permutation(len(cloud))[:len(cloud) // 2])
-    return Cloud(cloud.points[chosen]), settings, _unmoved
+    return Cloud(cloud.points[chosen]), settings, unmoved
 
 
 def _turned(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
@@ -139,13 +142,13 @@ def _in_unit(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cl
 
 
 def _shuffled(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
-    return Cloud(cloud.points[rng.permutation(len(cloud))]), settings, _unmoved
+    return Cloud(cloud.points[rng.permutation(len(cloud))]), settings, unmoved
 
 
 def _doubled(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
     """A fifth of the points twice."""
     again = rng.choice(len(cloud), len(cloud) // 5, replace=False)
-    return Cloud(np.concatenate([cloud.points, cloud.points[again]])), settings, _unmoved
+    return Cloud(np.concatenate([cloud.points, cloud.points[again]])), settings, unmoved
 
 
 def _with_outliers(cloud: Cloud, settings: dict, rng: np.random.Generator,
@@ -153,7 +156,7 @@ def _with_outliers(cloud: Cloud, settings: dict, rng: np.random.Generator,
     """1 % of points anywhere in the bounding box."""
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     stray = rng.uniform(low, high, (len(cloud) // 100, 3))
-    return Cloud(np.concatenate([cloud.points, stray])), settings, _unmoved
+    return Cloud(np.concatenate([cloud.points, stray])), settings, unmoved
 
 
 def _on_ground(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
@@ -169,14 +172,15 @@ def _on_ground(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[
     rise = height.min() - foot @ up + 0.001 * size * rng.normal(size=count)
     ground = (foot + rise[:, None] * up + (reach * np.cos(angle))[:, None] * side[0]
               + (reach * np.sin(angle))[:, None] * side[1])
-    return Cloud(np.concatenate([cloud.points, ground])), settings, _unmoved
+    return Cloud(np.concatenate([cloud.points, ground])), settings, unmoved
 
 
 def _as_it_is(cloud: Cloud, settings: dict, rng: np.random.Generator) -> tuple[Cloud, dict, Back]:
-    return cloud, settings, _unmoved
+    return cloud, settings, unmoved
 
 
-def _unmoved(places: np.ndarray) -> np.ndarray:
+def unmoved(places: np.ndarray) -> np.ndarray:
+    """Return places of a changed scan whose coordinates stayed."""
     return places
 
 
@@ -257,7 +261,7 @@ def measured(task: tuple[str, str, int], out: Path | None) -> dict[str, Any]:
 def _measured(task: tuple[str, str, int], out: Path | None) -> dict[str, Any]:
     name, change, seed = task
     cloud, settings = _subject(name, seed)
-    rng, back = np.random.default_rng([seed, *change.encode()]), _unmoved
+    rng, back = np.random.default_rng([seed, *change.encode()]), unmoved
     if change in DEGRADED:
         cloud = Cloud(DEGRADED[change](cloud.points, rng))
     else:
@@ -290,6 +294,11 @@ def _subject(name: str, seed: int) -> tuple[Cloud, dict[str, Any]]:
         return Cloud(case.points), case.settings
     if name in ("round", "one-sided"):
         return Cloud((round_case(seed) if name == "round" else one_sided_case(seed + 1)).points), {}
+    return raw_scan(name)
+
+
+def raw_scan(name: str) -> tuple[Cloud, dict[str, Any]]:
+    """Return a real scan in its file's unit, and what its user states."""
     return read_points(DATA / _REAL[name].file), _REAL[name].settings
 
 
@@ -381,6 +390,9 @@ def beyond_ends(found: np.ndarray, reference: np.ndarray) -> float:
 
 REAL_ROW = Asked("real scans: tube length more than a radius off any point, bridges aside",
                  "under 8 %")
+SURFACES = Asked("real scans: surface watertight, no self-intersection; points no farther outside "
+                 "a branch than twice their spacing", "all; report")
+QSM = Asked("aRchi_tree_1: radii over 5 mm against TreeQSM's", "report")
 REAL = Asked("worlds, real scans with independent skeletons: length within its stated interval; "
              "median error; refused though bare", "90 %; 8 %; 0")
 WORSE = Asked("worlds, the same degraded (half, one-sided, cut, noisy)", "90 %; 8 %; 0")
@@ -403,7 +415,18 @@ def real_rows(setting: Setting) -> list[Row]:
     failed = [_why(run) for run in done if run.failure]
     return [Row(*REAL_ROW, "; ".join([", ".join(f"{name} {share:.1%}" for name, share in
                                                 shares.items()), *failed]),
-                bool(shares and max(shares.values()) < 0.08 and not failed), len(done))]
+                bool(shares and max(shares.values()) < 0.08 and not failed), len(done)),
+            *_body_rows(sound(done))]
+
+
+def _body_rows(done: list[Trial]) -> list[Row]:
+    whole = sum(run["watertight"] for run in done)
+    told = "; ".join(f"{run.task[0]} {run['explained']:.0%}" for run in done)
+    rows = [Row(*SURFACES, f"{whole} of {len(done)}; {told}", whole == len(done), len(done))]
+    for median, size, share in (run["radius_off"] for run in done if run.task[0] == "tree"):
+        rows.append(Row(*QSM, f"median {median:+.0%}, median |difference| {size:.0%} on "
+                        f"{share:.0%} of its cylinders", None))
+    return rows
 
 
 def length_rows(setting: Setting) -> list[Row]:

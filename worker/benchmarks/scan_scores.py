@@ -223,18 +223,19 @@ class Dense:
         return cls(points, radius, low, high, share)
 
 
-def seen_part(truth: Skeleton, points: np.ndarray) -> Skeleton:
+def seen_part(truth: Skeleton, points: np.ndarray, margin: float = 2 * _STEP) -> Skeleton:
     """The part of the truth that a scan shows: ends beyond the last point near them are cut off.
 
     A stretch between points is required, whatever its length. Wood beyond all points is not, nor is
-    a twig without points of its own: its carrier's points do not show its base.
+    a twig without points of its own: its carrier's points do not show its base. Points count up to
+    ``margin`` [m] and a quarter radius off the wood.
     """
     run, distance = truth.branch[nearest_cylinders(truth, points)[0]], np.full(
         truth.node_count, np.inf)
     for number in np.unique(run):
         own = truth.branch == number
         distance[own] = cKDTree(points[run == number]).query(truth.nodes[own])[0]
-    shown = distance < truth.radius + 2 * _STEP + 0.25 * truth.radius
+    shown = distance < truth.radius + margin + 0.25 * truth.radius
     below = shown.copy()
     for node in range(truth.node_count - 1, 0, -1):
         below[truth.parent[node]] |= below[node]

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks import real_scans
+from benchmarks import peers, real_scans, sparse_scans
 from benchmarks.scan_scores import Outcomes, outcomes
 from benchmarks.table import Asked, Part, Row, Setting
 from benchmarks.worlds.sources import BARE_VIEWS, LEFT_OUT, SOURCES
@@ -124,12 +124,14 @@ def _view_rows(one: Outcomes, view: View) -> list[Row]:
         f"{one.centre_failures()} (mean {one.column('centre_radii').mean():.0%} of the radius, "
         f"worst {one.column('centre_radii').max():.0%})",
         f"median {np.median(error):.1%}, worst branch {error.max():.1%}, bias "
-        f"{np.median(one.column('radius_bias')):+.1%}, sigma covers {covered:.0%}",
+        f"{np.median(one.column('radius_bias')):+.1%}, sigma covers {covered:.0%}; the paper's "
+        f"nearest-point radii differ by {np.median(one.column('paper')):.0%}",
         f"worst {volumes.max():.1%}, median {np.median(volumes):.1%}, "
         f"{int((volumes > 0.08).sum())} over 8 % (of what points show; of all wood worst "
         f"{np.abs((1 + one.column('volume')) * one.column('shown') - 1).max():.1%}; stated "
         f"intervals hold the volume of {int(one.column('volume_held').sum())}, the length of "
-        f"{int(one.column('length_held').sum())}){one.told()}")
+        f"{int(one.column('length_held').sum())}); {int(one.column('watertight').sum())} "
+        f"watertight{one.told()}")
     return [Row(*asked, told, is_met, one.count)
             for asked, told, is_met in zip(view.rows, measured, met, strict=True)]
 
@@ -333,11 +335,19 @@ WORLDS = {
                    grows=True),
     "worlds-real": Part(real_scans.length_rows, 90, (real_scans.REAL, real_scans.BARE,
                                                      real_scans.WORSE), grows=True)}
+SPARSE = {
+    "sparse": Part(sparse_scans.sparse_rows, 60, sparse_scans.SPARSE, grows=True),
+    "sparse-real": Part(sparse_scans.real_rows, 60, sparse_scans.REAL, grows=True),
+    "perturbations": Part(sparse_scans.perturbation_rows, 90, (sparse_scans.PERTURBATIONS,),
+                          grows=True),
+    "peers": Part(peers.rows, 300, peers.PEERS, alone=True)}
 PARTS = {
+    **SPARSE,
     **WORLDS,
     "one-sided": _part("one-sided", partial(_view_rows, view=ONE_SIDED), ONE_SIDED.rows),
     "round": _part("round", partial(_view_rows, view=ROUND), ROUND.rows),
-    "real": Part(real_scans.real_rows, 60, (real_scans.REAL_ROW,), grows=True),
+    "real": Part(real_scans.real_rows, 60, (real_scans.REAL_ROW, real_scans.SURFACES,
+                                            real_scans.QSM), grows=True),
     "gaps": _part("gaps", gap_rows, (GAP_ROW,)),
     "2-mm": _part("2-mm", partial(_noise_rows, kind="2 mm"), noise_asked("2 mm")),
     "3-mm": _part("3-mm", partial(_noise_rows, kind="3 mm"), noise_asked("3 mm")),

@@ -22,9 +22,6 @@ CHAPTERS = {
         "others) that share no code with the project's own, seen by models of laser scanners, "
         "depth cameras, hand scanners and photogrammetry, bare, in leaf and in pots; and real "
         "scans with skeletons of others.")),
-    "geometry": ("Skeletons against programs and real scans", (
-        "Generated branches again, and real scans on which other programs (TreeQSM, aRchi) have "
-        "published cylinder models.")),
     "mechanics": ("Bending and motion", (
         "The finite elements against solutions that are known: rigid motions, the elastica by "
         "shooting, a manufactured solution for the order of convergence, a beam's frequency.")),

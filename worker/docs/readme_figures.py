@@ -82,7 +82,7 @@ ROWS = (
      "forks from one side, {other forks, around} from all around; radius bias {other bias, one "
      "side} and {other bias, around}; real scans against others' skeletons: length {real length} "
      "off (median), stated interval holds {real held}; our own generator, one side: {forks} of the "
-     "forks, radii {radius} off", "`tests/geometry`; `scripts/bench scans`, `geometry`"),
+     "forks, radii {radius} off", "`tests/geometry`; `scripts/bench scans`"),
     ("bending and motion", "{elastica} off the elastica at worst, first frequency {frequency} off",
      "`tests/mechanics`; `scripts/bench mechanics`"),
     ("Young's modulus along the branch, with 95 % intervals",

@@ -390,6 +390,42 @@ def weber_penn(rng: np.random.Generator) -> Plant:
     return growth.plant()
 
 
+# --- a drooping branch: zig-zag axes, limbs that alternate or are opposite, collars at forks
+
+
+def drooping(rng: np.random.Generator) -> Plant:
+    """One branch of a tree, bent down by its weight; no constant of the program was set on it."""
+    growth, collar = Growth(np.zeros(3), rng.uniform(0.0045, 0.008)), rng.uniform(0.1, 0.35)
+    paired, droop = rng.uniform() < 0.4, rng.uniform(0.3, 1.2)
+    swollen: dict[int, float] = {}
+
+    def axis(at: int, way: np.ndarray, long: float, thick: float, order: int) -> None:
+        side = np.cross(way, [0.0, 0.0, 1.0] + 0.2 * rng.normal(size=3))
+        side /= np.linalg.norm(side)
+        done, sign, zigzag = 0.0, 1.0, np.radians(rng.uniform(5, 20))
+        while done < long:
+            step = min(rng.uniform(0.025, 0.07), long - done + 0.005)
+            way = way / np.linalg.norm(way) - droop * step * np.array([0, 0, 1.0])
+            heading = way + sign * np.tan(zigzag) * side
+            count = max(round(step / 0.005), 1)
+            places = growth.nodes[at] + step * np.linspace(0, 1, count + 1)[1:, None] * (
+                heading / np.linalg.norm(heading))
+            taper = thick * (1 - 0.65 * (done + step * np.linspace(0, 1, count + 1)[1:]) / long)
+            at = int(growth.line(at, places, np.maximum(taper, 0.0013))[-1])
+            done, sign = done + step, -sign
+            left = long - done
+            for turn in (1, -1) if paired else (1,):
+                twig = left * rng.uniform(0.25, 0.6)
+                if order < 2 and twig > 0.04 and rng.uniform() < (0.7, 0.25)[order]:
+                    swollen[at] = 1 + collar
+                    limb = way - turn * sign * rng.uniform(0.7, 1.6) * side
+                    axis(at, limb, twig, growth.radius[at] * rng.uniform(0.45, 0.8), order + 1)
+
+    axis(0, np.array([*rng.normal(size=2), rng.uniform(-0.3, 0.6)]), rng.uniform(0.4, 0.8),
+         growth.radius[0], 0)
+    return growth.plant(knob=np.array([swollen.get(k, 1.0) for k in range(len(growth.nodes))]))
+
+
 def _shoot(growth: Growth, at: int, way: np.ndarray, length: float, rng: np.random.Generator,
            bend: float = 0.3) -> np.ndarray:
     """A wandering line of nodes from ``at`` [m]; it bends up (or down) by ``bend`` [rad]."""

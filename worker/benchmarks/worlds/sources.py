@@ -6,6 +6,7 @@ the project's own; with each left out it changes by a tenth to a quarter.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,6 +17,7 @@ from benchmarks.worlds.plants import (
     Plant,
     colonised,
     dichotomous,
+    drooping,
     monopodial,
     opposite,
     sympodial,
@@ -28,6 +30,8 @@ SOURCES: dict[str, Callable[[np.random.Generator], Plant]] = {
     "opposite": opposite, "dichotomous": dichotomous, "weber-penn": weber_penn}
 LEFT_OUT = frozenset(SOURCES)
 """Sources that no constant was set on alone."""
+NEW = "drooping"
+"""Source of which no program's constant and no fit has seen a scan."""
 _STREAM = 35  # separates these draws from those of other cases of a seed
 BARE_VIEWS = ("one-sided", "round")
 
@@ -68,6 +72,21 @@ def potted_case(seed: int, source: str) -> ScanCase:
     seen = rng.choice(ALL_AROUND)(sensors.potted(plant, rng), rng, 0.0005)
     return _case(f"{source}_potted_{seed}", seed, plant, seen, {"leave_out": True},
                  seen.label == sensors.SUPPORT)
+
+
+def sparse_case(seed: int, source: str, view: str) -> ScanCase:
+    """300 to 1,500 points of a branch, noise 2 to 3 mm, and 1 to 3 % of points anywhere."""
+    rng = _generator(seed, source, view, "sparse")
+    plant = drooping(rng) if source == NEW else SOURCES[source](rng).branch()
+    sensor = rng.choice(ONE_SIDED if view == "one-sided" else ALL_AROUND)
+    seen = sensor(Scene.bare(plant), rng, rng.uniform(0.002, 0.003))
+    count = int(np.exp(rng.uniform(*np.log([300, 1500]))))
+    points = seen.points[rng.permutation(len(seen.points))[:count]]
+    stray = rng.uniform(points.min(axis=0), points.max(axis=0), (
+        round(rng.uniform(0.01, 0.03) * count), 3))
+    case = _case(f"sparse_{source}_{view}_{seed}", seed, plant, seen, {"leave_out": True})
+    return replace(case, points=np.concatenate([points, stray]), leaf=np.repeat(
+        [False, True], [len(points), len(stray)]))
 
 
 def _generator(seed: int, *words: str) -> np.random.Generator:

@@ -38,7 +38,7 @@ from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
 #     [ W_H ]  P'  = [ W_H P ].
 #
 # The Laplacian is computed once, on the scan. Recomputed on the contracted points, as is usual, it
-# follows every hole of the scan and takes several times as long (`scripts/bench geometry`).
+# follows every hole of the scan and takes several times as long (`scripts/bench scans`).
 
 NEIGHBOURS = 12
 """Neighbours that the point-cloud Laplacian triangulates; 12 is as good as 30 and faster."""
