@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import scan_loops, silicone_beam
+from benchmarks import silicone_beam
 from benchmarks.paper_branches import BRANCHES, FRACTIONS, Bench, PaperBranch, exact_pull, measured
 from benchmarks.table import Asked, Part, Row, Setting, share_met
 from benchmarks.trials import Trial, column, joined
@@ -366,7 +366,6 @@ def _record(modes: Modes, node: int, rng: np.random.Generator) -> tuple[np.ndarr
 PARTS = {
     "exact": Part(_paper_table, 60, (_EXACT, *_TABLE)),
     "noise": Part(_noise_rows, 90, _NOISE, grows=True),
-    "scans": Part(scan_loops.estimate_rows, 60, scan_loops.ESTIMATE_ROWS, grows=True),
     "beam": Part(silicone_beam.recording_rows, 30, silicone_beam.RECORDING_ROWS),
     "other-loads": Part(silicone_beam.other_loads_row, 20, (silicone_beam.OTHER_LOADS,),
                         grows=True),

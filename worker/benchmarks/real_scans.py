@@ -284,7 +284,8 @@ def _measured(task: tuple[str, str, int], out: Path | None) -> dict[str, Any]:
     return found | {
         "off_points": off_any_point(made), "explained": explained(made.cloud.points, skeleton),
         "called_leaf": float(np.mean(leaf)), "flying": dropped.get("flying", 0) / dropped["read"],
-        **({} if other is None else _beside(axes, other())),
+        **({} if other is None else {"beyond_m": beyond_ends(np.stack(
+            [axes.nodes[axes.parent[1:]], axes.nodes[1:]], axis=1), other())}),
         **({"radius_off": _radii_off(axes)} if name == "tree" else {})}
 
 
@@ -324,25 +325,6 @@ def off_any_point(made: Reconstruction) -> float:
     distance, _ = cKDTree(made.cloud.points).query(here.points)
     asked = skeleton.radius_state[here.high] != BRIDGED
     return float((distance > 2 * here.radius)[asked].mean())
-
-
-def _beside(axes: Skeleton, other: np.ndarray) -> dict[str, Any]:
-    """Axes in the scan's coordinates [m] beside another's segments [k, 2, 3]: length beyond its
-    ends, mean distances [m] to them and back, lengths [m] by order.
-    """
-    ours = np.stack([axes.nodes[axes.parent[1:]], axes.nodes[1:]], axis=1)
-    places, theirs = (_places(each) for each in (ours, other))
-    step = np.linalg.norm(ours[:, 1] - ours[:, 0], axis=1)
-    return {"beyond_m": beyond_ends(ours, other),
-            "there_m": cKDTree(theirs).query(places)[0].mean(),
-            "back_m": cKDTree(places).query(theirs)[0].mean(),
-            "by_order_m": [float(step[axes.order[1:] == k].sum()) for k in range(4)]}
-
-
-def _places(segments: np.ndarray) -> np.ndarray:
-    """Twenty places on each segment."""
-    share = np.linspace(0, 1, 20)[:, None, None]
-    return (segments[:, 0] + share * (segments[:, 1] - segments[:, 0])).reshape(-1, 3)
 
 
 def _radii_off(axes: Skeleton) -> list[float]:

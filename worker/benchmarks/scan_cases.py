@@ -18,7 +18,6 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import frames, tangents
 
 _PITCH = 1 / 900  # width of a pixel at a depth of 1
-_THINNEST = 0.0015  # [m] radius of twigs at their tips
 _TREE_TWIGS = (9, 6, 4)  # on each axis of order 0, 1, 2
 _TREE_THINNEST = 0.006  # [m]
 
@@ -133,36 +132,6 @@ def _case(branch: GeneratedBranch, name: str) -> ScanCase:
                     branch.surface.volume)
 
 
-def crown_case(seed: int) -> ScanCase:
-    """A branch with twigs on its twigs down to 1.5 mm radius, 1 to 5 spacings thick."""
-    rng = np.random.default_rng([seed, 4])
-    spacing = float(rng.uniform(0.0012, 0.003))
-    base = branch_of(seed, fork_count=int(rng.integers(4, 11)), gap_count=0, radius_tip=0.003,
-                     length=0.8).skeleton
-    nodes, parent, radius = [base.nodes], [base.parent], [base.radius]
-    count = base.node_count
-    for run in base.runs()[1:]:
-        places = np.linspace(0.3, 0.8, int(rng.integers(2, 5)))
-        for share in places:
-            at = run[int(share * len(run))]
-            thick = max(0.6 * base.radius[at], _THINNEST)
-            way = base.nodes[run[-1]] - base.nodes[run[1]]
-            aside = np.cross(way, rng.normal(size=3))
-            direction = way / np.linalg.norm(way) + aside / np.linalg.norm(aside)
-            length = float(rng.uniform(0.05, 0.12))
-            steps = np.linspace(0, length, 15)[1:, None]
-            twig = base.nodes[at] + steps * direction / np.linalg.norm(direction)
-            nodes.append(twig)
-            parent.append(np.concatenate([[at], count + np.arange(len(twig) - 1)]))
-            radius.append(np.linspace(thick, _THINNEST, len(twig)))
-            count += len(twig)
-    truth = Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent), np.concatenate(radius))
-    spec = BranchSpec(length=0.8, noise=0.0004, point_spacing=spacing, occlusion=0.05,
-                      unevenness=0.2, radius_root=float(base.radius[0]), radius_tip=_THINNEST)
-    return ScanCase(f"crown_{seed}", seed, truth, scan(truth, spec, rng).points,
-                    settings={"leave_out": True})
-
-
 def leafy_case(seed: int) -> ScanCase:
     """A seedling: stems, and a leaf at each tip."""
     rng = np.random.default_rng([seed, 5])
@@ -259,5 +228,5 @@ def _axis(rng: np.random.Generator, start: np.ndarray, direction: np.ndarray, le
 KINDS: dict[str, Callable[[int], ScanCase]] = {
     "one-sided": one_sided_case, "2-mm": partial(one_sided_case, noise=0.002),
     "3-mm": partial(one_sided_case, noise=0.003), "round": round_case, "gaps": gap_case,
-    "single-view": single_view_case, "crowns": crown_case, "leafy": leafy_case}
+    "single-view": single_view_case, "leafy": leafy_case}
 """Cases by kind, from a seed."""

@@ -63,8 +63,6 @@ class _Fit(FitSpec, EstimateYoung):
     """An estimate with what only Python sets."""
 
 
-PARTS = ("sensor", "geometry", "mesh")
-"""Parts of the stated deviation of log E."""
 SCAN_ROW = Asked("scan to moduli, branches of left-out sources, round and one-sided, noise 1 and 2 "
                  "mm: 95 % intervals that hold",
                  "88 to 99 %, or a refusal that says what the scan lacks")
@@ -72,21 +70,12 @@ BENDING_ROW = Asked("the same of bending stiffness E I", "88 to 99 %")
 WIDTH_ROW = Asked("the same: median half width of E I's intervals, over the Cramer-Rao bound with "
                   "known shape", "1.5")
 ROWS = SCAN_ROW, BENDING_ROW, WIDTH_ROW
-ESTIMATE_ROWS = (
-    Asked("reconstructed from a scan: 95 % intervals that cover the truth", "88 to 99 %"),
-    Asked("the same: error of E", "-"))
 
 
 def loop_rows(setting: Setting) -> list[Row]:
     """Measure as many branches as there is time for; sources, views and noises take turns."""
     trials = _loops(setting)
     return [coverage_row(trials), bending_row(trials), width_row(trials)]
-
-
-def estimate_rows(setting: Setting) -> list[Row]:
-    """Of the same branches: intervals by view, and errors over what is stated."""
-    trials = _loops(setting)
-    return [view_row(trials), size_row(trials)]
 
 
 def _loops(setting: Setting) -> list[Trial]:
@@ -145,54 +134,20 @@ def width_row(trials: list[Trial]) -> Row:
                median <= 1.5, len(trials))
 
 
-def view_row(trials: list[Trial]) -> Row:
-    """Number of intervals that contain the truth; a refusal is not met here."""
-    fitted = sound(trials)
-    held = joined(fitted, "covered")
-    share, failed = float(held.mean()) if len(held) else 0.0, len(trials) - len(fitted)
-    told = ", ".join(f"{view} {100 * joined(own, 'covered').mean():.0f} %"
-                     for view, own in _by_view(fitted))
-    return Row(*ESTIMATE_ROWS[0], f"{100 * share:.1f} % of {len(held)} ({told}; "
-               f"{sum(each['is_poor'] for each in fitted)} of {len(trials)} fits say that they are "
-               f"poor, {failed} failed)",
-               False if failed else share_met(share, len(held), 0.88, 0.99), len(trials))
-
-
-def size_row(trials: list[Trial]) -> Row:
-    """Errors of the moduli, and of what is stated of them."""
-    told = []
-    for view, own in _by_view(sound(trials)):
-        errors = np.log1p(joined(own, "errors"))
-        over = np.median(np.abs(errors / joined(own, "stated"))) / 0.6745
-        parts = np.median([each["parts"] for each in own], axis=0)
-        each = ", ".join(f"{name} {100 * part:.1f} %"
-                         for name, part in zip(PARTS, parts, strict=True))
-        told.append(f"{view}: median {100 * np.median(np.abs(errors)):.1f} %, {over:.2f} of what "
-                    f"is stated ({each})")
-    return Row(*ESTIMATE_ROWS[1], "; ".join(told) or "no estimate", None, len(trials))
-
-
-def _by_view(trials: list[Trial]) -> list[tuple[str, list[Trial]]]:
-    views = {view: [each for each in trials if scan_of(each.task)[1] == view]
-             for view in ("round", "one-sided")}
-    return [(view, own) for view, own in views.items() if own]
-
-
 def loop(seed: int) -> dict[str, Any]:
     """Draw a branch, scan it, reconstruct it, pull it in a cell with errors, and estimate.
 
     Returns:
         Relative errors of E; of E and of E I: whether intervals contain the truth, their half
         widths in the log; errors of log E I; ``bounds``: half widths of intervals by the
-        Cramer-Rao bound if the shape were known, the same for log E and log E I; what is stated of
-        log E. Each of shape [K].
+        Cramer-Rao bound if the shape were known, the same for log E and log E I. Each of shape [K].
     """
     rng = np.random.default_rng([seed, 3])
     plant, view, noise = scan_of(seed)
     with tempfile.TemporaryDirectory() as temporary:
         found = _looped(Path(temporary), branch_case(int(rng.integers(2**31)), plant, view, noise),
                         rng)
-    written, deviation = found.written, found.written["young_deviation"]
+    written = found.written
     covered, widths = _compared(written["young_interval_pa"], found.young)
     bending_covered, bending_widths = _compared(written["bending_stiffness_interval_nm2"],
                                                 found.bending)
@@ -200,9 +155,7 @@ def loop(seed: int) -> dict[str, Any]:
             "widths": widths, "bending_covered": bending_covered,
             "bending_widths": bending_widths,
             "bending_errors": np.log(np.array(written["bending_stiffness_nm2"]) / found.bending),
-            "bounds": found.bounds, "stated": deviation["total"],
-            "parts": [float(np.median(np.array(deviation[name], float))) for name in PARTS],
-            "is_poor": any("fit is poor" in text for text in written["warnings"])}
+            "bounds": found.bounds}
 
 
 def _compared(interval: list, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -27,12 +27,10 @@ from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.radii.nearest_points import nearest_point_radii
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
-from limber.geometry.tets.tet_mesh import TetMesh
 from limber.stages.shape.reconstruct import Reconstruct
 
 _STEP = 0.001  # [m] between the places on the axes that are compared
 _DETOUR, _AROUND = 1.5, 3.0  # longest true path of a true bridge, in its lengths plus these radii
-_FAR = 4.0  # radii from an axis to the nearest node of the mesh, from which that leaves it out
 _SAME = 1e-4  # [m] between a point and its copy in a file of single precision
 _FEW = 8  # points of a twig, under which nothing is lost with it
 _MOST = 0.5  # of a twig's points, that are dropped with it
@@ -134,7 +132,6 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
     scored["told_bridges"] = [[bridge["probability"], bool(right)] for bridge, right in zip(
         bridges, bridges_right(bridges, seen), strict=True)]
     scored |= {"seed": case.seed, "left_out": result["left_out_twigs"], "shown": shown,
-               "unsaid_m": unsaid_length(aligned, branch),
                "length_held": held(result["length_interval_m"], seen.length),
                "volume_held": held(result["volume_interval_m3"], shown * case.volume)
                if case.volume else True,
@@ -151,17 +148,6 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
 def held(interval: list[float], value: float) -> bool:
     """Whether an interval contains a true value."""
     return interval[0] <= value <= interval[1]
-
-
-def unsaid_length(aligned: Skeleton, branch: Path) -> float:
-    """Length of axes [m] that is neither near the mesh nor on a branch reported as left out."""
-    masses = branch / "point_masses.json"
-    named = {mass["branch"] for mass in json.loads(masses.read_text()) if "branch" in mass} if (
-        masses.is_file()) else set()
-    distance, _ = cKDTree(TetMesh.read(branch / "mesh.vtu").nodes).query(aligned.nodes)
-    bare = (distance > _FAR * aligned.radius) & ~np.isin(aligned.branch, list(named))
-    step = np.linalg.norm(aligned.nodes - aligned.nodes[aligned.parent], axis=1)
-    return float(step[1:][bare[1:]].sum())
 
 
 def dropped_points(case: ScanCase, branch: Path) -> dict[str, float]:
@@ -282,7 +268,6 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
     on_axis = away < 1.5 * there.radius[near]
     sigma = found.radius_sigma[here.high]
     covered = np.abs(here.radius - there.radius[near]) < 1.96 * sigma
-    resolved = on_axis & (found.radius_state[here.high] == MEASURED)
     main_off = main_axis_error(truth, found)
     stated = [float(found.probability[run[1]]) for run in found.runs()[1:]]
     return {
@@ -298,7 +283,6 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
                                 / (2 * truth.radius[0])),
         "main_axis_radii": main_off, "length_error": found.length / truth.length - 1,
         "told_forks": [[p, bool(r)] for p, r in zip(stated, true_fork, strict=True)],
-        "resolved_bias": float(np.median(error[resolved])) if resolved.any() else 0.0,
         "told_nodes": _told_nodes(found.probability[here.high], right, found.branch[here.high]),
         "recall": float((back < np.maximum(there.radius, 0.001)).mean()),
         "right": float(right.mean())}

@@ -14,8 +14,7 @@ from benchmarks.scan_scores import Outcomes, outcomes
 from benchmarks.table import Asked, Part, Row, Setting
 from benchmarks.worlds.sources import BARE_VIEWS, LEFT_OUT, SOURCES
 
-_COUNTS = {"one-sided": 60, "2-mm": 60, "3-mm": 60, "round": 60, "single-view": 20, "gaps": 60,
-           "crowns": 12}
+_COUNTS = {"one-sided": 60, "2-mm": 60, "3-mm": 60, "round": 60, "single-view": 20, "gaps": 60}
 _QUICK = 15  # times as few
 _BINOMIAL = 1.96  # standard deviations of a share of few, that its row tells beside it
 _ALLOWED = 0.08
@@ -95,8 +94,6 @@ ROUND = View("round", (0.97, 0.02, 0, 0.08, 0.05))
 SINGLE_VIEW = View("single-view")
 ROOT_ROW = Asked("round and one-sided: root within one diameter", "118 of 120")
 GAP_ROW = Asked("gaps of 20 to 80 mm, half at forks: main axis within a radius", "57 of 60")
-CROWN_ROW = Asked("generated crowns, twigs to 1.5 mm, 1 to 5 spacings: radius bias where resolved; "
-                  "length recalled / right; left out unsaid", "10 %; 90 / 95 %; 0")
 
 
 def noise_asked(kind: str) -> tuple[Asked, ...]:
@@ -169,21 +166,6 @@ def gap_rows(gaps: Outcomes) -> list[Row]:
     held = int((off <= 1).sum())
     return [Row(*GAP_ROW, f"{held} of {gaps.count} (worst {off.max():.1f} radii); forks "
                 f"{gaps.forks()[0]}{gaps.told()}", held >= 0.95 * gaps.count, gaps.count)]
-
-
-def _crown_rows(crowns: Outcomes) -> list[Row]:
-    if not crowns.scores:
-        return _nothing((CROWN_ROW,), crowns)
-    bias = crowns.column("resolved_bias")
-    recall, right = (float(crowns.column(key).mean()) for key in ("recall", "right"))
-    unsaid = float(crowns.column("unsaid_m").sum())
-    return [Row(*CROWN_ROW,
-                f"{np.median(bias):+.1%} (worst {np.abs(bias).max():.1%}); {recall:.0%} (worst "
-                f"{crowns.column('recall').min():.0%}) / {right:.0%} (worst "
-                f"{crowns.column('right').min():.0%}); {1000 * unsaid:.0f} mm; sigma covers "
-                f"{crowns.column('covered').mean():.0%}; forks {crowns.forks()[0]}{crowns.told()}",
-                bool(np.abs(bias).max() < 0.10 and recall >= 0.90 and right >= 0.95
-                     and unsaid == 0 and not crowns.failed), crowns.count)]
 
 
 def _nothing(rows: tuple[Asked, ...], one: Outcomes) -> list[Row]:
@@ -355,9 +337,6 @@ PARTS = {
                       grows=True),
     "root": Part(partial(_rows_of, kinds=("one-sided", "round"), rows=lambda done: _root_rows(
         list(done.values()))), 30, (ROOT_ROW,), grows=True),
-    "crowns": _part("crowns", _crown_rows, (CROWN_ROW,), 90),
-    "probabilities": Part(partial(_rows_of, kinds=tuple(_COUNTS), rows=lambda done: (
-        probability_rows("", list(done.values())))), 30, probability_asked(""), grows=True),
     "single-view": _part("single-view", partial(_view_rows, view=SINGLE_VIEW), SINGLE_VIEW.rows)}
 """The table, in order of importance; ``--only`` also accepts one source of the worlds, and one scan
 of the same tree's row.

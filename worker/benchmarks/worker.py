@@ -415,7 +415,5 @@ PARTS = {
     "readme": Part(run_readme, 60, (README_ROW,), grows=True),
     "memory": Part(batches.memory, 30, (batches.MEMORY_ROW,), grows=True),
     "large": Part(large, 60, LARGE_ROWS, grows=True),
-    "kills": Part(batches.killed, 90, (batches.KILLS_ROW,), grows=True),
-    "dask": Part(batches.on_dask, 120, batches.DASK_ROWS, grows=True),
-    "two-cores": Part(batches.speed_up, 120, (batches.SPEED_UP_ROW,), grows=True)}
+    "kills": Part(batches.killed, 90, (batches.KILLS_ROW,), grows=True)}
 """The table, in order of importance; ``--only`` also accepts the fuzz of one reader."""
