@@ -16,13 +16,13 @@ from limber.geometry.skeleton.skeleton import Skeleton
 
 _SCORES = {"forks": 2, "forks_found": 2, "forks_false": 0, "centre_radii": 0.1, "centre_m": 1e-4,
            "radius_error": 0.01, "radius_bias": 0.01, "covered": 0.95, "volume": 0.01, "shown": 1.0,
-           "root_diameters": 0.1, "main_axis_radii": 0.3, "length_held": True, "volume_held": True,
+           "main_axis_radii": 0.3, "length_held": True, "volume_held": True,
            "told_forks": [[0.95, 1.0]], "told_bridges": [[0.7, 1.0]],
            "told_nodes": [[1.0, 0.9, 1.0, 1.0]] * 10, "paper": 0.08, "watertight": True}
 
 
 def test_parts_take_what_other_parts_kept(monkeypatch, tmp_path) -> None:
-    """The root's row counts cases that two parts made before."""
+    """A part that is measured again makes no case again."""
     made = []
 
     def scored(task: tuple[str, int], out: object) -> dict:
@@ -36,15 +36,21 @@ def test_parts_take_what_other_parts_kept(monkeypatch, tmp_path) -> None:
     for part in ("one-sided", "round"):
         table = rows(part)
         assert all(row.met and row.count == 4 for row in table)
-    count = len(made)
-    root, = rows("root")
-    assert len(made) == count == 8 and root.measured.startswith("8 of 8") and root.count == 8
+    assert len(rows("round")) == 4 and len(made) == 8
     gaps, = rows("gaps")
     again, = rows("gaps")
     assert gaps == again and gaps.measured.startswith("2 of 4 (worst inf")
     # Of cases for which there is no time a row says nothing.
     (tmp_path / "trials.jsonl").unlink()
-    assert rows("root", -1.0)[0].count == 1
+    assert rows("round", -1.0)[0].count == 1
+
+
+def test_a_root_counts_if_it_is_right_or_asked(monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr(scans, "_root_trial", lambda task: {
+        "right": task[1] % 2, "stated": 0.5 if task[1] % 3 else 0.99})
+    monkeypatch.setattr("benchmarks.trials.core_budget", lambda: 1)
+    row, = scans.PARTS["root"].run(Setting(3, True, Budget(60.0), SILENT, tmp_path))
+    assert row.measured == "2 of 3; 2; 0.493" and row.met is False
 
 
 def test_a_case_that_fails_is_counted(monkeypatch, tmp_path) -> None:

@@ -2,9 +2,9 @@
 
 ``python -m benchmarks.scan_probabilities --first SEED --count N --out DIR`` reconstructs N scans of
 each kind of the bench `scans` and of the worlds with no twig dropped, keeps the skeletons in DIR (a
-stopped run continues), and fits the logistic models of twigs, nodes, bridges and roots: by
-likelihood, slopes held to their sign and weakly to 0. Each source in turn is left out of the fit,
-and what the fit says of it is compared with the outcome, in tenths of the stated probability.
+stopped run continues), and fits the logistic models of twigs, nodes and bridges: by likelihood,
+slopes held to their sign and weakly to 0. Each source in turn is left out of the fit, and what the
+fit says of it is compared with the outcome, in tenths of the stated probability.
 """
 
 import argparse
@@ -35,7 +35,7 @@ from limber.geometry.skeleton.joining import bridge_evidence
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
-SIGNS = {"twigs": (1,), "nodes": (-1, -1, -1), "bridges": (1, -1, -1), "roots": (1,)}
+SIGNS = {"twigs": (1,), "nodes": (-1, -1, -1), "bridges": (1, -1, -1)}
 MOST = {"twigs": PLACED}
 """Most of what is said; 1 for those not named."""
 OWN = "own"
@@ -47,7 +47,7 @@ _FIT_KINDS = (*(kind for kind in KINDS if kind != "leafy"), *(
 
 @dataclass
 class Outcomes:
-    """Evidence [k, columns], outcome [k] and source [k] of twigs, nodes, bridges or roots."""
+    """Evidence [k, columns], outcome [k] and source [k] of twigs, nodes or bridges."""
 
     evidence: list[np.ndarray] = field(default_factory=list)
     there: list[np.ndarray] = field(default_factory=list)
@@ -78,9 +78,9 @@ def skeletonised(case: ScanCase) -> tuple[Skeleton, float, float, list[dict]]:
 
 def _collected(task: tuple[str, int], out: Path) -> dict[str, Any]:
     """Evidence of one case besides its skeleton, which is in ``KIND_SEED.csv``."""
-    skeleton, noise, root_probability, bridges = skeletonised((KINDS | WORLDS)[task[0]](task[1]))
+    skeleton, noise, _, bridges = skeletonised((KINDS | WORLDS)[task[0]](task[1]))
     write_cylinders(skeleton, _file(task, out))
-    return {"noise": noise, "root_probability": root_probability, "bridges": bridges}
+    return {"noise": noise, "bridges": bridges}
 
 
 def _file(task: tuple[str, int], out: Path) -> Path:
@@ -96,7 +96,7 @@ def collect(first: int, count: int, out: Path, seconds: float, kinds: Sequence[s
 
 
 def outcomes(done: list[Trial], out: Path) -> dict[str, Outcomes]:
-    """Evidence of each twig, of places on them, of bridges and roots, and the outcomes."""
+    """Evidence of each twig, of places on them and of bridges, and the outcomes."""
     told = {name: Outcomes() for name in SIGNS}
     for one in sound(done):
         kind, seed = one.task
@@ -111,11 +111,6 @@ def outcomes(done: list[Trial], out: Path) -> dict[str, Outcomes]:
         told["bridges"].add(np.array([bridge_evidence(*(bridge[name] for name in (
             "price", "length", "thickness", "rival_price"))) for bridge in one["bridges"]]).reshape(
                 -1, 3), bridges_right(one["bridges"], truth), source)
-        # Right if the fit returns a constant of 0 and a slope of 1.
-        chance = one["root_probability"]
-        odds = np.log(max(chance, 1e-12) / max(1 - chance, 1e-12))
-        off = np.linalg.norm(found.nodes[0] - truth.nodes[0])
-        told["roots"].add(np.array([[odds]]), np.array([off <= 2 * truth.radius[0]]), source)
     return told
 
 

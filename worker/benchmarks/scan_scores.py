@@ -26,7 +26,7 @@ from limber.geometry.io.skeletons import read_cylinders
 from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.radii.nearest_points import nearest_point_radii
-from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.stages.shape.reconstruct import Reconstruct
 
 _STEP = 0.001  # [m] between the places on the axes that are compared
@@ -266,21 +266,17 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
     hits, true_fork = fork_matches(truth, found)
     right = (away < np.maximum(there.radius[near], 0.001)) & ~doubled(found, here, near)
     on_axis = away < 1.5 * there.radius[near]
-    sigma = found.radius_sigma[here.high]
-    covered = np.abs(here.radius - there.radius[near]) < 1.96 * sigma
+    covered = np.abs(here.radius - there.radius[near]) < 1.96 * found.radius_sigma[here.high]
     main_off = main_axis_error(truth, found)
     stated = [float(found.probability[run[1]]) for run in found.runs()[1:]]
     return {
         "centre_m": float(np.concatenate([away, back]).mean()),
-        "centre_radii": float(in_radii.mean()), "centre_worst_radii": float(in_radii.max()),
+        "centre_radii": float(in_radii.mean()),
         "radius_error": float(np.median(np.abs(error))), "radius_bias": float(np.median(error)),
-        "sigma_m": float(np.median(sigma)), "covered": float(covered[on_axis].mean()),
+        "covered": float(covered[on_axis].mean()),
         **twig_lengths(there, back, truth, here, right, found),
-        "measured": float((found.radius_state[here.high] == MEASURED).mean()),
         "forks": truth.branch_count - 1, "forks_found": hits,
         "forks_false": int((~true_fork).sum()),
-        "root_diameters": float(np.linalg.norm(found.nodes[0] - truth.nodes[0])
-                                / (2 * truth.radius[0])),
         "main_axis_radii": main_off, "length_error": found.length / truth.length - 1,
         "told_forks": [[p, bool(r)] for p, r in zip(stated, true_fork, strict=True)],
         "told_nodes": _told_nodes(found.probability[here.high], right, found.branch[here.high]),

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from benchmarks.scan_cases import ScanCase
 from benchmarks.worlds import sensors
@@ -54,6 +55,17 @@ def branch_case(seed: int, source: str, view: str, noise: float) -> ScanCase:
     sensor = rng.choice(ONE_SIDED if view == "one-sided" else ALL_AROUND)
     return _case(f"{source}_{view}_{seed}", seed, plant,
                  sensor(Scene.bare(plant), rng, noise), {"leave_out": True})
+
+
+def thinned_case(seed: int) -> ScanCase:
+    """A bare plant, or every other time a branch that hangs any way round, of 400 to 20,000 points.
+    """
+    rng = np.random.default_rng([seed, _STREAM])
+    source, view = rng.choice(list(SOURCES)), rng.choice(BARE_VIEWS)
+    case = (branch_case(seed, source, view, 0.001) if seed % 2 else bare_case(seed, source, view))
+    points = rng.permutation(case.points)[:int(400 * 50**rng.uniform())]
+    up = Rotation.random(rng=rng).as_matrix()[0] if seed % 2 else case.settings["up"]
+    return replace(case, points=points, settings=case.settings | {"up": tuple(up)})
 
 
 def leafy_case(seed: int, source: str) -> ScanCase:
