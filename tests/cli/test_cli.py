@@ -15,10 +15,11 @@ from types import SimpleNamespace
 
 import click
 import pytest
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from limber.cli import main
 from limber.cli.main import call
+from limber.cli.stage_command import StageCommand
 from limber.cli.terminal import (
     UNITS,
     closing_lines,
@@ -29,36 +30,43 @@ from limber.cli.terminal import (
 )
 from limber.core.errors import Cancelled, ConvergenceError, InputError, SafetyStop
 from limber.core.files import caches
+from limber.core.progress import SILENT
 from limber.geometry.settings import ReconstructSettings
-from limber.stages.command_line import command_line, settings_options
+from limber.stages.command_line import command_line
 from limber.stages.registry import stage_class, stage_summaries
+from limber.stages.stage import About, Tool
 
 
-class Settings(BaseModel):
-    """Settings of a stage that exists for the tests."""
+class Probe(Tool):
+    """Probe."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    about = About("probe")
 
-    size: float = Field(0.5, gt=0, allow_inf_nan=False, description="Size [m].")
+    size: float = Field(0.5, gt=0, description="Size [m].")
     deep: bool = Field(False, description="Go deep.")
     goal: tuple[float, float, float] | None = Field(None, description="Goal [m].")
     fractions: tuple[float, ...] = Field((0.2, 0.4), description="Fractions.")
 
 
-def invoke(function, arguments, capfd):
-    """Run a command made from ``function``; return exit code and standard output's lines."""
-    command = main.stage_command("probe")(function)
+def invoke(function, arguments, capfd, base=Probe, **about):
+    """Run the command of a stage that does ``function(stage, progress)``; return exit code and
+    standard output's lines."""
+    class Tested(base):
+        """Probe."""
+
+        def run(self, progress=SILENT):
+            return function(self, progress)
+    Tested.about = About("probe", **about)
     with pytest.raises(SystemExit) as stop:
-        command.main(arguments, standalone_mode=False)
+        StageCommand(Tested).main(arguments, standalone_mode=False)
     return stop.value.code, capfd.readouterr().out.splitlines()
 
 
 def test_result_is_the_last_json_line(capfd):
     """--json ends with one object that has the contract's keys and the result's."""
-    def function(run, **_options):
-        """Probe."""
-        run.progress(0.5, "half", count=2)
-        run.progress.warn("careful")
+    def function(_stage, progress):
+        progress(0.5, "half", count=2)
+        progress.warn("careful")
         return {"tet_count": 12}
     code, lines = invoke(function, ["--json", "--progress", "json"], capfd)
     assert code == 0
@@ -80,8 +88,7 @@ def test_result_is_the_last_json_line(capfd):
 ])
 def test_exit_codes(failure, code, status, capfd):
     """Each kind of failure ends with its exit code, and --json still ends with one object."""
-    def function(run, **_options):
-        """Probe."""
+    def function(_stage, _progress):
         raise failure
     got, lines = invoke(function, ["--json"], capfd)
     assert got == code
@@ -90,22 +97,21 @@ def test_exit_codes(failure, code, status, capfd):
 
 
 @pytest.mark.parametrize(("arguments", "wanted"), [
-    ([], Settings()),
+    ([], {}),
     (["--size", "2", "--deep", "--goal", "1", "2", "3", "--fractions", "0.5,0.9"],
-     Settings(size=2, deep=True, goal=(1, 2, 3), fractions=(0.5, 0.9))),
+     {"size": 2, "deep": True, "goal": (1, 2, 3), "fractions": (0.5, 0.9)}),
 ])
 def test_settings_become_options(arguments, wanted, capfd):
-    """Every field is an option with its type; the function gets one checked settings object."""
+    """Every field is an option with its type; the stage that runs has what was typed."""
     seen = []
 
-    @settings_options(Settings)
-    def function(run, settings, **_options):
-        """Probe."""
-        seen.append(settings)
+    def function(stage, _progress):
+        seen.append(stage)
         return {}
     code, _ = invoke(function, arguments, capfd)
     assert code == 0
-    assert seen == [wanted]
+    assert [dict(stage) for stage in seen] == [dict(Probe(**wanted))]
+    assert [stage.model_fields_set for stage in seen] == [wanted.keys()]
 
 
 @pytest.mark.parametrize(("arguments", "wanted"), [
@@ -115,13 +121,14 @@ def test_a_word_may_stand_for_the_numbers_of_an_option(arguments, wanted, capfd)
     """As it is typed; a command line made of it is read the same."""
     seen = []
 
+    class Base(ReconstructSettings, Tool):
+        """Probe."""
+
     def code_of(given):
-        @settings_options(ReconstructSettings)
-        def function(run, settings, **_options):
-            """Probe."""
-            seen.append(settings)
+        def function(stage, _progress):
+            seen.append(stage)
             return {}
-        return invoke(function, given, capfd)[0]
+        return invoke(function, given, capfd, Base)[0]
     assert code_of(arguments) == 0 and code_of(command_line(seen[0])) == 0
     assert [settings.root for settings in seen] == [wanted, wanted]
     with pytest.raises(click.UsageError, match="extra arguments"):
@@ -132,11 +139,7 @@ def test_a_word_may_stand_for_the_numbers_of_an_option(arguments, wanted, capfd)
 @pytest.mark.parametrize("arguments", [["--size=-1"], ["--size=nan"], ["--fractions", "0.1,x"]])
 def test_refused_setting_is_named(arguments, capfd):
     """A value out of range is a usage error (2); the last JSON line names option and value."""
-    @settings_options(Settings)
-    def function(run, settings, **_options):
-        """Probe."""
-        return {}
-    code, lines = invoke(function, [*arguments, "--json"], capfd)
+    code, lines = invoke(lambda *_: {}, [*arguments, "--json"], capfd)
     assert code == 2
     assert arguments[0].split("=")[0] in json.loads(lines[-1])["error"]
 
@@ -177,15 +180,15 @@ def test_completion_knows_commands_and_options(shell, capfd, monkeypatch):
 
 def test_values_are_shown_in_full_on_demand(capfd):
     """Short lines by default, every value with --verbose, one object with --json."""
-    def function(run, **_options):
-        """Probe."""
-        run.close("12 tetrahedra.", where="a.branch", then="limber simulate a.branch")
-        return {"tet_count": 12}
-    short = invoke(function, [], capfd)[1]
+    def printed(*arguments):
+        return invoke(lambda *_: {"tet_count": 12}, arguments, capfd,
+                      found=("{tet_count} tetrahedra.",), where="a.branch",
+                      then="limber simulate a.branch")[1]
+    short = printed()
     assert short[:3] == ["12 tetrahedra.", "in    a.branch", "next  limber simulate a.branch"]
     assert "--verbose" in short[3] and len(short) == 4
-    assert invoke(function, ["-v"], capfd)[1][0] == "tet_count: 12"
-    assert json.loads(invoke(function, ["--json"], capfd)[1][0])["tet_count"] == 12
+    assert printed("-v")[0] == "tet_count: 12"
+    assert json.loads(printed("--json")[0])["tet_count"] == 12
 
 
 REQUIRED = [(name, model, field) for name in stage_summaries()
@@ -248,13 +251,15 @@ def test_standard_output_that_takes_nothing_is_told(monkeypatch, capfd):
 @pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", None)])
 def test_interrupt_ends_with_130(kind):
     """Ctrl-C, SIGTERM and a closed terminal end a command with 130 and the cancelled status."""
-    program = ("import signal, time\nfrom limber.cli import main\n"
+    program = ("import signal, time\nfrom limber.cli import main, stage_command\n"
+               "from limber.stages.stage import About, Tool\n"
                "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
-               "def function(run, **_):\n"
-               "    'Probe.'\n"
-               "    print('ready', flush=True); time.sleep(30)\n"
+               "class Probe(Tool):\n"
+               "    about = About('probe')\n"
+               "    def run(self, progress=None):\n"
+               "        print('ready', flush=True); time.sleep(30)\n"
                "main._terminate_like_interrupt()\n"
-               "main.stage_command('probe')(function).main(['--json'], standalone_mode=False)")
+               "stage_command.StageCommand(Probe).main(['--json'], standalone_mode=False)")
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True,
                                stderr=subprocess.DEVNULL)
     assert process.stdout.readline().strip() == "ready"
@@ -267,19 +272,17 @@ def test_interrupt_ends_with_130(kind):
 
 def test_help_names_default_and_range_as_typed():
     """A switch's default is the switch, a vector's has spaces, a list's commas; bounds are told."""
-    class Ranged(BaseModel):
+    class Ranged(Tool):
         """Settings with every kind of default."""
+
+        about = About("probe")
 
         samples: int = Field(150, ge=30, le=5000, description="Samples.")
         upright: bool = Field(True, description="Turn it.")
         damping: tuple[float, float] = Field((0.5, 0.002), description="Damping [1/s, s].")
         fractions: tuple[float, ...] = Field((0.2, 0.8), description="Places.")
 
-    @click.command()
-    @settings_options(Ranged)
-    def probe(settings):
-        """Probe."""
-
+    probe = StageCommand(Ranged)
     told = " ".join(probe.get_help(click.Context(probe)).split())
     for text in ("[default: 150; at least 30; at most 5000]", "[default: --upright]",
                  "[default: 0.5 0.002]", "[default: 0.2,0.8]"):

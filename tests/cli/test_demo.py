@@ -10,6 +10,7 @@ import pytest
 
 from limber.cli import main
 from limber.cli.commands import demo
+from limber.cli.stage_command import StageCommand
 from limber.core.errors import NoPathError, Option, Text, WorkError
 from limber.stages.command_line import options_of, without_foreign_options
 from limber.store import Branch
@@ -180,7 +181,7 @@ def test_refusals_of_a_scan_name_only_options_that_the_demo_has() -> None:
     named = {"--" + option.replace("_", "-") for path in files for option in re.findall(
         r'Option\("(\w+)"', path.read_text(encoding="utf-8"))}
     assert {"--plants", "--crop", "--skeleton", "--unexplained"} <= named
-    assert named <= options_of(demo.command)
+    assert named <= options_of(StageCommand(demo.Demo))
 
 
 @pytest.mark.parametrize("failing", ["reconstruct", "plan"])
@@ -191,7 +192,7 @@ def test_what_a_stage_alone_can_take_is_not_proposed(stages, tmp_path, failing, 
     told = capsys.readouterr().err
     assert "There is no path. Walls. Or move the goal (--goal)." in told
     assert f"`limber {failing}` has more options" in told
-    assert {*OPTION.findall(told)} <= options_of(demo.command)
+    assert {*OPTION.findall(told)} <= options_of(StageCommand(demo.Demo))
 
 
 def test_sentences_and_brackets_with_other_options_are_left_out() -> None:

@@ -7,7 +7,7 @@ import pytest
 from tests.robot.test_hand_eye import BOARD, CARRIED, STANDING, STANDING_BOARD
 
 from limber.cell.cell_file import CameraEntry, Cell, read_cell, write_cell
-from limber.cli.commands.robot import command
+from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotation_vector
 from limber.robot.calibration import Board, View, find_board, fit_pictures
@@ -126,10 +126,9 @@ def test_the_command_calibrates_by_pictures(branch_folder, tmp_path, capfd):
     (tmp_path / "pictures.csv").write_text("\n".join(lines) + "\n")
     path = tmp_path / "cell.toml"
     write_cell(path, Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, camera=CAMERA))
-    with pytest.raises(SystemExit) as stop:
-        command.main(["calibrate", str(path), str(branch_folder), "--images",
-                      str(tmp_path / "pictures.csv"), "--json"], standalone_mode=False)
+    code = call(["robot", "calibrate", str(path), str(branch_folder), "--images",
+                 str(tmp_path / "pictures.csv"), "--json"])
     told = json.loads(capfd.readouterr().out.splitlines()[-1])
-    assert stop.value.code == 0, told
+    assert code == 0, told
     assert told["residual_px"] < 1.0 and len(told["pictures"]) == 6
     assert read_cell(path).base.pose == pytest.approx(told["base_pose"])

@@ -8,7 +8,7 @@ import pytest
 import tomlkit
 
 from limber.cell.cell_file import Cell, read_cell, write_cell
-from limber.cli.commands.robot import command
+from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 
@@ -162,10 +162,9 @@ def test_a_new_cell_shows_every_section_and_key(tmp_path, capfd):
     path = tmp_path / "new.toml"
 
     def run(*options: str) -> int:
-        with pytest.raises(SystemExit) as stop:
-            command.main(["new-cell", str(path), *options], standalone_mode=False)
+        code = call(["robot", "new-cell", str(path), *options])
         capfd.readouterr()
-        return stop.value.code
+        return code
     assert run("--model", "ur10", "--mass-kg", "1.1", "--gripper", "digital_output",
                "--grasp-distance", "0.2") == 0
     cell = read_cell(path)
@@ -209,11 +208,9 @@ def test_a_gripper_with_the_values_of_a_bare_flange_is_refused(tmp_path, tool, t
 
 def test_a_new_cell_says_what_is_to_be_filled_in_instead_of_zero(tmp_path, capfd):
     path = tmp_path / "new.toml"
-    with pytest.raises(SystemExit) as stop:
-        command.main(["new-cell", str(path), "--gripper", "robotiq", "--json"],
-                     standalone_mode=False)
+    code = call(["robot", "new-cell", str(path), "--gripper", "robotiq", "--json"])
     told = json.loads(capfd.readouterr().out.splitlines()[-1])
-    assert stop.value.code == 0 and told["to_fill_in"] == ["tool.grasp_pose", "tool.mass_kg"]
+    assert code == 0 and told["to_fill_in"] == ["tool.grasp_pose", "tool.mass_kg"]
     text = path.read_text(encoding="utf-8")
     assert text.count("TO FILL IN") == 2 and "\ngrasp_pose" not in text
     with pytest.raises(InputError, match="State where the branch lies between the fingers"):
@@ -224,8 +221,6 @@ def test_a_new_cell_says_what_is_to_be_filled_in_instead_of_zero(tmp_path, capfd
 
 
 def test_the_schema_of_a_cell_names_its_sections(capfd):
-    from limber.cli.commands.schema import command as schema
-
-    schema.main(["cell"], standalone_mode=False)
+    assert call(["schema", "cell"]) == 0
     told = json.loads(capfd.readouterr().out)
     assert {"robot", "sensor", "camera", "second_arm", "obstacles"} <= set(told["properties"])

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from limber.cell.cell_file import Cell
-from limber.cli.main import stage_command
+from limber.cli.stage_command import StageCommand
 from limber.core.errors import SafetyStop, WorkError
 from limber.core.progress import SILENT
 from limber.robot.operator_decisions import retreat_if_chosen
+from limber.stages.stage import About, Tool
 
 
 class Link:
@@ -107,11 +108,13 @@ def test_an_arm_that_holds_tells_its_force(choice):
 
 
 def test_what_a_stopped_command_found_is_in_its_json(capfd):
-    @stage_command("stopped")
-    def stopped(run):
-        raise SafetyStop("It was stopped.", result={"after_stop": {"force_n": 1.5}})
+    class Stopped(Tool):
+        about = About("stopped")
+
+        def run(self, progress=SILENT):
+            raise SafetyStop("It was stopped.", result={"after_stop": {"force_n": 1.5}})
     with pytest.raises(SystemExit) as stop:
-        stopped.main(["--json"], standalone_mode=False)
+        StageCommand(Stopped).main(["--json"], standalone_mode=False)
     told = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert stop.value.code == 4 and told["after_stop"] == {"force_n": 1.5}
     assert told["error"] == "It was stopped."

@@ -24,7 +24,7 @@ from benchmarks.robot_cells import (
 from benchmarks.robot_faults import restored
 from limber.cell.cell_file import CameraEntry, Cell
 from limber.cell.known_arms import arm_named
-from limber.cli.main import command_of
+from limber.cli.stage_command import StageCommand
 from limber.core.errors import BranchFolderError, InputError, NoPathError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import SILENT
@@ -218,7 +218,7 @@ def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folde
     axis = skeleton.point_at(0.92) - skeleton.point_at(0.87)
     path = cell_file(cell_at(branch_folder, stepped.address), tmp_path)
     with pytest.raises(SystemExit) as stop:
-        command_of(RecordPull).main(
+        StageCommand(RecordPull).main(
             [str(branch_folder), "--cell", str(path), "--name", "stiff", "--confirm", "stiff",
              "--after-stop", "retreat", "--shape", "straight", "--direction", *map(str, axis),
              "--distance", "0.03", "--speed", "0.007", "--json"], standalone_mode=False)

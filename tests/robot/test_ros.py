@@ -14,7 +14,6 @@ from tests.subjects.commands import robot_answer
 
 from benchmarks.robot_rosbridge import RosBridge
 from limber.cell.cell_file import Cell, write_cell
-from limber.cli.commands.ros import command
 from limber.core.errors import InputError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.motion.joint_path import joint_path
@@ -330,7 +329,7 @@ def test_a_gripper_moves_by_its_action_and_tells_that_it_holds(tmp_path, capfd):
 
     def run(*arguments: str) -> tuple[int, dict]:
         return robot_answer(capfd, "gripper", path, "--position", "0.8", "--effort", "20",
-                            *arguments, "--url", server.url, group=command)
+                            *arguments, "--url", server.url, group="ros")
     with RosBridge(HOME) as server:
         assert run()[0] == 0 and run("--arm")[0] == 2 and not server.heard
         code, told = run("--arm", "--confirm", "gripper")

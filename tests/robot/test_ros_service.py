@@ -10,7 +10,7 @@ from tests.robot.test_ros import CELL, HOME, line, robot_at
 
 from benchmarks.robot_rosbridge import ReplayedBridge, RosBridge
 from limber.cell.cell_file import write_cell
-from limber.cli.commands.ros import command
+from limber.cli.main import call
 from limber.core.errors import SafetyStop
 
 KINDS = {"/joint_states": "sensor_msgs/msg/JointState",
@@ -35,12 +35,11 @@ def test_a_node_calls_the_retreat_as_a_service(monkeypatch, tmp_path, capfd):
             calling = threading.Thread(target=server.call_service, args=("/limber/retreat", times))
             server.answers.clear()
             calling.start()
-            with pytest.raises(SystemExit) as stop:
-                command.main(["serve", str(tmp_path / "cell.toml"), "--url", server.url, *arguments,
-                              "--json"], standalone_mode=False)
+            code = call(["ros", "serve", str(tmp_path / "cell.toml"), "--url", server.url,
+                         *arguments, "--json"])
             calling.join()
             told = json.loads(capfd.readouterr().out.splitlines()[-1])
-            assert stop.value.code == 4 and told["calls"] == times, told
+            assert code == 4 and told["calls"] == times, told
             return [answer["values"] for answer in server.answers]
         [told] = called()
         assert not told["success"] and "Not armed" in told["message"]
@@ -54,10 +53,8 @@ def test_a_node_calls_the_retreat_as_a_service(monkeypatch, tmp_path, capfd):
 
 def test_a_service_that_may_move_needs_a_confirmation(tmp_path, capfd):
     write_cell(tmp_path / "cell.toml", CELL)
-    with pytest.raises(SystemExit) as stop:
-        command.main(["serve", str(tmp_path / "cell.toml"), "--arm", "--json"],
-                     standalone_mode=False)
-    assert stop.value.code == 2
+    code = call(["ros", "serve", str(tmp_path / "cell.toml"), "--arm", "--json"])
+    assert code == 2
     assert "Nobody confirmed" in json.loads(capfd.readouterr().out.splitlines()[-1])["error"]
 
 

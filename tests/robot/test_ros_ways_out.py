@@ -11,7 +11,7 @@ from tests.robot.test_ros import CELL, HOME, ROOT, line, robot_at
 
 from benchmarks.robot_rosbridge import STEP, RosBridge, SteppedBridge
 from limber.cell.cell_file import Cell, write_cell
-from limber.cli.commands.ros import command
+from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError, SafetyStop, WorkError
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.ros.guarded_robot import RosRobot, Topics
@@ -351,7 +351,6 @@ def test_every_command_refuses_the_papers_cell_without_its_topic(tmp_path, capfd
     """Before it asks for a branch, a path or rosbridge: `follow` in its dry run too."""
     write_cell(tmp_path / "cell.toml", PAPER)
     name, *rest = arguments
-    with pytest.raises(SystemExit) as stop:
-        command.main([name, str(tmp_path / "cell.toml"), *rest, "--json"], standalone_mode=False)
-    assert stop.value.code == 2
+    code = call(["ros", name, str(tmp_path / "cell.toml"), *rest, "--json"])
+    assert code == 2
     assert "sensor.topic" in json.loads(capfd.readouterr().out.splitlines()[-1])["error"]

@@ -7,8 +7,8 @@ import pytest
 
 from limber.cell.cell_file import Cell
 from limber.cell.reach_and_collision import ArmSurroundings
-from limber.cli.robot_commands.moves import log_move
-from limber.cli.robot_commands.weigh import weighed, weightless
+from limber.cli.commands.robot.moves import log_move
+from limber.cli.commands.robot.weigh import Weigh, weighed, weightless
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.motion.joint_path import to_joints
@@ -104,7 +104,7 @@ def test_an_arm_weighs_its_gripper_by_small_tilts(sensor, told, monkeypatch):
     ways = [to_joints(cell, *pair, around) for pair in pairwise(wanted)]
     rows = []
     link = Link(cell, joints, rows, sensor)
-    monkeypatch.setattr("limber.cli.robot_commands.weigh.time.sleep", link.read)
+    monkeypatch.setattr("limber.cli.commands.robot.weigh.time.sleep", link.read)
     found = weighed(cell, link, ways, rows)
     assert (told is None and not found.faults) or told in found.faults[0]
     assert told is not None or found.mass == pytest.approx(MASS, abs=0.05)
@@ -119,10 +119,11 @@ def test_a_gripper_is_weighed_before_the_branch_is_held(monkeypatch, tmp_path):
     with pytest.raises(InputError, match="was never weighed"):
         require_weighed(cell)
     require_weighed(weightless(cell))
-    log_move(path, "weigh", weighed_mass | {"faults": ["the sensor's sign"]} | weighed_as(cell))
+    asked = Weigh(cell_file=path)
+    log_move(asked, weighed_mass | {"faults": ["the sensor's sign"]} | weighed_as(cell))
     with pytest.raises(InputError, match="The last weighing found that the sensor's sign"):
         require_weighed(cell)
-    log_move(path, "weigh", weighed_mass | {"faults": []} | weighed_as(cell))
+    log_move(asked, weighed_mass | {"faults": []} | weighed_as(cell))
     require_weighed(cell)
     for stated in (MASS + 0.3, MASS - 0.3, 0.0):
         other = cell.model_copy(update={"tool": cell.tool.model_copy(update={"mass_kg": stated})})

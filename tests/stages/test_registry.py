@@ -7,6 +7,7 @@ import click
 import pytest
 
 from limber.cli import main
+from limber.cli.stage_command import StageCommand
 from limber.stages.command_line import command_line
 from limber.stages.registry import all_schemas, stage_class, stage_schema, stage_summaries
 
@@ -37,7 +38,7 @@ def parsed(name, arguments):
                                                for field in self.model_fields_set}))
             return {}
     with pytest.raises(SystemExit) as stop:
-        main.command_of(Caught).main(arguments, standalone_mode=False)
+        StageCommand(Caught).main(arguments, standalone_mode=False)
     assert stop.value.code == 0
     return seen[0]
 

@@ -48,10 +48,10 @@ _BEAT_SECONDS = 0.2
 _ENDING_SECONDS = 0.2  # of a driver's process: the controller's watchdog ends its program meanwhile
 _SOLVING_STEPS = 15  # of the arm, while the branch is solved
 _IN_ROBOTS_TIME = ("limber.robot.", "limber.stages.pulls.", "limber.stages.paths.",
-                   "limber.cli.robot_commands.", "benchmarks.robot_faults")
+                   "limber.cli.commands.robot.", "benchmarks.robot_faults")
 _LOADED_LATE = ("limber.robot.operator_decisions", "limber.stages.pulls.record",
                 "limber.stages.pulls.record_nudge", "limber.stages.paths.execute",
-                "limber.cli.robot_commands.moves", "limber.cli.robot_commands.weigh")
+                "limber.cli.commands.robot.moves", "limber.cli.commands.robot.weigh")
 
 
 class Wall(Nothing):

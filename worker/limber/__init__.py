@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from limber.api.verbs import mesh as mesh
     from limber.api.verbs import open as open
     from limber.api.verbs import reconstruct as reconstruct
+    from limber.api.verbs import run as run
     from limber.stages.moduli.estimate import Estimate as Estimate
     from limber.stages.motion.load import Load as Load
     from limber.stages.motion.simulate import Simulation as Simulation
@@ -58,6 +59,7 @@ _PLACES = {
     "mesh": "api.verbs",
     "open": "api.verbs",
     "reconstruct": "api.verbs",
+    "run": "api.verbs",
     "settings": "api.settings_table",
 }
 

@@ -1,6 +1,8 @@
 """``python -m limber``: the command ``limber``, for where scripts are not on the PATH."""
 
-from limber.cli.main import run
+import sys
+
+from limber.cli.main import call
 
 if __name__ == "__main__":
-    run()
+    sys.exit(call())

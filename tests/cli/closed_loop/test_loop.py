@@ -19,7 +19,7 @@ from limber.cli.closed_loop.cell_layout import (
 )
 from limber.cli.closed_loop.comparison import Planned, Watch, compared, comparison
 from limber.cli.closed_loop.loop import ClosedLoop
-from limber.cli.robot_commands.calibrate import _points
+from limber.cli.commands.robot.calibrate import _points
 from limber.core.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, cast
 from limber.api.by_name import ByName
 from limber.api.running import in_python_words, run_stage, stage_of
 from limber.api.settings_table import known_stage
+from limber.cli.known import command_class
 from limber.core.errors import InputError
 from limber.core.settings import checked_settings, nearest
-from limber.stages.registry import result_of, stage_class
+from limber.stages.registry import result_of
 from limber.stages.result import Result, Written, drawn
 from limber.store import Branch as Folder
 
@@ -413,5 +414,5 @@ class Branch:
         if replayed := settings.get("pull") if name == "simulate" else None:
             key = f"replay:{replayed}"
         if settings.get("follow") or not key:
-            return (stage_class(name).about.result or Result).read(None, name, values)
+            return (command_class(name).about.result or Result).read(None, name, values)
         return result_of(self._read(), key, values)

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from limber.cli.known import command_class
 from limber.core.errors import Command, InputError, LimberError, Option, Text
 from limber.core.json_values import plain
 from limber.core.progress import BarSink, LineSink, Progress, Sink
-from limber.stages.registry import stage_class
 from limber.stages.stage import Stage
 
 _STAGES = {"add_pull": "import-pull", "energy_field": "energy"}
@@ -56,7 +56,7 @@ def run_stage(name: str, arguments: Mapping[str, Any], *, quiet: bool) -> tuple[
 
 def _checked(name: str, arguments: Mapping[str, Any]) -> Stage:
     try:
-        return stage_class(name).checked(
+        return command_class(name).checked(
             {key: plain(value) if isinstance(value, np.ndarray | np.generic | list | tuple)
              else value for key, value in arguments.items()})
     except InputError as error:

@@ -20,9 +20,9 @@ def settings(verb: str) -> "SettingsTable":
     >>> limber.settings("plan")["max_force"]
     Setting(meaning='Largest force of the gripper at any pose [N].', default=None)
     """
-    from limber.stages.registry import stage_class
+    from limber.cli.known import command_class
 
-    stage = stage_class(known_stage(verb))
+    stage = command_class(known_stage(verb))
     return SettingsTable(verb, {
         name: Setting(field.description or "",
                       "required" if field.is_required() else field.default)
@@ -75,9 +75,9 @@ def known_stage(verb: str) -> str:
     Raises:
         InputError: there is none.
     """
-    from limber.stages.registry import stage_summaries
+    from limber.cli.known import command_names
 
-    name, known = stage_of(verb), list(stage_summaries())
+    name, known = stage_of(verb), command_names()
     if name not in known:
         raise InputError(f"There is no stage {verb!r}.", nearest(name, known))
     return name

@@ -17,7 +17,9 @@ import numpy as np
 
 from limber.api.branch import Branch, PathLike
 from limber.api.running import run_stage
+from limber.api.settings_table import known_stage
 from limber.core.errors import InputError
+from limber.stages.result import Result
 
 if TYPE_CHECKING:
     from limber.stages.shape.generate import Generated
@@ -105,6 +107,23 @@ def open(folder: PathLike) -> "Branch":
     True
     """
     return Branch(folder)
+
+
+def run(command: str, *, quiet: bool = False, **settings: Any) -> Result:
+    """Run a command that has no verb, such as ``robot draw``, ``robot check`` or ``doctor``.
+
+    Args:
+        command: Its name.
+        quiet: Show no progress.
+        settings: Its inputs, settings and options, as ``limber.settings(command)`` lists them.
+
+    Raises:
+        InputError: there is no such command, or a setting is refused.
+
+    >>> limber.run("verify", branch_folder="a.branch").values["file_count"] > 5
+    True
+    """
+    return Result.read(None, command, run_stage(known_stage(command), settings, quiet=quiet)[1])
 
 
 def _made(stage: str, folder: PathLike, quiet: bool, arguments: dict[str, Any]) -> Branch:

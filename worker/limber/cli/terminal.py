@@ -6,11 +6,14 @@ with the names of results in them, ``"{length_m:m} of centreline"``; the units a
 """
 
 import math
+import re
 import shlex
 import string
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import click
 
 Line = str | Callable[[Mapping[str, Any]], str | None]
 """A template, or a function from results to a line; a line without its results is omitted."""
@@ -119,6 +122,24 @@ class _Quoted(_Filled):
 
 
 _FILLED, _QUOTED = _Filled(), _Quoted()
+
+
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+
+
+def without_control(text: str) -> str:
+    """Return a text that cannot control the terminal, as names and texts of files might."""
+    return _CONTROL.sub("?", text)
+
+
+def say(text: str) -> None:
+    """Print on standard error."""
+    click.echo(without_control(text), err=True)
+
+
+def table_text(title: str, rows: Sequence[Sequence[str]]) -> str:
+    """Return a table below its title; its first row is the header."""
+    return "\n".join([f"\n{title}", *(f"  {line}" for line in table_lines(rows))])
 
 
 def table_lines(rows: Sequence[Sequence[str]]) -> Iterator[str]:

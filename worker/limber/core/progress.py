@@ -6,7 +6,8 @@ A long function takes ``progress: Progress = SILENT`` and calls it during the wo
 
 A call raises :class:`limber.core.errors.Cancelled` once the work has been cancelled, so the work
 can stop at every call. ``progress.part(0.2, 0.6)`` is a view for a sub-task.
-``progress.warn(message)`` reports a warning that does not stop the work.
+``progress.warn(message)`` reports a warning that does not stop the work, ``progress.say(line)``
+what has been done so far.
 """
 
 import contextlib
@@ -29,13 +30,16 @@ class Progress:
     Args:
         sink: Gets fraction, message and numbers.
         on_warning: Gets each warning.
+        on_line: Gets each line of what has been done.
     """
 
-    def __init__(self, sink: Sink | None = None, on_warning: Callable[[Text], None] | None = None,
-                 *, _span: tuple[float, float] = (0.0, 1.0),
-                 _stop: threading.Event | None = None):
+    def __init__(self, sink: Sink | None = None,
+                 on_warning: Callable[[Text], object] = lambda _message: None,
+                 on_line: Callable[[str], object] = lambda _line: None, *,
+                 _span: tuple[float, float] = (0.0, 1.0), _stop: threading.Event | None = None):
         self._sink = sink
         self._on_warning = on_warning
+        self._on_line = on_line
         self._span = _span
         self._stop = _stop or threading.Event()
 
@@ -50,14 +54,17 @@ class Progress:
 
     def warn(self, *message: Part) -> None:
         """Warn the user of something that does not stop the work, in the parts of a ``Text``."""
-        if self._on_warning is not None:
-            self._on_warning(Text(*message))
+        self._on_warning(Text(*message))
+
+    def say(self, line: str) -> None:
+        """Print what has been done, or a table, for people."""
+        self._on_line(line)
 
     def part(self, start: float, stop: float) -> "Progress":
         """Return a progress whose 0..1 is ``start..stop`` of this one."""
         low, high = self._span
         span = (low + (high - low) * start, low + (high - low) * stop)
-        return Progress(self._sink, self._on_warning, _span=span, _stop=self._stop)
+        return Progress(self._sink, self._on_warning, self._on_line, _span=span, _stop=self._stop)
 
     def named(self, name: str) -> "Progress":
         """Return the same progress, its warnings prefixed with ``name``."""
@@ -75,11 +82,11 @@ class Progress:
         return self._with_warnings(keep)
 
     def _with_warnings(self, on_warning: Callable[[Text], None]) -> "Progress":
-        return Progress(self._sink, on_warning, _span=self._span, _stop=self._stop)
+        return Progress(self._sink, on_warning, self._on_line, _span=self._span, _stop=self._stop)
 
     def to_the_end(self) -> "Progress":
         """Return the same progress for work that is finished even though it was cancelled."""
-        return Progress(self._sink, self._on_warning, _span=self._span)
+        return Progress(self._sink, self._on_warning, self._on_line, _span=self._span)
 
     def cancel(self) -> None:
         """Make the next report, from any thread, raise ``Cancelled``."""

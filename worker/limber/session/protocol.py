@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 
 from limber.core.errors import InputError
 from limber.core.json_values import json_object
-from limber.core.settings import GraspMode
+from limber.core.settings import GraspMode, Settings
 
 PROTOCOL = 2
 """Version of commands, events and the frames' file; clients with another version are refused."""
@@ -240,10 +240,8 @@ class Lines:
 # The settings of a session.
 
 
-class SessionSettings(BaseModel):
+class SessionSettings(Settings):
     """Options of `limber session`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     mode: GraspMode = Field(
         "rigid", description="rigid: the marked grasp holds position and rotation. "

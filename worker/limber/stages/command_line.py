@@ -6,20 +6,20 @@ be given several times. A field's ``json_schema_extra`` may also have: ``argumen
 its name), ``short`` (a short option), ``switch`` (no ``--no-name``), ``metavar``.
 """
 
-import functools
 import re
 import types
 import typing
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import click
-from pydantic import BaseModel
 
 from limber.core.errors import Command, Option, Text
 from limber.core.settings import OneOf, Settings, checked_settings
 from limber.stages.stage import Stage
+
+Made = typing.TypeVar("Made", bound=Settings)
 
 
 class GroupedOption(click.Option):
@@ -140,32 +140,19 @@ def is_own(part: Option | Command, own: Collection[str]) -> bool:
     return isinstance(part, Command) or str(Option(part.name)) in own
 
 
-def settings_options(model: type[BaseModel], name: str = "settings", *,
-                     without: Collection[str] = ()) -> Callable[[Callable], Callable]:
-    """Add one option for each field of a model but ``without``, which keep their defaults; the
-    function gets ``name=model(...)``. InputError when it is called with values that the model
-    refuses."""
-    prefix = f"{name}__"
-
-    def wrap(function: Callable) -> Callable:
-        @functools.wraps(function)
-        def body(*args: Any, **options: Any) -> Any:
-            given = {option: options.pop(option) for option in list(options)
-                     if option.startswith(prefix)}
-            settings = checked_settings(model, {
-                option.removeprefix(prefix): value for option, value in given.items()
-                if value is not None})
-            return function(*args, **{name: settings}, **options)
-        command: Callable = body
-        for field in reversed(_names(model)):
-            if field not in without:
-                command = _parameter(model, field, model.model_fields[field],
-                                     prefix + field)(command)
-        return command
-    return wrap
+def parameters(model: type[Settings]) -> list[click.Parameter]:
+    """Return an argument or option for each field of a model."""
+    return [_parameter(model, name) for name in _names(model)]
 
 
-def _names(model: type[BaseModel]) -> list[str]:
+def made_of(model: type[Made], typed: Mapping[str, Any]) -> Made:
+    """Return the model of what was typed, by the names of its fields; InputError if it is refused.
+    """
+    return checked_settings(model, {name: typed[name] for name in _names(model)
+                                    if typed.get(name) is not None})
+
+
+def _names(model: type[Settings]) -> list[str]:
     return model.names() if issubclass(model, Stage) else list(model.model_fields)
 
 
@@ -203,37 +190,37 @@ def _typed(name: str, field: Any, value: Any) -> list[str]:
     return [flag, ",".join(map(str, value))]
 
 
-def _parameter(model: type[BaseModel], name: str, field: Any, destination: str) -> Callable:
+def _parameter(model: type[Settings], name: str) -> click.Parameter:
+    field: Any = model.model_fields[name]
     extra = field.json_schema_extra or {}
     kind, optional = _plain_type(field.annotation)
-    grouped = issubclass(model, Settings)
-    group = model.group_of(name) if grouped else "options"
+    group = model.group_of(name)
     if extra.get("argument"):
-        return click.argument(destination, cls=DescribedArgument, metavar=name.upper(),
-                              type=_click_type(kind), required=field.is_required(),
-                              description=field.description or "", group=group)
+        own = name.upper() if field.is_required() else f"[{name.upper()}]"
+        return DescribedArgument([name], metavar=extra.get(
+            "metavar", None if typing.get_origin(kind) is Literal else own),
+                                 type=_click_type(kind), required=field.is_required(),
+                                 description=field.description or "", group=group)
     hidden = field.is_required() or optional
     default = None if hidden else field.get_default(call_default_factory=True)
     flag = "--" + name.replace("_", "-")
     flags = [extra["short"], flag] if "short" in extra else [flag]
-    common = {"cls": GroupedOption, "default": None, "required": field.is_required(),
-              "group": group,
-              "expert": grouped and model.is_expert(name),
-              "help": _help(name, field, kind, default)}
+    common = {"default": None, "required": field.is_required(), "group": group,
+              "expert": model.is_expert(name), "help": _help(name, field, kind, default)}
     if "metavar" in extra:
         common["metavar"] = extra["metavar"]
     if kind is bool and extra.get("switch"):
-        return click.option(*flags, destination, is_flag=True,
-                            **common | {"help": field.description})
+        return GroupedOption([*flags, name], is_flag=True,
+                             **common | {"help": field.description})
     if kind is bool:
-        return click.option(f"{flag}/--no-{flag[2:]}", destination, **common)
+        return GroupedOption([f"{flag}/--no-{flag[2:]}", name], **common)
     if typing.get_origin(kind) is tuple:
-        return _tuple_option([*flags, destination], typing.get_args(kind), common,
+        return _tuple_option([*flags, name], typing.get_args(kind), common,
                              _words(field.annotation))
     for part in field.metadata:
         if isinstance(part, OneOf):
-            return click.option(*flags, destination, type=click.Choice(part.names()), **common)
-    return click.option(*flags, destination, type=_click_type(kind), **common)
+            return GroupedOption([*flags, name], type=click.Choice(part.names()), **common)
+    return GroupedOption([*flags, name], type=_click_type(kind), **common)
 
 
 def _words(annotation: Any) -> list[str]:
@@ -243,21 +230,21 @@ def _words(annotation: Any) -> list[str]:
 
 
 def _tuple_option(names: list[str], items: tuple, common: dict[str, Any], words: list[str],
-                  ) -> Callable:
+                  ) -> click.Option:
     if items[-1] is Ellipsis and typing.get_origin(items[0]) is tuple:
         parts = typing.get_args(items[0])
-        return click.option(*names, nargs=len(parts), type=parts[0], multiple=True, **common)
+        return GroupedOption(names, nargs=len(parts), type=parts[0], multiple=True, **common)
     if items[-1] is Ellipsis:
         # Repeated values add up: using only the last would silently drop the others.
-        return click.option(*names, callback=_listed, multiple=True,
-                            **{"metavar": "A,B,...", **common})
+        return GroupedOption(names, callback=_listed, multiple=True,
+                             **{"metavar": "A,B,...", **common})
     if len(items) == 3:
         common = {"metavar": "|".join(["X Y Z", *words]), **common}
     if words:
         kind = _NumberOrWord(words)
         common = {"callback": kind.joined, **common}
-        return click.option(*names, nargs=len(items), type=kind, **common)
-    return click.option(*names, nargs=len(items), type=items[0], **common)
+        return GroupedOption(names, nargs=len(items), type=kind, **common)
+    return GroupedOption(names, nargs=len(items), type=items[0], **common)
 
 
 def _click_type(kind: Any) -> Any:
@@ -280,7 +267,7 @@ def _plain_type(annotation: Any) -> tuple[Any, bool]:
 def _help(name: str, field: Any, kind: Any, default: Any) -> str:
     """A field's description, then its default and range as they are typed."""
     parts = []
-    if default is not None and default != ():
+    if default not in (None, "", ()):
         if kind is bool:
             flag = name if default else f"no_{name}"
             parts.append(f"default: --{flag.replace('_', '-')}")

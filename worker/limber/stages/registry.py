@@ -32,7 +32,7 @@ _registered: "list[type[Stage]]" = []
 
 
 @dataclass(frozen=True, order=True)
-class _Found:
+class Found:
     """A stage's class, found without importing it: where it is, and what ``--help`` shows."""
 
     position: int
@@ -40,6 +40,10 @@ class _Found:
     summary: str
     module: str
     kind: str
+
+    def stage(self) -> "type[Stage]":
+        """Import the class."""
+        return getattr(importlib.import_module(self.module), self.kind)
 
 
 def register(stage: "type[Stage]") -> None:
@@ -49,24 +53,21 @@ def register(stage: "type[Stage]") -> None:
 
 
 @cache
-def _stages() -> dict[str, _Found]:
+def _stages() -> dict[str, Found]:
     """Return all stages by name, in the order in which they run."""
-    stages: dict[str, _Found] = {}
+    stages: dict[str, Found] = {}
     for found in sorted({*_in_files()} | {
-            _Found(kind.about.position, kind.about.name, _summary(kind.__doc__), kind.__module__,
-                   kind.__qualname__) for kind in _registered}):
+            Found(kind.about.position, kind.about.name, first_words(kind.__doc__), kind.__module__,
+                  kind.__qualname__) for kind in _registered}):
         if (other := stages.setdefault(found.name, found)) is not found:
             raise InputError(f"Two modules make a stage {found.name}: {other.module} and "
                              f"{found.module}.", "", "Uninstall the package of one of them.")
     return stages
 
 
-def _in_files() -> Iterator[_Found]:
+def _in_files() -> Iterator[Found]:
     """Stages in this folder and in other packages."""
-    folder = Path(__file__).parent
-    for path in folder.rglob("*.py"):
-        yield from _described(path, ".".join((
-            __package__, *path.relative_to(folder).with_suffix("").parts)))
+    yield from found_in(Path(__file__).parent, __package__)
     for entry in importlib.metadata.entry_points(group="limber.stages"):
         try:
             spec = importlib.util.find_spec(entry.module)
@@ -81,7 +82,14 @@ def _in_files() -> Iterator[_Found]:
         yield from found
 
 
-def _described(path: Path, module: str) -> Iterator[_Found]:
+def found_in(folder: Path, package: str) -> Iterator[Found]:
+    """Return the stages in the files of a package's folder."""
+    for path in folder.rglob("*.py"):
+        yield from _described(path, ".".join((
+            package, *path.relative_to(folder).with_suffix("").parts)))
+
+
+def _described(path: Path, module: str) -> Iterator[Found]:
     """The stages in a file: classes with ``about = About(NAME, POSITION, ...)``."""
     text = path.read_text(encoding="utf-8")
     for kind in ast.parse(text).body if "About(" in text else ():
@@ -90,11 +98,12 @@ def _described(path: Path, module: str) -> Iterator[_Found]:
         for node in kind.body:
             if (isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
                     and getattr(node.targets[0], "id", "") == "about"):
-                name, position = (ast.literal_eval(part) for part in node.value.args[:2])
-                yield _Found(position, name, _summary(ast.get_docstring(kind)), module, kind.name)
+                name, position, *_ = *map(ast.literal_eval, node.value.args[:2]), 0
+                yield Found(position, name, first_words(ast.get_docstring(kind)), module, kind.name)
 
 
-def _summary(docstring: str | None) -> str:
+def first_words(docstring: str | None) -> str:
+    """Return the first paragraph of a docstring in one line."""
     return inspect.cleandoc(docstring or "").split("\n\n")[0].replace("\n", " ")
 
 
@@ -107,8 +116,7 @@ def stage_class(name: str) -> "type[Stage]":
     """Return the class of a stage; KeyError if there is no such stage."""
     found = _stages()[name]
     registered = [kind for kind in _registered if kind.about.name == name]
-    return registered[0] if registered else getattr(
-        importlib.import_module(found.module), found.kind)
+    return registered[0] if registered else found.stage()
 
 
 def result_of(branch: "Branch", key: str, values: Mapping[str, Any]) -> "Result":
@@ -139,18 +147,22 @@ def result_kinds() -> "dict[str, type[Result]]":
 
 
 def stage_schema(name: str) -> dict[str, Any]:
+    """Return the schema of the stage of this name, as :func:`schema_of` does."""
+    return schema_of(stage_class(name))
+
+
+def schema_of(stage: "type[Stage]") -> dict[str, Any]:
     """Return what a program needs to know to run a stage, as plain JSON.
 
     ``inputs``, ``settings`` and ``options`` are JSON schemas. Their properties also have ``group``
     (their title), ``expert`` and possibly ``unit``; ``panel`` is false if no panel may store it. An
     input with ``argument`` is given without its name; ``short`` is its short option.
     """
-    stage = stage_class(name)
     about, whole = stage.about, stage.model_json_schema()
     fields = {field: {key: value for key, value in content.items() if key not in _MARKS}
               for field, content in whole["properties"].items()}
     return {
-        "name": name, "summary": stage_summaries()[name], "key": about.key,
+        "name": about.name, "summary": first_words(stage.__doc__), "key": about.key,
         "reads": list(about.reads), "writes": list(about.writes),
         "step": about.step, "label": about.label, "moves_robot": about.moves_robot} | {
         part: {"additionalProperties": False,

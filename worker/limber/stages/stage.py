@@ -47,8 +47,9 @@ class About:
     """What everything needs to know of a stage beside its fields.
 
     Attributes:
-        name: Name of the command.
-        position: Its position in ``limber --help``, in the order in which stages run.
+        name: Name of the command; in two words that of one in a group, such as ``robot check``.
+        position: Its position in ``limber --help``, in the order in which stages run; other
+            commands are in alphabetical order.
         result: What it returns; None: values without labels.
         key: Key of its entry in the manifest; ``{name}`` is replaced by the field. Empty: none.
         reads: Names of the branch folder's files that it reads; ``{name}`` as in ``key``.
@@ -56,19 +57,24 @@ class About:
         found: Lines of findings, which :func:`limber.cli.terminal.found_lines` fills from fields
             and result; without any, the whole result is shown.
         then: The usual next command, its names and paths filled in likewise.
+        where: Where the results are, likewise; None: what it wrote, or the branch folder.
+        prints: Whether ``run`` prints its own output, as a script for a shell; such a command has
+            no ``--json`` and no progress.
         step: Its panel in the add-on (:data:`addon.steps.STEPS`); empty: none.
         label: Label of its button there.
         moves_robot: Whether it moves a robot; batches then do not run it.
     """
 
     name: str
-    position: int
+    position: int = 0
     result: "type[Result] | None" = None
     key: str = ""
     reads: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
     found: "Sequence[str | Callable[[Mapping[str, Any]], str | None]]" = ()
     then: str = ""
+    where: "str | Callable[[Mapping[str, Any]], Any] | None" = None
+    prints: bool = False
     step: str = ""
     label: str = ""
     moves_robot: Literal["", "when armed", "always"] = ""
@@ -202,6 +208,14 @@ class PlacedStage(BranchStage):
             if kind == "branch" and value is not None:
                 moved[name] = tuple(alignment.apply_metres(value).tolist())
         return self.model_copy(update=moved)
+
+
+class Tool(Stage):
+    """A command beside the stages, such as ``limber robot check``; ``--help`` shows all of it."""
+
+    @classmethod
+    def is_expert(cls, name: str) -> bool:
+        return False
 
 
 class KeptStage(Stage):

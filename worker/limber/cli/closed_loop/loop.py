@@ -7,7 +7,7 @@ robot's ports and Limber's own commands. At the end both sides are compared.
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -74,14 +74,13 @@ _DONE = {"generate": 0.02, "scan": 0.08, "reconstruct": 0.15, "calibrate": 0.16,
 @dataclass
 class ClosedLoop:
     """One run of the loop on a branch of its own, below ``folder``, with a virtual robot of this
-    model and loopback address; ``seed`` of the branch, the sensors' noise and the touching, ``say``
-    gets one line per part, ``seconds`` the duration of each."""
+    model and loopback address; ``seed`` of the branch, the sensors' noise and the touching,
+    ``seconds`` the duration of each part."""
 
     folder: Path
     seed: int = 1
     address: str = "127.0.0.1"
     model: str = "ur5e"
-    say: Callable[[str], None] = lambda line: None
     progress: Progress = SILENT
     seconds: dict[str, float] = field(default_factory=dict)
     _done: float = 0.0
@@ -327,4 +326,4 @@ class ClosedLoop:
             self._done = ends
             took = round(time.perf_counter() - began, 1)
             self.seconds[name] = round(self.seconds.get(name, 0.0) + took, 1)
-            self.say(f"  {title:<42} {took:6.1f} s")
+            self.progress.say(f"  {title:<42} {took:6.1f} s")

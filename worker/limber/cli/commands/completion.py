@@ -1,11 +1,14 @@
 """Print a script that completes commands and options with the Tab key."""
 
+from typing import Any, Literal
+
 import click
 
+from limber.core.progress import SILENT, Progress
+from limber.stages.stage import About, Tool, argument
 
-@click.command("completion")
-@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
-def command(shell: str) -> None:
+
+class Completion(Tool):
     """Print a script that completes commands, options, choices and file names with Tab.
 
     \b
@@ -16,10 +19,17 @@ def command(shell: str) -> None:
     It takes effect in the next shell. The script queries `limber` itself, so that it knows the
     commands and options of the installed version, including those of other packages.
     """
-    from click.shell_completion import get_completion_class
 
-    from limber.cli.main import main
+    about = About("completion", prints=True)
 
-    kind = get_completion_class(shell)
-    assert kind is not None, shell
-    click.echo(kind(main, {}, "limber", "_LIMBER_COMPLETE").source())
+    shell: Literal["bash", "zsh", "fish"] = argument("The shell.")
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        from click.shell_completion import get_completion_class
+
+        from limber.cli.main import main
+
+        kind = get_completion_class(self.shell)
+        assert kind is not None, self.shell
+        click.echo(kind(main, {}, "limber", "_LIMBER_COMPLETE").source())
+        return {}

@@ -1,17 +1,16 @@
 """Run the whole pipeline on one branch."""
 
-import functools
 import json
 import shlex
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
-import click
+from pydantic import Field
 
-from limber.cli.main import Run, stage_command
+from limber.cli.terminal import closing_lines, table_text
 from limber.core.errors import (
     Cancelled,
     Command,
@@ -25,15 +24,13 @@ from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_json
 from limber.core.optional import require_extra
 from limber.core.processes.child import run_stage
+from limber.core.progress import SILENT, Progress
+from limber.core.settings import Groups
 from limber.geometry.settings import ReconstructSettings
-from limber.stages.command_line import (
-    GroupedOption,
-    command_line,
-    options_of,
-    settings_options,
-    without_foreign_options,
-)
+from limber.stages.command_line import command_line, without_foreign_options
 from limber.stages.registry import stage_class
+from limber.stages.shape.reconstruct import Reconstruct
+from limber.stages.stage import About, Stage, argument, given, option
 from limber.store import Branch
 from limber.store.manifest import MANIFEST, Manifest
 from limber.version import VERSION
@@ -51,13 +48,16 @@ _ENDS = {"generate": 0.01, "reconstruct": 0.15, "virtual-pull": 0.3, "estimate":
          "simulate": 0.55, "energy": 0.8, "plan": 0.92, "report": 0.95, "scene": 1.0}
 
 
+_FILES = ("report", "scene", "picture")
+
+
 @dataclass
 class _Demo:
     """A demo in progress: its folder and the results of its stages, by command."""
 
     folder: Path
     branch: Path
-    run: Run
+    progress: Progress
     own: frozenset[str]
     """The demo's options."""
     reports: bool
@@ -72,7 +72,7 @@ class _Demo:
         """Run one stage as a process; show its progress and duration; keep its result."""
         name = str(arguments[0])
         started = time.perf_counter()
-        progress = self.run.progress.part(self.done, _ENDS[name])
+        progress = self.progress.part(self.done, _ENDS[name])
         progress(0.0, title)
         before = self._entries()
         try:
@@ -87,7 +87,7 @@ class _Demo:
         self._tell(title, name)
         for warning in result.get("warnings", []):
             if text := without_foreign_options(Text(warning), self.own):
-                self.run.progress.warn(f"{name}: {text}")
+                self.progress.warn(f"{name}: {text}")
 
     def show(self) -> None:
         """Write the report, then scene and picture, unless they show the current branch; the report
@@ -109,23 +109,23 @@ class _Demo:
         except Cancelled:
             raise
         except LimberError as error:
-            self.run.progress.warn(f"There is no scene and no picture: {error}")
+            self.progress.warn(f"There is no scene and no picture: {error}")
             return
         write_atomically(note, json.dumps(origin) + "\n")
         if self.reports:
-            run_stage([str(word) for word in pictured], self.run.progress.part(1.0, 1.0))
+            run_stage([str(word) for word in pictured], self.progress.part(1.0, 1.0))
 
     def written(self) -> dict[str, Path | None]:
         """Return the paths of report, scene and picture, as far as this demo has them."""
-        report, scene, picture = (self.branch / "report.html", self.folder / "scene.blend",
-                                  self.folder / "scene.png")
         shown = "scene" in self.kept or "scene" in self.results
-        return {"report": report if self.reports else None, "scene": scene if shown else None,
-                "picture": picture if shown else None}
+        paths = (self.branch / "report.html", self.folder / "scene.blend",
+                 self.folder / "scene.png")
+        return {name: path if made else None for name, path, made in zip(
+            _FILES, paths, (self.reports, shown, shown), strict=True)}
 
     def _tell(self, title: str, name: str) -> None:
         duration = "kept" if name in self.kept else f"{self.seconds[name]:.1f} s"
-        self.run.say(f"  {title:<42} {duration:>8}")
+        self.progress.say(f"  {title:<42} {duration:>8}")
 
     def _entries(self) -> dict[str, str]:
         """Return when each stage of the branch was finished, by its entry."""
@@ -152,98 +152,111 @@ class _Demo:
                            f"{self.folder}.")
 
 
-_option = functools.partial(click.option, cls=GroupedOption, group="demo")
+def _end(values: Mapping[str, Any]) -> str:
+    """What was found, where the results are, and what to type next."""
+    if values["robot"]:
+        then = ""
+    elif values["cloud"] is None:
+        then = "limber demo SCAN.ply   (your own scan)"
+    else:
+        then = (f"limber import-pull {shlex.quote(values['branch'])} PULL --name NAME   (a pull "
+                "that you measured)")
+    files = [f"{name:<8}{values[name]}" for name in _FILES if values[name] is not None]
+    return "\n".join(closing_lines([*values["found"], *files], then=then))
 
 
-@stage_command("demo")
-@click.argument("cloud", required=False, type=click.Path(path_type=Path))
-@_option("-o", "--output", type=click.Path(path_type=Path),
-         help="Folder of the results.  [default: out/NAME]")
-@_option("--skeleton", type=click.Path(path_type=Path),
-         help="Your own skeleton in the cloud's coordinates, as of `limber reconstruct`.")
-@_option("--edits", type=click.Path(path_type=Path),
-         help="Edits of the skeleton, as of `limber skeleton`.")
-@_option("--goal", type=float, nargs=3, metavar="X Y Z",
-         help="Goal position of the grasp, in the branch's frame [m]. Default: a place "
-              "for the branch's tip, some centimetres away.")
-@_option("--young", default=",".join(f"{value:g}" for value in DEMO_YOUNG),
-         show_default=True, metavar="A,B,C,D",
-         help="Assumed Young's modulus [Pa] at the control points of your CLOUD's pull.")
-@_option("--seed", type=int, default=1, show_default=True,
-         help="Seed of the generated branch, the sensor noise and the planner.")
-@_option("--force", is_flag=True, help="Reconstruct again even if nothing has changed.")
-@_option("--robot", is_flag=True, help="Run the closed loop instead, with a virtual robot that "
-         "scans, pulls and moves a generated branch.")
-@settings_options(ReconstructSettings, "scan", without=("young",))
-def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed: int, robot: bool,
-            **wishes: Any) -> dict[str, Any]:
+class Demo(ReconstructSettings, Stage):
     """The whole pipeline on one branch: a generated one with known truth, or your CLOUD with a
     simulated pull, whose modulus is assumed."""
-    if robot:
-        return _closed_loop(run, cloud, output or Path("out") / "robot", seed)
-    if cloud is not None and not cloud.is_file():
-        raise InputError(f"There is no file {cloud}.", "The demo needs the scan of one branch.",
-                         "Name a PLY, XYZ, TXT, CSV, PCD or LAS file, or none at all.")
-    name = cloud.stem if cloud else "generated"
-    folder = output or Path("out") / name
-    demo = _Demo(folder, folder / f"{name}.branch", run,
-                 options_of(click.get_current_context().command), _has_report(run))
-    _make_folder(demo.folder)
-    started = time.perf_counter()
-    run.say(f"Limber demo on {cloud or 'a generated branch'}, results in {demo.folder}")
-    if cloud is not None:
-        run.say("The pull is simulated with an assumed Young's modulus (--young). The stiffness "
-                "of this branch was not measured.")
-    failure = _run_stages(demo, cloud, young=young, seed=seed, options=wishes)
-    demo.show()
-    _show_tables(demo)
-    summary = _summary(demo) | {"demo_seconds": round(time.perf_counter() - started, 1)}
-    if failure is not None:
-        if demo.reports:
-            run.say(f"The report has what was found before: {summary['report']}")
-        raise failure
-    run.close(*_found(demo), *_files(demo),
-              then="limber demo SCAN.ply   (your own scan)" if cloud is None else
-              f"limber import-pull {shlex.quote(str(demo.branch))} PULL --name NAME   "
-              "(a pull that you measured)")
-    return summary
+
+    about = About("demo", where="", found=(_end,))
+    groups: ClassVar[Groups] = {"demo": ("young",)}
+    cloud: Path | None = argument("Your scan of one branch.", default=None, group="demo")
+    output: Path | None = given("Folder of the results. Default: out/NAME.", group="demo",
+                                common=True, short="-o")
+    skeleton: Path | None = given(
+        "Your own skeleton in the cloud's coordinates, as of `limber reconstruct`.", group="demo",
+        common=True)
+    edits: Path | None = given("Edits of the skeleton, as of `limber skeleton`.", group="demo",
+                               common=True)
+    goal: tuple[float, float, float] | None = given(
+        "Goal position of the grasp, in the branch's frame [m]. Default: a place for the "
+        "branch's tip, some centimetres away.", group="demo", common=True)
+    young: tuple[float, ...] = Field(  # type: ignore[assignment]
+        DEMO_YOUNG, json_schema_extra={"metavar": "A,B,C,D", "common": True}, description=(
+            "Assumed Young's modulus [Pa] at the control points of your CLOUD's pull."))
+    seed: int = option("Seed of the generated branch, the sensor noise and the planner.", 1,
+                       group="demo", common=True)
+    force: bool = option("Reconstruct again even if nothing has changed.", False, switch=True,
+                         group="demo", common=True)
+    robot: bool = option("Run the closed loop instead, with a virtual robot that scans, pulls and "
+                         "moves a generated branch.", False, switch=True, group="demo",
+                         common=True)
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        cloud = self.cloud
+        if self.robot:
+            return _closed_loop(self, self.output or Path("out") / "robot", progress)
+        if cloud is not None and not cloud.is_file():
+            raise InputError(f"There is no file {cloud}.", "The demo needs the scan of one "
+                             "branch.", "Name a PLY, XYZ, TXT, CSV, PCD or LAS file, or none at "
+                             "all.")
+        name = cloud.stem if cloud else "generated"
+        folder = self.output or Path("out") / name
+        demo = _Demo(folder, folder / f"{name}.branch", progress,
+                     frozenset(str(Option(name)) for name in self.names()), _has_report(progress))
+        _make_folder(demo.folder)
+        started = time.perf_counter()
+        progress.say(f"Limber demo on {cloud or 'a generated branch'}, results in {demo.folder}")
+        if cloud is not None:
+            progress.say("The pull is simulated with an assumed Young's modulus (--young). The "
+                         "stiffness of this branch was not measured.")
+        failure = _run_stages(demo, self)
+        demo.show()
+        _show_tables(demo)
+        summary = _summary(demo) | {"demo_seconds": round(time.perf_counter() - started, 1)}
+        if failure is not None:
+            if demo.reports:
+                progress.say(f"The report has what was found before: {summary['report']}")
+            raise failure
+        return summary | {"found": _found(demo)}
 
 
-def _has_report(run: Run) -> bool:
+def _has_report(progress: Progress) -> bool:
     """Whether a report can be written; a warning with the remedy, before minutes of work."""
     try:
         require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
     except MissingDependencyError as error:
-        run.progress.warn(f"There will be no report: {error}")
+        progress.warn(f"There will be no report: {error}")
         return False
     return True
 
 
-def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[str, Any]:
-    if cloud is not None:
-        raise InputError(Text(Option("robot"), f" was given with the scan {cloud}."), "The virtual "
-                         "robot scans a generated branch.", "Omit one of them.")
+def _closed_loop(asked: Demo, folder: Path, progress: Progress) -> dict[str, Any]:
+    if asked.cloud is not None:
+        raise InputError(Text(Option("robot"), f" was given with the scan {asked.cloud}."),
+                         "The virtual robot scans a generated branch.", "Omit one of them.")
     require_extra("robot", ("rtde_control", "rtde_io"), "The virtual robot's client")
-    reports = _has_report(run)
+    reports = _has_report(progress)
     from limber.cli.closed_loop.comparison import comparison
     from limber.cli.closed_loop.loop import ClosedLoop
 
     started = time.perf_counter()
-    run.say(f"Limber demo with a virtual robot, results in {folder}")
-    result = ClosedLoop(folder, seed, say=run.say, progress=run.progress).run()
+    progress.say(f"Limber demo with a virtual robot, results in {folder}")
+    result = ClosedLoop(folder, asked.seed, progress=progress).run()
     for title, rows in comparison(result):
-        run.show(title, rows)
-    demo = _Demo(folder, Path(result["branch"]), run, frozenset(), reports, done=_ENDS["plan"])
+        progress.say(table_text(title, rows))
+    demo = _Demo(folder, Path(result["branch"]), progress, frozenset(), reports,
+                 done=_ENDS["plan"])
     demo.show()
-    run.close(_loop_sentence(result), *_files(demo))
-    return result | demo.written() | {"demo_seconds": round(time.perf_counter() - started, 1)}
+    return result | demo.written() | {"demo_seconds": round(time.perf_counter() - started, 1),
+                                      "found": [_loop_sentence(result)]}
 
 
-def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
-                options: Mapping[str, Any]) -> LimberError | None:
+def _run_stages(demo: _Demo, asked: Demo) -> LimberError | None:
     """Run all stages up to the plan; a failure after the mesh still ends in a report. Return those
     that failed."""
-    branch = demo.branch
+    branch, cloud, seed = demo.branch, asked.cloud, asked.seed
     truth: tuple[str, ...] = ()
     errors = "realistic"
     if cloud is None:
@@ -253,8 +266,12 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
         errors = str(demo.folder / "sensor.toml")
         Path(errors).write_text(_SMALL_SENSOR, encoding="utf-8")
     else:
-        truth = ("--young", young)
-    demo.stage("scan to tetrahedra", "reconstruct", cloud, "-o", branch, *_scan_options(options))
+        truth = ("--young", ",".join(map(str, asked.young)))
+    # All but the output and the assumed moduli is as the reconstruction takes it.
+    known = asked.model_fields_set & Reconstruct.model_fields.keys() - {"output", "young"}
+    scan = Reconstruct(**{name: getattr(asked, name) for name in known}
+                       | {"cloud": cloud, "output": branch})
+    demo.stage("scan to tetrahedra", "reconstruct", *command_line(scan))
     failure = None
     try:
         demo.stage("a simulated pull, with noise and the errors of a cell", "virtual-pull", branch,
@@ -263,14 +280,14 @@ def _run_stages(demo: _Demo, cloud: Path | None, *, young: str, seed: int,
         demo.stage("Young's modulus from the pull", "estimate", branch)
         demo.stage("a pull with the estimated modulus", "simulate", branch)
         demo.stage("energy over grasp poses", "energy", branch, "--seed", seed)
-        goal = ["--goal", *options["goal"]] if options.get("goal") else _tip_goal(branch)
+        goal = _tip_goal(branch) if asked.goal is None else ["--goal", *asked.goal]
         demo.stage("the gentlest path and the shortest", "plan", branch, "--name", "to-goal",
                    "--seed", seed, *goal)
     except Cancelled:
         raise
     except LimberError as error:
         failure = error
-        demo.run.progress.warn(f"{error} Report and scene show the results so far.")
+        demo.progress.warn(f"{error} Report and scene show the results so far.")
     return failure
 
 
@@ -281,15 +298,6 @@ def _tip_goal(branch: Path) -> list[object]:
 
     goal = tip_goal(EnergyField.read(branch / "energy.npz"))
     return ["--tip-goal", *goal.region.middle.tolist(), "--goal-tolerance", goal.tolerance]
-
-
-def _scan_options(chosen: Mapping[str, Any]) -> list[object]:
-    """Known properties of the scan, as options of `limber reconstruct`."""
-    options: list[object] = list(command_line(chosen["scan"]))
-    for name in ("skeleton", "edits"):
-        if chosen[name]:
-            options += [f"--{name}", chosen[name]]
-    return [*options, "--force"] if chosen["force"] else options
 
 
 def _make_folder(folder: Path) -> None:
@@ -305,10 +313,10 @@ def _show_tables(demo: _Demo) -> None:
 
     if "estimate" in demo.results:
         estimate, pull = demo.results["estimate"], demo.results["virtual-pull"]
-        demo.run.show("Young's modulus", modulus_rows(estimate, pull))
-        demo.run.say(held_sentence(estimate, pull))
+        demo.progress.say(table_text("Young's modulus", modulus_rows(estimate, pull)))
+        demo.progress.say(held_sentence(estimate, pull))
     if "plan" in demo.results:
-        demo.run.show("Paths", comparison_rows(demo.results["plan"]))
+        demo.progress.say(table_text("Paths", comparison_rows(demo.results["plan"])))
 
 
 def _found(demo: _Demo) -> list[str]:
@@ -331,11 +339,6 @@ def _loop_sentence(result: Mapping[str, Any]) -> str:
     return (f"{held} of {len(result['covered'])} intervals contain the true modulus; the flower "
             f"{flower}; the force along the path was within 5 % of the peak, or its interval, on "
             f"{100 * result['force_within_share']:.1f} % of it.")
-
-
-def _files(demo: _Demo) -> list[str]:
-    """Print where the results are."""
-    return [f"{name:<8}{path}" for name, path in demo.written().items() if path is not None]
 
 
 def _read_note(path: Path) -> Any:

@@ -5,13 +5,13 @@ import importlib.util
 import os
 import platform
 import shutil
+from collections.abc import Mapping
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from limber.cli.main import Run, stage_command
 from limber.core.optional import how_to_install
+from limber.core.progress import SILENT, Progress
+from limber.stages.stage import About, Tool, option
 
 if TYPE_CHECKING:
     from limber.core.files.caches import Cache
@@ -51,27 +51,34 @@ PARTS = [
 ]
 
 
-@stage_command("doctor")
-@click.option("--warm", is_flag=True, help="Compile the solver's kernels now, not at first use.")
-def command(run: Run, warm: bool) -> dict[str, Any]:
-    """Installed and missing packages, and what does not work without them."""
-    result = report()
-    if warm:
-        from limber.geometry.warm_up import warm_up as warm_geometry
-        from limber.mechanics.warm_up import warm_up as warm_mechanics
-        from limber.planning.warm_up import warm_up as warm_planning
-        from limber.reduced.strain_polynomial import compile_kernels
+def _packages(values: Mapping[str, Any]) -> str:
+    missing = values["missing"]
+    return "\n".join([
+        f"{len(PARTS) - len(missing)} of {len(PARTS)} packages are installed.",
+        *(f"{module} is {values['packages'][module]}" for module in missing)])
 
-        # First what a grab needs: someone may open the example and press on it.
-        warm_mechanics(run.progress.part(0.0, 0.4))
-        compile_kernels()
-        warm_geometry(run.progress.part(0.4, 0.5))
-        warm_planning(run.progress.part(0.5, 1.0))
-    run.close(f"Python {result['python']}, {result['cores']} cores, {result['system']}.",
-              f"{len(PARTS) - len(result['missing'])} of {len(PARTS)} packages are installed.",
-              *(f"{module} is {result['packages'][module]}" for module in result["missing"]),
-              f"Blender: {result['blender']}")
-    return result
+
+class Doctor(Tool):
+    """Installed and missing packages, and what does not work without them."""
+
+    about = About("doctor", found=("Python {python}, {cores} cores, {system}.", _packages,
+                                   "Blender: {blender}"))
+
+    warm: bool = option("Compile the solver's kernels now, not at first use.", False, switch=True)
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        if self.warm:
+            from limber.geometry.warm_up import warm_up as warm_geometry
+            from limber.mechanics.warm_up import warm_up as warm_mechanics
+            from limber.planning.warm_up import warm_up as warm_planning
+            from limber.reduced.strain_polynomial import compile_kernels
+
+            # First what a grab needs: someone may open the example and press on it.
+            warm_mechanics(progress.part(0.0, 0.4))
+            compile_kernels()
+            warm_geometry(progress.part(0.4, 0.5))
+            warm_planning(progress.part(0.5, 1.0))
+        return report()
 
 
 def report() -> dict[str, Any]:

@@ -1,24 +1,37 @@
 """Print the inputs and outputs of all stages as JSON schemas."""
 
 import json
+from typing import Any, Literal
 
 import click
 
-from limber.stages.registry import all_schemas, stage_table
+from limber.cli.known import command_class, others
+from limber.core.progress import SILENT, Progress
+from limber.stages.registry import all_schemas, schema_of, stage_table
+from limber.stages.stage import About, Tool, argument, option
 
 
-@click.command("schema")
-@click.argument("what", required=False, type=click.Choice(["stages", "cell"]), default="stages")
-@click.option("--table", is_flag=True, help="Print the table of stages of the guide instead.")
-def command(what: str, table: bool) -> None:
+class Schema(Tool):
     """Print what every stage takes, reads and writes as JSON; with `cell`, what a cell file takes.
 
     A stage's inputs, settings and options are JSON schemas with titles, groups and units: the
-    add-on's panels and batch jobs are made from them. `limber STAGE --schema` prints one.
+    add-on's panels and batch jobs are made from them. `limber STAGE --schema` prints one, `limber
+    schema commands` prints those of the commands beside the stages.
     """
-    if what == "cell":
-        from limber.cell.cell_file import Cell
 
-        click.echo(json.dumps(Cell.model_json_schema(), indent=1))
-        return
-    click.echo(stage_table() if table else json.dumps(all_schemas(), indent=1))
+    about = About("schema", prints=True)
+
+    what: Literal["stages", "commands", "cell"] = argument("What is described.", default="stages")
+    table: bool = option("Print the table of stages of the guide instead.", False, switch=True)
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        if self.what == "cell":
+            from limber.cell.cell_file import Cell
+
+            content = Cell.model_json_schema()
+        elif self.what == "commands":
+            content = {name: schema_of(command_class(name)) for name in others()}
+        else:
+            content = all_schemas()
+        click.echo(stage_table() if self.table else json.dumps(content, indent=1))
+        return {}

@@ -1,24 +1,24 @@
 """Hold a branch in a process that other programs bend through JSON lines."""
 
 import sys
-from pathlib import Path
+from typing import Any
 
-import click
-
+from limber.core.progress import SILENT, Progress
 from limber.session.protocol import SessionSettings
-from limber.stages.command_line import settings_options
+from limber.stages.stage import About, BranchStage, Tool
 
 
-@click.command("session")
-@click.argument("branch_folder", type=click.Path(path_type=Path))
-@settings_options(SessionSettings)
-def command(branch_folder: Path, settings: SessionSettings) -> None:
+class Session(SessionSettings, BranchStage, Tool):
     """A branch held in a process that other programs bend.
 
     Commands are JSON lines on standard input, events are JSON lines on standard output, and frames
     are in a memory-mapped file: `python -m limber.session.worker --help` lists them. The session
     ends at the end of its input.
     """
-    from limber.session.worker import run_session
 
-    sys.exit(run_session(branch_folder, settings))
+    about = About("session", prints=True)
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        from limber.session.worker import run_session
+
+        sys.exit(run_session(self.branch_folder, SessionSettings.of(self)))

@@ -1,32 +1,44 @@
 """Show what a batch has done, and what failed, runs or waits."""
 
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import click
+from limber.cli.terminal import table_text
+from limber.core.progress import SILENT, Progress
+from limber.stages.stage import About, Tool, argument
 
-from limber.cli.main import Run, stage_command
+
+def _states(values: Mapping[str, Any]) -> str:
+    return f"Of {values['branch_count']} branches " + ", ".join(
+        f"{values[state]} {state}" for state in ("done", "failed", "running", "waiting")
+        if values[state]) + "."
 
 
-@stage_command("status")
-@click.argument("job_file", type=click.Path(path_type=Path), metavar="JOBS.toml")
-def command(run: Run, job_file: Path) -> dict[str, Any]:
+def _next(values: Mapping[str, Any]) -> str:
+    return f"next  limber batch {shlex.quote(str(values['job_file']))}" if values[
+        "waiting"] else ""
+
+
+class Status(Tool):
     """Show the progress of a job file's batch, also while it runs; each failure with its reason."""
-    from limber.batch.batch_progress import RUNNING, Records, counts, failures
-    from limber.batch.job_file import read_jobs
 
-    jobs = read_jobs(job_file)
-    records = Records(jobs)
-    failed = failures(jobs, records)
-    if failed:
-        run.show("Failed", [["branch", "stage", "why"], *map(list, failed)])
-    count = counts(jobs, records)
-    run.close(f"Of {len(jobs.branches)} branches " + ", ".join(
-        f"{number} {state}" for state, number in count.items() if number) + ".",
-              then=f"limber batch {shlex.quote(str(job_file))}" if count["waiting"] else "")
-    return {"branch_count": len(jobs.branches), **count,
-            "running_now": [f"{branch.name} {task.label}" for branch in jobs.branches
-                            for task in branch.tasks
-                            if records.of(branch, task).status == RUNNING],
-            "failures": [list(one) for one in failed]}
+    about = About("status", found=(_states, _next))
+
+    job_file: Path = argument("The job file.", metavar="JOBS.toml")
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        from limber.batch.batch_progress import RUNNING, Records, counts, failures
+        from limber.batch.job_file import read_jobs
+
+        jobs = read_jobs(self.job_file)
+        records = Records(jobs)
+        failed = failures(jobs, records)
+        if failed:
+            progress.say(table_text("Failed", [["branch", "stage", "why"], *map(list, failed)]))
+        return {"branch_count": len(jobs.branches), **counts(jobs, records),
+                "running_now": [f"{branch.name} {task.label}" for branch in jobs.branches
+                                for task in branch.tasks
+                                if records.of(branch, task).status == RUNNING],
+                "failures": [list(one) for one in failed]}

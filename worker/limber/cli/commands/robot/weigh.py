@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from limber.cli.main import Run
-from limber.cli.robot_commands.moves import log_move, move_command, require_empty, stands
+from limber.cli.cell_tool import ArmedTool, confirmed_by
+from limber.cli.commands.robot.moves import log_move, require_empty, stands
+from limber.core.errors import SafetyStop
+from limber.core.progress import SILENT, Progress
+from limber.stages.stage import About
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell
@@ -22,44 +24,48 @@ _SETTLE_SECONDS = 0.3
 _READ_SECONDS = 0.5
 
 
-@move_command("weigh")
-def weigh(run: Run, cell_file: Path, confirm: str | None, armed: bool) -> dict[str, Any]:
+class Weigh(ArmedTool):
     """Tilt the empty gripper a little about two axes, and compare its weight with tool.mass_kg.
 
     A sensor of another sign, unit or other axes is named, and so is a mass that is off; exit code
     4. Do this away from the branch, before the first pull.
     """
-    from limber.cell.cell_file import read_cell
-    from limber.cell.obstacles import cell_obstacles
-    from limber.cell.reach_and_collision import ArmSurroundings
-    from limber.core.errors import SafetyStop
-    from limber.robot.driver.link import RobotLink
-    from limber.robot.motion.joint_path import to_joints
-    from limber.robot.operator_decisions import require_confirmation
-    from limber.robot.robot_state import require_tilts, tilted_joints, weighed_as
 
-    cell = read_cell(cell_file)
-    require_empty(cell, run)
-    sample, _ = stands(cell)
-    tilted = tilted_joints(sample.joints, cell.tool.mass_kg or 0.0)
-    require_tilts(-cell.arm.forward(tilted)[:, 2, :3], cell.tool.mass_kg or 0.0)
-    around = ArmSurroundings(cell, cell_obstacles(cell, cell_file.parent), None)
-    moves = [to_joints(cell, first, second, around)
-             for first, second in pairwise(tilted)]
-    result: dict[str, Any] = {"armed": armed, "duration_s": sum(move.duration for move in moves)}
-    if not armed:
+    about = About("robot weigh", moves_robot="when armed")
+
+    confirm: str | None = confirmed_by("weigh")
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        from limber.cell.obstacles import cell_obstacles
+        from limber.cell.reach_and_collision import ArmSurroundings
+        from limber.robot.driver.link import RobotLink
+        from limber.robot.motion.joint_path import to_joints
+        from limber.robot.operator_decisions import require_confirmation
+        from limber.robot.robot_state import require_tilts, tilted_joints, weighed_as
+
+        cell = self.cell()
+        require_empty(cell, progress)
+        sample, _ = stands(cell)
+        tilted = tilted_joints(sample.joints, cell.tool.mass_kg or 0.0)
+        require_tilts(-cell.arm.forward(tilted)[:, 2, :3], cell.tool.mass_kg or 0.0)
+        around = ArmSurroundings(cell, cell_obstacles(cell, self.cell_file.parent), None)
+        moves = [to_joints(cell, first, second, around) for first, second in pairwise(tilted)]
+        result: dict[str, Any] = {"armed": self.arm,
+                                  "duration_s": sum(move.duration for move in moves)}
+        if not self.arm:
+            return result
+        require_confirmation("weigh", self.confirm, cell, progress)
+        rows: list[np.ndarray] = []
+        with RobotLink(weightless(cell), rows.append) as link:
+            found = weighed(cell, link, moves, rows)
+        result |= {"mass_kg": found.mass, "mass_sigma_kg": found.sigma,
+                   "faults": list(found.faults)}
+        log_move(self, result | weighed_as(cell))
+        if found.faults:
+            raise SafetyStop(f"{'; '.join(found.faults)}.", "The guard would feel another force "
+                             "than the branch's.", "Correct [sensor] or tool.mass_kg in the cell "
+                             "file.", result=result)
         return result
-    require_confirmation("weigh", confirm, cell, run.progress)
-    rows: list[np.ndarray] = []
-    with RobotLink(weightless(cell), rows.append) as link:
-        found = weighed(cell, link, moves, rows)
-    result |= {"mass_kg": found.mass, "mass_sigma_kg": found.sigma, "faults": list(found.faults)}
-    log_move(cell_file, "weigh", result | weighed_as(cell))
-    if found.faults:
-        raise SafetyStop(f"{'; '.join(found.faults)}.", "The guard would feel another force than "
-                         "the branch's.", "Correct [sensor] or tool.mass_kg in the cell file.",
-                         result=result)
-    return result
 
 
 def weightless(cell: Cell) -> Cell:
@@ -69,7 +75,6 @@ def weightless(cell: Cell) -> Cell:
 
 def weighed(cell: Cell, link: RobotLink, moves: list[Trajectory], rows: list[np.ndarray]) -> Any:
     """Read the sensor at each end of ``moves``, and compare; ``rows`` grows as samples come."""
-    from limber.core.errors import SafetyStop
     from limber.robot.robot_state import weigh as weigh_readings
 
     link.wait_for_samples()

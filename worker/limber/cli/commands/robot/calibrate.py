@@ -2,62 +2,28 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import click
 import numpy as np
+from pydantic import Field
 
-from limber.cli.main import Run, stage_command
-from limber.core.errors import Option, Text
+from limber.cli.cell_tool import CellTool
+from limber.cli.terminal import table_text
+from limber.core.errors import InputError, Option, Text, WorkError
+from limber.core.not_none import present
+from limber.core.progress import SILENT, Progress
+from limber.stages.stage import About, argument, given
 
 if TYPE_CHECKING:
+    from limber.cell.cell_file import Cell
     from limber.robot.calibration import CameraFit
+    from limber.store import Branch
 
-CameraSide = Literal["stand", "gripper"]
 
-
-@stage_command("calibrate")
-@click.argument("cell_file", type=click.Path(path_type=Path))
-@click.argument("branch_folder", type=click.Path(path_type=Path))
-@click.option("--points", "points_file", type=click.Path(path_type=Path),
-              help="CSV of points on the branch to touch: name,x_m,y_m,z_m in the branch's frame. "
-              "With six more columns, robot_x_m to robot_rz_rad, the robot's pose is read from "
-              "the file.")
-@click.option("--views", "views_file", type=click.Path(path_type=Path),
-              help="CSV of a board or marker seen by the camera that scanned the branch, one line "
-              "for each pose of the arm: robot_x_m to robot_rz_rad of the gripper's middle, "
-              "seen_x_m, seen_y_m, seen_z_m in the camera's frame, and seen_rx_rad, seen_ry_rad, "
-              "seen_rz_rad for a board.")
-@click.option("--images", "images_file", type=click.Path(path_type=Path),
-              help="CSV of the camera's pictures of a board, one line for each pose of the arm: "
-              "image (a file beside the table) and robot_x_m to robot_rz_rad. Needs OpenCV and "
-              "[camera] in the cell file.")
-@click.option("--board", "board_kind", type=click.Choice(["charuco", "apriltag"]),
-              default="charuco", show_default=True, help="With --images: what is printed.")
-@click.option("--squares", type=int, nargs=2, default=(7, 5), show_default=True,
-              help="Squares of the ChArUco board along x and y.")
-@click.option("--square-m", default=0.03, show_default=True,
-              help="Edge length of its squares, or of the AprilTag [m].")
-@click.option("--marker-m", default=0.022, show_default=True,
-              help="Edge length of its markers [m].")
-@click.option("--dictionary", help="Of the markers, as OpenCV names it. Default: DICT_5X5_100 or "
-              "DICT_APRILTAG_36h11.")
-@click.option("--camera-on", type=click.Choice(["stand", "gripper"]), default="stand",
-              show_default=True, help="With --views and --images: what carries the camera. The "
-              "other one carries the board.")
-@click.option("--scan-pose", type=float, nargs=6, metavar="X Y Z RX RY RZ",
-              help="With --camera-on gripper: pose of the gripper in the base frame [m, rad] when "
-              "the camera scanned the branch. Default: the scan is in the board's frame.")
-@click.option("--largest-residual", default=0.01, show_default=True,
-              help="Largest residual of a point or view [m]; a larger one is refused.")
-def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path | None,
-              views_file: Path | None, images_file: Path | None, camera_on: CameraSide,
-              scan_pose: tuple[float, ...] | None, largest_residual: float,
-              **printed: Any) -> dict[str, Any]:
+class Calibrate(CellTool):
     """Write the robot's base in the branch's frame into the cell file, from points or views.
 
     Points are touched with the middle of the gripper while the robot is guided by hand; the
@@ -66,29 +32,63 @@ def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path 
     the camera's pictures by another program (OpenCV's solvePnP gives such poses). The branch's scan
     is in the frame of that camera, so no points need to be touched.
     """
-    from limber.cell.cell_file import read_cell
-    from limber.core.errors import InputError
-    from limber.store import Branch
 
-    cell, branch = read_cell(cell_file), Branch.read(branch_folder)
-    if sum(file is not None for file in (points_file, views_file, images_file)) != 1:
-        raise InputError(Text("Exactly one of ", Option("points"), ", ", Option("views"), " and ",
-                              Option("images"), " must be given."),
-                         "The base is found from touched points or from a camera's views.",
-                         "Give one of them.")
-    if points_file is not None:
-        return _by_touching(run, cell_file, cell, branch, points_file, largest_residual)
-    if scan_pose is not None and camera_on == "stand":
-        raise InputError(Text(Option("scan_pose"), " was given, but the camera is fixed."),
-                         "The position of a fixed camera does not follow from a pose of the arm.",
-                         "Omit it, or give ", Option("camera_on", "gripper"), ".")
-    found = (_views_of(views_file, camera_on, largest_residual) if views_file is not None else
-             _pictures_of(run, cell, images_file, camera_on, largest_residual, **printed))
-    return _by_seeing(run, cell_file, cell, branch, found, camera_on, scan_pose)
+    about = About("robot calibrate", where="{cell_file}", found=(
+        "The base's position is known to {position_sigma_m:m} (standard deviation); RMS residual "
+        "{residual_m:m}.",), then="limber robot check {cell_file}")
+
+    branch_folder: Path = argument("The branch folder.")
+    points: Path | None = given(
+        "CSV of points on the branch to touch: name,x_m,y_m,z_m in the branch's frame. With six "
+        "more columns, robot_x_m to robot_rz_rad, the robot's pose is read from the file.")
+    views: Path | None = given(
+        "CSV of a board or marker seen by the camera that scanned the branch, one line for each "
+        "pose of the arm: robot_x_m to robot_rz_rad of the gripper's middle, seen_x_m, seen_y_m, "
+        "seen_z_m in the camera's frame, and seen_rx_rad, seen_ry_rad, seen_rz_rad for a board.")
+    images: Path | None = given(
+        "CSV of the camera's pictures of a board, one line for each pose of the arm: image (a "
+        "file beside the table) and robot_x_m to robot_rz_rad. Needs OpenCV and [camera] in the "
+        "cell file.")
+    board: Literal["charuco", "apriltag"] = Field(
+        "charuco", description="With --images: what is printed.")
+    squares: tuple[int, int] = Field((7, 5), description=(
+        "Squares of the ChArUco board along x and y."))
+    square_m: float = Field(0.03, description=(
+        "Edge length of its squares, or of the AprilTag [m]."))
+    marker_m: float = Field(0.022, description="Edge length of its markers [m].")
+    dictionary: str | None = Field(None, description=(
+        "Of the markers, as OpenCV names it. Default: DICT_5X5_100 or DICT_APRILTAG_36h11."))
+    camera_on: Literal["stand", "gripper"] = Field("stand", description=(
+        "With --views and --images: what carries the camera. The other one carries the board."))
+    scan_pose: tuple[float, float, float, float, float, float] | None = Field(
+        None, description="With --camera-on gripper: pose of the gripper in the base frame [m, "
+        "rad] when the camera scanned the branch. Default: the scan is in the board's frame.",
+        json_schema_extra={"metavar": "X Y Z RX RY RZ"})
+    largest_residual: float = Field(0.01, description=(
+        "Largest residual of a point or view [m]; a larger one is refused."))
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        from limber.store import Branch
+
+        cell, branch = self.cell(), Branch.read(self.branch_folder)
+        if sum(file is not None for file in (self.points, self.views, self.images)) != 1:
+            raise InputError(Text("Exactly one of ", Option("points"), ", ", Option("views"),
+                                  " and ", Option("images"), " must be given."),
+                             "The base is found from touched points or from a camera's views.",
+                             "Give one of them.")
+        if self.points is not None:
+            return _by_touching(self, cell, branch, self.points, progress)
+        if self.scan_pose is not None and self.camera_on == "stand":
+            raise InputError(Text(Option("scan_pose"), " was given, but the camera is fixed."),
+                             "The position of a fixed camera does not follow from a pose of the "
+                             "arm.", "Omit it, or give ", Option("camera_on", "gripper"), ".")
+        if self.views is not None:
+            return _by_seeing(self, cell, branch, _views_of(self, self.views), progress)
+        fit, summary = _pictures_of(self, cell, present(self.images, "images"), progress)
+        return _by_seeing(self, cell, branch, fit, progress) | summary
 
 
-def _views_of(views_file: Path, camera_on: CameraSide, largest_residual: float,
-              ) -> tuple[CameraFit, dict[str, Any]]:
+def _views_of(asked: Calibrate, views_file: Path) -> CameraFit:
     """Fit the camera to a table of board poses that another program has found."""
     from limber.core.files.tables import read_columns
     from limber.recordings.recording import POSE_COLUMNS
@@ -101,36 +101,34 @@ def _views_of(views_file: Path, camera_on: CameraSide, largest_residual: float,
     is_board = all(name in table for name in seen_columns)
     robot = np.column_stack([table[name] for name in robot_columns])
     seen = np.column_stack([table[name] for name in seen_columns[:6 if is_board else 3]])
-    return fit_camera(robot, seen, camera_on, largest_residual=largest_residual), {}
+    return fit_camera(robot, seen, asked.camera_on, largest_residual=asked.largest_residual)
 
 
-def _pictures_of(run: Run, cell: Any, images_file: Path | None, camera_on: CameraSide,
-                 largest_residual: float, *, board_kind: Literal["charuco", "apriltag"],
-                 squares: tuple[int, int], square_m: float, marker_m: float,
-                 dictionary: str | None) -> tuple[CameraFit, dict[str, Any]]:
+def _pictures_of(asked: Calibrate, cell: Cell, images_file: Path, progress: Progress,
+                 ) -> tuple[CameraFit, dict[str, Any]]:
     """Find a board in pictures and fit the camera to them."""
-    from limber.core.errors import InputError
     from limber.robot.calibration import Board, find_board, fit_pictures
 
-    assert images_file is not None
     if cell.camera is None:
         raise InputError("The cell file has no [camera].", "Focal length and size of the pictures "
                          "are unknown.", "Add [camera] with width, height, focal_px and "
                          "centre_px.")
-    usual = "DICT_5X5_100" if board_kind == "charuco" else "DICT_APRILTAG_36h11"
-    board = Board(board_kind, squares, square_m, marker_m, dictionary or usual)
+    usual = "DICT_5X5_100" if asked.board == "charuco" else "DICT_APRILTAG_36h11"
+    board = Board(asked.board, asked.squares, asked.square_m, asked.marker_m,
+                  asked.dictionary or usual)
     names, poses = _pictures(images_file)
     found = [find_board(images_file.parent / name, board, cell.camera) for name in names]
     for name, view in zip(names, found, strict=True):
         if view is None:
-            run.progress.warn(f"The board is not seen in {name}, which is omitted.")
+            progress.warn(f"The board is not seen in {name}, which is omitted.")
     views = [view for view in found if view is not None]
     if not views:
         raise InputError("The board is seen in no picture.", "", "Check ", Option("board"), ", ",
                          Option("squares"), " and ", Option("dictionary"), " against what was "
                          "printed.")
     robot = poses[[view is not None for view in found]]
-    fit, pixels = fit_pictures(robot, views, cell.camera, camera_on, largest_residual)
+    fit, pixels = fit_pictures(robot, views, cell.camera, asked.camera_on,
+                               asked.largest_residual)
     return fit, {"residual_px": float(np.sqrt(np.mean(pixels**2))), "pictures": [
         {"name": view.name, "residual_px": float(off), "corners": len(view.corners)}
         for view, off in zip(views, pixels, strict=True)]}
@@ -138,7 +136,6 @@ def _pictures_of(run: Run, cell: Any, images_file: Path | None, camera_on: Camer
 
 def _pictures(path: Path) -> tuple[list[str], np.ndarray]:
     """Names and poses [n, 6] of a table of pictures."""
-    from limber.core.errors import InputError
     from limber.core.files.tables import csv_records
     from limber.recordings.recording import POSE_COLUMNS
 
@@ -154,74 +151,65 @@ def _pictures(path: Path) -> tuple[list[str], np.ndarray]:
     return names, poses.reshape(-1, 6)
 
 
-def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any,
-               found: tuple[CameraFit, dict[str, Any]], camera_on: CameraSide,
-               scan_pose: tuple[float, ...] | None) -> dict[str, Any]:
+def _by_seeing(asked: Calibrate, cell: Cell, branch: Branch, fit: CameraFit, progress: Progress,
+               ) -> dict[str, Any]:
     from limber.core.numerics.rigid import matrices, pose_vectors
     from limber.robot.calibration import base_from_camera
     from limber.store.loading import load_skeleton
 
-    fit, summary = found
     alignment = branch.manifest.alignment
     scan = np.eye(4)
     scan[:3, :3] = np.array(alignment.rotation)
     scan[:3, 3] = -scan[:3, :3] @ np.array(alignment.origin)
     pose, position_sigma, rotation_sigma = base_from_camera(
-        fit, scan, camera_on, None if scan_pose is None else np.array(scan_pose),
+        fit, scan, asked.camera_on,
+        None if asked.scan_pose is None else np.array(asked.scan_pose),
         load_skeleton(branch).nodes.mean(axis=0))
     camera = matrices(fit.camera)
-    camera = (matrices(pose) if camera_on == "stand"
+    camera = (matrices(pose) if asked.camera_on == "stand"
               else matrices(np.array(cell.tool.grasp_pose))) @ camera
     mounted = {"pose": tuple(map(float, pose_vectors(camera))),
-               "mount": "branch" if camera_on == "stand" else "flange"}
+               "mount": "branch" if asked.camera_on == "stand" else "flange"}
     if cell.camera is not None:
         cell = cell.model_copy(update={"camera": cell.camera.model_copy(update=mounted)})
-    _write_base(cell_file, cell, branch.uuid, pose, position_sigma, rotation_sigma, fit.residual)
-    run.show("Views", [["view", "off [mm]"], *(
-        [str(number + 1), f"{1000 * off:.2f}"] for number, off in enumerate(fit.residuals))])
-    _close(run, cell_file, fit.residual, position_sigma)
-    return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": pose,
+    _write_base(asked.cell_file, cell, branch.uuid, pose, position_sigma, rotation_sigma,
+                fit.residual)
+    progress.say(table_text("Views", [["view", "off [mm]"], *(
+        [str(number + 1), f"{1000 * off:.2f}"] for number, off in enumerate(fit.residuals))]))
+    return {"cell": str(asked.cell_file), "branch": branch.uuid, "base_pose": pose,
             "residual_m": fit.residual, "position_sigma_m": position_sigma,
             "rotation_sigma_rad": rotation_sigma, "camera_pose": mounted["pose"],
-            "camera_mount": mounted["mount"]} | summary
+            "camera_mount": mounted["mount"]}
 
 
-def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file: Path,
-                 largest_residual: float) -> dict[str, Any]:
-    from limber.core.errors import InputError
+def _by_touching(asked: Calibrate, cell: Cell, branch: Branch, points_file: Path,
+                 progress: Progress) -> dict[str, Any]:
     from limber.robot.calibration import fit_base, require_frame
 
     names, on_branch, touched = _points(points_file)
     # Before the user touches any points.
-    require_frame(on_branch, names, "on the branch", largest_residual)
+    require_frame(on_branch, names, "on the branch", asked.largest_residual)
     version = cell.robot.version
     if touched is None:
         if not sys.stdin.isatty():
             raise InputError("Touching points needs a terminal, and standard input is "
                              "none.", "", "Run it in a terminal, or give the robot's poses "
                              "in the points file.")
-        touched, version = _touch(run, cell, names)
-    fit = fit_base(touched, on_branch, largest_residual=largest_residual, names=names)
+        touched, version = _touch(cell, names)
+    fit = fit_base(touched, on_branch, largest_residual=asked.largest_residual, names=names)
     cell = cell.model_copy(update={"robot": cell.robot.model_copy(update={"version": version})})
-    _write_base(cell_file, cell, branch.uuid, fit.pose, fit.position_sigma, fit.rotation_sigma,
-                fit.residual)
-    run.show("Touched points", [["point", "off [mm]"], *(
-        [name, f"{1000 * off:.2f}"] for name, off in zip(names, fit.residuals, strict=True))])
-    _close(run, cell_file, fit.residual, fit.position_sigma)
-    return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": fit.pose,
+    _write_base(asked.cell_file, cell, branch.uuid, fit.pose, fit.position_sigma,
+                fit.rotation_sigma, fit.residual)
+    progress.say(table_text("Touched points", [["point", "off [mm]"], *(
+        [name, f"{1000 * off:.2f}"] for name, off in zip(names, fit.residuals, strict=True))]))
+    return {"cell": str(asked.cell_file), "branch": branch.uuid, "base_pose": fit.pose,
             "residual_m": fit.residual,
             "points": [{"name": name, "residual_m": float(off)}
                        for name, off in zip(names, fit.residuals, strict=True)],
             "position_sigma_m": fit.position_sigma, "rotation_sigma_rad": fit.rotation_sigma}
 
 
-def _close(run: Run, cell_file: Path, residual: float, sigma: float) -> None:
-    run.close(f"The base's position is known to {1e3 * sigma:.2g} mm (standard deviation); RMS "
-              f"residual {1e3 * residual:.2g} mm.", where=cell_file,
-              then=f"limber robot check {shlex.quote(str(cell_file))}")
-
-
-def _write_base(cell_file: Path, cell: Any, branch: str, pose: np.ndarray, position_sigma: float,
+def _write_base(cell_file: Path, cell: Cell, branch: str, pose: np.ndarray, position_sigma: float,
                 rotation_sigma: float, residual: float) -> None:
     """Write a cell whose base is calibrated for a branch, with the branch's identity."""
     from limber.cell.cell_file import BaseEntry, write_cell
@@ -234,7 +222,6 @@ def _write_base(cell_file: Path, cell: Any, branch: str, pose: np.ndarray, posit
 
 
 def _points(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
-    from limber.core.errors import InputError
     from limber.core.files.tables import csv_rows
 
     try:
@@ -264,10 +251,9 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
+def _touch(cell: Cell, names: list[str]) -> tuple[np.ndarray, str]:
     """Read the tool's position at each point; the arm is guided by hand, no command is sent to it.
     """
-    from limber.core.errors import WorkError
     from limber.robot.calibration import touched_point
     from limber.robot.ur.rtde import SampleStream
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from limber.cli.main import Run, stage_command
-from limber.core.errors import Option, Text
+from limber.cli.cell_tool import CellTool
+from limber.core.errors import InputError, Option, Text, WorkError
+from limber.core.progress import SILENT, Progress
+from limber.stages.stage import About, given, option
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell
@@ -17,17 +18,16 @@ if TYPE_CHECKING:
 _SECONDS = 1.0
 
 
-@stage_command("check")
-@click.argument("cell_file", type=click.Path(path_type=Path))
-@click.option("--offline", is_flag=True, help="Read files only: no robot is needed.")
-@click.option("--branch", "folder", type=click.Path(path_type=Path), help="Branch folder that the "
-              "cell must belong to; with --offline.")
-@click.option("--plan", help="Plan of the branch folder whose motion the arm must be able to "
-              "follow; with --offline.")
-@click.option("--realsense", is_flag=True, help="Compare [camera] with the connected RealSense "
-              "camera too.")
-def check(run: Run, cell_file: Path, offline: bool, folder: Path | None, plan: str | None,
-          realsense: bool) -> dict[str, Any]:
+def _from_files_line(values: Mapping[str, Any]) -> str:
+    if not values["offline"]:
+        return ""
+    plan = values["plan"]
+    return (f"{values['cell_file']} describes a {values['arm']}; its base is known to "
+            f"{1000 * values['base_position_sigma_m']:.1f} mm"
+            f"{f', and the arm can follow {plan}' if plan else ''}. No robot was asked.")
+
+
+class Check(CellTool):
     """Read model, version, settings, mode and force, and compare them with the cell.
 
     The robot does not move, and nothing is written to the controller. Each difference is stated
@@ -35,35 +35,48 @@ def check(run: Run, cell_file: Path, offline: bool, folder: Path | None, plan: s
     showing them, and restore them. With --offline only the cell file, its calibration and a plan
     are checked.
     """
-    from limber.cell.cell_file import read_cell
-    from limber.core.errors import InputError
-    from limber.robot.robot_state import unweighed
 
-    if ((folder or plan) and not offline) or (plan and folder is None):
-        raise InputError(
-            Text(Option("branch"), " and ", Option("plan"), " are checked from files."), "A plan "
-            "belongs to a branch.", "Give ", Option("offline", True), " ", Option("branch"),
-            " FOLDER, and ", Option("plan"), " NAME if you want.")
-    cell = read_cell(cell_file)
-    if reason := unweighed(cell):
-        run.progress.warn(f"{reason}. Weigh it before the arm moves a branch (limber robot weigh).")
-    camera = _camera(run, cell) if realsense else {}
-    if offline:
-        return camera | _from_files(run, cell, cell_file, folder, plan)
-    return camera | _from_robot(run, cell)
+    about = About("robot check", found=(
+        "A {arm} with controller version {version} answers at {address}; "
+        "{samples_per_second:.0f} samples a second. Nothing was moved or written.",
+        _from_files_line))
+
+    offline: bool = option("Read files only: no robot is needed.", False, switch=True)
+    branch: Path | None = given("Branch folder that the cell must belong to; with --offline.")
+    plan: str | None = given("Plan of the branch folder whose motion the arm must be able to "
+                             "follow; with --offline.")
+    realsense: bool = option("Compare [camera] with the connected RealSense camera too.", False,
+                             switch=True)
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        from limber.robot.robot_state import unweighed
+
+        if ((self.branch or self.plan) and not self.offline) or (
+                self.plan and self.branch is None):
+            raise InputError(
+                Text(Option("branch"), " and ", Option("plan"), " are checked from files."),
+                "A plan belongs to a branch.", "Give ", Option("offline", True), " ",
+                Option("branch"), " FOLDER, and ", Option("plan"), " NAME if you want.")
+        cell = self.cell()
+        if reason := unweighed(cell):
+            progress.warn(f"{reason}. Weigh it before the arm moves a branch (limber robot "
+                          "weigh).")
+        camera = _camera(cell, progress) if self.realsense else {}
+        return camera | (_from_files(self, cell, progress) if self.offline
+                         else _from_robot(cell, progress))
 
 
-def _from_files(run: Run, cell: Cell, cell_file: Path, folder: Path | None, plan: str | None,
-                ) -> dict[str, Any]:
+def _from_files(check: Check, cell: Cell, progress: Progress) -> dict[str, Any]:
     """Check a cell, its calibration and a plan without a robot."""
     from limber.cell.cell_file import check_branch
     from limber.cell.obstacles import cell_obstacles
     from limber.stages.paths.execute import ExecutePlan, planned_motion
     from limber.store import Branch
 
-    obstacles = cell_obstacles(cell, cell_file.parent)
+    folder, plan = check.branch, check.plan
+    obstacles = cell_obstacles(cell, check.cell_file.parent)
     for text in _not_stated(cell):
-        run.progress.warn(text)
+        progress.warn(text)
     result: dict[str, Any] = {
         "arm": cell.arm.name, "obstacles": len(obstacles),
         "base_position_sigma_m": cell.base.position_sigma_m,
@@ -71,15 +84,12 @@ def _from_files(run: Run, cell: Cell, cell_file: Path, folder: Path | None, plan
         "calibration_residual_m": cell.base.residual_m}
     if plan is None and folder is not None and (
             warning := check_branch(cell, Branch.read(folder).uuid, folder)):
-        run.progress.warn(warning)
+        progress.warn(warning)
     if plan is not None and folder is not None:
         planned = planned_motion(
-            ExecutePlan(branch_folder=folder, name=plan, cell=cell_file, unwatched=True),
-            run.progress, is_to_move=True)
+            ExecutePlan(branch_folder=folder, name=plan, cell=check.cell_file, unwatched=True),
+            progress, is_to_move=True)
         result |= {"plan": plan, "motion": planned.result}
-    run.close(f"{cell_file} describes a {cell.arm.name}; its base is known to "
-              f"{1000 * cell.base.position_sigma_m:.1f} mm"
-              f"{f', and the arm can follow {plan}' if plan else ''}. No robot was asked.")
     return result
 
 
@@ -105,19 +115,18 @@ def _not_stated(cell: Cell) -> list[str]:
     return found
 
 
-def _camera(run: Run, cell: Cell) -> dict[str, Any]:
+def _camera(cell: Cell, progress: Progress) -> dict[str, Any]:
     """Compare the connected camera with the cell's."""
     from limber.robot.depth_camera import RealSense, camera_differences
 
     with RealSense() as camera:
         differences = camera_differences(cell, camera.camera)
     for each in differences:
-        run.progress.warn(f"{each}.")
+        progress.warn(f"{each}.")
     return {"camera_differences": differences}
 
 
-def _from_robot(run: Run, cell: Cell) -> dict[str, Any]:
-    from limber.core.errors import WorkError
+def _from_robot(cell: Cell, progress: Progress) -> dict[str, Any]:
     from limber.robot.robot_state import observe
 
     try:
@@ -127,22 +136,20 @@ def _from_robot(run: Run, cell: Cell) -> dict[str, Any]:
                         " the files are checked without a robot.") from error
     version = seen.facts.get("version")
     if cell.robot.version and version and cell.robot.version != version:
-        run.progress.warn(f"The cell was calibrated with controller version {cell.robot.version}; "
-                          f"the controller now has {version}.")
+        progress.warn(f"The cell was calibrated with controller version {cell.robot.version}; "
+                      f"the controller now has {version}.")
     if seen.program_runs:
-        run.progress.warn("A program is running on the controller. It has to be stopped on the "
-                          "pendant before a motion.")
+        progress.warn("A program is running on the controller. It has to be stopped on the "
+                      "pendant before a motion.")
     for each in seen.differences:
-        run.progress.warn(f"{each}.")
+        progress.warn(f"{each}.")
     for warning in seen.implausible(cell):
-        run.progress.warn(f"The force sensor: {warning}.")
-    computer = _computer(run)
+        progress.warn(f"The force sensor: {warning}.")
+    computer = _computer(progress)
     force = seen.readings[:, :3]
-    run.close(f"A {cell.arm.name} with controller version {version} answers at "
-              f"{cell.robot.address}; {len(seen.samples) / _SECONDS:.0f} samples a second. "
-              "Nothing was moved or written.")
     return seen.facts | computer | {
-        "arm": cell.arm.name, "payload_kg": cell.tool.mass_kg, "sensor": cell.sensor.kind,
+        "arm": cell.arm.name, "address": cell.robot.address,
+        "payload_kg": cell.tool.mass_kg, "sensor": cell.sensor.kind,
         "differences": [vars(each) for each in seen.differences],
         "samples_per_second": len(seen.samples) / _SECONDS,
         "force_without_tare_n": force.mean(axis=0), "force_sigma_n": force.std(axis=0),
@@ -162,20 +169,20 @@ def _calibration(cell: Cell, seen: Observed) -> dict[str, Any] | None:
             "flange_off_nominal_rad": off_rad}
 
 
-def _computer(run: Run) -> dict[str, bool]:
+def _computer(progress: Progress) -> dict[str, bool]:
     """Real-time privileges of the loop that moves a robot."""
     from limber.robot.driver.real_time import claim_real_time, keep_awake, spare_what_is_loaded
 
     summary = {"real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
                "kept_awake": keep_awake()}
     if not summary["real_time"]:
-        run.progress.warn("The loop has no real-time priority. Other programs can delay it, which "
-                          "stops the robot.")
+        progress.warn("The loop has no real-time priority. Other programs can delay it, which "
+                      "stops the robot.")
     if not summary["kept_in_memory"]:
-        run.progress.warn("The driver's memory is not locked (on Linux `ulimit -l`). Memory that "
-                          "was swapped out can delay it, which stops the robot.")
+        progress.warn("The driver's memory is not locked (on Linux `ulimit -l`). Memory that "
+                      "was swapped out can delay it, which stops the robot.")
     if not summary["kept_awake"]:
-        run.progress.warn("The computer's processors may sleep while idle (on Linux, write access "
-                          "to /dev/cpu_dma_latency prevents this). Those of a virtual machine "
-                          "wake late, which stops the robot.")
+        progress.warn("The computer's processors may sleep while idle (on Linux, write access "
+                      "to /dev/cpu_dma_latency prevents this). Those of a virtual machine "
+                      "wake late, which stops the robot.")
     return summary

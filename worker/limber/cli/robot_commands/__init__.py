@@ -1,1 +1,0 @@
-"""The commands of `limber robot`, one per module."""
