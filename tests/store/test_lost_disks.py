@@ -2,7 +2,6 @@
 
 import builtins
 import errno
-import gc
 import io
 import os
 import re
@@ -44,17 +43,6 @@ class Disk:
         return call
 
 
-@pytest.fixture
-def quick_collection():
-    """What all other tests have loaded is left out of the garbage collector's walks: each error
-    of a disk has one, and takes a quarter of a second with it.
-    """
-    gc.collect()
-    gc.freeze()
-    yield
-    gc.unfreeze()
-
-
 def write(branch: Branch, number: int) -> None:
     with branch.stage("a", {"n": number}) as stage:
         stage.path("x.txt").write_text(str(number))
@@ -62,7 +50,6 @@ def write(branch: Branch, number: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick_collection")
 @pytest.mark.parametrize(("code", "names"), [(errno.ENOSPC, _WRITING), (errno.ESTALE, _ALL)])
 def test_at_every_step_the_folder_is_left_before_or_after(tmp_path, monkeypatch, code, names):
     """The error is in words, the folder whole, the right to write free again."""
