@@ -205,7 +205,8 @@ def test_what_goes_wrong_during_a_pull_is_noticed_within_ten_millimetres(
     begin = flange_of(stepped)
     with after_a_way(stepped, 0.006, action, **values), pytest.raises(SafetyStop, match=told):
         RecordPull(branch_folder=branch_folder, cell=path, name="wrong",
-                   **sideways_pull(branch_folder, distance=0.03), confirm="wrong").run()
+                   **sideways_pull(branch_folder, distance=0.03, speed=0.02),
+                   confirm="wrong").run()
     assert 0.006 < np.linalg.norm(flange_of(stepped) - begin) < 0.016
     assert np.linalg.norm(stepped.state["tool_speed"]) < 1e-3
 
@@ -514,7 +515,8 @@ def test_a_realsense_records_what_the_tracker_follows(branch_folder, tmp_path, r
     camera = VirtualRealSense(robot.address, placed.pose)
     monkeypatch.setitem(sys.modules, "pyrealsense2", camera)
     result = RecordPull(branch_folder=branch_folder, cell=path, name="seen",
-                        **sideways_pull(branch_folder, distance=0.03), confirm="seen",
+                        **sideways_pull(branch_folder, distance=0.03, speed=0.02),
+                        confirm="seen",
                         realsense=True).run()
     assert result["ended"] == "reached" and result["depth_images"] > 5
     folder = branch_folder / "pulls" / "seen"
