@@ -1,6 +1,7 @@
 """What every test shares: real recordings; small meshes, branches and pulls with known truth."""
 
 import gc
+import json
 import os
 import shutil
 import signal
@@ -141,12 +142,18 @@ def branch_folder(branch_template, tmp_path):
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Refuse a test held to wall clocks where `scripts/test` does not look for it."""
+    """Mark as slow what the last whole run took over half a second for; refuse a test held to wall
+    clocks where `scripts/test` does not look for it."""
     lost = [item.nodeid for item in items if item.get_closest_marker("real_time") is not None
             and Path(__file__).parent / "robot" not in item.path.parents]
     if lost:
         raise pytest.UsageError(f"real_time is for tests/robot alone: {', '.join(lost)}")
-    for item in items:  # tests/run.py asks for a mark of every new test that takes long
+    known = json.loads((Path(__file__).parent / "durations.json").read_text(encoding="utf-8"))
+    for item in items:
+        path, _, name = item.nodeid.partition("::")
+        if f"{path.removesuffix('.py').replace('/', '.')}::{name}" in known:
+            item.add_marker("slow")
+        # tests/run.py asks for a mark of every new test that takes long.
         if LONG & {mark.name for mark in item.iter_markers()}:
             item.user_properties.append(("long", "yes"))
 
@@ -157,17 +164,10 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+def pytest_unconfigure() -> None:
+    """At the end nothing is left."""
+    gc.unfreeze()
+
+
 LONG = {"slow", "campaign", "real_time", "real_blender"}
 """Marks that a test which takes long has one of."""
-_QUICK_SECONDS = 2.0
-"""A test without the mark `slow` takes half a second; several times that is worth a word."""
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Name the tests that lack the mark `slow`, so that `scripts/test --fast` stays fast."""
-    reports = terminalreporter.getreports("passed") + terminalreporter.getreports("failed")
-    for report in reports:
-        if report.when == "call" and report.duration > _QUICK_SECONDS and not (
-                LONG & set(report.keywords)):
-            terminalreporter.write_line(
-                f"not marked slow, and took {report.duration:.1f} s: {report.nodeid}")

@@ -39,7 +39,7 @@ REAL_BLENDER = ["tests/addon", "-m", "real_blender and not campaign", "--duratio
 CHECKS = {"types": [BIN / "mypy"], "layers": [BIN / "lint-imports", "--no-cache", "--no-logo"],
           "packages": [sys.executable, ROOT / "scripts/check_dependencies"]}
 DURATIONS = ROOT / "tests" / "durations.json"
-"""Seconds of each test over 1 s, longest first, as the last whole run measured them."""
+"""Seconds of each test over half a second, longest first, as the last whole run measured them."""
 LONG_SECONDS = 5.0
 """A test that takes longer is marked `slow` or `campaign`, or was there before this rule."""
 
@@ -140,7 +140,7 @@ def unmarked_parts(parts: list[Part]) -> list[Part]:
 def write_durations(parts: list[Part]) -> None:
     """Keep how long the tests of a whole run took, to half a second."""
     rounded = {name: round(2 * seconds) / 2 for part in parts
-               for name, seconds in part.seconds_of.items() if seconds > 1.0}
+               for name, seconds in part.seconds_of.items() if seconds > 0.5}
     ordered = dict(sorted(rounded.items(), key=lambda one: (-one[1], one[0])))
     DURATIONS.write_text(json.dumps(ordered, indent=0) + "\n", encoding="utf-8")
 
