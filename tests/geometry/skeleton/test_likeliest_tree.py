@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from benchmarks.worlds.sources import bare_case
-from limber.geometry.skeleton.likeliest_tree import fitted, likeliest_tree
+from limber.geometry.skeleton.likeliest_tree import _falling, fitted, likeliest_tree
+from limber.geometry.skeleton.repair import PointSpacing
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
-from limber.geometry.skeleton.tree_likelihood import DIRECTIONS, PointLikelihood
+from limber.geometry.skeleton.tree_likelihood import PointLikelihood
 
 
 def rod(radius: float = 0.004, length: float = 0.3, nodes: int = 20) -> Skeleton:
@@ -19,9 +21,10 @@ def rod(radius: float = 0.004, length: float = 0.3, nodes: int = 20) -> Skeleton
 
 
 def skin(radius: float, noise: float, count: int = 600, half: bool = False) -> np.ndarray:
-    """Points on a rod of 0.3 m along x, or on its upper half [m]."""
+    """Points on a rod of 0.3 m along x, or on its upper half, seen from above [m]."""
     rng = np.random.default_rng(0)
-    angle = rng.uniform(0, np.pi if half else 2 * np.pi, count)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    angle = np.arccos(rng.uniform(-1, 1, count)) if half else angle
     points = np.column_stack([rng.uniform(0, 0.3, count), radius * np.cos(angle),
                               radius * np.sin(angle)])
     return points + rng.normal(0, noise, points.shape)
@@ -36,7 +39,7 @@ def test_the_density_across_an_axis_integrates_to_one(radius, noise, facing):
     total = np.mean([2 * np.pi * np.sum(distance * scan.across(
         distance, np.full(4000, radius), None if facing is None else np.full(4000, np.cos(one)),
     )[:, 0]) * (distance[1] - distance[0]) for one in (angle if facing else angle[:1])])
-    assert total == pytest.approx(1.0, abs=2e-3)
+    assert total == pytest.approx(1.0, abs=2e-3 if facing is None else 4e-3)  # seven harmonics
 
 
 @pytest.mark.parametrize("noise", [0.0005, 0.003])
@@ -48,10 +51,31 @@ def test_a_cylinder_too_thick_or_too_thin_scores_less(noise):
 
 def test_the_side_that_was_seen_scores_most():
     upper, round_ = (PointLikelihood.of(skin(0.004, 0.0005, half=half)) for half in (True, False))
-    up = [way for way in DIRECTIONS if way[2] > 0.99 * np.linalg.norm(way)]
-    below = upper.seen_from(-up[0]).score(rod())
-    assert upper.seen_from(up[0]).score(rod()) > upper.score(rod()) > below
-    assert round_.score(rod()) > round_.seen_from(up[0]).score(rod())
+    up = np.array([0.0, 0.0, 1.0])
+    below = upper.seen_from(-up).score(rod())
+    assert upper.seen_from(up).score(rod()) > upper.score(rod()) > below
+    assert round_.where_seen(rod()).sight is None
+
+
+@pytest.mark.slow
+def test_the_sensor_is_found_between_the_directions_that_are_tried():
+    points = skin(0.004, 0.0005, half=True)
+    turn = np.radians(20)
+    rotation = np.array([[1, 0, 0], [0, np.cos(turn), -np.sin(turn)],
+                         [0, np.sin(turn), np.cos(turn)]])
+    sight = PointLikelihood.of(points @ rotation.T).where_seen(rod()).sight
+    across = sight[:, 1:].mean(axis=0)  # along the rod nothing shows it
+    assert np.degrees(np.arctan2(-across[0], across[1])) == pytest.approx(20, abs=6)
+
+
+def test_radii_fall_away_from_the_root_by_least_squares():
+    """The nearest falling values, against a general solver on a small tree."""
+    parent = np.array([-1, 0, 1, 1, 3, 4])
+    value, weight = np.array([1.0, 0.5, 0.9, 2.0, 0.1, 0.4]), np.array([1.0, 2, 1, 0.5, 3, 1])
+    node = np.arange(1, 6)
+    known = minimize(lambda x: np.sum(weight * (x - value)**2), np.zeros(6), constraints={
+        "type": "ineq", "fun": lambda x: x[parent[node]] - x[node]}).x
+    assert _falling(value, weight, parent) == pytest.approx(known, abs=1e-5)
 
 
 def test_a_fit_finds_axis_and_radius_from_one_side():
@@ -99,9 +123,8 @@ def test_a_twig_that_no_point_shows_is_left_out():
     twig = np.array([[0.15, 0.0, 0.02], [0.15, 0.0, 0.05]])
     first = Skeleton.from_edges(np.vstack([whole.nodes, twig]), np.concatenate(
         [whole.parent, [10, 20]]), np.full(22, 0.004))
-    found, side, count = likeliest_tree(first, points)
+    found, count = likeliest_tree(first, PointLikelihood.of(points), PointSpacing.of(points))
     assert found.branch_count == count == 1
-    assert side is None
 
 
 @pytest.mark.slow
@@ -109,6 +132,6 @@ def test_points_that_nothing_explains_become_a_twig():
     rng = np.random.default_rng(1)
     twig = np.column_stack([np.full(60, 0.15), np.zeros(60), rng.uniform(0.005, 0.08, 60)])
     points = np.vstack([skin(0.004, 0.0005), twig + rng.normal(0, 0.001, twig.shape)])
-    found, _, _ = likeliest_tree(rod(), points)
+    found, _ = likeliest_tree(rod(), PointLikelihood.of(points), PointSpacing.of(points))
     assert found.branch_count == 2
     assert found.length == pytest.approx(0.38, rel=0.05)

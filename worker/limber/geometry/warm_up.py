@@ -5,9 +5,12 @@ import numpy as np
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.leaves import leaf_log_odds, surroundings
 from limber.geometry.skeleton.joining import join_pieces
+from limber.geometry.skeleton.likeliest_tree import State, grown
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
+from limber.geometry.skeleton.repair import PointSpacing
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.tree_likelihood import PointLikelihood
 from limber.geometry.surface.surface import distance_to_surface
 from limber.geometry.surface.tubes import branch_surface
 
@@ -21,6 +24,8 @@ def warm_up(progress: Progress = SILENT) -> None:
     surface = branch_surface(skeleton)
     distance_to_surface(skeleton.nodes, surface)
     fit_axes(skeleton, surface.vertices, rounds=1, settled=True)
+    grown(State.of(skeleton, PointLikelihood.of(surface.vertices)),
+          PointSpacing.of(surface.vertices))  # used by thin scans alone
     line = np.array([[0, 0, 0.01 * k] for k in (*range(4), *range(6, 10))])
     join_pieces(line, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [5, 6], [6, 7]]), np.full(8, 0.01),
                 np.full(8, 20), np.full(8, 0.01), gap=0.03, bridge_limit=0.1,

@@ -2,34 +2,34 @@
 
 Where points are few and scatter as far as twigs are thick, no step can decide for itself what is
 wood. So each change is a proposal: leave out a twig, draw an end back, lengthen it, add a twig
-towards points that nothing explains. It is kept if the score rises
+towards points that are badly explained. It is kept if the score rises
 (:mod:`~limber.geometry.skeleton.tree_likelihood`). Between them axes and radii go to the largest
 posterior with the prior of wood: an expectation step asks where on the skin each point was, given
 the noise, and a maximisation step moves axes and radii to fit (Dempster, Laird, Rubin 1977).
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
-from scipy.special import ive, ndtr
+from scipy.special import ive
 
+from limber.core.numerics.compiled import compiled_exactly
 from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.confidence import assessed, doubted
 from limber.geometry.skeleton.radii.axis_fit import TargetDistances, data_terms
-from limber.geometry.skeleton.radii.fit_kernels import Match, match_cylinders, nearest_cylinders
-from limber.geometry.skeleton.radii.wood import Bends, Wood
+from limber.geometry.skeleton.radii.fit_kernels import match_cylinders, nearest_cylinders
+from limber.geometry.skeleton.radii.wood import Bends, Wood, turn_cost, turn_variance
 from limber.geometry.skeleton.repair import PointSpacing, resampled, without_kinks
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.tree_likelihood import DIRECTIONS, HIDDEN, PointLikelihood, Scatter
+from limber.geometry.skeleton.tree_likelihood import PointLikelihood, Scatter
 
 SEARCHED_POINTS = 1_500
 """Most points of a scan that is searched so: a limit of time."""
 _SPACING = 1.5  # radii between nodes
-_PASSES, _STEPS, _LAST_STEPS = 4, 6, 10  # rounds of proposals; steps of a fit between and after
+_PASSES, _STEPS, _LAST_STEPS = 6, 6, 10  # rounds of proposals; steps of a fit between and after
 # Length of the main path over the radius at its base, and the deviation of its logarithm, where
 # the scan shows no skin: twelve plants of six generators have 52 to 142.
 _SLENDER, _SLENDER_SIGMA = 92.0, 0.5
@@ -37,62 +37,51 @@ _ALONG, _HELD = 0.3, 10.0  # radii that a step moves nodes along their axis, and
 _CHANGE = 0.5  # most that a step changes the logarithm of a radius
 _FIRM = 0.02  # least part of a point's weight with which it holds the axis across
 _TWIG = 0.6  # radius of a new twig over that of its carrier
-_FURTHER = 4.0  # numbers that an axis to a further point costs
-_TIPS = 2  # of the nearest ends that may go on to a point
-_SIDE_POINTS, _SIDE_STEPS = 600, 3  # points and steps that show from which side a scan was seen
-_ANGLE = 2 * np.pi * (np.arange(48) + 0.5) / 48  # of positions around an axis
-_EDGE = 8.0  # sharpness of the border between seen and hidden half
-_SHARP = 60.0  # concentration from which a point's place on the skin is known
+_BADLY, _FEET, _TIPS = 400, 8, 2  # points explained worst; nodes and ends from which twigs may lead
+_TABLE, _FACINGS = 48, 5  # distances and angles at which the density of a new twig is known
+_POSITIONS = (2 * np.arange(24) + 1) / 24 - 1  # around an axis, within so many deviations:
+_WIDE = 4.5
 
 
 def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, progress: Progress = SILENT,
                ) -> tuple[Skeleton, float, int] | None:
     """Return the likeliest tree found from the ``first``, that of the contracted points with all
-    its spurs, the noise [m] and the number of twigs left out, if it scores more than the ``known``;
-    ``points`` [m, 3] [m] are the scan's."""
-    skeleton, side, count = likeliest_tree(first, points, progress)
+    its spurs, the noise [m] and the number of twigs left out, if it scores more than the ``known``
+    with axes and radii fitted alike; ``points`` [m, 3] [m] are the scan's."""
+    apart = PointSpacing.of(points)
+    scan = PointLikelihood.of(points).where_seen(known)
+    skeleton, count = likeliest_tree(first, scan, apart, progress)
+    alike = fitted(_spaced(known, apart), scan, _LAST_STEPS)
+    if scan.score(skeleton) <= scan.score(alike):
+        return None
     residual = nearest_cylinders(skeleton, points)[1]
     noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
-    found = assessed(skeleton, points, noise, one_sided=side is not None)
+    found = assessed(skeleton, points, noise, one_sided=scan.sight is not None)
     even, kinks = without_kinks(found)
-    found = doubted(even, points, noise) if kinks else found
-    scan = PointLikelihood.of(points)
-    return (found, noise, count) if scan.best(found) > scan.best(known) else None
+    return doubted(even, points, noise) if kinks else found, noise, count
 
 
-def likeliest_tree(first: Skeleton, points: np.ndarray, progress: Progress = SILENT,
-                   ) -> tuple[Skeleton, np.ndarray | None, int]:
-    """The likeliest tree found from the ``first``, the direction [3] from which the scan saw it
-    (None: from all around), and the number of twigs left out."""
-    scan, apart = PointLikelihood.of(points), PointSpacing.of(points)
-    skeleton, count = first, 0
+def likeliest_tree(first: Skeleton, scan: PointLikelihood, apart: PointSpacing,
+                   progress: Progress = SILENT) -> tuple[Skeleton, int]:
+    """The likeliest tree found from the ``first`` and the number of twigs left out."""
+    skeleton, best, found, count = first, -np.inf, first, 0
     for number in range(_PASSES):
-        progress(number / (_PASSES + 1), "comparing trees")
-        skeleton = resampled(skeleton, _SPACING, apart.at(skeleton.nodes))
-        state = State.of(fitted(skeleton, scan, _STEPS), scan)
-        rest = pruned(state)
+        progress(number / _PASSES, "comparing trees")
+        state = State.of(fitted(_spaced(skeleton, apart), scan, _STEPS), scan)
+        rest = drawn_back(pruned(state))
         count += state.skeleton.branch_count - rest.skeleton.branch_count
-        after = grown(drawn_back(rest), apart)
+        if (score := scan.score(rest.skeleton)) > best:
+            best, found = score, rest.skeleton
+        after = grown(rest, apart)
         skeleton = after.skeleton
-        if after is state:
+        if after is rest:
             break
-    skeleton = fitted(resampled(skeleton, _SPACING, apart.at(skeleton.nodes)), scan, _STEPS)
-    progress(_PASSES / (_PASSES + 1), "which side was seen")
-    side = _side(skeleton, points)
-    return (skeleton if side is None else fitted(skeleton, scan.seen_from(side), _LAST_STEPS),
-            side, count)
+    return fitted(_spaced(found, apart), scan, _LAST_STEPS), count
 
 
-def _side(skeleton: Skeleton, points: np.ndarray) -> np.ndarray | None:
-    """The direction from which the scan saw the tree, if axes and radii that fit it score more."""
-    some = points[:: max(len(points) // _SIDE_POINTS, 1)]
-    scan = PointLikelihood.of(some)
-
-    def after(side: np.ndarray | None) -> float:
-        seen = scan.seen_from(side)
-        return seen.score(fitted(skeleton, seen, _SIDE_STEPS))
-
-    return max((None, *DIRECTIONS), key=after)
+def _spaced(skeleton: Skeleton, apart: PointSpacing) -> Skeleton:
+    """The skeleton with nodes as far apart as radii and points allow."""
+    return resampled(skeleton, _SPACING, apart.at(skeleton.nodes))
 
 
 # Axes and radii of the largest posterior.
@@ -109,13 +98,14 @@ def fitted(skeleton: Skeleton, scan: PointLikelihood, steps: int) -> Skeleton:
 def _step(skeleton: Skeleton, scan: PointLikelihood, prior: "_Prior") -> Skeleton:
     match = scan.match(skeleton)
     distance = np.maximum(match.residual + match.thick, 1e-12)
-    density = scan.across(distance, match.thick, scan.facing(skeleton, match, match.normal))
-    scatter = scan.scattered(skeleton, match, density)
+    density = scan.densities(skeleton, match)
+    scatter = scan.scattered(skeleton, density)
     share = density * scatter.shares / skeleton.length
     share /= (share.sum(axis=1) + scatter.background / scan.volume)[:, None]
     weight = (share / scan.noises**2).sum(axis=1)
-    across = np.cross(scan.axes(skeleton, match), match.normal)
-    place = _places(skeleton, match, distance * match.thick * weight, scan, across)
+    axes = scan.axes(skeleton, match)
+    across = np.cross(axes, match.normal)
+    place = _places(axes, match.normal, distance * match.thick * weight, scan, across)
     outwards = np.einsum("mj,mj->m", place, match.normal)
     firm = np.maximum(1 - match.thick * outwards / distance, _FIRM)
     own, right, _ = data_terms(skeleton.parent, skeleton.nodes, match, weight, place,
@@ -123,12 +113,37 @@ def _step(skeleton: Skeleton, scan: PointLikelihood, prior: "_Prior") -> Skeleto
                                np.sqrt(firm)[:, None] * across)
     # In logarithms of radii.
     unit = np.column_stack([np.ones_like(skeleton.nodes), skeleton.radius]).ravel()
-    step = prior.solved(own.multiply(unit).T.multiply(unit), unit * right,
+    own = own.multiply(unit).T.multiply(unit)
+    step = prior.solved(own, unit * right,
                         np.column_stack([skeleton.nodes, np.log(skeleton.radius)]))
     far = np.linalg.norm(step[:, :3], axis=1) / np.maximum(skeleton.radius, scatter.scale)
     move = step[:, :3] / np.maximum(far, 1.0)[:, None]
-    return replace(skeleton.moved(skeleton.nodes + move),
-                   radius=skeleton.radius * np.exp(np.clip(step[:, 3], -_CHANGE, _CHANGE)))
+    log_radius = np.log(skeleton.radius) + np.clip(step[:, 3], -_CHANGE, _CHANGE)
+    return replace(skeleton.moved(skeleton.nodes + move), radius=np.exp(
+        _falling(log_radius, own.diagonal()[3::4] + 1.0, skeleton.parent)))
+
+
+def _falling(value: np.ndarray, weight: np.ndarray, parent: np.ndarray) -> np.ndarray:
+    """The nearest values [n] that nowhere rise away from the root: a few far points would swell a
+    twig. Least squares with weights [n] on a rooted tree (Pardalos and Xue 1999)."""
+    total, mass = (weight * value).tolist(), weight.tolist()
+    block = list(range(len(total)))  # the uppermost node of each node's block, or one of its block
+    below: list[list[int]] = [[] for _ in total]
+    for node in range(len(total) - 1, -1, -1):
+        while below[node]:
+            most = max(below[node], key=lambda each: total[each] / mass[each])
+            if total[most] / mass[most] <= total[node] / mass[node]:
+                break
+            total[node] += total[most]
+            mass[node] += mass[most]
+            block[most] = node
+            below[node].remove(most)
+            below[node] += below[most]
+        if node:
+            below[parent[node]].append(node)
+    for node in range(1, len(total)):
+        block[node] = block[block[node]]
+    return np.array([total[each] / mass[each] for each in block])
 
 
 @dataclass(frozen=True)
@@ -180,31 +195,30 @@ def _padded(matrix: sparse.csr_matrix, more: int) -> sparse.csr_matrix:
         matrix.indptr, np.full(more, matrix.indptr[-1]))), (size, size))
 
 
-def _places(skeleton: Skeleton, match: Match, sharpness: np.ndarray, scan: PointLikelihood,
+def _places(axes: np.ndarray, normal: np.ndarray, sharpness: np.ndarray, scan: PointLikelihood,
             across: np.ndarray) -> np.ndarray:
     """Mean direction [m, 3] from the axis to where each point is on the skin, given where it was
-    measured: a von Mises distribution of this ``sharpness``, and the half that was seen. ``across``
+    measured: a von Mises distribution of this ``sharpness``, and what the sensor sees. ``across``
     [m, 3] is the direction around the axis."""
-    facing, aside = (scan.facing(skeleton, match, ways) for ways in (match.normal, across))
+    facing, aside = (scan.facing(axes, ways) for ways in (normal, across))
     if facing is None or aside is None:
-        return (ive(1, sharpness) / ive(0, sharpness))[:, None] * match.normal
-    seen = ndtr(_EDGE * (facing[:, None] * np.cos(_ANGLE) + aside[:, None] * np.sin(_ANGLE)))
-    density = (HIDDEN + (1 - HIDDEN) * 2 * seen) * np.exp(
-        np.minimum(sharpness, _SHARP)[:, None] * (np.cos(_ANGLE) - 1))
+        return (ive(1, sharpness) / ive(0, sharpness))[:, None] * normal
+    turn = np.minimum(_WIDE / np.sqrt(np.maximum(sharpness, 1e-300)), np.pi)[:, None] * _POSITIONS
+    density = scan.seen(facing[:, None] * np.cos(turn) + aside[:, None] * np.sin(turn)) * np.exp(
+        sharpness[:, None] * (np.cos(turn) - 1))
     density /= density.sum(axis=1)[:, None]
-    known = sharpness > _SHARP
-    out = np.where(known, 1 - 0.5 / np.maximum(sharpness, 1.0), density @ np.cos(_ANGLE))
-    beside = np.where(known, 0.0, density @ np.sin(_ANGLE))
-    return out[:, None] * match.normal + beside[:, None] * across
+    return (np.sum(density * np.cos(turn), axis=1)[:, None] * normal
+            + np.sum(density * np.sin(turn), axis=1)[:, None] * across)
 
 
-# Proposals: each changes the density of few points and the length.
+# Proposals: each changes the density of few points, the length, and the bends.
 
 
 @dataclass(frozen=True)
 class State:
     """A tree, the density of the scan's points across its axes [1/m^2], shape [m], their cylinders
-    [m] and distances from those [m], shape [m], under a scatter that the proposals leave."""
+    [m] and distances from those [m], shape [m], under a scatter that the proposals leave, and what
+    the turn before each node costs [n]."""
 
     skeleton: Skeleton
     scan: PointLikelihood
@@ -212,15 +226,17 @@ class State:
     wood: np.ndarray
     segment: np.ndarray
     residual: np.ndarray
+    turns: np.ndarray
 
     @classmethod
     def of(cls, skeleton: Skeleton, scan: PointLikelihood, scatter: Scatter | None = None,
            ) -> "State":
         """The state of a tree; with the likeliest scatter if none is given."""
         match = scan.match(skeleton)
-        density = scan.across(np.maximum(match.residual + match.thick, 0.0), match.thick)
-        scatter = scatter or scan.scattered(skeleton, match, density)
-        return cls(skeleton, scan, scatter, density @ scatter.shares, match.segment, match.residual)
+        density = scan.densities(skeleton, match)
+        scatter = scatter or scan.scattered(skeleton, density)
+        return cls(skeleton, scan, scatter, density @ scatter.shares, match.segment,
+                   match.residual, Bends.of(skeleton).costs(skeleton.nodes))
 
     def after(self, skeleton: Skeleton) -> "State":
         """The state of another tree with the same scatter."""
@@ -230,7 +246,7 @@ class State:
     def log(self) -> float:
         """Its score."""
         return self.scan.log(self.wood, self.scatter, self.skeleton.length,
-                             self.skeleton.branch_count)
+                             self.skeleton.branch_count) - float(self.turns.sum())
 
     def without(self, nodes: np.ndarray, runs: int = 0) -> float:
         """The score without nodes, a mask [n], whose children are all among them; ``runs`` of them
@@ -245,24 +261,10 @@ class State:
                                     skeleton.radius, self.scan.points[own],
                                     ends[near.reshape(len(own), -1)])
             wood = wood.copy()
-            wood[own] = self.scan.across(np.maximum(match.residual + match.thick, 0.0),
-                                         match.thick) @ self.scatter.shares
+            wood[own] = self.scan.densities(skeleton, match, own) @ self.scatter.shares
         return self.scan.log(wood, self.scatter,
                              skeleton.length - float(skeleton.steps[nodes].sum()),
-                             skeleton.branch_count - runs)
-
-    def with_cylinder(self, start: np.ndarray, end: np.ndarray, radius: float, runs: int) -> float:
-        """The score with one more cylinder from ``start`` to ``end`` [m], shape [3] each."""
-        step, points = end - start, self.scan.points
-        share = np.clip((points - start) @ step / max(float(step @ step), 1e-300), 0.0, 1.0)
-        distance = np.linalg.norm(points - start - share[:, None] * step, axis=1)
-        nearer = np.flatnonzero(distance - radius < self.residual)
-        wood = self.wood.copy()
-        wood[nearer] = self.scan.across(distance[nearer], np.full(len(nearer), radius),
-                                        ) @ self.scatter.shares
-        return self.scan.log(wood, self.scatter,
-                             self.skeleton.length + float(np.linalg.norm(step)),
-                             self.skeleton.branch_count + runs)
+                             skeleton.branch_count - runs) - float(self.turns[~nodes].sum())
 
 
 def pruned(state: State) -> State:
@@ -279,67 +281,158 @@ def pruned(state: State) -> State:
 
 
 def drawn_back(state: State) -> State:
-    """Shorten ends node by node while the score rises."""
+    """Shorten ends to where the score is highest."""
     skeleton, best = state.skeleton, state.log
     gone, children = np.zeros(skeleton.node_count, bool), skeleton.child_counts()
     for tip in skeleton.tips():
-        node = int(tip)
+        node, tried, shorter = int(tip), gone.copy(), gone
         while skeleton.parent[node] > 0 and children[skeleton.parent[node]] == 1:
-            gone[node] = True
-            score = state.without(gone)
-            if score <= best:
-                gone[node] = False
-                break
-            best, node = score, int(skeleton.parent[node])
+            tried[node] = True
+            score = state.without(tried)
+            if score > best:
+                best, shorter = score, tried.copy()
+            node = int(skeleton.parent[node])
+        gone = shorter
     return state.after(skeleton.subset(~gone)) if gone.any() else state
 
 
 def grown(state: State, apart: PointSpacing) -> State:
-    """Lengthen ends, or add twigs, to points that the background explains best, the nearest first,
-    while the score rises."""
-    given_up = np.zeros(len(state.scan.points), bool)
+    """Lengthen ends, or add twigs, to points that are badly explained, where the score rises most
+    first."""
     while True:
-        background = state.scatter.background / state.scan.volume
-        left = np.flatnonzero((state.wood / state.skeleton.length < background) & ~given_up)
-        for point, starts in _nearest_first(state.skeleton, state.scan.points, left):
-            longer = _longer(state, state.scan.points[point], starts, apart)
-            if longer is not None:
-                state = longer
+        twigs, chosen = _Twigs.of(state, apart), []
+        gain = twigs.gains(state)
+        used = np.zeros(len(state.scan.points), bool)
+        for k in np.argsort(-gain, kind="stable"):
+            if gain[k] <= 0:
                 break
-            given_up[point] = True
-        else:
+            nearer = twigs.nearer(int(k), state)
+            if not used[nearer].any():
+                used |= nearer
+                chosen.append(int(k))
+        after = state.after(twigs.added(chosen, state.skeleton, apart)) if chosen else state
+        if after.log <= state.log:
             return state
+        state = after
 
 
-def _nearest_first(skeleton: Skeleton, points: np.ndarray, left: np.ndarray,
-                   ) -> Iterable[tuple[int, list[int]]]:
-    """Points left over, each with the nodes from which an axis may lead to it."""
-    if len(left) == 0:
-        return []
-    distance, node = cKDTree(skeleton.nodes).query(points[left])
-    tips = skeleton.tips()
-    _, tip = cKDTree(skeleton.nodes[tips]).query(points[left], k=min(_TIPS, len(tips)))
-    tip = tips[tip.reshape(len(left), -1)]
-    return [(int(left[k]), list(dict.fromkeys([int(node[k]), *tip[k].tolist()])))
-            for k in np.argsort(distance, kind="stable")]
+@dataclass(frozen=True)
+class _Twigs:
+    """Straight twigs that may be added, or that lengthen ends: their feet, nodes [t]; their ends
+    [m], shape [t, 3]; radii [m], shape [t]; and what fork or turn at the foot costs [t]."""
+
+    foot: np.ndarray
+    end: np.ndarray
+    radius: np.ndarray
+    cost: np.ndarray
+
+    @classmethod
+    def of(cls, state: State, apart: PointSpacing) -> "_Twigs":
+        """Those to the points explained worst, from the nearest nodes and ends."""
+        skeleton, points = state.skeleton, state.scan.points
+        badly = np.sort(np.argsort(state.wood, kind="stable")[:_BADLY])
+        tips, children = skeleton.tips(), skeleton.child_counts()
+        near = [all_of[cKDTree(skeleton.nodes[all_of]).query(points[badly], k=min(
+            count, len(all_of)))[1].reshape(len(badly), -1)]
+                for all_of, count in ((np.arange(skeleton.node_count), _FEET), (tips, _TIPS))]
+        pairs = np.unique(np.column_stack([np.hstack(near).ravel(), np.repeat(
+            badly, sum(each.shape[1] for each in near))]), axis=0)
+        way = points[pairs[:, 1]] - skeleton.nodes[pairs[:, 0]]
+        length = np.linalg.norm(way, axis=1)
+        apart_from = length > skeleton.radius[pairs[:, 0]]
+        (foot, to), way, length = pairs[apart_from].T, way[apart_from], length[apart_from]
+        before = skeleton.nodes[foot] - skeleton.nodes[np.maximum(skeleton.parent[foot], 0)]
+        step = np.linalg.norm(before, axis=1)
+        turn = way / length[:, None] - before / np.maximum(step, 1e-300)[:, None]
+        mean = (step + np.minimum(length, _SPACING * apart.at(points[to]))) / 2
+        bend = turn_cost(np.sum(turn**2, axis=1) / turn_variance(mean, skeleton.radius[foot]))
+        goes_on = children[foot] == 0
+        return cls(foot, points[to], skeleton.radius[foot] * np.where(goes_on, 1.0, _TWIG),
+                   np.where(goes_on, bend, state.scan.twig_cost))
+
+    def gains(self, state: State) -> np.ndarray:
+        """By how much each raises the score, shape [t]."""
+        scan, skeleton = state.scan, state.skeleton
+        feet, table_of = np.unique(self.foot, return_inverse=True)
+        radius = np.zeros(len(feet))
+        radius[table_of] = self.radius
+        size = float(np.linalg.norm(np.ptp(scan.points, axis=0)))
+        distance = np.append(0.0, np.geomspace(1e-4, 1.0, _TABLE)) * size
+        facing = np.linspace(-1, 1, _FACINGS) if scan.sight is not None else np.zeros(1)
+        grid = np.array(np.meshgrid(radius, facing, distance, indexing="ij"))
+        density = scan.across(grid[2].ravel(), grid[0].ravel(), None if scan.sight is None
+                              else grid[1].ravel()) @ state.scatter.shares
+        table = np.log(np.maximum(density, 1e-300)).reshape(grid.shape[1:])
+        return _raised(
+            skeleton.nodes[self.foot], self.end, self.radius, table_of, table, np.log(
+                distance[1:3]), scan.points, np.zeros((0, 3)) if scan.sight is None else scan.sight,
+            state.wood, state.residual, skeleton.length, state.scatter.background / scan.volume,
+        ) - self.cost
+
+    def nearer(self, k: int, state: State) -> np.ndarray:
+        """Which points would be a twig's, a mask [m]."""
+        start, points = state.skeleton.nodes[self.foot[k]], state.scan.points
+        way = self.end[k] - start
+        share = np.clip((points - start) @ way / (way @ way), 0.0, 1.0)
+        distance = np.linalg.norm(points - start - share[:, None] * way, axis=1)
+        return distance - self.radius[k] < state.residual
+
+    def added(self, chosen: list[int], skeleton: Skeleton, apart: PointSpacing) -> Skeleton:
+        """The skeleton with those chosen."""
+        spacing = _SPACING * np.maximum(apart.at(self.end[chosen]), 1e-6)
+        nodes, parent, radius = [skeleton.nodes], [skeleton.parent], [skeleton.radius]
+        made = skeleton.node_count
+        for k, step in zip(chosen, spacing, strict=True):
+            start = skeleton.nodes[self.foot[k]]
+            count = max(round(float(np.linalg.norm(self.end[k] - start) / step)), 1)
+            share = np.arange(1, count + 1)[:, None] / count
+            nodes.append(start + (self.end[k] - start) * share)
+            parent.append(np.append(self.foot[k], made + np.arange(count - 1)))
+            radius.append(np.full(count, self.radius[k]))
+            made += count
+        return Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent),
+                                   np.concatenate(radius))
 
 
-def _longer(state: State, to: np.ndarray, starts: list[int], apart: PointSpacing) -> State | None:
-    """The state with an axis ``to`` a point [m] from the best of the ``starts``; None if the score
-    does not rise."""
-    skeleton, children = state.skeleton, state.skeleton.child_counts()
-    radius = skeleton.radius * np.where(children > 0, _TWIG, 1.0)
-    scores = [state.with_cylinder(skeleton.nodes[node], to, radius[node], int(children[node] > 0))
-              for node in starts]
-    best = int(np.argmax(scores))
-    if scores[best] <= state.log + _FURTHER / 2 * np.log(len(state.scan.points)):
-        return None
-    node = starts[best]
-    way = to - skeleton.nodes[node]
-    spacing = _SPACING * max(float(apart.at(to[None])[0]), 1e-6)
-    count = max(round(float(np.linalg.norm(way)) / spacing), 1)
-    added = skeleton.nodes[node] + way * (np.arange(1, count + 1) / count)[:, None]
-    parent = np.concatenate([[node], skeleton.node_count + np.arange(count - 1)])
-    return state.after(Skeleton.from_edges(
-        np.vstack([skeleton.nodes, added]), np.concatenate([skeleton.parent, parent]),
-        np.concatenate([skeleton.radius, np.full(count, radius[node])])))
+@compiled_exactly
+def _raised(foot: np.ndarray, end: np.ndarray, radius: np.ndarray, table_of: np.ndarray,
+            table: np.ndarray, first: np.ndarray, points: np.ndarray, sight: np.ndarray,
+            wood: np.ndarray, residual: np.ndarray, length: float, elsewhere: float) -> np.ndarray:
+    """By how much each of t cylinders raises the logarithm of the likelihood of points [m, 3] with
+    densities ``wood`` [m] across the axes. ``table`` [tables, facings, distances] holds logarithms
+    of the density across theirs, at 0 and at distances whose logarithms are evenly spaced."""
+    rise = np.zeros(len(foot))
+    for k in range(len(foot)):
+        ax, ay, az = end[k, 0] - foot[k, 0], end[k, 1] - foot[k, 1], end[k, 2] - foot[k, 2]
+        square = ax * ax + ay * ay + az * az
+        after = length + np.sqrt(square)
+        for i in range(len(points)):
+            px, py, pz = (points[i, 0] - foot[k, 0], points[i, 1] - foot[k, 1],
+                          points[i, 2] - foot[k, 2])
+            t = min(max((px * ax + py * ay + pz * az) / square, 0.0), 1.0)
+            dx, dy, dz = px - t * ax, py - t * ay, pz - t * az
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            here = wood[i]
+            if distance - radius[k] < residual[i]:
+                place = max((np.log(max(distance, 1e-300)) - first[0]) / (first[1] - first[0]) + 1,
+                            0.0)
+                low = min(int(place), table.shape[2] - 2)
+                part = min(place - low, 1.0)
+                row, beside = 0, 0.0
+                if len(sight) > 0:
+                    x, y, z = sight[i, 0], sight[i, 1], sight[i, 2]
+                    on = (x * ax + y * ay + z * az) / square
+                    x, y, z = x - on * ax, y - on * ay, z - on * az
+                    open_ = max(np.sqrt(x * x + y * y + z * z), 0.2)
+                    cosine = (x * dx + y * dy + z * dz) / (open_ * max(distance, 1e-300))
+                    at = (min(max(cosine, -1.0), 1.0) + 1) / 2 * (table.shape[1] - 1)
+                    row = min(int(at), table.shape[1] - 2)
+                    beside = at - row
+                log = (1 - part) * table[table_of[k], row, low] + part * table[
+                    table_of[k], row, low + 1]
+                if beside > 0.0:
+                    log += beside * ((1 - part) * table[table_of[k], row + 1, low] + part * table[
+                        table_of[k], row + 1, low + 1] - log)
+                here = np.exp(log)
+            rise[k] += np.log((here / after + elsewhere) / (wood[i] / length + elsewhere))
+    return rise

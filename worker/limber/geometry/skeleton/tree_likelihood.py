@@ -5,27 +5,30 @@ across; or it is background, anywhere in the scan. Its density across an axis of
 s is Rice's: (2 pi s^2)^-1 exp(-(d^2 + r^2) / 2 s^2) I0(d r / s^2) at the distance d. So a skin
 needs points around its section and none inside, and a cylinder that is too thick, or goes through
 several twigs, is not flattered. Along the tree points are evenly spread: more axes must show more
-points. The noise differs from point to point by Student's distribution. Where a scan saw only one
-side, the part of the skin that faces it has nearly all points.
+points. The noise differs from point to point by Student's distribution. A sensor at one place sees
+points evenly spread across its sight: on a skin by the cosine of the angle to it. Twigs cost what
+their numbers do, and bends what they do by the prior of wood.
 """
 
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
-from scipy.special import ive, ndtr
+from scipy.special import ive
 
+from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.radii.fit_kernels import Match, match_cylinders
+from limber.geometry.skeleton.radii.wood import Bends
 from limber.geometry.skeleton.skeleton import Skeleton
 
-DIRECTIONS = [way / np.linalg.norm(way) for way in np.argwhere(np.ones((3, 3, 3))) - 1.0
-              if way.any()]
-"""Directions to a sensor: to the faces, edges and corners of a cube."""
+_DIRECTIONS = [way / np.linalg.norm(way) for way in np.argwhere(np.ones((3, 3, 3))) - 1.0
+               if way.any()]  # to the faces, edges and corners of a cube
+_TURN, _HALVINGS = 0.35, 3  # first step of the search for the sensor [rad; 1 / size]; smaller ones
 _NOISES = np.geomspace(2e-4, 0.03, 24)  # fractions of the scan's diagonal
 _FREEDOM = 4.0  # of Student's distribution of the noise
 _BACKGROUND, _ROUNDS = 0.05, 4  # first share of the background; rounds that find it
 _MARGIN = 0.02  # [m] around the scan where background may be
-HIDDEN = 0.1
-"""Density of the hidden half, as a fraction of that all around."""
+_HIDDEN = 0.03  # density of the hidden half, as a fraction of that all around
 _OPEN = 0.2  # sine of the angle between axis and sight under which an axis has no seen half
 # A twig's fork, direction (2), length, radius and bend: each costs half the logarithm of the points
 # (Schwarz 1978, Bayes' information criterion).
@@ -49,13 +52,13 @@ class PointLikelihood:
     Attributes:
         noises: Standard deviations across the axes that occur [m], shape [k].
         volume: Where background may be [m^3].
-        side: Direction to the sensor, a unit vector [3]; None: seen from all around.
+        sight: Unit vectors from points to the sensor, shape [m, 3]; None: seen from all around.
     """
 
     points: np.ndarray
     noises: np.ndarray
     volume: float
-    side: np.ndarray | None = None
+    sight: np.ndarray | None = None
 
     @classmethod
     def of(cls, points: np.ndarray) -> "PointLikelihood":
@@ -63,9 +66,12 @@ class PointLikelihood:
         size = np.ptp(points, axis=0)
         return cls(points, _NOISES * float(np.linalg.norm(size)), float(np.prod(size + _MARGIN)))
 
-    def seen_from(self, side: np.ndarray | None) -> "PointLikelihood":
-        """The same where a scan saw the skin from one side."""
-        return replace(self, side=side)
+    def seen_from(self, direction: np.ndarray, near: float = 0.0) -> "PointLikelihood":
+        """The same for a sensor in a ``direction`` [3] from the middle of the points, by their size
+        over ``near`` away."""
+        size = float(np.linalg.norm(np.ptp(self.points, axis=0)))
+        way = direction - near / size * (self.points - self.points.mean(axis=0))
+        return replace(self, sight=way / np.linalg.norm(way, axis=1)[:, None])
 
     def match(self, skeleton: Skeleton) -> Match:
         """The cylinder of each point."""
@@ -81,11 +87,20 @@ class PointLikelihood:
         density = ive(0, sharpness) * np.exp(-0.5 * off**2) / (2 * np.pi * self.noises**2)
         if facing is None:
             return density
-        # The fraction of a von Mises distribution in the seen half: exact to its first order where
-        # it is flat, and where it is sharp.
-        flat = np.sqrt(2 / np.pi)
-        seen = ndtr(facing[:, None] * flat * sharpness / np.sqrt(1 + flat**2 * sharpness))
-        return density * (HIDDEN + (1 - HIDDEN) * 2 * seen)
+        # Fourier's series of the half-wave rectified cosine. Around the circle the noise is von
+        # Mises'; its harmonics are nearly those of a wrapped normal distribution.
+        first = sharpness / (0.5 + np.sqrt(sharpness**2 + 2.25))
+        once = np.clip(facing, -1.0, 1.0)[:, None]
+        twice = 2 * once**2 - 1
+        seen = (1 + np.pi / 2 * first * once + 2 / 3 * first**4 * twice
+                - 2 / 15 * first**16 * (2 * twice**2 - 1)
+                + 2 / 35 * first**36 * (4 * twice**3 - 3 * twice))
+        return density * (_HIDDEN + (1 - _HIDDEN) * np.maximum(seen, 0.0))
+
+    @staticmethod
+    def seen(cosine: np.ndarray) -> np.ndarray:
+        """Density on a skin by the cosine of the angle to the sensor, over that all around."""
+        return _HIDDEN + (1 - _HIDDEN) * np.pi * np.maximum(cosine, 0.0)
 
     @staticmethod
     def axes(skeleton: Skeleton, match: Match) -> np.ndarray:
@@ -93,18 +108,25 @@ class PointLikelihood:
         axis = skeleton.nodes[match.segment] - skeleton.nodes[skeleton.parent[match.segment]]
         return axis / np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
 
-    def facing(self, skeleton: Skeleton, match: Match, ways: np.ndarray) -> np.ndarray | None:
-        """Cosine of the angle around the axis between the sensor and ``ways`` across the axis at
-        each point [m, 3], shape [m]; 0 where the sensor looks along it; None: all around."""
-        if self.side is None:
+    def facing(self, axes: np.ndarray, ways: np.ndarray, some: np.ndarray | slice = slice(None),
+               ) -> np.ndarray | None:
+        """Cosine of the angle around the ``axes`` between the sensor and ``ways`` across them at
+        ``some`` of the points [m, 3], shape [m]; 0 where it looks along them; None: all around."""
+        if self.sight is None:
             return None
-        axis = self.axes(skeleton, match)
-        sight = self.side - (axis @ self.side)[:, None] * axis
+        sight = self.sight[some]
+        sight = sight - np.einsum("mj,mj->m", axes, sight)[:, None] * axes
         size = np.linalg.norm(sight, axis=1)
         return np.where(size > _OPEN, np.einsum("mj,mj->m", ways, sight)
                         / np.maximum(size, _OPEN), 0.0)
 
-    def scattered(self, skeleton: Skeleton, match: Match, density: np.ndarray) -> Scatter:
+    def densities(self, skeleton: Skeleton, match: Match, some: np.ndarray | slice = slice(None),
+                  ) -> np.ndarray:
+        """Density [1/m^2] across the axes at ``some`` of the points, shape [m, k]."""
+        return self.across(np.maximum(match.residual + match.thick, 0.0), match.thick,
+                           self.facing(self.axes(skeleton, match), match.normal, some))
+
+    def scattered(self, skeleton: Skeleton, density: np.ndarray) -> Scatter:
         """The likeliest scatter for densities [m, k] across the axes of a tree."""
         found = []
         along, elsewhere = density / skeleton.length, 1 / self.volume
@@ -124,17 +146,42 @@ class PointLikelihood:
         """Logarithm of the likelihood of a tree of ``length`` [m] and so many ``runs``, given the
         density of the points across its axes [1/m^2], shape [m], less the cost of its twigs."""
         return float(np.log(wood / length + scatter.background / self.volume).sum()
-                     ) - _TWIG_NUMBERS / 2 * np.log(len(self.points)) * runs
+                     ) - self.twig_cost * runs
+
+    @property
+    def twig_cost(self) -> float:
+        """By how much a twig must raise the logarithm of the likelihood."""
+        return _TWIG_NUMBERS / 2 * float(np.log(len(self.points)))
 
     def score(self, skeleton: Skeleton) -> float:
-        """The logarithm of the likelihood of the points given a tree, less the cost of its twigs,
-        with the likeliest scatter. Only differences between trees of one scan mean something."""
-        match = self.match(skeleton)
-        density = self.across(np.maximum(match.residual + match.thick, 0.0), match.thick,
-                              self.facing(skeleton, match, match.normal))
-        scatter = self.scattered(skeleton, match, density)
-        return self.log(density @ scatter.shares, scatter, skeleton.length, skeleton.branch_count)
+        """The logarithm of the likelihood of the points given a tree, less the cost of its twigs
+        and bends, with the likeliest scatter. Only differences between trees of one scan mean
+        something."""
+        density = self.densities(skeleton, self.match(skeleton))
+        scatter = self.scattered(skeleton, density)
+        return self.log(density @ scatter.shares, scatter, skeleton.length, skeleton.branch_count,
+                        ) - float(Bends.of(skeleton).costs(skeleton.nodes).sum())
 
-    def best(self, skeleton: Skeleton) -> float:
-        """The score from where the points most likely saw the tree."""
-        return max(self.seen_from(side).score(skeleton) for side in (None, *DIRECTIONS))
+    def where_seen(self, skeleton: Skeleton) -> "PointLikelihood":
+        """The same for a sensor where a tree scores most, or all around."""
+        def scored(direction: np.ndarray, near: float = 0.0) -> tuple[float, np.ndarray, float]:
+            direction = direction / np.linalg.norm(direction)
+            return self.seen_from(direction, near).score(skeleton), direction, near
+
+        around = replace(self, sight=None)
+        score, direction, near = max(map(scored, _DIRECTIONS), key=itemgetter(0))
+        if score <= around.score(skeleton):
+            return around
+        step, halvings = _TURN, 0
+        while halvings < _HALVINGS:
+            beside = any_normal(direction)
+            above = np.cross(direction, beside)
+            best = max([scored(direction + turn * step, near)
+                        for turn in (beside, -beside, above, -above)]
+                       + [scored(direction, max(near + closer, 0.0)) for closer in (step, -step)],
+                       key=itemgetter(0))
+            if best[0] > score:
+                score, direction, near = best
+            else:
+                step, halvings = step / 2, halvings + 1
+        return self.seen_from(direction, near)

@@ -34,6 +34,16 @@ FREEDOM = 4.0
 """Of Student's distribution of what fits and forks are off: some fail."""
 
 
+def turn_cost(square: np.ndarray) -> np.ndarray:
+    """How much less likely than none turns are, as a logarithm; ``square`` is over the variance."""
+    return (FREEDOM + 2) / 2 * np.log1p(square / FREEDOM)
+
+
+def turn_variance(length: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Variance by component [rad^2] of an axis's turn between pieces of this mean length [m]."""
+    return _BEND * length / radius
+
+
 @dataclass(frozen=True)
 class Wood:
     """The prior of the logarithms of n radii and of k trends: the taper of each run, and what the
@@ -121,10 +131,11 @@ def _pipes(parent: np.ndarray, radius: np.ndarray, forks: np.ndarray,
 @dataclass(frozen=True)
 class Bends:
     """The prior of the axes, which turn slowly with a few sharp bends: changes of direction at
-    runs' inner nodes as a matrix over nodes [k, n], their variances by component [rad^2], and their
-    weights by Student's distribution."""
+    runs' inner nodes as a matrix over nodes [k, n], the nodes after them [k], their variances by
+    component [rad^2], and their weights by Student's distribution."""
 
     turns: sparse.csr_matrix
+    after_turn: np.ndarray
     variance: np.ndarray
     trust: np.ndarray
 
@@ -140,14 +151,21 @@ class Bends:
         inner = np.concatenate([np.empty(0, np.int64), *(chain[1:-1] for chain in chains)])
         second = second_differences(chains, steps, skeleton.node_count) if chains else (
             sparse.csr_matrix((0, skeleton.node_count)))
-        variance = _BEND * length / skeleton.radius[inner] + np.where(
+        variance = turn_variance(length, skeleton.radius[inner]) + np.where(
             skeleton.child_counts()[inner] > 1, _KINK**2, 0.0)
-        return cls(sparse.diags(length) @ second, variance, np.ones(len(inner)))
+        after = np.concatenate([np.empty(0, np.int64), *(chain[2:] for chain in chains)])
+        return cls(sparse.diags(length) @ second, after, variance, np.ones(len(inner)))
 
     def after(self, nodes: np.ndarray) -> "Bends":
         """The same with the weights that axes [m], shape [n, 3], give."""
         square = np.sum((self.turns @ nodes)**2, axis=1) / self.variance
         return replace(self, trust=(FREEDOM + 2) / (FREEDOM + square))
+
+    def costs(self, nodes: np.ndarray) -> np.ndarray:
+        """How much less likely than straight axes [m, 3] [m] make the turn before each node, as a
+        logarithm, shape [m]."""
+        square = np.sum((self.turns @ nodes)**2, axis=1) / self.variance
+        return np.bincount(self.after_turn, turn_cost(square), len(nodes))
 
     def precision(self) -> sparse.csr_matrix:
         """Of nodes (x, y, z [m], logarithm of the radius), shape [4 n, 4 n]."""
