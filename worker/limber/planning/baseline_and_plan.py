@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError, NoPathError, Option, Text
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.certificate.feasibility import judge
 from limber.planning.certificate.lower_bound import ENOUGH, Certificate, certify
@@ -93,8 +94,8 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     none = dict.fromkeys(margins, 0.0)
     surely = (asked or limits).beyond(field)
     errors = (asked or limits).errors(field)
-    options = {"errors": errors, "asked_goal": asked_goal, "before": before,
-               "is_bounded": is_bounded}
+    options: Any = {"errors": errors, "asked_goal": asked_goal, "before": before,
+                    "is_bounded": is_bounded}
     if closed is not None:
         return replace(_in_doubt(closed, field, start, goal, settings, limits, surely, **options,
                                  progress=progress), margins=none)
@@ -285,8 +286,8 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], tree: np.ndarray | 
     length = float(arc_lengths(shortest)[-1])
     if tree is not None:  # as long as it is reported
         length = max(length, float(arc_lengths(resample(tree, STEP))[-1]))
-    return plan_detour(problem, shortest, (1.0 + settings.max_detour / 100.0) * length, rough,
-                       progress=progress.part(0.3, 1.0))
+    most = (1.0 + present(settings.max_detour, "largest detour") / 100.0) * length
+    return plan_detour(problem, shortest, most, rough, progress=progress.part(0.3, 1.0))
 
 
 def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,

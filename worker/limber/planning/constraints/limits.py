@@ -7,7 +7,7 @@ an error of at most this margin. Whether a limit is kept is decided on the full 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -191,7 +191,7 @@ class Limits:
 
     def tightened(self, factors: dict[str, float]) -> "Limits":
         """Return the limits divided by ``factors``, by the names of ``asked``."""
-        of_loads = {name: limit / factors[name] for name, limit in self.asked_loads().items()
+        of_loads: Any = {name: limit / factors[name] for name, limit in self.asked_loads().items()
                     if name in factors}
         return replace(self, **of_loads, constraints=tuple(
             each.tightened(factors[each.name]) if each.name in factors else each
@@ -306,7 +306,8 @@ class Limits:
     def on(self, known: EnergyField, margins: dict[str, float] | None = None) -> FieldArrays:
         """Return the field with these limits for compiled loops, tighter by ``margins``."""
         less = margins or {}
-        tighter = {name: limit - less.get(name, 0.0) for name, limit in self.asked().items()}
+        tighter: Any = {name: limit - less.get(name, 0.0)
+                        for name, limit in self.asked().items()}
         return known.limited(tighter.pop("energy", np.inf), tighter.pop("force", np.inf),
                              low=self.low, high=self.high, **tighter)
 
@@ -342,8 +343,9 @@ def with_unit(name: str) -> str:
 
 def limits_in_file(entries: dict[str, dict[str, float]]) -> Limits:
     """Return the limits in a plan's file, by the keys of :func:`with_unit`."""
-    return Limits(**{name: float(entries[with_unit(name)]["limit"]) for name in UNITS
-                     if with_unit(name) in entries})
+    known: Any = {name: float(entries[with_unit(name)]["limit"]) for name in UNITS
+                  if with_unit(name) in entries}
+    return Limits(**known)
 
 
 def sizes(states: SolvedPoses) -> dict[str, np.ndarray]:

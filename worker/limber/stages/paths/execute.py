@@ -185,8 +185,9 @@ def planned_motion(asked: ExecutePlan, progress: Progress, *, is_to_move: bool) 
     clear = KeptClear.of(cell, asked.cell.parent, model, stated.get("clearance_m"))
     # The plan's own rotation of the gripper is the one checked against obstacles.
     rotation = asked.gripper_rotation or (stated.get("robot") or {}).get("gripper_rotation")
-    wish = {"speed": present(asked.speed, "speed"), "rotation": rotation,
-            "blocked": blocked_by(cell, clear.obstacles, clear.clearance)}
+    wish: dict[str, Any] = {
+        "speed": present(asked.speed, "speed"), "rotation": rotation,
+        "blocked": blocked_by(cell, clear.obstacles, clear.clearance)}
     planned = planned_poses(branch, asked.name, model.rest_position)
     offsets = offsets_along(stated.get("turning"), planned[:, :3])
     planned = turned(planned, offsets) if offsets.any() else planned

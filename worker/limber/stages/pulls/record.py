@@ -219,7 +219,7 @@ def _recorded(branch: Branch, cell: Cell, asked: RecordPull, blocked: Blocked,
             doubts += predicted
             link.start(trajectory)
             event = _watched(link, observers, recorder, trajectory, progress)
-            ended = {"ended": _how_it_ended(event, doubts)}
+            ended: dict[str, Any] = {"ended": _how_it_ended(event, doubts)}
             if event["event"] == "reached":
                 # The last observations arrive a little later.
                 time.sleep(0.5)
