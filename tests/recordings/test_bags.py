@@ -239,8 +239,8 @@ def test_joints_are_called_as_the_cells_arm_calls_them(tmp_path, bare_folder, re
     (lambda bag: pulled(bag, wrench=None), "no wrench.*Its topics: /pose"),
     (lambda bag: pulled(bag, pose=None), "no pose"),
     (lambda bag: (pulled(bag), pulled(bag, wrench="/other", pose=None)),
-     "2 wrench topics.*one topic of each kind.*--wrench-topic"),
-    (lambda bag: (pulled(bag), pulled(bag, wrench=None, pose="/left")), "--pose-topic"),
+     "2 wrench topics.*one topic of each kind.*--topic wrench=TOPIC"),
+    (lambda bag: (pulled(bag), pulled(bag, wrench=None, pose="/left")), "--topic pose=TOPIC"),
     (lambda bag: pulled(bag, shift=3600.0), "3600 s apart.*--bag-clock log"),
 ])
 def test_what_a_bag_lacks_is_said(tmp_path, bare_folder, made, told):
@@ -257,7 +257,7 @@ def test_what_was_asked_can_be_answered(tmp_path, bare_folder):
         pulled(bag, shift=3600.0)
         pulled(bag, wrench="/other", pose="/left")
     ImportPull(branch_folder=bare_folder, source=tmp_path / "two.mcap", name="two",
-               wrench_topic="/wrench", pose_topic="/left", bag_clock="log").run()
+               topic=("wrench=/wrench", "pose=/left"), bag_clock="log").run()
     pull = read_pull(bare_folder / "pulls" / "two")
     assert np.allclose(pull.wrenches[:, 0], 50 * pull.poses[:, 0], atol=1e-6)
 

@@ -52,7 +52,7 @@ class _BagReading:
 
     def recorded(self) -> Recorded:
         """The gripper's poses and wrenches, and the observations, from time 0."""
-        wrench = self.chosen("wrench", self.settings.wrench_topic, "wrench_topic",
+        wrench = self.chosen("wrench", "wrench",
                              "Stiffness cannot be estimated without a measured force.")
         if self.bag.broken:
             self.warnings.append(f"{self.bag.path.name}: {self.bag.broken} messages could not be "
@@ -72,9 +72,10 @@ class _BagReading:
         return Recorded(observation, robot, seen, labels, is_table=False,
                         warnings=tuple(self.warnings))
 
-    def chosen(self, kind: str, named: str | None, option: str, why: str) -> Topic:
-        """The one topic of a kind, or the named one."""
-        bag, topics = self.bag, self.bag.of(kind)
+    def chosen(self, kind: str, name: str, why: str) -> Topic:
+        """The one topic of a kind, or the one that was given for ``name``."""
+        bag, topics, named = self.bag, self.bag.of(kind), self.settings.topic_of(name)
+        option = Option("topic", (f"{name}=TOPIC",))
         if named is not None:
             topics = tuple(topic for topic in topics if topic.name == named)
         if len(topics) == 1:
@@ -86,19 +87,18 @@ class _BagReading:
             missing = f"no {kind}" if named is None else f"no {kind} on {named}"
             raise InputError(f"{bag.path} has {missing}.",
                              Text(why, f" Its topics: {present[:400]}."),
-                             "Name a topic with ", Option(option), f" (known: {known}).")
+                             "Name a topic with ", option, f" (known: {known}).")
         raise InputError(f"{bag.path} has {len(topics)} {kind} topics: {known}.", "A pull uses one "
-                         "gripper and one topic of each kind.", "Select one with ", Option(option),
-                         ".")
+                         "gripper and one topic of each kind.", "Select one with ", option, ".")
 
     def gripper(self) -> tuple[np.ndarray, np.ndarray, str]:
         """Times [s], poses [n, 6] of the gripper, and their reference frame."""
-        name = self.settings.pose_topic
+        name = self.settings.topic_of("pose")
         if not self.bag.of("pose") or (name is not None and not name.startswith("/")):
-            found = self.by_frames(name) or self.by_joints(name)
+            found = self.by_frames(name) or self.by_joints()
             if found is not None:
                 return found
-        topic = self.chosen("pose", name, "pose_topic", "The gripper's pose is needed.")
+        topic = self.chosen("pose", "pose", "The gripper's pose is needed.")
         motion = Motion.of(self.times(topic), topic.values)
         if len(motion.times) < 2:
             raise InputError(f"{self.bag.path}: {topic.name} has {len(motion.times)} poses.",
@@ -124,7 +124,7 @@ class _BagReading:
             f"{self.bag.path.name}: the gripper's pose is that of frame {frame} in {root}.")
         return times, pose_vectors(found), root
 
-    def by_joints(self, name: str | None) -> tuple[np.ndarray, np.ndarray, str] | None:
+    def by_joints(self) -> tuple[np.ndarray, np.ndarray, str] | None:
         """The gripper from the arm's joint angles; InputError if there are only angles, and no arm
         was named."""
         if not self.bag.of("joints"):
@@ -134,7 +134,7 @@ class _BagReading:
                              "must be computed from the arm's model and tool.", "Give the robot's "
                              "cell file with ", Option("cell"), " cell.toml, or record poses or "
                              "TF.")
-        topic = self.chosen("joints", name, "pose_topic", "The gripper's pose is needed.")
+        topic = self.chosen("joints", "pose", "The gripper's pose is needed.")
         times, first = np.unique(self.times(topic), return_index=True)
         return times, self.request.robot.joint_poses(topic.labels, topic.values[first]), "base"
 
@@ -222,22 +222,22 @@ class _BagReading:
 
     def observed(self) -> tuple[str, Observations | None]:
         """Observations of the branch: markers as values; images and clouds become files."""
-        bag, named = self.bag, self.settings.points_topic
+        bag, named = self.bag, self.settings.topic_of("points")
         if named == "none":
             return "none", None
         images = [topic for topic in bag.of("image") if named in (None, topic.name)]
         points = [topic for topic in bag.of("points") if named in (None, topic.name)]
         if named is not None and not images and not points:
-            self.chosen("points", named, "points_topic",
-                        Text("The option ", Option("points_topic"), " requests it."))
+            self.chosen("points", "points",
+                        Text("The option ", Option("topic"), " requests it."))
         if named is None and len(points) == 1:
             images = []
         if len(images) + len(points) > 1:
             known = ", ".join(topic.name for topic in (*images, *points))
             raise InputError(f"{bag.path} has more than one topic that shows the branch: {known}.",
                              "The model is compared with only one of them.", "Select one with ",
-                             Option("points_topic"), ", or give ",
-                             Option("points_topic", "none"), ".")
+                             Option("topic", ("points=TOPIC",)), ", or give ",
+                             Option("topic", ("points=none",)), ".")
         if images:
             self.write_images(images[0])
             return "depth", None

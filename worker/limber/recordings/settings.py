@@ -23,8 +23,7 @@ class ImportSettings(Settings):
     groups: ClassVar[Groups] = {
         "input": ("kind", "robot", "unit", "force_unit", "rate_hz", "nominal", "marker_frame",
                   "coordinates", "time_offset", "yolo_weights", "yolo_prompt"),
-        "bags and robot logs": ("cell", "frame_pose", "wrench_topic", "pose_topic",
-                                "points_topic", "bag_clock"),
+        "bags and robot logs": ("cell", "frame_pose", "topic", "bag_clock"),
         "grasp and loads": ("grasp_point", "grasp_distance", "grasp_radius", "grasp_mode",
                             "direction", "weight", "load", "own_weight"),
         "simulation": ("motion", "swing_start"),
@@ -99,12 +98,11 @@ class ImportSettings(Settings):
     frame_pose: tuple[float, float, float, float, float, float] | None = Field(
         None, description="Pose of the frame in which the gripper's poses, forces and torques are "
         "given: [m] and rotation vector [rad]. Default: the cell's base, else the branch's frame.")
-    wrench_topic: str | None = Field(None, description="Topic of the wrench, if there are several.")
-    pose_topic: str | None = Field(
-        None, description="Topic of the gripper's pose, or its TF frame, if there are several.")
-    points_topic: str | None = Field(
-        None, description="Topic of markers, clouds or depth images. none: no observations are "
-        "used.")
+    topic: tuple[Annotated[str, Field(pattern="^(wrench|pose|points)=.+")], ...] = Field(
+        (), description="A topic of a bag, if there are several for one of these. wrench=TOPIC: of "
+        "the wrench. pose=TOPIC: of the gripper's pose, or its TF frame. points=TOPIC: of markers, "
+        "clouds or depth images; points=none: no observations are used. May be given several "
+        "times.", json_schema_extra={"metavar": "NAME=TOPIC"})
     bag_clock: Literal["header", "log"] = Field(
         "header", description="Time stamps of a bag: those in the messages' headers, or the "
             "times of logging.")
@@ -116,6 +114,10 @@ class ImportSettings(Settings):
         "of a class of another.")
 
     _force = field_validator("weight", "load")(possible_force)
+
+    def topic_of(self, name: str) -> str | None:
+        """The topic that was given for the wrench, the pose or the points."""
+        return dict(each.split("=", 1) for each in self.topic).get(name)
 
 
 class ImportSpec(ImportSettings):
