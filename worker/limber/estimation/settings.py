@@ -33,7 +33,7 @@ class EstimateSettings(Settings):
         "material": ("also", "field", "pith_radius", "bark"),
         "solver": ("method", "delta_m2", "forward", "quick"),
     }
-    common = ("pull", "fractions")
+    common = ("pull", "fractions", "method", "also", "quick")
 
     pull: tuple[str, ...] = Field((), description="Names of the pulls to use. Default: all.")
     method: Literal["gauss-newton", "nelder-mead"] = Field(
@@ -166,7 +166,7 @@ class VirtualPullSettings(Settings):
         "noise": ("camera", "seed"),
         "errors of the cell": ("cell_errors",),
     }
-    common = ("cell_errors", "seed")
+    common = ("cell_errors", "seed", "young")
 
     young: tuple[float, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]. Default: that of a "

@@ -105,7 +105,7 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
         "material": ("young", "poisson", "density", "density_sigma"),
         "mesh": ("grasp_fraction",),
     }
-    common = ("unit", "up", "root", "leaves")
+    common = ("unit", "up", "root", "leaves", "plants", "crop")
 
     unit: Literal["m", "cm", "mm", "in", "um"] = Field(
         "m", description="Unit of the file, if it does not state one.")
@@ -154,7 +154,7 @@ class MeshSurfaceSettings(Settings):
         "mesh": ("grasp_fraction",),
         "material": ("young", "poisson", "density", "density_sigma"),
     }
-    common = ("unit",)
+    common = ("unit", "root")
 
     unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
     up: Direction = Field(

@@ -37,7 +37,7 @@ class SimulateSettings(Settings):
         "material": ("young", "material", "gravity", "damping"),
         "solver": ("step", "newmark"),
     }
-    common = ("name", "move", "grasp_force", "young")
+    common = ("name", "move", "turn", "grasp_force", "young", "kind", "duration")
 
     name: str = Field("simulate", pattern=r"^[\w-]+$",
                       description="Name of the result files: frames/NAME.pc2 and frames/NAME.json.")

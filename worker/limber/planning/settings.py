@@ -15,6 +15,8 @@ class EnergySettings(Settings):
         "samples": ("samples", "field_error", "deflection", "seed"),
         "solver": ("forward",),
     }
+    common: ClassVar[tuple[str, ...]] = ("samples", "field_error")
+
     samples: int = Field(225, ge=30, description=(
         "Number of grasp positions to solve. Two thirds are spread evenly; the others are placed "
         "where neighbouring solutions disagree."))
@@ -67,7 +69,8 @@ class PlanSettings(Settings):
         "timing": ("speed", "hold"),
         "solver": ("planner", "seed"),
     }
-    common: ClassVar[tuple[str, ...]] = ("goal", "tip_goal", "target", "max_force", "max_strain")
+    common: ClassVar[tuple[str, ...]] = (
+        "goal", "tip_goal", "target", "max_force", "max_strain", "max_detour")
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Goal position of the grasp, in the branch's frame [m]. Without any goal, a distant pose "

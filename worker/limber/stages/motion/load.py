@@ -158,7 +158,7 @@ class ApplyLoads(KeptStage, BranchStage):
         "gusts": ("gust", "gust_record"),
         "limits": ("limit_load",),
         "output": ("name",)}
-    common = ("wind", "snow", "fruit", "cut", "name")
+    common = ("wind", "gust", "snow", "fruit", "cut", "name")
 
     wind: tuple[float, float, float] | None = Field(
         None, description="Wind velocity in the branch's frame [m/s].",

@@ -71,6 +71,7 @@ class ComparePlanners(KeptStage, PlacedStage):
         then="limber report {branch_folder}", step="plan", label="Compare Planners")
     groups: ClassVar[Groups] = {"trials": ("trials", "goal", "seed"),
                                 "solver": ("max_detour",)}
+    common = ("trials", "goal")
 
     name: str = given("Name of the comparison's files.", "planners", group="output")
     trials: int = Field(10, ge=1, le=1000, description=(

@@ -87,6 +87,7 @@ class ExecutePlan(BranchStage):
         then="limber report {branch_folder}", step="robot", label="Check With Robot",
         moves_robot="when armed")
     groups: ClassVar[Groups] = {"motion": ("speed", "hold", "gripper_rotation")}
+    common = ("speed", "hold")
 
     name: str = given("Name of the plan.", "path", common=True)
     cell: Path = required("The robot's cell file.", "cell.toml")

@@ -48,7 +48,7 @@ class RecordPull(BranchStage):
     groups: ClassVar[Groups] = {
         "pull": ("direction", "distance", "shape", "waypoints", "suggested", "speed", "cycles",
                  "pause")}
-    common = ("direction", "distance")
+    common = ("direction", "distance", "speed", "suggested")
 
     cell: Path = required("The robot's cell file.", "cell.toml")
     name: str = given("Name of the recording.", "pull-1", group="output", common=True)

@@ -84,6 +84,7 @@ class SuggestPull(KeptStage, BranchStage):
         then="limber record {branch_folder} --suggested --cell cell.toml", step="estimate",
         label="Suggest the Next Pull")
     groups: ClassVar[Groups] = {"limits": ("fractions", "max_strain", "max_force")}
+    common = ("max_strain", "max_force")
 
     plan: str | None = given(
         "Name of a plan. The result states whether another pull is worthwhile for it.", common=True)

@@ -134,6 +134,7 @@ class Export(BranchStage):
                "{cylinder_count:count} cylinders."),
         step="report", label="Export for Other Programs")
     groups: ClassVar[Groups] = {"output": ("links", "gravity", "load", "columns")}
+    common = ("links", "columns")
 
     output: Path = required(
         "File to write; its suffix says what: "

@@ -33,6 +33,7 @@ class MakeScene(BranchStage):
                "Turntable {turntable}."))
     groups: ClassVar[Groups] = {
         "picture": ("width", "sides", "color", "plan", "motion", "strength")}
+    common = ("color", "plan", "motion")
 
     cell: Path | None = given(
         "The robot's cell file. Its arm, gripper, camera, obstacles and workspace are shown as "

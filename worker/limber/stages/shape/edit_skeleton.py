@@ -87,7 +87,7 @@ class ReviewSkeleton(BranchStage):
         "Edits (JSON) that replace those of the branch. An empty list removes all.", common=True)
     frame: Literal["scan", "branch"] = given(
         "Coordinates of the edits: those of the scan's file, or the branch's frame [m].", "scan")
-    append: bool = given("Append the edits to those of the branch.", False)
+    append: bool = given("Append the edits to those of the branch.", False, common=True)
     alternative: int | None = given(
         "Append the edits of this alternative, numbered as listed.", common=True,
         limits={"ge": 2})

@@ -44,7 +44,7 @@ class Generate(GeneratedSettings, Stage):
                "scanned as {point_count:count} points.",),
         then="limber reconstruct {cloud} -o {folder}.branch")
     groups: ClassVar[Groups] = {"shape": ("seed",)}
-    common = ("seed",)
+    common = ("seed", "length", "fork_count", "view")
 
     folder: Path = argument("The folder to make.", group="output")
     seed: int = Field(0, description="Seed of everything random.")

@@ -40,7 +40,7 @@ class SetTarget(KeptStage, PlacedStage):
                "{mass_kg:kg}.",),
         then="limber energy {branch_folder}", step="plan", label="Name a Target")
     groups: ClassVar[Groups] = {"input": ("at", "mass", "remove")}
-    common = ("at",)
+    common = ("at", "mass", "remove")
 
     name: str = argument("Name of the target: letters, digits, dash, underscore.")
     at: tuple[float, float, float] | None = Field(
