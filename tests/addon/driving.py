@@ -77,9 +77,14 @@ def picture(name):
     def step():
         request = FOLDER / f"{name}.request"
         if "picture" not in started:
-            draw()
-            started["picture"] = request
+            # All is drawn before the next turn.
+            for area in view()[0].screen.areas:
+                area.tag_redraw()
+            started["picture"] = "drawn"
+            return False
+        if started["picture"] == "drawn":
             request.touch()
+            started["picture"] = "asked"
         if request.exists():
             return False
         del started["picture"]

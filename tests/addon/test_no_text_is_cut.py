@@ -46,8 +46,9 @@ def write_font(path) -> None:
 def cuts(path, sidebar) -> list[tuple[int, int]]:
     """Return where in a picture of the sidebar [left, upper, right, lower] texts are cut: x, y
     [pixels]."""
-    pixels = np.asarray(Image.open(path).convert("RGB").crop(sidebar)).astype(int)
-    light = np.where(np.ptp(pixels, axis=2) < 12, pixels.sum(axis=2), 0)
+    red, green, blue = np.asarray(Image.open(path).convert("RGB").crop(sidebar), np.int16).T
+    most, least = (each(each(red, green), blue) for each in (np.maximum, np.minimum))
+    light = np.where(most - least < 12, red + green + blue, 0).T
     low, high = ndimage.minimum_filter(light, BLOCK), ndimage.maximum_filter(light, BLOCK)
     found, _ = ndimage.label((low > 330) & (high - low < 20))
     return [(part[1].start + sidebar[0], part[0].start + sidebar[1])
