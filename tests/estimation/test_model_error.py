@@ -67,7 +67,7 @@ def test_a_refined_mesh_is_the_same_body(small_bench):
 @pytest.mark.slow
 def test_the_mesh_error_foretells_how_a_much_finer_mesh_differs(small):
     """A mesh of few long elements is too stiff; by how much is told, to be corrected."""
-    bench = Bench(small, slice_length=4.0, sides=6)
+    bench = Bench(small, slice_length=5.0, sides=4)
     grasp = grasp_on(bench.mesh, GraspEntry(
         point_m=tuple(small.skeleton.point_at(0.9)), radius_m=0.012, mode="point"))
     operator = point_operator(bench.mesh, bench.points)

@@ -21,7 +21,7 @@ from limber.stages.moduli.estimate import EVALUATIONS, EstimateYoung, follow
 from limber.store import Branch
 from limber.store.loading import load_estimated_subject, stiffness_deviation
 
-QUICK = FitSpec(key_frames=6)
+QUICK = FitSpec(key_frames=6, mesh_check=False, shapes=0)
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 
 
@@ -187,7 +187,7 @@ def test_following_a_pull(branch_folder):
     SpecifiedPull(branch_folder=branch_folder, name="long", young=tuple(TRUTH), poisson=0.36,
                 frames=24, seed=6, phase=0.5, position_noise=5e-4).run()
     # What follows frame by frame knows one form of the field.
-    settings = FitSpec(pull=("long",), key_frames=6, field="inverse_distance")
+    settings = QUICK.model_copy(update={"pull": ("long",), "field": "inverse_distance"})
     result = follow(Fit.of(settings, branch_folder=branch_folder), SILENT, training_count=12,
                     pace=0)
     assert result["frame_count"] == 24 and result["method"] == "online"
@@ -204,10 +204,9 @@ def test_following_a_pull(branch_folder):
 @pytest.mark.slow
 def test_a_hollow_branch_has_stiffer_wood_and_the_same_bending_stiffness(branch_folder):
     """The mesh gets the modulus of solid sections; what is computed on it stays the same."""
-    quick = QUICK.model_copy(update={"mesh_check": False, "shapes": 0})
-    solid = Fit.of(quick, branch_folder=branch_folder).run()
+    solid = Fit.of(QUICK, branch_folder=branch_folder).run()
     mesh = TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"]
-    hollow = Fit.of(quick.model_copy(update={"pith_radius": 6e-3}),
+    hollow = Fit.of(QUICK.model_copy(update={"pith_radius": 6e-3}),
                     branch_folder=branch_folder).run()
     wood = np.array(hollow["young_pa"]) / np.array(solid["young_pa"])
     # The radius falls from 10 to 8 mm.

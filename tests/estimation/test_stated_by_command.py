@@ -101,7 +101,7 @@ def test_stated_layers_give_the_modulus_of_the_wood(branch_of, branch_folder, tm
     assert holds(stated["bending_stiffness_interval_nm2"], bending).all()
     assert np.array(stated["young_pa"]) == pytest.approx(YOUNG, rel=0.2)
     assert np.array(stated["bending_stiffness_nm2"]) == pytest.approx(bending, rel=0.2)
-    solid = estimated(tmp_path, branch_folder, pull, capsys)
+    solid = estimated(tmp_path, branch_folder, pull, capsys, "--quick")
     factor = np.array(solid["young_pa"]) / np.array(stated["young_pa"])
     assert factor == pytest.approx(np.exp(share @ np.log(truth.second_moment(radius) / (
         np.pi / 4 * radius**4))), rel=0.1)
