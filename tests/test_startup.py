@@ -13,7 +13,7 @@ HEAVY = ("scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.ndimage", 
 @pytest.mark.slow
 def test_what_is_heavy_waits_for_its_first_use():
     """``scipy.optimize.minimize(...)`` imports scipy's part when it is called, and not before."""
-    code = ("import limber.estimation.fit, limber.planning.make_plan, limber.geometry.reconstruction"
-            f", sys; print([name for name in {HEAVY} if name in sys.modules])")
+    code = ("import sys, limber.estimation.fit, limber.planning.make_plan, "
+            f"limber.geometry.reconstruction; print([*{set(HEAVY)} & set(sys.modules)])")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
