@@ -79,8 +79,9 @@ def _window(script: str, blender: str, environment: dict[str, str], folder: Path
     with (folder / "said.txt").open("w") as said, subprocess.Popen(
             [blender, "--enable-event-simulate", "--window-geometry", "0", "0", *map(str, size),
              "--python", str(FOLDER / script), "--", str(folder)],
-            env=environment | {"DISPLAY": display}, stdout=subprocess.DEVNULL,
-            stderr=said) as process:
+            # Software draws, on one core: others have the rest.
+            env=environment | {"DISPLAY": display, "LP_NUM_THREADS": "0"},
+            stdout=subprocess.DEVNULL, stderr=said) as process:
         try:
             yield process
         finally:
