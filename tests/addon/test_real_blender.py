@@ -56,15 +56,6 @@ def test_command_is_the_workers(run, beam):
     assert "There is no folder" in json.loads(done.stdout.splitlines()[-1])["error"]
 
 
-def test_without_a_worker(run, has_worker):
-    """No worker: exit code 3 and what to do about it."""
-    if has_worker:
-        pytest.skip("LIMBER_TEST_ZIP brings the worker along")
-    done = run("-b", "--command", "limber", "doctor", LIMBER_PYTHON="")
-    assert done.returncode == 3
-    assert "LIMBER_PYTHON" in done.stderr
-
-
 def test_the_worker_comes_along(blender, tmp_path):
     """The zip with wheels is the whole installation: a scan is reconstructed with no other
     Python. It fetches 150 MB, so only where LIMBER_TEST_WHEELS is set."""
