@@ -515,8 +515,7 @@ def test_a_realsense_records_what_the_tracker_follows(branch_folder, tmp_path, r
     camera = VirtualRealSense(robot.address, placed.pose)
     monkeypatch.setitem(sys.modules, "pyrealsense2", camera)
     result = RecordPull(branch_folder=branch_folder, cell=path, name="seen",
-                        **sideways_pull(branch_folder, distance=0.03, speed=0.02),
-                        confirm="seen",
+                        **sideways_pull(branch_folder, distance=0.03), confirm="seen",
                         realsense=True).run()
     assert result["ended"] == "reached" and result["depth_images"] > 5
     folder = branch_folder / "pulls" / "seen"
