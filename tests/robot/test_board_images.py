@@ -1,13 +1,12 @@
 """The base from pictures of a board: in pixels, with an interval that holds; found by OpenCV."""
 
-import json
 
 import numpy as np
 import pytest
 from tests.robot.test_hand_eye import BOARD, CARRIED, STANDING, STANDING_BOARD
+from tests.subjects.commands import answer
 
 from limber.cell.cell_file import CameraEntry, Cell, read_cell, write_cell
-from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotation_vector
 from limber.robot.calibration import Board, View, find_board, fit_pictures
@@ -112,7 +111,7 @@ def test_a_printed_board_is_found_where_it_is(kind, tmp_path):
         find_board(tmp_path / "small.png", board, CAMERA)
 
 
-def test_the_command_calibrates_by_pictures(branch_folder, tmp_path, capfd):
+def test_the_command_calibrates_by_pictures(branch_folder, tmp_path):
     """From files to the cell: base, camera and residuals in pixels."""
     cv2 = pytest.importorskip("cv2")
     robot, views = pictures(6, "stand", 1)
@@ -126,9 +125,8 @@ def test_the_command_calibrates_by_pictures(branch_folder, tmp_path, capfd):
     (tmp_path / "pictures.csv").write_text("\n".join(lines) + "\n")
     path = tmp_path / "cell.toml"
     write_cell(path, Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, camera=CAMERA))
-    code = call(["robot", "calibrate", str(path), str(branch_folder), "--images",
-                 str(tmp_path / "pictures.csv"), "--json"])
-    told = json.loads(capfd.readouterr().out.splitlines()[-1])
+    code, told = answer("robot", "calibrate", path, branch_folder, "--images",
+                        tmp_path / "pictures.csv")
     assert code == 0, told
     assert told["residual_px"] < 1.0 and len(told["pictures"]) == 6
     assert read_cell(path).base.pose == pytest.approx(told["base_pose"])

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 import tomlkit
+from tests.subjects.commands import answer
 
 from limber.cell.cell_file import Cell, read_cell, write_cell
 from limber.cli.main import call
@@ -208,8 +209,7 @@ def test_a_gripper_with_the_values_of_a_bare_flange_is_refused(tmp_path, tool, t
 
 def test_a_new_cell_says_what_is_to_be_filled_in_instead_of_zero(tmp_path, capfd):
     path = tmp_path / "new.toml"
-    code = call(["robot", "new-cell", str(path), "--gripper", "robotiq", "--json"])
-    told = json.loads(capfd.readouterr().out.splitlines()[-1])
+    code, told = answer("robot", "new-cell", path, "--gripper", "robotiq")
     assert code == 0 and told["to_fill_in"] == ["tool.grasp_pose", "tool.mass_kg"]
     text = path.read_text(encoding="utf-8")
     assert text.count("TO FILL IN") == 2 and "\ngrasp_pose" not in text

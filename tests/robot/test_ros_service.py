@@ -1,16 +1,15 @@
 """The retreat as a service of ROS, and a bag that is replayed to the guard."""
 
-import json
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.robot.test_ros import CELL, HOME, line, robot_at
+from tests.subjects.commands import answer
 
 from benchmarks.robot_rosbridge import ReplayedBridge, RosBridge
 from limber.cell.cell_file import write_cell
-from limber.cli.main import call
 from limber.core.errors import SafetyStop
 
 KINDS = {"/joint_states": "sensor_msgs/msg/JointState",
@@ -20,7 +19,7 @@ KINDS = {"/joint_states": "sensor_msgs/msg/JointState",
 @pytest.mark.slow
 @pytest.mark.real_time
 @pytest.mark.usefixtures("first_in_line")
-def test_a_node_calls_the_retreat_as_a_service(monkeypatch, tmp_path, capfd):
+def test_a_node_calls_the_retreat_as_a_service(monkeypatch, tmp_path):
     """Slow: there and back in real time. Not armed it answers; armed it goes back, once."""
     monkeypatch.setenv("LIMBER_STATE", str(tmp_path))
     write_cell(tmp_path / "cell.toml", CELL)
@@ -35,10 +34,9 @@ def test_a_node_calls_the_retreat_as_a_service(monkeypatch, tmp_path, capfd):
             calling = threading.Thread(target=server.call_service, args=("/limber/retreat", times))
             server.answers.clear()
             calling.start()
-            code = call(["ros", "serve", str(tmp_path / "cell.toml"), "--url", server.url,
-                         *arguments, "--json"])
+            code, told = answer("ros", "serve", tmp_path / "cell.toml", "--url", server.url,
+                                *arguments)
             calling.join()
-            told = json.loads(capfd.readouterr().out.splitlines()[-1])
             assert code == 4 and told["calls"] == times, told
             return [answer["values"] for answer in server.answers]
         [told] = called()
@@ -51,11 +49,10 @@ def test_a_node_calls_the_retreat_as_a_service(monkeypatch, tmp_path, capfd):
         assert {order["id"] for order in server.answers} == {"call-0", "call-1"}
 
 
-def test_a_service_that_may_move_needs_a_confirmation(tmp_path, capfd):
+def test_a_service_that_may_move_needs_a_confirmation(tmp_path):
     write_cell(tmp_path / "cell.toml", CELL)
-    code = call(["ros", "serve", str(tmp_path / "cell.toml"), "--arm", "--json"])
-    assert code == 2
-    assert "Nobody confirmed" in json.loads(capfd.readouterr().out.splitlines()[-1])["error"]
+    code, told = answer("ros", "serve", tmp_path / "cell.toml", "--arm")
+    assert code == 2 and "Nobody confirmed" in told["error"]
 
 
 def test_a_moving_arm_is_not_sent_back(monkeypatch, tmp_path):

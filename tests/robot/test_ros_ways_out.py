@@ -1,6 +1,5 @@
 """Whatever ends a goal in ROS cancels it and publishes a stop; no clock runs in most of these."""
 
-import json
 import os
 import signal
 import threading
@@ -8,10 +7,10 @@ import threading
 import numpy as np
 import pytest
 from tests.robot.test_ros import CELL, HOME, ROOT, line, robot_at
+from tests.subjects.commands import answer
 
 from benchmarks.robot_rosbridge import STEP, RosBridge, SteppedBridge
 from limber.cell.cell_file import Cell, write_cell
-from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError, SafetyStop, WorkError
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.ros.guarded_robot import RosRobot, Topics
@@ -347,10 +346,9 @@ def test_a_sensor_that_is_not_heard_in_ros_is_refused(cell, told):
 
 @pytest.mark.parametrize("arguments", [
     ["check"], ["follow", "a.branch"], ["retreat"], ["serve"]])
-def test_every_command_refuses_the_papers_cell_without_its_topic(tmp_path, capfd, arguments):
+def test_every_command_refuses_the_papers_cell_without_its_topic(tmp_path, arguments):
     """Before it asks for a branch, a path or rosbridge: `follow` in its dry run too."""
     write_cell(tmp_path / "cell.toml", PAPER)
     name, *rest = arguments
-    code = call(["ros", name, str(tmp_path / "cell.toml"), *rest, "--json"])
-    assert code == 2
-    assert "sensor.topic" in json.loads(capfd.readouterr().out.splitlines()[-1])["error"]
+    code, told = answer("ros", name, tmp_path / "cell.toml", *rest)
+    assert code == 2 and "sensor.topic" in told["error"]

@@ -7,11 +7,14 @@ import click
 import pytest
 
 from limber.cli import main
+from limber.cli.known import command_class, command_names, others
 from limber.cli.stage_command import StageCommand
 from limber.stages.command_line import command_line
-from limber.stages.registry import all_schemas, stage_class, stage_schema, stage_summaries
+from limber.stages.registry import all_schemas, schema_of, stage_schema, stage_summaries
+from limber.stages.stage import Tool
 
 NAMES = list(stage_summaries())
+ALL = [name for name in command_names() if not command_class(name).about.prints]
 
 # Values other than the defaults, of every kind of field.
 OTHERS = {
@@ -23,6 +26,7 @@ OTHERS = {
                                                (0.0, 0.0, 0.2, 0.0, 0.0, -1.0))},
     "estimate": {"branch_folder": "-odd.branch", "pull": ("one", "two"),
                  "fractions": (0.25, 0.75), "quick": True},
+    "ros gripper": {"position": 0.5, "arm": True},
 }
 
 
@@ -30,8 +34,8 @@ def parsed(name, arguments):
     """Return the stage that a command line makes."""
     seen = []
 
-    class Caught(stage_class(name)):
-        about = replace(stage_class(name).about, result=None, found=())
+    class Caught(command_class(name)):
+        about = replace(command_class(name).about, result=None, found=())
 
         def run(self, progress=None):
             seen.append(type(self).__base__(**{field: getattr(self, field)
@@ -45,50 +49,50 @@ def parsed(name, arguments):
 
 def sample(name):
     """Return a stage with values that are no defaults."""
-    stage = stage_class(name)
+    stage = command_class(name)
     required = {field: f"some-{field}" for field, about in stage.model_fields.items()
                 if about.is_required()}
     return stage(**(required | OTHERS.get(name, {})
                     | ({"force": True} if "force" in stage.model_fields else {})))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ALL)
 def test_command_line_and_json_round_trip(name):
     """A stage becomes a command line, or JSON, that gives it back."""
     stage = sample(name)
     assert parsed(name, command_line(stage)) == stage
-    again = stage_class(name).checked(json.loads(json.dumps(stage.stated())))
+    again = command_class(name).checked(json.loads(json.dumps(stage.stated())))
     assert again == stage and again.model_fields_set == stage.model_fields_set
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ALL)
 def test_schema_round_trip(name):
     """The schema is plain JSON, its defaults give the defaults, and the manifest has the settings.
     """
-    schema = json.loads(json.dumps(stage_schema(name), allow_nan=False))
+    schema = json.loads(json.dumps(schema_of(command_class(name)), allow_nan=False))
     stage = sample(name)
     defaults = {field: about["default"] for part in ("inputs", "settings", "options")
                 for field, about in schema[part]["properties"].items() if "default" in about}
-    needed = {field: "some" for field, about in type(stage).model_fields.items()
+    needed = {field: getattr(stage, field) for field, about in type(stage).model_fields.items()
               if about.is_required()}
     assert type(stage).model_validate(needed | defaults) == type(stage)(**needed)
     assert list(stage.model_dump()) == list(schema["settings"]["properties"])
     assert {part: list(schema[part]["properties"]) for part in stage.parts()} == stage.parts()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ALL)
 def test_description_is_whole(name):
     """A stage's name is its file's; all that is grouped exists, and all is grouped and told."""
-    stage = stage_class(name)
+    stage = command_class(name)
     assert stage.about.name == name
-    assert stage_summaries()[name].endswith(".")
+    assert schema_of(stage)["summary"].endswith(".")
     for base in stage.__mro__:
         named = {field for names in vars(base).get("groups", {}).values() for field in names}
         assert named | set(vars(base).get("common", ())) <= set(
             getattr(base, "model_fields", {}))
     for field, about in stage.model_json_schema()["properties"].items():
         assert about["description"], field
-        assert about["group"] != "options", field
+        assert about["group"] != "options" or issubclass(stage, Tool), field
     for place in (stage.about.key, *stage.about.reads, *stage.about.writes):
         assert "{name}" not in place or "name" in stage.model_fields
 
@@ -125,6 +129,8 @@ def test_schema_commands_print_json(capsys):
     told = printed("schema")
     assert told == json.loads(json.dumps(all_schemas()))
     assert told["stages"]["plan"] == printed("plan", "--schema")
+    told = printed("schema", "commands")
+    assert list(told) == list(others()) and told["cache"] == printed("cache", "--schema")
 
 
 def test_a_file_is_a_stage(tmp_path, monkeypatch):

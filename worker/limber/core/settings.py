@@ -99,7 +99,8 @@ def within(*limits: tuple[float, float]) -> AfterValidator:
 
 
 class OneOf:
-    """Annotates a text that is one of a registry's names, which are looked up when needed."""
+    """Annotates a text that is one of a registry's names, which are looked up when needed, or
+    None."""
 
     def __init__(self, names: Callable[[], tuple[str, ...]]):
         self.names = names
@@ -108,10 +109,11 @@ class OneOf:
         return core_schema.no_info_after_validator_function(self._known, handler(source))
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
-        return {**handler(schema), "enum": list(self.names())}
+        made = handler(schema)
+        return {**made, "enum": [*self.names(), *([None] if "anyOf" in made else [])]}
 
-    def _known(self, name: str) -> str:
-        if name not in self.names():
+    def _known(self, name: str | None) -> str | None:
+        if name is not None and name not in self.names():
             raise ValueError(f"it must be one of {', '.join(self.names())}")
         return name
 
