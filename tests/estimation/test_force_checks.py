@@ -173,7 +173,8 @@ def followed(bench, small, pull, young=None, **settings):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("advised", [{"drive": "pose"}, {"also": ("frame",)}])
+@pytest.mark.parametrize("advised", [
+    {"drive": "pose"}, pytest.param({"also": ("frame",)}, marks=pytest.mark.campaign)])
 def test_intervals_hold_whatever_was_advised(small_bench, small, off, advised):
     """A prescribed path, a free frame."""
     interval = followed(small_bench, small, off, **advised)

@@ -117,7 +117,7 @@ def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("forward", ["full", "reduced"])
+@pytest.mark.parametrize("forward", ["full", pytest.param("reduced", marks=pytest.mark.campaign)])
 def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, monkeypatch,
                                                       forward: str):
     """Killed at its third evaluation, or at its end before anything was entered: the next run

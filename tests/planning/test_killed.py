@@ -75,8 +75,7 @@ def assert_clean(folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [
-    signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGTERM])
 def test_a_killed_energy_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
     """Earlier results stand; the next run sweeps what was left, and finds what it always finds."""
     before = (folder / "energy.npz").read_bytes()
@@ -102,10 +101,9 @@ def assert_same(now: np.ndarray, then: np.ndarray, name: str) -> None:
                                    err_msg=name)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.usefixtures("coarse_bound")
-@pytest.mark.parametrize("kind", [
-    signal.SIGTERM, pytest.param(signal.SIGKILL, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("kind", [signal.SIGTERM, signal.SIGKILL])
 def test_a_killed_plan_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
     """While both paths are solved on the full model."""
     ask = (folder, "--start-seed", "3", "--name", "new")
