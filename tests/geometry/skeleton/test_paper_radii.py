@@ -1,7 +1,6 @@
-"""The paper's radii, against a direct computation; and an estimator from outside."""
+"""The paper's radii, against a direct computation."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +11,6 @@ from limber.core.settings import checked_settings
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_points
 from limber.geometry.io.skeletons import read_swc
-from limber.geometry.radius_estimators import ESTIMATORS
-from limber.geometry.reconstruction import reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings, SkeletonSettings
 from limber.geometry.skeleton.contraction import contract
 from limber.geometry.skeleton.radii.nearest_points import nearest_point_radii
@@ -73,18 +70,6 @@ def test_reconstruct_takes_them(scan, capsys):
             _directly(skeleton.nodes[node], points, 30), rel=1e-3)
     assert told["watertight"] and told["mesh_volume_m3"] > 0
     assert branch.manifest.stages["reconstruct"].settings["radius_neighbours"] == 30
-
-
-@pytest.mark.slow
-def test_another_estimator_is_one_function(scan, monkeypatch):
-    """As an outside file would add it."""
-    monkeypatch.setitem(ESTIMATORS, "even", f"{__name__}:even_radii")
-    made = reconstruct_cloud(read_points(scan), ReconstructSettings(radii="even"))
-    assert (made.meshed.skeleton.radius == 0.006).all()
-
-
-def even_radii(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings) -> Skeleton:
-    return replace(skeleton, radius=np.full(skeleton.node_count, 0.006))
 
 
 @pytest.mark.slow

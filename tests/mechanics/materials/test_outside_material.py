@@ -341,27 +341,6 @@ def test_a_changed_law_is_computed_again(capsys, folder):
     assert energy_and_frames()[0] > 2 * first[0]
 
 
-def test_an_installed_package_gives_its_law_to_commands(capsys, folder, tmp_path, monkeypatch):
-    """By an entry point: the name is a choice, the law is loaded when it is asked for."""
-    (tmp_path / "softwood.py").write_text(
-        "from limber.mechanics import MaterialLaw\n\n\n"
-        "class Spruce(MaterialLaw):\n    name = 'spruce'\n\n"
-        "    def energy(self, strain, lame_lambda, lame_mu):\n"
-        "        trace = strain[..., :3].sum(axis=-1)\n"
-        "        return (0.5 * lame_lambda * trace**2\n"
-        "                + 2 * lame_mu * (strain**2 @ [1.0, 1, 1, 2, 2, 2]))\n")
-    facts = tmp_path / "softwood-1.0.dist-info"
-    facts.mkdir()
-    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: softwood\nVersion: 1.0\n")
-    (facts / "entry_points.txt").write_text(
-        "[limber.materials]\nspruce = softwood:Spruce\npine = softwood:Spruce\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    code, told = simulated(capsys, folder, "spruce", "--kind", "static")
-    assert code == 0 and json.loads(told.out.splitlines()[-1])["converged"]
-    code, told = simulated(capsys, folder, "pine")
-    assert code == 2 and "has the name 'spruce'" in told.err
-
-
 def test_what_cannot_use_it_refuses(mesh):
     """The reduced model, and programs that are told two moduli; small strains alike will do."""
     mooney, fibres = (make_model(mesh, name) for name in NAMES[:2])

@@ -6,6 +6,8 @@ import importlib.util
 import shlex
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -71,3 +73,19 @@ def loaded(function: Any) -> Any:
         return function
     module, _, name = function.partition(":")
     return attrgetter(name)(importlib.import_module(module))
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Objects that a setting names: ``own`` by their paths ``module:name``, imported when chosen,
+    and those that other packages have as entry points of ``group``."""
+
+    group: str
+    own: Mapping[str, str]
+
+    def names(self) -> tuple[str, ...]:
+        return (*self.own, *entry_points(group=self.group).names)
+
+    def named(self, name: str) -> Any:
+        return loaded(self.own[name]) if name in self.own else (
+            entry_points(group=self.group)[name].load())

@@ -11,7 +11,6 @@ from limber.core.alignment import Alignment
 from limber.core.constants import STANDARD_GRAVITY, UNIT_METRES
 from limber.core.errors import InputError, Option
 from limber.core.not_none import present
-from limber.core.optional import loaded
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf
@@ -38,8 +37,7 @@ from limber.geometry.pruned_twigs import (
     touching_texts,
     twig_mass,
 )
-from limber.geometry.radius_estimators import ESTIMATORS
-from limber.geometry.settings import ReconstructSettings
+from limber.geometry.settings import ESTIMATORS, ReconstructSettings
 from limber.geometry.skeleton.alternatives import alternatives, entries
 from limber.geometry.skeleton.edits import Edit, SetRoot, edited
 from limber.geometry.skeleton.plausibility import (
@@ -203,8 +201,8 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         if text:
             progress.warn(text)
     alignment, cloud, found = _aligned(wood, found, settings)
-    if own is None and settings.radii in ESTIMATORS:
-        estimate = loaded(ESTIMATORS[settings.radii])
+    if own is None and settings.radii != "fit":
+        estimate = ESTIMATORS.named(settings.radii)
         found = replace(found, skeleton=estimate(found.skeleton, cloud.points, settings))
         cloud = labelled(cloud, found.skeleton)
     # Nothing is written before the user has answered: an earlier result stays whole.

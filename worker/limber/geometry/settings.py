@@ -4,6 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
+from limber.core.optional import Choices
 from limber.core.settings import (
     Direction,
     Groups,
@@ -12,8 +13,12 @@ from limber.core.settings import (
     possible_density,
     possible_young,
 )
-from limber.geometry.radius_estimators import estimator_names
 
+ESTIMATORS = Choices("limber.radii", {
+    "fit": "", "paper": "limber.geometry.skeleton.radii.nearest_points:nearest_point_radii"})
+"""Estimators of a skeleton's radii: called with the aligned skeleton as fitted, the aligned points
+[m], shape [m, 3], and the settings, they return the skeleton with their radii; ``fit`` leaves it.
+"""
 GRASP_FRACTION = 2.0 / 3.0
 """Position along the main path at which a branch is held by default."""
 DENSITY_SIGMA = 0.1
@@ -57,7 +62,7 @@ class SkeletonSettings(Settings):
     gap_factor: float = Field(
         3.0, gt=1, le=100, description="A step between contracted points of more than this many "
         "median steps is a gap: the paper's gamma.")
-    radii: Annotated[str, OneOf(estimator_names)] = Field(
+    radii: Annotated[str, OneOf(ESTIMATORS.names)] = Field(
         "fit", description="fit: radii fitted together with the axes. paper: the median distance "
         "of the nearest points from each node of the skeleton.")
     radius_neighbours: int = Field(

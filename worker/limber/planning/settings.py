@@ -5,7 +5,15 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from limber.core.settings import BOX, POSITION, Groups, Settings, within
+from limber.core.optional import Choices
+from limber.core.settings import BOX, POSITION, Groups, OneOf, Settings, within
+
+PLANNERS = Choices("limber.planners", {
+    "auto": "", "ompl": "limber.planning.planners.trees:OmplRrtStar",
+    "own": "limber.planning.planners.rrt_star:OwnRrtStar"})
+"""Classes of planners (:class:`limber.planning.planners.rrt_star.Planner`) by the names of
+``engine``, in the order in which ``auto`` prefers them.
+"""
 
 
 class EnergySettings(Settings):
@@ -52,7 +60,7 @@ class Effort:
     """
 
     iterations: int = 3000
-    engine: Literal["auto", "ompl", "own"] = "auto"
+    engine: str = "auto"
     inertia: bool = True
 
 
@@ -158,7 +166,7 @@ class PlanSpec(PlanSettings):
     """A plan, with what only Python sets: the fields of :class:`Effort`."""
 
     iterations: int = Field(Effort.iterations, ge=100, le=200_000)
-    engine: Literal["auto", "ompl", "own"] = Effort.engine
+    engine: Annotated[str, OneOf(PLANNERS.names)] = Effort.engine
     inertia: bool = Effort.inertia
 
     @property

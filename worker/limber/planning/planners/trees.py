@@ -16,13 +16,12 @@ from limber.core.progress import SILENT, Progress
 from limber.planning.cost import edge_cost, path_cost
 from limber.planning.planners.refine import polish, shortcut, slide_end
 from limber.planning.planners.rrt_star import (
-    OwnRrtStar,
     PathProblem,
-    Planner,
     Search,
     Searched,
     SearchTree,
 )
+from limber.planning.settings import PLANNERS
 
 # RRT* of the Open Motion Planning Library on the same problem, cost and limits as our own.
 #
@@ -174,17 +173,12 @@ def _rules(base: object, information: object, problem: PathProblem, search: Sear
     return Validity(information), EdgeCheck(information), PathCost(information), goal
 
 
-PLANNERS: dict[str, Planner] = {"ompl": OmplRrtStar(), "own": OwnRrtStar()}
-"""Planners by the names of ``--engine``, in the order in which ``auto`` prefers them; an external
-one is added to it.
-"""
-
-
 def chosen_engine(engine: str) -> str:
     """Return the name of the planner for a setting: the first available one for ``auto``."""
     if engine != "auto":
         return engine
-    return next(name for name, planner in PLANNERS.items() if not planner.missing())
+    return next(name for name in PLANNERS.own if name != "auto" and not PLANNERS.named(name)(
+        ).missing())
 
 
 @dataclass(frozen=True)
@@ -205,7 +199,7 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
               progress: Progress = SILENT) -> FoundPath:
     """Search for the path of least cost with one of ``PLANNERS``. NoPathError if none within the
     iterations, MissingDependencyError if the planner is not installed."""
-    found = PLANNERS[engine].search(problem, search, progress)
+    found = PLANNERS.named(engine)().search(problem, search, progress)
     raw, reached = found.path, len(found.tree.nodes) if found.tree else 1
     if raw is None:
         raise NoPathError(f"{search.iterations} iterations found no allowed path to the goal "
