@@ -12,7 +12,7 @@ from limber.planning.constraints.damage import DamageAlong, Strength, assumed, r
 from limber.planning.constraints.limits import Limits
 from limber.planning.settings import PlanSpec
 from limber.results.report.damage_figure import damage_along_branch
-from limber.results.report.report_tables import comparison_rows
+from limber.stages.paths.plan import Plan
 from limber.stages.paths.plan_strength import (
     default_limit,
     strength_for,
@@ -139,7 +139,7 @@ def test_a_plan_over_its_strength_is_said_to_be():
     unknown = strength_of_plan(None, plan, moving, progress)
     assert unknown["over"] and unknown["damage_probability"] is None and len(told) == 1
     assert np.array_equal(unknown["grasp_m"], [6.0, 7.0, 8.0])
-    rows = comparison_rows({"baseline": {}, "plan": {}, "strength": over})
+    rows = Plan.of({"baseline": {}, "plan": {}, "strength": over}).comparison()
     assert rows[-2][2] == "1.4" and rows[-1][0].startswith("probability of damage")
 
 

@@ -19,7 +19,7 @@ from limber.results.findings import (
 )
 from limber.results.report import estimate_figures, plan_figures
 from limber.results.report.charts import two_views
-from limber.results.report.report_tables import comparison_rows
+from limber.stages.paths.plan import Plan
 from limber.store import Branch
 
 PLAN = {"plan": {"length_m": 0.177, "peak_energy_j": 0.0555, "peak_force_n": 0.657,
@@ -69,7 +69,7 @@ def test_a_force_beyond_an_arm_is_said_beside_it():
     assert "UR3E carries (29 N)" in beyond_sentence(small)
     assert not remarks_on(PLAN | {"robot": {"model": "ur16e"}})
     assert not remarks_on(PLAN | {"robot": {"model": "arms/gone.urdf"}})
-    rows = comparison_rows(PLAN)
+    rows = Plan.of(PLAN).comparison()
     assert rows[0][-1] == "beyond reach" and all(len(row) == 5 for row in rows)
     force = next(row for row in rows if row[0].startswith("peak force"))
     assert force[1] == "104" and force[-1] == "shortest: more than a UR10 carries (98 N)"

@@ -105,10 +105,10 @@ def _masses(branch: Branch) -> Any:
 def _planned(branch: Branch) -> Any:
     """A plan's JSON and tables as scene and report show them."""
     from limber.planning.plan_file import read_plan
-    from limber.results.report.report_tables import comparison_rows
+    from limber.stages.paths.plan import Plan
 
     plan = read_plan(branch.path("plans/to-goal.json"))
-    comparison_rows(plan.summary)
+    Plan.of(plan.summary).comparison()
     return _shown(branch), plan.plan, plan.baseline, plan.motion
 
 

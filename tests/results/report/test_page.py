@@ -13,7 +13,6 @@ from limber.geometry.tets.tree_sweep import straight_beam
 from limber.results.report.estimate_figures import young_along_branch
 from limber.results.report.report_tables import (
     cause_rows,
-    comparison_rows,
     deviation_rows,
     held_out_rows,
     held_sentence,
@@ -22,6 +21,7 @@ from limber.results.report.report_tables import (
     true_moduli,
 )
 from limber.results.scene.graphs import young_graph
+from limber.stages.paths.plan import Plan
 from limber.stages.registry import result_of
 from limber.stages.results.report import WriteReport, page_of
 from limber.store import Branch
@@ -137,7 +137,7 @@ def test_tables_without_truth_or_numbers():
     assert rows == [["control point", "E [MPa]", "95 % interval [MPa]"],
                     ["1", "2", "1 to 4"], ["2", "3", "undetermined"]]
     plan = {"baseline": {"length_m": 0.5, "peak_force_n": None}, "plan": {"length_m": 0.55}}
-    assert comparison_rows(plan)[1:] == [["path length [m]", "0.5", "0.55", "+10.0 %"]]
+    assert Plan.of(plan).comparison()[1:] == [["path length [m]", "0.5", "0.55", "+10.0 %"]]
 
 
 def test_the_legs_of_a_motion_stand_in_order():

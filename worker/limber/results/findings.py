@@ -57,6 +57,12 @@ def modulus_sentence(estimate: Mapping[str, Any], assumed: str = "") -> str:
             f"{f'; {assumed}' if assumed else ''}).")
 
 
+def plan_sentences(plan: Mapping[str, Any]) -> list[str]:
+    """Return what was found by a plan, by its summary."""
+    return [text for find in (path_sentence, certificate_sentence, beyond_sentence)
+            if (text := find(plan))]
+
+
 def path_sentence(plan: Mapping[str, Any]) -> str:
     """Return length, energy and force of the gentle path, and its savings, by a plan's summary."""
     gentle = plan["plan"]

@@ -22,7 +22,7 @@ import html
 import importlib
 import io
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -301,6 +301,27 @@ class Result(BaseModel):
         rows = [[label.heading, value, between] for label, value, between in self._labelled()]
         return [["quantity", "value", "95 % interval"], *rows] if any(
             row[2] for row in rows) else [["quantity", "value"], *(row[:2] for row in rows)]
+
+    def against(self, other: Self, titles: Sequence[str],
+                remarks: Mapping[str, str] = MappingProxyType({})) -> list[list[str]]:
+        """Return the labelled values of this and the ``other`` as a table below ``titles``, with
+        the change in percent, and, if there are any, with ``remarks`` by field."""
+        rows, notes = [["measure", *titles, "change"]], ["beyond reach"]
+        for name, field in type(self).model_fields.items():
+            before, after = getattr(self, name), getattr(other, name)
+            extra = field.json_schema_extra
+            if before is None or after is None or not isinstance(extra, dict):
+                continue
+            label: Any = extra["label"]
+            rows.append([label.heading, label.text(before), label.text(after),
+                         f"{100 * (after / before - 1):+.1f} %" if before else "-"])
+            notes.append(remarks.get(name, ""))
+        return [[*row, note] for row, note in zip(rows, notes, strict=True)] if any(
+            notes[1:]) else rows
+
+    def sentences(self, branch: "Branch") -> list[str]:
+        """Return what was found, for the report's first section and the end of a command."""
+        return []
 
     def section(self, branch: "Branch", key: str) -> "Section | None":
         """Return its section in the report, None without: its rows and its figure."""

@@ -309,27 +309,28 @@ def _make_folder(folder: Path) -> None:
 
 
 def _show_tables(demo: _Demo) -> None:
-    from limber.results.report.report_tables import comparison_rows, held_sentence, modulus_rows
+    from limber.results.report.report_tables import held_sentence, modulus_rows
+    from limber.stages.paths.plan import Plan
 
     if "estimate" in demo.results:
         estimate, pull = demo.results["estimate"], demo.results["virtual-pull"]
         demo.progress.say(table_text("Young's modulus", modulus_rows(estimate, pull)))
         demo.progress.say(held_sentence(estimate, pull))
     if "plan" in demo.results:
-        demo.progress.say(table_text("Paths", comparison_rows(demo.results["plan"])))
+        demo.progress.say(table_text("Paths", Plan.of(demo.results["plan"]).comparison()))
 
 
 def _found(demo: _Demo) -> list[str]:
     """The demo's findings, in the sentences of its stages."""
-    from limber.results.findings import beyond_sentence, certificate_sentence, path_sentence
+    from limber.stages.paths.plan import Plan
+    from limber.store import Branch
 
-    plan = demo.results["plan"]
-    sentences = [path_sentence(plan), certificate_sentence(plan), beyond_sentence(plan)]
+    sentences = Plan.of(demo.results["plan"]).sentences(Branch.read(demo.branch))
     if demo.kept:
         kept = "All results" if not demo.results.keys() - demo.kept - {"generate"} else (
             f"Results of {', '.join(sorted(demo.kept))}")
         sentences.append(f"{kept} were kept from an earlier demo. --force reconstructs again.")
-    return [line for line in sentences if line]
+    return sentences
 
 
 def _loop_sentence(result: Mapping[str, Any]) -> str:

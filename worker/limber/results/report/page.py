@@ -11,14 +11,9 @@ from limber.estimation.estimate_file import read_estimate
 from limber.geometry.skeleton.qsm_tables import Caliper
 from limber.results.findings import (
     ASSUMED,
-    ASSUMED_PULL,
-    beyond_sentence,
-    certificate_sentence,
-    modulus_sentence,
-    path_sentence,
     simulated_pull,
 )
-from limber.results.report.report_tables import action_rows, cause_rows, is_assumed
+from limber.results.report.report_tables import action_rows, cause_rows
 from limber.results.report.section import Section, inline_png
 from limber.results.report.shape_sections import (
     cylinders_section,
@@ -32,15 +27,16 @@ _SOURCE_LABELS = {"file": "source", "unit": "unit of length", "sha256": "sha256 
                   "truth": "known truth"}
 
 
-def draw_page(branch: Branch,
+def draw_page(branch: Branch, sentences: list[str],
               results: Sequence[Callable[[Branch], Section | None]], *,
               shape: list[list[str]], mesh: list[list[str]], calipers: Sequence[Caliper] = (),
               progress: Progress = SILENT) -> tuple[str, list[Section]]:
-    """Return the page for the stages that have been run, as HTML, and its sections, by builders of
-    each, rows of shape and mesh, and caliper diameters to compare with the scan's. InputError for a
-    diameter beyond the branch; MissingDependencyError without the extra ``report``."""
+    """Return the page for the stages that have been run, as HTML, and its sections, by what was
+    found, builders of each, rows of shape and mesh, and caliper diameters to compare with the
+    scan's. InputError for a diameter beyond the branch; MissingDependencyError without the extra
+    ``report``."""
     require_extra("report", ("matplotlib", "jinja2"), "The report")
-    page = [_found(branch), *_held_back(branch), _summary(branch, shape)]
+    page = [_found(branch, sentences), *_held_back(branch), _summary(branch, shape)]
     builders: list[Callable[[Branch], Section | None]] = [
         scan_section, partial(cylinders_section, calipers=calipers),
         partial(mesh_section, rows=mesh), *results, _provenance]
@@ -51,12 +47,6 @@ def draw_page(branch: Branch,
     return _render(branch, page), page
 
 
-def _names(branch: Branch, stage: str) -> list[str]:
-    """The names of a stage's results, sorted."""
-    return sorted(key.partition(":")[2] for key in branch.manifest.stages
-                  if key.startswith(f"{stage}:"))
-
-
 def with_picture(html: str, png: bytes) -> str:
     """Return a page with a render of the scene at the end of its first section."""
     figure = (f'<figure><img src="{inline_png(png)}" alt="Rendered scene.">'
@@ -64,25 +54,16 @@ def with_picture(html: str, png: bytes) -> str:
     return html.replace("</section>", f"{figure}</section>", 1)
 
 
-def _found(branch: Branch) -> Section:
+def _found(branch: Branch, sentences: list[str]) -> Section:
     """The findings in one paragraph, and their limits."""
     section, pull = Section("What was found"), simulated_pull(branch)
     if pull is not None:
         section.text.append(ASSUMED if pull["young_assumed"] else (
             "The branch was generated and its pull simulated, so that the true modulus is known."))
-    sentences = []
-    if branch.has("estimate.json"):
-        sentences.append(modulus_sentence(
-            read_estimate(branch.path("estimate.json")),
-            ASSUMED_PULL if is_assumed(pull) else ""))
-    else:
-        sentences.append("Young's modulus has not been estimated from a pull: what follows holds "
-                         "for the modulus that the mesh has.")
-    plans = [branch.manifest.stages[f"plan:{name}"] for name in _names(branch, "plan")]
-    if plans:
-        newest = max(plans, key=lambda entry: entry.finished).result
-        sentences += [path_sentence(newest), certificate_sentence(newest), beyond_sentence(newest)]
-    section.text.append(" ".join(filter(None, sentences)))
+    if not branch.has("estimate.json"):
+        sentences = ["Young's modulus has not been estimated from a pull: what follows holds for "
+                     "the modulus that the mesh has.", *sentences]
+    section.text.append(" ".join(sentences))
     return section
 
 

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import count
 from operator import itemgetter
 from typing import Any
 
 from limber.core.labels import place_text, table_of
-from limber.results.findings import ASSUMED, remarks_on
+from limber.results.findings import ASSUMED
 
 
 def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
@@ -45,13 +46,12 @@ def rigidity_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     """Return flexural rigidity E I per control point; none if the shape was not judged."""
     if not estimate.get("bending_stiffness_nm2"):
         return []
-    rows = [["control point", "E I [N m^2]", "E I [N mm^2]", "95 % interval [N m^2]"]]
-    for number, (value, (low, high)) in enumerate(zip(
-            estimate["bending_stiffness_nm2"], estimate["bending_stiffness_interval_nm2"],
-            strict=True)):
-        rows.append([str(number + 1), f"{value:.4g}", f"{1e6 * value:.4g}",
-                     f"{low:.4g} to {high:.4g}"])
-    return rows
+    return table_of(
+        zip(estimate["bending_stiffness_nm2"], estimate["bending_stiffness_interval_nm2"],
+            count(1), strict=False),
+        ("control point", itemgetter(2)), ("E I [N m^2]", itemgetter(0), ".4g"),
+        ("E I [N mm^2]", lambda each: 1e6 * each[0], ".4g"),
+        ("95 % interval [N m^2]", lambda each: "{:.4g} to {:.4g}".format(*each[1])))
 
 
 def held_sentence(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> str:
@@ -68,31 +68,6 @@ def is_assumed(pull: Mapping[str, Any] | None) -> bool:
     return bool((pull or {}).get("young_assumed"))
 
 
-def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
-    """Return shortest against gentle path, with peaks and changes in percent. A last column states
-    which limits of arm or wood are exceeded, if any."""
-    rows = [["measure", "shortest", "gentle", "change"]]
-    remarks, notes = remarks_on(plan), []
-    for label, key, unit in [
-            ("path length", "length_m", "m"),
-            ("energy along the path", "energy_integral_jm", "J m"),
-            ("sum of energy, 5 mm steps", "energy_sum_nmm", "N mm"),
-            ("peak energy", "peak_energy_j", "J"), ("peak force", "peak_force_n", "N"),
-            ("largest strain", "peak_strain", "m/m")]:
-        before, after = plan["baseline"].get(key), plan["plan"].get(key)
-        if before is None or after is None:
-            continue
-        change = f"{100 * (after / before - 1):+.1f} %" if before else "-"
-        rows.append([f"{label} [{unit}]", f"{before:.4g}", f"{after:.4g}", change])
-        notes.append(remarks.get(key, ""))
-    below = _below(plan)
-    if not any(notes):
-        return rows + below
-    notes += [""] * len(below)
-    return [[*row, remark] for row, remark in zip(
-        rows + below, ["beyond reach", *notes], strict=True)]
-
-
 def leg_rows(legs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return a plan's legs in order; a row is left empty where nothing moves or is known."""
     moving = [leg if leg["length_m"] > 0.0 else {**leg, "length_m": None, "peak_speed_m_s": None}
@@ -103,24 +78,6 @@ def leg_rows(legs: Sequence[Mapping[str, Any]]) -> list[list[str]]:
         ("force [N]", "peak_force_n", ".3g"),
         ("to obstacles [mm]", "obstacle_distance_m", ".0f mm"),
         ("arm to branch [mm]", "branch_distance_m", ".0f mm"))
-
-
-def _below(plan: Mapping[str, Any]) -> list[list[str]]:
-    """Rows with values of the gentle path alone."""
-    rows = []
-    gap = (plan.get("certificate") or {}).get("gap_percent")
-    if gap is not None:
-        words = "energy above the gentlest within the length" if plan.get("detour") else (
-            "cost above the best possible path's")
-        rows.append([f"{words}, at most [%]", "", f"{gap:.1f}", ""])
-    if strength := plan.get("strength"):
-        share = strength["peak_strain"] / strength["median_strain"]
-        rows.append([f"largest strain over that at break ({strength['source']})", "",
-                     f"{share:.2g}", ""])
-        if strength["damage_probability"] is not None:
-            rows.append(["probability of damage [%]", "",
-                         f"{100 * strength['damage_probability']:.2g}", ""])
-    return rows
 
 
 def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:

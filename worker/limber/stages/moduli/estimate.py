@@ -98,6 +98,13 @@ class Estimate(Result):
             ("Modulus by pull", rows_of.pull_rows(known)),
             ("Pulls predicted by a fit without them: RMS errors", rows_of.held_out_rows(known)))
 
+    def sentences(self, branch: Branch) -> list[str]:
+        from limber.results.findings import ASSUMED_PULL, modulus_sentence, simulated_pull
+
+        pull = simulated_pull(branch)
+        assumed = ASSUMED_PULL if pull and pull["young_assumed"] else ""
+        return [modulus_sentence(self.file or self.values, assumed)]
+
     def section(self, branch: Branch, key: str) -> Section:
         from limber.results.findings import ASSUMED, simulated_pull
         from limber.results.report.estimate_figures import report_figures
@@ -124,10 +131,7 @@ class Estimate(Result):
 
 
 def _moduli_line(values: Mapping[str, Any]) -> str:
-    from limber.results.findings import ASSUMED_PULL, modulus_sentence, simulated_pull
-
-    pull = simulated_pull(Branch.read(values["branch_folder"]))
-    return modulus_sentence(values, ASSUMED_PULL if pull and pull["young_assumed"] else "")
+    return Estimate.of(values).sentences(Branch.read(values["branch_folder"]))[0]
 
 
 class EstimateYoung(EstimateSettings, Repeatable, BranchStage):

@@ -54,6 +54,18 @@ if TYPE_CHECKING:
 _FRAME_RATE = 24.0  # frames per second of the played motion; a pose is a frame
 
 
+class PathNumbers(Result):
+    """What a path costs on the full model."""
+
+    keys: ClassVar = {"peak_strain": "peak_strain"}
+    length: float | None = shown("path length", ".4g m")
+    energy_integral: float | None = shown("energy along the path", ".4g J m")
+    energy_sum: float | None = shown("sum of energy, 5 mm steps", ".4g N mm")
+    peak_energy: float | None = shown("peak energy", ".4g J")
+    peak_force: float | None = shown("peak force", ".4g N")
+    peak_strain: float | None = shown("largest strain", ".4g m/m")
+
+
 class Plan(Result):
     """A gentle path of the grasp and the shortest one, both computed with the full model.
 
@@ -113,11 +125,39 @@ class Plan(Result):
                 "damage": DamageAlong.read(branch.path(damage)) if branch.has(damage) else None}
 
     def tables(self) -> list[Table]:
-        from limber.results.report.report_tables import comparison_rows, leg_rows
+        from limber.results.report.report_tables import leg_rows
 
         return filled(
-            ("Both paths, on the full model", comparison_rows(self.values)),
+            ("Both paths, on the full model", self.comparison()),
             ("The whole motion, leg by leg", leg_rows(self.values.get("legs", []))))
+
+    def comparison(self) -> list[list[str]]:
+        """Return the shortest against the gentle path, and below what is known of the latter alone;
+        a last column states which limits of arm or wood are exceeded, if any."""
+        from limber.results.findings import remarks_on
+
+        plan, remarks = self.values, remarks_on(self.values)
+        rows = PathNumbers.of(plan["baseline"]).against(
+            PathNumbers.of(plan["plan"]), ("shortest", "gentle"),
+            {key.removesuffix("_n"): remark for key, remark in remarks.items()})
+        below = []
+        if (gap := (plan.get("certificate") or {}).get("gap_percent")) is not None:
+            words = "energy above the gentlest within the length" if plan.get("detour") else (
+                "cost above the best possible path's")
+            below.append([f"{words}, at most [%]", f"{gap:.1f}"])
+        if strength := plan.get("strength"):
+            share = strength["peak_strain"] / strength["median_strain"]
+            below.append([f"largest strain over that at break ({strength['source']})",
+                          f"{share:.2g}"])
+            if (damage := strength["damage_probability"]) is not None:
+                below.append(["probability of damage [%]", f"{100 * damage:.2g}"])
+        empty = [""] * (len(rows[0]) - 3)
+        return rows + [[title, "", value, *empty] for title, value in below]
+
+    def sentences(self, branch: Branch) -> list[str]:
+        from limber.results.findings import plan_sentences
+
+        return plan_sentences(self.values)
 
     def plot_damage(self) -> Figure:
         """Draw where along the branch the gentle path would damage it, and how probably.
@@ -165,17 +205,12 @@ class Plan(Result):
 
 
 def _found_lines(values: Mapping[str, Any]) -> str:
-    from limber.results.findings import (
-        beyond_sentence,
-        certificate_sentence,
-        modulus_origin,
-        path_sentence,
-    )
+    from limber.results.findings import modulus_origin
 
-    origin = modulus_origin(Branch.read(values["branch_folder"]))
-    return "\n".join(filter(None, (
-        path_sentence(values), certificate_sentence(values), beyond_sentence(values),
-        "" if origin == "estimated" else f"All this holds for Young's modulus as {origin}.")))
+    branch = Branch.read(values["branch_folder"])
+    origin = modulus_origin(branch)
+    return "\n".join([*Plan.of(values).sentences(branch), *(
+        [] if origin == "estimated" else [f"All this holds for Young's modulus as {origin}."])])
 
 
 class PlanPaths(PlanSettings, Repeatable, PlacedStage):

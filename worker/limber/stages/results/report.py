@@ -87,25 +87,34 @@ def page_of(branch: Branch, *, calipers: "Sequence[Caliper]" = (), progress: Pro
     """Return the page of a branch as HTML, and its sections."""
     from limber.results.report.page import draw_page
 
-    values = branch.made.result if branch.made else {}
-    return draw_page(branch, _sections(branch), shape=Shape.of(values).rows(),
-                     mesh=MeshNumbers.of(values).rows(), calipers=calipers, progress=progress)
+    values, results = branch.made.result if branch.made else {}, _results(branch)
+    return draw_page(branch, _sentences(branch, results), _sections(results),
+                     shape=Shape.of(values).rows(), mesh=MeshNumbers.of(values).rows(),
+                     calipers=calipers, progress=progress)
 
 
-def _section_of(branch: Branch, key: str) -> "Section | None":
-    return result_of(branch, key, branch.manifest.stages[key].result).section(branch, key)
+def _results(branch: Branch) -> "dict[type[Result], dict[str, Result]]":
+    """The branch's results by kind and entry, in the order of the page."""
+    found: dict[type[Result], dict[str, Result]] = {}
+    for word in sorted(result_kinds(), key=(_ORDER + tuple(result_kinds())).index):
+        found.setdefault(result_kinds()[word], {}).update(
+            (key, result_of(branch, key, branch.manifest.stages[key].result))
+            for key in sorted(branch.manifest.stages) if key.partition(":")[0] == word)
+    return found
 
 
-def _sections(branch: Branch) -> "list[Callable[[Branch], Section | None]]":
-    """Functions that make the sections of the results, in the order of the page."""
-    words = sorted(result_kinds(), key=(_ORDER + tuple(result_kinds())).index)
-    keys: dict[type[Result], list[str]] = {}
-    for word in words:
-        keys.setdefault(result_kinds()[word], []).extend(
-            key for key in sorted(branch.manifest.stages) if key.partition(":")[0] == word)
+def _sentences(branch: Branch, results: "dict[type[Result], dict[str, Result]]") -> list[str]:
+    """What was found, by the newest result of each kind."""
+    return [sentence for known in results.values() if known for sentence in known[max(
+        known, key=lambda key: branch.manifest.stages[key].finished)].sentences(branch)]
+
+
+def _sections(results: "dict[type[Result], dict[str, Result]]",
+              ) -> "list[Callable[[Branch], Section | None]]":
+    """Functions that make the sections of the results."""
     found: list[Callable[[Branch], Section | None]] = []
-    for kind, known in keys.items():
-        found += [partial(_section_of, key=key) for key in known] or (
+    for kind, known in results.items():
+        found += [partial(result.section, key=key) for key, result in known.items()] or (
             [partial(_gap, kind)] if kind.missing else [])
     return found
 
