@@ -18,6 +18,8 @@ from limber.batch.scheduler_scripts import commands
 from limber.cli import main
 from limber.core.errors import InputError
 from limber.geometry.generated import generate_branch
+from limber.geometry.io.clouds import CLOUDS
+from limber.geometry.io.formats import suffixes_of
 from limber.mechanics.materials import laws
 from limber.planning.settings import PlanSpec
 from limber.stages import registry
@@ -76,6 +78,11 @@ def test_each_is_in_the_schema(package):
     assert "line" in PlanSpec.model_json_schema()["properties"]["engine"]["enum"]
     with pytest.raises(InputError, match="has the name 'spruce'"):
         laws.material_named("pine")
+
+
+def test_a_format_that_is_broken_stops_nothing(package):
+    with pytest.warns(UserWarning, match="NOTHING could not register a format of a point cloud"):
+        assert ".foo" in suffixes_of(CLOUDS.readers())
 
 
 def test_each_is_a_command_or_an_option(package):

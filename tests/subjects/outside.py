@@ -105,6 +105,7 @@ ENTRIES = """[limber.stages]
 count = outside.count:Count
 [limber.clouds]
 dots = outside.things:DOTS
+broken = outside.things:NOTHING
 [limber.exports]
 nodes = outside.things:NODES
 [limber.radii]

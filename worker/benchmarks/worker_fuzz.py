@@ -314,7 +314,6 @@ _LINES: dict[str, list[list[str]]] = {
 files other than its own; `limber cache` does.
 """
 _CODES = (0, 2, 3, 4, 130)
-_OWN = ("--json", "--progress", "--help", "--help-all", "--schema", "-o", "--data", "--clear")
 
 
 def _lines(name: str, _template: Path, folder: Path) -> list[Path]:

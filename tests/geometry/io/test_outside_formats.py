@@ -10,7 +10,6 @@ from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.geometry.bodies import body_format
 from limber.geometry.generated import generate_branch
-from limber.geometry.io import formats
 from limber.geometry.io.clouds import CLOUDS, read_points
 from limber.geometry.io.formats import Format, starts_with
 from limber.geometry.io.skeletons import SKELETONS, read_skeleton
@@ -75,24 +74,6 @@ def test_reconstruct_takes_it(dots, tmp_path, capsys):
     assert call(["reconstruct", str(tmp_path), "-o", str(tmp_path / "out"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert told["done_count"] == 1 and told["done"]["in.foo"]["watertight"]
-
-
-def test_installed_packages_add_theirs(monkeypatch, tmp_path):
-    """When the registry is first asked; one that is broken is told and stops nothing."""
-    class Entry:
-        def __init__(self, value):
-            self.value = value
-
-        def load(self):
-            if self.value == "broken":
-                raise ImportError("no module")
-            return Format("dots", (".foo",), Dots.read)
-
-    monkeypatch.setattr(formats, "entry_points", lambda group: [Entry("broken"), Entry(group)])
-    registry = formats.Registry("cloud", "limber.things")
-    with pytest.warns(UserWarning, match="broken could not register a format of a cloud"):
-        assert formats.suffixes_of(registry.readers()) == (".foo",)
-    assert [one.name for one in registry] == ["dots"]
 
 
 # A format of skeletons of another package: registered, it is read and written by our commands.
