@@ -56,7 +56,7 @@ class SceneDataError(ValueError):
 
 @dataclass(frozen=True)
 class SceneData:
-    """Arrays by name, and their description: limber.results.scene.contents lists them all."""
+    """Arrays by name, and their description: limber.results.scene.animation lists them all."""
 
     arrays: dict[str, np.ndarray]
     info: dict[str, Any]

@@ -20,7 +20,7 @@ from tests.subjects.commands import answer
 
 import limber
 from benchmarks.robot_cells import cell_file, standing_at
-from limber.api import branch, settings_table, verbs
+from limber.api import branch
 from limber.core.errors import BranchFolderError, InputError, MissingDependencyError, WorkError
 from limber.core.progress import LineSink
 from limber.geometry.io.clouds import read_cloud
@@ -126,7 +126,7 @@ def test_the_docstrings_examples(own, tmp_path, monkeypatch):
     counts = [doctest.testmod(
         module, extraglobs={"limber": limber},
         optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
-        for module in (verbs, settings_table, branch, *{
+        for module in (branch, *{
             sys.modules[kind.__module__] for kind in RESULTS})]
     assert sum(count.attempted for count in counts) >= 20
     assert not sum(count.failed for count in counts)
@@ -249,7 +249,7 @@ def test_what_is_wrong_is_said_in_a_python_users_words(example, wrong, told):
 
 def test_a_command_in_a_message_stays_whole(tmp_path):
     """An option becomes a keyword argument, a command that is to be typed stays one."""
-    from limber.api.running import in_python_words
+    from limber.api.branch import in_python_words
     from limber.core.errors import Command, Option, Text
 
     with pytest.raises(WorkError) as told, in_python_words():
@@ -261,7 +261,7 @@ def test_a_command_in_a_message_stays_whole(tmp_path):
 
 def test_verbs_in_two_threads_give_the_script_back():
     """It is hidden until the last of them has ended, in whatever order they do."""
-    from limber.api.running import script_run_once
+    from limber.api.branch import script_run_once
 
     script = sys.modules["__main__"]
     first, second = script_run_once(), script_run_once()

@@ -18,7 +18,7 @@ from tests.golden.references import small_parts
 
 import limber
 from limber.batch.job_file import read_jobs
-from limber.batch.machines import run_task
+from limber.batch.run import run_task
 from limber.core.progress import SILENT
 from limber.recordings.recording import read_pull
 from limber.stages.pulls.export_pull import ExportPull

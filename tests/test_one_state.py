@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.core.progress import Progress
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.settings import FitSpec, PullSpec
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull
 from limber.geometry.tets.tet_mesh import mark

@@ -11,7 +11,7 @@ import pytest
 from limber.core.errors import InputError
 from limber.core.files.atomic import file_digest
 from limber.core.settings import checked_settings
-from limber.results.scene.contents import scene_data
+from limber.results.scene.animation import scene_data
 from limber.store import Branch
 
 EXAMPLE = Path(__file__).parents[1] / "blend_files" / "bending_branch"

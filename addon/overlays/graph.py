@@ -1,6 +1,6 @@
 """A graph in the 3D view's lower right corner: Young's modulus along the branch, energy, force.
 
-The worker states all positions in the frame (``limber.results.scene.graphs``); here it is drawn.
+The worker states all positions in the frame (``limber.results.scene.animation``); here it is drawn.
 """
 
 import blf

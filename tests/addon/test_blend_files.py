@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.results.scene.contents import scene_data
+from limber.results.scene.animation import scene_data
 from limber.store import Branch
 
 FOLDER = Path(__file__).parents[2] / "blend_files"

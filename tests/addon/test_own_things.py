@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.addon.conftest import make_beam_branch
 
-from limber.results.scene.contents import scene_data
+from limber.results.scene.animation import scene_data
 from limber.store import Branch
 
 pytestmark = pytest.mark.usefixtures("worker_here")

@@ -32,7 +32,7 @@ def positions(bpy):
 
 def _scene_in_process(addon, branch, path, bpy, motion=None):
     """Build the scene here, as the process of `limber scene` does, without rendering."""
-    from limber.results.scene.contents import scene_data
+    from limber.results.scene.animation import scene_data
     from limber.store import Branch
 
     scenes = importlib.import_module("limber_addon.scene")
@@ -158,7 +158,7 @@ def test_a_motion_plays_in_its_own_time(bpy, addon, beam, write_pc2, positions, 
 def test_targets_go_with_the_branch(bpy, addon, beam, tmp_path):
     """A named target is a ball of that name that follows its place on the branch."""
     from limber.mechanics.loads.loaded_branch import NamedTarget
-    from limber.results.scene.contents import scene_data
+    from limber.results.scene.animation import scene_data
     from limber.store import Branch
 
     scenes = importlib.import_module("limber_addon.scene")
@@ -293,7 +293,7 @@ def test_command_says_what_is_missing(beam, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_scene_script_reports_its_failure(bpy, beam, write_pc2, tmp_path):
     """Frames of another mesh end the process with code 3 and a reason, not with a still branch."""
-    from limber.results.scene.contents import scene_data
+    from limber.results.scene.animation import scene_data
     from limber.store import Branch
 
     scene_data(Branch.open(beam.folder)).write(tmp_path / "data.npz")
@@ -326,7 +326,7 @@ def test_the_robots_links_go_with_the_frames(bpy, addon, beam, tmp_path):
     """
     from mathutils import Vector
 
-    from limber.results.scene.contents import scene_data as data_of
+    from limber.results.scene.animation import scene_data as data_of
     from limber.store import Branch
 
     shown_data = data_of(Branch.open(beam.folder))
@@ -362,7 +362,7 @@ def test_a_cell_is_shown_where_its_file_says(bpy, addon, beam, tmp_path):
     """Arm, gripper and an obstacle that lets one see through; shown again they are not doubled."""
     from limber.cell.cell_file import Cell
     from limber.cell.obstacles import Box
-    from limber.results.scene.contents import scene_data as data_of
+    from limber.results.scene.animation import scene_data as data_of
     from limber.results.scene.still_objects import add_cell
     from limber.store import Branch
 
@@ -394,7 +394,7 @@ def test_a_long_legend_keeps_to_its_margin_and_height(bpy, addon, beam, tmp_path
     """Lines break where the margin ends; all is smaller where it would leave the picture below."""
     from mathutils import Vector
 
-    from limber.results.scene.contents import scene_data as data_of
+    from limber.results.scene.animation import scene_data as data_of
     from limber.store import Branch
 
     shown_data = data_of(Branch.open(beam.folder))

@@ -9,8 +9,8 @@ import zipfile
 import numpy as np
 import pytest
 
+from limber.results.scene.animation import scene_data
 from limber.results.scene.colours import FORMAT
-from limber.results.scene.contents import scene_data
 from limber.store import Branch
 
 

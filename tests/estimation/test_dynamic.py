@@ -8,8 +8,8 @@ import pytest
 from benchmarks.paper_branches import Bench
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import gauss_newton
-from limber.estimation.forward.dynamic_pull import DynamicForward
 from limber.estimation.forward.forward_model import key_frames, smoothed, travel
+from limber.estimation.forward.solved_pull import DynamicForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.uncertainty.identifiability import identifiability, require_scale
 from limber.recordings.synchronisation import Frames

@@ -14,9 +14,9 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.hung_load import settled
+from limber.recordings.import_request import read_nominal, register
 from limber.recordings.importing import against_load
 from limber.recordings.recording import GraspEntry, Observations, grasp_on, read_pull
-from limber.recordings.registration import read_nominal, register
 
 BEAM = Path(__file__).parents[1] / "data" / "silicone_beam"
 YOUNG, WEIGHTS = 2.5e7, (0.3, 0.7)

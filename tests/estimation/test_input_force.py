@@ -9,9 +9,9 @@ from benchmarks.paper_branches import measured
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.fitting.optimise import nelder_mead
-from limber.estimation.forward.dynamic_pull import DynamicForward
 from limber.estimation.forward.forward_model import course_of, motion_response, nodal_loads
 from limber.estimation.forward.observed_path import ObservedPathForward
+from limber.estimation.forward.solved_pull import DynamicForward
 from limber.estimation.parameters import Values
 from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import PullSpec, simulate_pull

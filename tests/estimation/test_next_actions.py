@@ -7,11 +7,10 @@ import pytest
 from tests.estimation.test_nuisances import TRUTH, objective_of
 
 from benchmarks.paper_branches import Bench, PaperBranch, exact_pull, measured
-from limber.estimation.control_point_count import equal_fractions, is_open, supported
 from limber.estimation.estimated_branch import subject_of
-from limber.estimation.fit import fit_branch
+from limber.estimation.fit import equal_fractions, fit_branch, is_open, supported
 from limber.estimation.fitting.objective import EvaluationLog, Objective
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import PullSpec, simulate_pull

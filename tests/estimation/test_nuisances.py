@@ -28,7 +28,7 @@ from limber.estimation.fitting.nuisances import (
     unlikely,
 )
 from limber.estimation.fitting.objective import EvaluationLog, Objective
-from limber.estimation.forward import quasi_static
+from limber.estimation.forward import solved_pull
 from limber.estimation.forward.forward_model import PointDirections
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.parameters import ParameterSpace, Values
@@ -104,14 +104,14 @@ def test_a_branch_that_folds_up_is_given_up_early(small_bench, bad_cell, monkeyp
     What stood before stands again after that."""
     objective = objective_of(small_bench, bad_cell)
     free = objective.space.pack(Values(TRUTH, 0.36, 900.0))
-    before, solve, asked = objective.evaluate(free), quasi_static.solve_static, []
+    before, solve, asked = objective.evaluate(free), solved_pull.solve_static, []
 
     def folding(*arguments, **named):
         asked.append(1)
         return replace(solve(*arguments, **named), iterations=iterations)
 
     with monkeypatch.context() as patch:
-        patch.setattr(quasi_static, "solve_static", folding)
+        patch.setattr(solved_pull, "solve_static", folding)
         assert objective.evaluate(free - [0.4, 0.0, 0.8, 0.0]) is None
     assert len(asked) <= most
     assert objective.evaluate(free).objective == pytest.approx(before.objective, rel=0.05)

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import Bench, measured
-from limber.estimation.online.filter import FRAME_ITERATIONS, OnlineEstimator, OnlineFrame
-from limber.estimation.online.full_model import FullBranch, Here
+from limber.estimation.online.filter import (
+    FRAME_ITERATIONS,
+    FullBranch,
+    Here,
+    OnlineEstimator,
+    OnlineFrame,
+)
 from limber.estimation.settings import FitSpec
 from limber.recordings.synchronisation import frames_of
 from limber.reduced.model_cache import build_reduced

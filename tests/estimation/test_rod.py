@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.core.errors import InputError
-from limber.estimation.forward.gripper_path import MotionWanted
+from limber.estimation.forward.observed_path import MotionWanted
 from limber.estimation.rod import Rod
 from limber.estimation.settings import PullSpec
 from limber.estimation.simulated_pull import simulate_pull

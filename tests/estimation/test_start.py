@@ -12,7 +12,7 @@ from limber.core.progress import Progress
 from limber.estimation.fitting.initial_modulus import scaled_start
 from limber.estimation.fitting.objective import Evaluation, EvaluationLog, Objective
 from limber.estimation.fitting.optimise import LONGEST_STEP, gauss_newton
-from limber.estimation.forward.gripper_path import force_for_travel
+from limber.estimation.forward.observed_path import force_for_travel
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.mechanics.grasp import Grasp

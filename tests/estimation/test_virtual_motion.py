@@ -9,7 +9,7 @@ from benchmarks.paper_branches import Bench
 from limber.core.errors import InputError
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import gauss_newton
-from limber.estimation.forward.dynamic_pull import DynamicForward
+from limber.estimation.forward.solved_pull import DynamicForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import PullSpec, TrueBranch, simulate_pull

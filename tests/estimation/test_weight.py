@@ -11,7 +11,7 @@ from limber.estimation.estimated_branch import forwards_of, subject_of
 from limber.estimation.fit import fit_branch, fit_pulls
 from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.forward.observed_path import ObservedPathForward
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace
 from limber.estimation.settings import FitSpec, PullSpec
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull

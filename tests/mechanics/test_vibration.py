@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.mechanics.dynamics.modes import lowest_modes
+from limber.mechanics.dynamics.motion import lowest_modes
 from limber.mechanics.model import BranchModel
 
 

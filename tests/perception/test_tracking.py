@@ -6,8 +6,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from limber.geometry.cloud.camera import SeenCloud, depth_to_cloud
-from limber.perception.curve import RestCurve
-from limber.perception.tracking import Anchor, CurveTracker, rest_offset
+from limber.perception.observe import Anchor, CurveTracker, RestCurve, rest_offset
 from limber.recordings.image_folders import segment_by_depth
 
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)

@@ -7,10 +7,9 @@ import pytest
 
 from limber.core.errors import Cancelled, NoPathError
 from limber.core.progress import Progress
-from limber.planning.baseline_and_plan import plan_pair, with_bound
+from limber.planning.baseline_and_plan import plan_detour, plan_pair, with_bound
 from limber.planning.certificate import lower_bound
-from limber.planning.certificate.grid import about_goal, first_grid, refined
-from limber.planning.certificate.lower_bound import certify
+from limber.planning.certificate.lower_bound import about_goal, certify, first_grid, refined
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import CostWeights, arc_lengths, path_cost, resample
 from limber.planning.field.energy_field import knowing
@@ -19,7 +18,6 @@ from limber.planning.goals.goal import Ball
 from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
 from limber.planning.path_problem import GentleProblem
 from limber.planning.planners import refine as refine_module
-from limber.planning.planners.detour import plan_detour
 from limber.planning.planners.refine import (
     Limited,
     plan_gentle,

@@ -11,7 +11,7 @@ from limber.core.progress import Progress
 from limber.planning.constraints.damage import DamageAlong, Strength, assumed, read_break_tests
 from limber.planning.constraints.limits import Limits
 from limber.planning.settings import PlanSpec
-from limber.results.report.damage_figure import damage_along_branch
+from limber.results.report.figures import damage_along_branch
 from limber.stages.paths.plan import Plan
 from limber.stages.paths.plan_strength import (
     default_limit,

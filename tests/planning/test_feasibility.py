@@ -15,7 +15,7 @@ from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.stored_states import GraspSamples
 from limber.planning.goals.goal_kinds import GraspGoal, default_goal
-from limber.planning.passages import solved_if_undecided
+from limber.planning.make_plan import solved_if_undecided
 from limber.planning.path_problem import BlockedError, GentleProblem
 from limber.planning.planners.least_violation import easiest_path
 from limber.planning.planners.refine import plan_gentle, refine

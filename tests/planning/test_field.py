@@ -7,10 +7,9 @@ import pytest
 from tests.planning.conftest import small_grasp_model
 
 from limber.core.errors import InputError, WorkError
-from limber.planning.field import fit_choice
+from limber.planning.field import energy_field
 from limber.planning.field.chart import Chart
-from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.field.fit_choice import error_measures
+from limber.planning.field.energy_field import EnergyField, error_measures, fit_field
 from limber.planning.field.radial import RadialInterpolant
 from limber.planning.field.sampling import energy_inputs
 from limber.planning.field.valid_region import TrustRegion
@@ -57,7 +56,7 @@ def test_a_fit_is_chosen_for_most_poses_and_not_for_the_stiffest(ridge, monkeypa
         return error_measures(some, (1.0 + off) * some.energies,
                               (1.0 + off[:, None]) * some.forces), np.zeros((len(some.poses), 4))
 
-    monkeypatch.setattr(fit_choice, "cross_validated_errors", left_out)
+    monkeypatch.setattr(energy_field, "cross_validated_errors", left_out)
     assert fit_field(samples).energy_fit.kernel == "quintic"
 
 

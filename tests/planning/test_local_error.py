@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.planning import passages
+from limber.planning import make_plan
 from limber.planning.certificate.feasibility import judge
 from limber.planning.constraints.limits import Limits
 from limber.planning.cost import STEP, CostWeights, EdgeWeights
@@ -13,7 +13,7 @@ from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.field.radial import LocalError, slack_slopes, slacks_at
 from limber.planning.goals.goal import Ball, allowed_points
 from limber.planning.goals.goal_kinds import GraspGoal, TargetGoal
-from limber.planning.passages import checked_wall, confirmed, not_confirmed
+from limber.planning.make_plan import checked_wall, confirmed, not_confirmed
 from limber.planning.path_problem import BlockedError, GentleProblem
 from limber.planning.plan_file import read_plan
 from limber.planning.planners.least_violation import LeastViolation
@@ -121,7 +121,7 @@ def test_a_wall_is_confirmed_by_the_full_model_or_refuted(apart, small_model, mo
     """States over the limit confirm a proof; states that keep it, or that the field was farther
     above than its error, refute it and are learnt."""
     field, places, forces = apart
-    monkeypatch.setattr(passages, "_STATES", 2)
+    monkeypatch.setattr(make_plan, "_STATES", 2)
     none = BlockedError("No path exists.", "Proven on a grid.", "").behind(places)
     low, high = Limits(force=0.3 * forces.min()), Limits(force=3.0 * forces.max())
     monkeypatch.setattr(Limits, "errors", lambda self, known: {})
@@ -137,7 +137,7 @@ def test_a_wall_is_confirmed_by_the_full_model_or_refuted(apart, small_model, mo
     monkeypatch.setattr(Limits, "errors", lambda self, known: {"force": wrong})
     assert checked_wall(field, small_model, low, none, AT_REST).learnt is not None
     assert checked_wall(field, small_model, low, BlockedError("No."), AT_REST).bears_out
-    monkeypatch.setattr(passages, "solve_branch", lambda *_, **__: ([None], []))
+    monkeypatch.setattr(make_plan, "solve_branch", lambda *_, **__: ([None], []))
     unsolved = checked_wall(field, small_model, low, none, AT_REST)
     assert not unsolved.bears_out and unsolved.learnt is None
 
@@ -146,7 +146,7 @@ def test_a_target_out_of_reach_is_confirmed_by_the_full_model(apart, small_model
     """States near the goal confirm that the target stays outside it; one in it, or nearer than the
     field's error allows, refutes that. A state over a limit refutes nothing."""
     field, places, forces = apart
-    monkeypatch.setattr(passages, "_STATES", 2)
+    monkeypatch.setattr(make_plan, "_STATES", 2)
     none = BlockedError("No path exists.", "Proven on a grid.", "").behind(
         np.empty((0, 3)), places[:1])
     tip = field.tip(places[:1])[0]

@@ -11,8 +11,8 @@ from limber.core.errors import InputError, NoPathError
 from limber.planning.constraints.limits import Limits
 from limber.planning.path_on_full_model import resolve_path
 from limber.robot.motion.execution import Turned
-from limber.stages.paths import plan_turning
-from limber.stages.paths.plan_turning import Clamped, turned_by
+from limber.stages.paths import plan_cell
+from limber.stages.paths.plan_cell import Clamped, turned_by
 
 
 @pytest.fixture(scope="module")
@@ -42,14 +42,14 @@ def test_the_torque_is_second_order_in_the_offset(clamped):
 
 def test_an_offset_never_needs_the_torque_at_which_the_guard_stops(clamped, monkeypatch):
     """Where no limit of torque is given either."""
-    monkeypatch.setattr(plan_turning.Clamped, "of", lambda *_: clamped)
+    monkeypatch.setattr(plan_cell.Clamped, "of", lambda *_: clamped)
     allowed = []
 
     def motion(_cell, _predicted, _axis, cost, _slack, most, **_asked):
         allowed.append(most)
         none = np.zeros((len(cost.along), 3))
         return Turned(None, none, none[:, 0], none[:, 0])
-    monkeypatch.setattr(plan_turning, "turned_motion", motion)
+    monkeypatch.setattr(plan_cell, "turned_motion", motion)
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.6, 0, 0, 0, 0, 0)},
                 limits={"hard_torque_nm": 2.0})
     states = SimpleNamespace(poses=np.repeat(clamped.poses, 2, axis=0))

@@ -7,9 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError
-from limber.recordings.import_request import BranchFrame, require_on_branch
+from limber.recordings.import_request import BranchFrame, register, require_on_branch
 from limber.recordings.recording import GraspEntry, Observations
-from limber.recordings.registration import register
 from limber.recordings.synchronisation import estimate_offset, frames_of
 
 

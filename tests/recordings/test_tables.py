@@ -8,10 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.foreign_files import CAPTURES, COUNT, M1, M2
 from limber.core.errors import InputError
-from limber.recordings.robot_tables import is_robot_table, robot_stream
 from limber.recordings.tables import (
+    is_robot_table,
     marker_stream,
     read_table,
+    robot_stream,
     same_label,
     split_title,
     time_stream,

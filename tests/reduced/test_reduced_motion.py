@@ -9,8 +9,7 @@ from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel, Grasp, RayleighDamping, solve_static
 from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
 from limber.reduced.model_cache import build_reduced
-from limber.reduced.reduced_dynamics import ReducedStepper
-from limber.reduced.reduced_model import ReducedSettings
+from limber.reduced.reduced_model import ReducedSettings, ReducedStepper
 from limber.reduced.refresh import RefreshingModel, estimate_error
 from limber.reduced.training import Snapshots, TrainingSettings
 

@@ -18,7 +18,7 @@ from limber.results.findings import (
     remarks_on,
 )
 from limber.results.report import estimate_figures, plan_figures
-from limber.results.report.charts import two_views
+from limber.results.report.section import two_views
 from limber.stages.paths.plan import Plan
 from limber.store import Branch
 

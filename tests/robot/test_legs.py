@@ -9,7 +9,7 @@ from limber.core.progress import Progress
 from limber.planning.plan_file import PlanPath
 from limber.robot.motion.execution import described, legs_of, robot_motion
 from limber.robot.motion.trajectory import Predicted
-from limber.stages.paths.plan_legs import legs_in_cell, legs_without_cell
+from limber.stages.paths.plan_cell import legs_in_cell, legs_without_cell
 
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},
             tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "grip_seconds": 0.5},

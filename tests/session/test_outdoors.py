@@ -16,9 +16,9 @@ from limber.mechanics.added_masses import PointMass
 from limber.mechanics.loads.load_effects import load_effects
 from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
 from limber.session import protocol
-from limber.session.outdoor_effects import EffectsTeller, effects_of, gusts_of
 from limber.session.protocol import SessionSettings
 from limber.session.session_branch import HeldBranch, load_held
+from limber.session.worker import EffectsTeller, effects_of, gusts_of
 from limber.stages.motion.load import ApplyLoads
 from limber.store import Branch
 from limber.store.loading import load_branch, load_skeleton

@@ -107,7 +107,7 @@ def test_gusts_that_make_no_sense(tmp_path, content, settings, told):
 @pytest.mark.usefixtures("unpainted")
 def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     """Its table and picture on the page, its frames in the scene; a damaged file is named."""
-    from limber.results.scene.contents import scene_data
+    from limber.results.scene.animation import scene_data
 
     folder = Path(shutil.copytree(EXAMPLE, tmp_path / "a.branch"))
     gale = ApplyLoads(branch_folder=folder, wind=(6.0, 0.0, 0.0), gust=0.2, name="gale")

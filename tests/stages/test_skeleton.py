@@ -24,7 +24,7 @@ from limber.geometry.io.skeletons import read_skeleton, read_swc
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.search_result import FoundSkeleton, result_of_skeleton
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.results.scene.contents import scene_data
+from limber.results.scene.animation import scene_data
 from limber.results.scene.still_objects import EDITED
 from limber.stages.shape.edit_skeleton import ReviewSkeleton
 from limber.stages.shape.reconstruct import Reconstruct, load_search

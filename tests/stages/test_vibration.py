@@ -9,7 +9,7 @@ import pytest
 
 from limber.cli.main import call
 from limber.core.errors import InputError
-from limber.mechanics.dynamics.modes import lowest_modes
+from limber.mechanics.dynamics.motion import lowest_modes
 from limber.stages.moduli.vibration import FitVibration
 from limber.stages.registry import result_of
 from limber.store import Branch

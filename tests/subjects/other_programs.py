@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.mechanics.dynamics.modes import lowest_modes
+from limber.mechanics.dynamics.motion import lowest_modes
 from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
 from limber.mechanics.statics.solve import solve_static
 from limber.results.exports.rigid_links import matched, mjcf_text, rod_tree

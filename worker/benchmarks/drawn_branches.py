@@ -23,7 +23,7 @@ from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit import fit_branch
 from limber.estimation.fit_assessment import Estimate, judge_model, require_result
 from limber.estimation.fitting.objective import EvaluationLog, Objective
-from limber.estimation.forward.gripper_path import MotionWanted, moved
+from limber.estimation.forward.observed_path import MotionWanted, moved
 from limber.estimation.next_pull import Cell, Known, PullChoice, suggest
 from limber.estimation.parameters import Values, open_field
 from limber.estimation.settings import FitSpec

@@ -21,9 +21,8 @@ from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit_assessment import Estimate
 from limber.estimation.fitting.initial_modulus import scaled_start
 from limber.estimation.fitting.optimise import gauss_newton, nelder_mead
-from limber.estimation.online.filter import OnlineFrame
+from limber.estimation.online.filter import Beside, OnlineFrame
 from limber.estimation.online.follow import begin
-from limber.estimation.online.full_model import Beside
 from limber.estimation.parameters import Values
 from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import PullSpec, simulate_pull, write_depth_frames
@@ -32,7 +31,7 @@ from limber.geometry.generated import generate_branch
 from limber.geometry.reconstruction import mesh_skeleton
 from limber.geometry.settings import DENSITY_SIGMA, ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.mechanics.dynamics.modes import Modes, lowest_modes
+from limber.mechanics.dynamics.motion import Modes, lowest_modes
 from limber.mechanics.model import BranchModel
 from limber.recordings.recording import Pull
 from limber.recordings.synchronisation import frames_of

@@ -21,8 +21,13 @@ from limber.mechanics import BranchModel, Grasp, young_weights
 from limber.mechanics.dynamics.drive import unwrapped
 from limber.mechanics.dynamics.integration import NewmarkSettings
 from limber.reduced.model_cache import ReducedCache, model_key, reduce_snapshots
-from limber.reduced.reduced_dynamics import ReducedMotionState, ReducedStepper
-from limber.reduced.reduced_model import ReducedModel, ReducedSettings, ReducedState
+from limber.reduced.reduced_model import (
+    ReducedModel,
+    ReducedMotionState,
+    ReducedSettings,
+    ReducedState,
+    ReducedStepper,
+)
 from limber.reduced.refresh import estimate_error
 from limber.reduced.training import Snapshots, Trainer, TrainingSettings, sample_poses
 from limber.session.client import InteractiveSession

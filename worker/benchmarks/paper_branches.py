@@ -9,7 +9,7 @@ from limber.core.progress import Progress
 from limber.estimation.fit import fit_pulls
 from limber.estimation.fit_assessment import Estimate
 from limber.estimation.fitting.objective import Objective
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import PullSpec, TrueBranch, simulate_pull

@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.table import Asked, Part, Row, Setting
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.generated import generate_branch
-from limber.results.scene.contents import scene_data
+from limber.results.scene.animation import scene_data
 from limber.store import Branch
 
 _SCREEN = (1280, 800)

@@ -20,7 +20,7 @@ import psutil
 
 from benchmarks.table import Asked, Row, Setting
 from benchmarks.worker_branch_files import TEMPLATE
-from limber.batch.machines import run_task
+from limber.batch.run import run_task
 from limber.core.processes import Pool
 from limber.stages.motion.load import ApplyLoads
 from limber.stages.shape.generate import Generate

@@ -77,7 +77,7 @@ def _in_folder(name: str, act: Callable[[Branch], Any], template: Path, path: Pa
 
 
 def _shown(branch: Branch) -> Any:
-    from limber.results.scene.contents import scene_data
+    from limber.results.scene.animation import scene_data
     from limber.store.loading import load_targets
 
     data = scene_data(branch, targets=load_targets(branch))
@@ -198,7 +198,7 @@ def _load(branch: Branch) -> Any:
 
 
 def _swing(branch: Branch) -> Any:
-    from limber.results.report.swing_section import along_path
+    from limber.results.report.figures import along_path
     from limber.stages.moduli.swing import Swing
 
     swing = Swing.read(branch, "swing", _SWING)

@@ -175,7 +175,7 @@ def _nominal(_template: Path, folder: Path) -> list[Path]:
 
 
 def _read_nominal(_template: Path, path: Path) -> Any:
-    from limber.recordings.registration import read_nominal
+    from limber.recordings.import_request import read_nominal
 
     return read_nominal(path)
 
@@ -325,7 +325,7 @@ def _addon_read(module: str, function: str, _template: Path, path: Path) -> Any:
 
 
 def _scene_file(template: Path, folder: Path) -> list[Path]:
-    from limber.results.scene.contents import scene_data
+    from limber.results.scene.animation import scene_data
 
     path = folder / "scene.npz"
     scene_data(Branch.open(template)).write(path)
@@ -360,8 +360,7 @@ def _rtde(_template: Path, folder: Path) -> list[Path]:
 
 def _log(_template: Path, path: Path) -> Any:
     """A robot's log, up to the pull made from it."""
-    from limber.recordings.robot_tables import is_robot_table, robot_stream
-    from limber.recordings.tables import read_table, split_title
+    from limber.recordings.tables import is_robot_table, read_table, robot_stream, split_title
 
     return is_robot_table([split_title(title) for title in read_table(path).titles]), robot_stream(
         path)

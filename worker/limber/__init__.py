@@ -10,7 +10,7 @@ From a scan to a gentle path::
     branch.energy_field()
     branch.plan(max_force=3.0).plot()
 
-:mod:`limber.api.verbs` says what all verbs share. ``limber.settings("plan")`` lists what a verb
+:mod:`limber.api.branch` says what all verbs share. ``limber.settings("plan")`` lists what a verb
 takes. The command ``limber`` does the same in a terminal, and the Blender add-on (folder
 ``addon``) on screen. Nothing in this package imports ``bpy``.
 """
@@ -23,12 +23,12 @@ from limber.version import VERSION as __version__
 
 if TYPE_CHECKING:
     from limber.api.branch import Branch as Branch
-    from limber.api.settings_table import settings as settings
-    from limber.api.verbs import generate as generate
-    from limber.api.verbs import mesh as mesh
-    from limber.api.verbs import open as open
-    from limber.api.verbs import reconstruct as reconstruct
-    from limber.api.verbs import run as run
+    from limber.api.branch import generate as generate
+    from limber.api.branch import mesh as mesh
+    from limber.api.branch import open as open
+    from limber.api.branch import reconstruct as reconstruct
+    from limber.api.branch import run as run
+    from limber.api.branch import settings as settings
     from limber.stages.moduli.estimate import Estimate as Estimate
     from limber.stages.motion.load import Load as Load
     from limber.stages.motion.simulate import Simulation as Simulation
@@ -55,12 +55,12 @@ _PLACES = {
     "Result": "stages.result",
     "Simulation": "stages.motion.simulate",
     "Written": "stages.result",
-    "generate": "api.verbs",
-    "mesh": "api.verbs",
-    "open": "api.verbs",
-    "reconstruct": "api.verbs",
-    "run": "api.verbs",
-    "settings": "api.settings_table",
+    "generate": "api.branch",
+    "mesh": "api.branch",
+    "open": "api.branch",
+    "reconstruct": "api.branch",
+    "run": "api.branch",
+    "settings": "api.branch",
 }
 
 __getattr__, __dir__ = _exports(__name__, _PLACES)

@@ -20,7 +20,7 @@ from limber.results.report.report_tables import (
     modulus_rows,
     true_moduli,
 )
-from limber.results.scene.graphs import young_graph
+from limber.results.scene.animation import young_graph
 from limber.stages.paths.plan import Plan
 from limber.stages.registry import result_of
 from limber.stages.results.report import WriteReport, page_of

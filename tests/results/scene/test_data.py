@@ -14,9 +14,8 @@ from limber.core.errors import BranchFolderError, InputError
 from limber.geometry.tets.tree_sweep import straight_beam
 from limber.results.motion_files import node_average
 from limber.results.report import plan_figures
+from limber.results.scene.animation import FIRST, SECOND, scene_data
 from limber.results.scene.colours import linear_of
-from limber.results.scene.contents import scene_data
-from limber.results.scene.graphs import FIRST, SECOND
 from limber.store import Branch
 
 

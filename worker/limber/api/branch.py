@@ -1,19 +1,36 @@
-"""A branch folder and its operations, as a Python object."""
+"""A branch folder and its operations, as a Python object.
 
+All verbs work alike. Required arguments come first, without names; all others are the inputs,
+settings and options of its command by name (``--mesh-spacing 4`` is ``mesh_spacing=4``), which
+:func:`limber.settings` lists. ``quiet=True`` shows no progress. A verb runs its stage in this
+process, writes the same files as the command, and returns a frozen result. Unchanged results are
+not computed again. Errors are those of :mod:`limber.core.errors`; warnings are Python warnings.
+"""
+
+import contextlib
 import html
 import os
-from collections.abc import Mapping
+import sys
+import tempfile
+import threading
+import types
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
-from limber.api.by_name import ByName
-from limber.api.running import in_python_words, run_stage, stage_of
-from limber.api.settings_table import known_stage
+import numpy as np
+
 from limber.cli.known import command_class
-from limber.core.errors import InputError
+from limber.core.errors import Command, InputError, LimberError, Option, Text
+from limber.core.json_values import plain
+from limber.core.progress import BarSink, LineSink, Progress, Sink
 from limber.core.settings import checked_settings, nearest
 from limber.stages.registry import result_of
 from limber.stages.result import Result, Written, drawn
+from limber.stages.stage import Stage
 from limber.store import Branch as Folder
 
 if TYPE_CHECKING:
@@ -30,6 +47,139 @@ if TYPE_CHECKING:
     from limber.stages.paths.execute import Execution
     from limber.stages.paths.plan import Plan
     from limber.stages.pulls.import_pull import Pull
+    from limber.stages.shape.generate import Generated
+
+# Running a stage for a Python user: progress, warnings, and messages with Python names.
+
+_STAGES = {"add_pull": "import-pull", "energy_field": "energy"}
+_lock = threading.Lock()
+_hidden: list[types.ModuleType] = []
+"""The user's script, once for each stage that runs."""
+
+
+def stage_of(verb: str) -> str:
+    """Return the name of the command that a verb of the Python interface runs."""
+    return _STAGES.get(verb, verb.replace("_", "-"))
+
+
+def run_stage(name: str, arguments: Mapping[str, Any], *, quiet: bool) -> tuple[str,
+                                                                                dict[str, Any]]:
+    """Run a stage in this process.
+
+    Args:
+        name: Name of the stage.
+        arguments: Its inputs, settings and options by name; arrays are accepted for lists.
+        quiet: Show no progress.
+
+    Returns:
+        The name of its entry in the branch's manifest, empty if it makes none; and the output of
+        its command with ``--json``, from ``warnings`` on.
+
+    Raises:
+        InputError: a name is not known, or a value is refused. LimberError: as for the stage.
+    """
+    caught: list[Text] = []
+    try:
+        with in_python_words(), script_run_once(), _sink(name, quiet) as sink:
+            stage = _checked(name, arguments)
+            result = stage.run(Progress(sink, caught.append))
+    finally:
+        for text in caught:
+            warnings.warn(text.shown(_in_python), stacklevel=_users_level())
+    return stage.entry, {"warnings": caught} | plain(result)
+
+
+def _checked(name: str, arguments: Mapping[str, Any]) -> Stage:
+    try:
+        return command_class(name).checked(
+            {key: plain(value) if isinstance(value, np.ndarray | np.generic | list | tuple)
+             else value for key, value in arguments.items()})
+    except InputError as error:
+        error.fix = Text(f"limber.settings({name!r}) lists what it takes.")
+        raise
+
+
+def _users_level() -> int:
+    """Number of calls between the function that asks and the line that called a verb."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and frame.f_globals["__name__"].startswith("limber."):
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+@contextlib.contextmanager
+def script_run_once() -> Iterator[None]:
+    """Keep the processes that a stage starts from importing the user's script: that would run it
+    again, and they do not need it."""
+    with _lock:
+        _hidden.append(_hidden[0] if _hidden else sys.modules["__main__"])
+        sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        with _lock:
+            script = _hidden.pop()
+            if not _hidden:
+                sys.modules["__main__"] = script
+
+
+@contextlib.contextmanager
+def _sink(title: str, quiet: bool) -> Iterator[Sink | None]:
+    """The progress display: a bar in a terminal, a line in a notebook, none elsewhere."""
+    if quiet:
+        yield None
+    elif "ipykernel" in sys.modules:
+        with LineSink(title) as line:
+            yield line
+    elif sys.stderr.isatty():
+        with BarSink(title) as bar:
+            yield bar
+    else:
+        yield None
+
+
+@contextlib.contextmanager
+def in_python_words() -> Iterator[None]:
+    """Make error messages name keyword arguments instead of options."""
+    try:
+        yield
+    except LimberError as error:
+        error.seen, error.why, error.fix = (
+            Text(text.shown(_in_python)) for text in (error.seen, error.why, error.fix))
+        raise
+
+
+def _in_python(part: Option | Command) -> str:
+    if isinstance(part, Command):
+        return str(part)
+    return part.name if part.value is None else f"{part.name}={part.value!r}"
+
+
+# Entries of a branch folder by name.
+
+Value = TypeVar("Value")
+
+
+class ByName(Mapping[str, Value], Generic[Value]):
+    """Entries of a branch folder by name; each is read on request."""
+
+    def __init__(self, names: list[str], read: Callable[[str], Value]):
+        self._names, self._read = tuple(names), read
+
+    def __getitem__(self, name: str) -> Value:
+        if name not in self._names:
+            raise KeyError(f"{name!r} does not exist; known: {', '.join(self._names) or 'none'}")
+        return self._read(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __repr__(self) -> str:
+        return f"<{', '.join(self._names) or 'none'}>"
+
 
 PathLike = str | os.PathLike[str]
 
@@ -416,3 +566,208 @@ class Branch:
         if settings.get("follow") or not key:
             return (command_class(name).about.result or Result).read(None, name, values)
         return result_of(self._read(), key, values)
+
+
+# The settings of a verb: their defaults and meanings.
+
+def settings(verb: str) -> "SettingsTable":
+    """Return the settings of a verb, or of a command, with their defaults and meanings.
+
+    Raises:
+        InputError: there is no such verb.
+
+    >>> limber.settings("plan")["max_force"]
+    Setting(meaning='Largest force of the gripper at any pose [N].', default=None)
+    """
+    from limber.cli.known import command_class
+
+    stage = command_class(known_stage(verb))
+    return SettingsTable(verb, {
+        name: Setting(field.description or "",
+                      "required" if field.is_required() else field.default)
+        for name in stage.names() if name != "branch_folder"
+        for field in [stage.model_fields[name]]})
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting of a verb.
+
+    Attributes:
+        meaning: With its unit in square brackets.
+        default: Or ``required``.
+    """
+
+    meaning: str
+    default: Any
+
+
+class SettingsTable(Mapping[str, Setting]):
+    """The settings of a verb by name; it prints as a list, and as a table in a notebook."""
+
+    def __init__(self, verb: str, content: Mapping[str, Setting]):
+        self._verb, self._content = verb, MappingProxyType({**content})
+
+    def __getitem__(self, name: str) -> Setting:
+        return self._content[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._content)
+
+    def __len__(self) -> int:
+        return len(self._content)
+
+    def __repr__(self) -> str:
+        return "\n".join([f"Settings of {self._verb}:", *(
+            f"  {name} = {one.default!r}: {one.meaning}" for name, one in self.items())])
+
+    def _repr_html_(self) -> str:
+        rows = "".join(f"<tr><td><code>{name}</code></td><td>{html.escape(repr(one.default))}</td>"
+                       f"<td>{html.escape(one.meaning)}</td></tr>" for name, one in self.items())
+        return (f"<table><caption>{html.escape(self._verb)}</caption>"
+                f"<tr><th>setting</th><th>default</th><th>meaning</th></tr>{rows}</table>")
+
+
+def known_stage(verb: str) -> str:
+    """Return the name of a verb's command.
+
+    Raises:
+        InputError: there is none.
+    """
+    from limber.cli.known import command_names
+
+    name, known = stage_of(verb), command_names()
+    if name not in known:
+        raise InputError(f"There is no stage {verb!r}.", nearest(name, known))
+    return name
+
+
+# The verbs of the Python interface: a branch and its operations.
+
+def generate(folder: PathLike, *, quiet: bool = False, **settings: Any) -> "Generated":
+    """Make a branch with known truth, and scan it as a scanner would.
+
+    Args:
+        folder: Folder for the scan and its truth.
+        quiet: Show no progress.
+        settings: ``length`` [m], ``fork_count``, ``noise`` [m], ``seed`` and those that
+            ``limber.settings("generate")`` lists.
+
+    >>> scan = limber.generate("scan", length=0.3, fork_count=0, seed=1)
+    >>> scan.cloud.name, scan.young.shape
+    ('cloud.ply', (4,))
+    """
+    from limber.stages.shape.generate import Generated
+
+    _, values = run_stage("generate", {**settings, "folder": folder}, quiet=quiet)
+    return Generated.read(None, "generate", values)
+
+
+def reconstruct(cloud: "PathLike | np.ndarray | Mapping[str, Any]", folder: PathLike, *,
+                quiet: bool = False, **settings: Any) -> "Branch":
+    """Make a branch folder from a scan: skeleton, surface and tetrahedra.
+
+    Args:
+        cloud: A point cloud's file; or points, shape [n, 3]; or columns ``x``, ``y``, ``z`` and
+            others by name, as a structured array or a table of pandas has them. Numbers are in
+            ``unit``.
+        folder: The branch folder to make or replace.
+        quiet: Show no progress.
+        settings: ``unit`` ("m", "cm", "mm", "in", "um"), ``root`` [3], ``mesh_spacing`` in radii,
+            ``young`` [Pa], ``skeleton`` (a file of your own) and those that
+            ``limber.settings("reconstruct")`` lists.
+
+    Raises:
+        InputError: the scan or a setting cannot be used. WorkError: no branch was found.
+
+    >>> branch = limber.reconstruct("scan/cloud.ply", "new.branch", mesh_spacing=4)
+    >>> branch.mesh.cell_data["young"].max() / 1e6
+    100.0
+    """
+    if isinstance(cloud, str | os.PathLike):
+        if Path(cloud).is_dir():
+            raise InputError(f"{cloud} is a folder.", "One scan becomes one branch.",
+                             "Call limber.reconstruct for each of its files.")
+        return _made("reconstruct", folder, quiet, {**settings, "cloud": cloud})
+    with tempfile.TemporaryDirectory(prefix="limber-cloud-") as temporary:
+        path = Path(temporary) / "array.ply"
+        _write_cloud(cloud, path)
+        return _made("reconstruct", folder, quiet, {**settings, "cloud": path})
+
+
+def mesh(surface: PathLike, folder: PathLike, *, quiet: bool = False, **settings: Any) -> "Branch":
+    """Make a branch folder from a closed surface, a table of sections or a cylinder model.
+
+    Args:
+        surface: The file: STL, PLY, OBJ, a CSV of sections, or a cylinder model.
+        folder: The branch folder to make or replace.
+        quiet: Show no progress.
+        settings: ``unit``, ``root`` [3], ``young`` [Pa] and those that
+            ``limber.settings("mesh")`` lists.
+
+    Raises:
+        InputError: the surface or a setting cannot be used. MeshingError: meshing failed.
+
+    >>> sections = ["x_mm,y_mm,z_mm,width_mm,height_mm", "0,0,0,10,10", "0,0,200,10,10"]
+    >>> _ = Path("beam.csv").write_text("\\n".join(sections))
+    >>> limber.mesh("beam.csv", "beam.branch").mesh.nodes[:, 2].max().round(3)
+    0.2
+    """
+    return _made("mesh", folder, quiet, {**settings, "surface": surface})
+
+
+def open(folder: PathLike) -> "Branch":
+    """Return the branch of a folder that :func:`limber.reconstruct` or a command has made.
+
+    Raises:
+        BranchFolderError: there is no such folder, or it is damaged or of a newer format.
+
+    >>> limber.open("a.branch").mesh.is_quadratic
+    True
+    """
+    return Branch(folder)
+
+
+def run(command: str, *, quiet: bool = False, **settings: Any) -> Result:
+    """Run a command that has no verb, such as ``robot draw``, ``robot check`` or ``doctor``.
+
+    Args:
+        command: Its name.
+        quiet: Show no progress.
+        settings: Its inputs, settings and options, as ``limber.settings(command)`` lists them.
+
+    Raises:
+        InputError: there is no such command, or a setting is refused.
+
+    >>> limber.run("verify", branch_folder="a.branch").values["file_count"] > 5
+    True
+    """
+    return Result.read(None, command, run_stage(known_stage(command), settings, quiet=quiet)[1])
+
+
+def _made(stage: str, folder: PathLike, quiet: bool, arguments: dict[str, Any]) -> Branch:
+    run_stage(stage, {**arguments, "output": folder}, quiet=quiet)
+    return Branch(folder)
+
+
+def _write_cloud(cloud: "np.ndarray | Mapping[str, Any]", path: Path) -> None:
+    """Write points or columns as a PLY file.
+
+    Raises:
+        InputError: they are not points.
+    """
+    from limber.geometry.cloud.cloud import Cloud
+
+    names = getattr(getattr(cloud, "dtype", None), "names", None) or (
+        list(cloud) if hasattr(cloud, "keys") else None)
+    if names is None:
+        points = np.asarray(cloud)
+        if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+            raise InputError(f"The cloud is an array of shape {points.shape} and type "
+                             f"{points.dtype}.",
+                             "Points have shape [n, 3].",
+                             "Give other columns by name: {\"x\": ..., \"red\": ...}.")
+        columns = dict(zip("xyz", points.T, strict=True))
+    else:
+        columns = {str(name): np.asarray(cloud[name]) for name in names}
+    Cloud.from_columns(columns).write_ply(path)

@@ -10,7 +10,7 @@ from limber.core.errors import Command, InputError, Option
 from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.forward_model import Forward, PointDirections, under_its_weight
 from limber.estimation.forward.observed_path import ObservedPathForward
-from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
+from limber.estimation.forward.solved_pull import QuasiStaticForward, uses_torque
 from limber.estimation.parameters import ParameterSpace, Values, YoungField, open_field
 from limber.estimation.settings import FitSpec
 from limber.geometry.skeleton.skeleton import Skeleton, control_points
@@ -208,7 +208,7 @@ def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subj
                          "Use ", Command("swing", Option("pull", name)), ", or name other pulls "
                          "with ", Option("pull"), ".")
     if entry.motion == "dynamic":
-        from limber.estimation.forward.dynamic_pull import DynamicForward
+        from limber.estimation.forward.solved_pull import DynamicForward
 
         return DynamicForward(name, subject.model, subject.weights, entry, frames, rest,
                               field=subject.field)

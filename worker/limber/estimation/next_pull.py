@@ -20,7 +20,7 @@ from limber.core.processes import run_tasks
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, forwards_of, parameter_space
 from limber.estimation.fitting.objective import Objective
-from limber.estimation.forward.gripper_path import MotionWanted, moved
+from limber.estimation.forward.observed_path import MotionWanted, moved
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.mechanics.model import BranchModel

@@ -9,7 +9,7 @@ from limber.core.errors import InputError, Option, WorkError
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import PredictSettings
 from limber.recordings.recording import PullEntry

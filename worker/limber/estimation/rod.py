@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from limber.core.errors import Option, WorkError
 from limber.core.progress import SILENT, Progress
-from limber.estimation.forward.gripper_path import TURNED_PART, MotionWanted, sideways_forces
+from limber.estimation.forward.observed_path import TURNED_PART, MotionWanted, sideways_forces
 from limber.geometry.skeleton.skeleton import Skeleton
 
 STATIONS = 400

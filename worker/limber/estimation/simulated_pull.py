@@ -18,7 +18,7 @@ from limber.core.errors import InputError, Option, Text, WorkError
 from limber.core.not_none import present
 from limber.core.numerics.rigid import composed, rotated
 from limber.core.progress import SILENT, Progress
-from limber.estimation.forward.gripper_path import MotionMade, MotionWanted, moved
+from limber.estimation.forward.observed_path import MotionMade, MotionWanted, moved
 from limber.estimation.rod import Rod, RodMotion
 from limber.estimation.settings import PullSpec
 from limber.estimation.uncertainty.model_error import refined

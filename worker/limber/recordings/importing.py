@@ -57,15 +57,16 @@ from limber.recordings.recording_formats import (
     RecordingFormat,
     recording_format,
 )
-from limber.recordings.robot_tables import is_robot_table, robot_stream
 from limber.recordings.sensor_checks import clean
 from limber.recordings.synchronisation import DETERMINED_S, estimate_offset
 from limber.recordings.tables import (
     LENGTH_UNITS_M,
     Title,
+    is_robot_table,
     marker_stream,
     marker_tracks,
     read_table,
+    robot_stream,
     split_title,
 )
 from limber.recordings.time_series import MAD_TO_SIGMA, Stream

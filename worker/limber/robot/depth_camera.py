@@ -209,7 +209,7 @@ def look(cell: Cell, branch: np.ndarray, progress: Progress) -> LiveView | None:
 
 # Depth images of a pull while it is recorded: what they show of the branch, on the robot's clock.
 #
-# The tracker that finds the control points (:mod:`limber.perception.tracking`) reads them later,
+# The tracker that finds the control points (:mod:`limber.perception.observe`) reads them later,
 # with the gripper's pose. Only pixels near the branch and outside arm and gripper are kept.
 
 _DEPTH_SCALE = 10_000.0  # steps of 0.1 mm

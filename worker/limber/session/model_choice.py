@@ -17,8 +17,12 @@ from limber.mechanics.dynamics.integration import NewmarkSettings
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
 from limber.reduced.model_cache import read_model
-from limber.reduced.reduced_dynamics import ReducedStepper
-from limber.reduced.reduced_model import ReducedModel, ReducedState, ReducedStaticSettings
+from limber.reduced.reduced_model import (
+    ReducedModel,
+    ReducedState,
+    ReducedStaticSettings,
+    ReducedStepper,
+)
 from limber.session.frame_buffer import HeldAt, Status
 from limber.session.protocol import Load, SessionSettings
 from limber.session.session_branch import Answer, HeldBranch

@@ -42,8 +42,8 @@ from pydantic import (
 from limber.core.errors import InputError
 from limber.core.files.reading import checked_as
 from limber.core.json_values import number_array, plain
-from limber.core.labels import BESIDE, SCALES, text_of
 from limber.core.optional import require_extra
+from limber.core.units import BESIDE, SCALES, text_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

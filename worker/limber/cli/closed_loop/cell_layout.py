@@ -11,7 +11,7 @@ from limber.cell.cell_file import Cell, LimitsEntry
 from limber.core.errors import NoPathError
 from limber.core.files.tables import write_table
 from limber.core.numerics.rigid import any_normal, inverted, matrices, pose_vectors
-from limber.estimation.forward.gripper_path import force_for_travel
+from limber.estimation.forward.observed_path import force_for_travel
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics import solve_static
 from limber.recordings.recording import POSE_COLUMNS

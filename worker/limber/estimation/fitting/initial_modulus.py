@@ -14,7 +14,7 @@ from limber.estimation.fitting.objective import Evaluation, Objective, seen_in
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.forward.forward_model import Forward
 from limber.estimation.forward.observed_path import ObservedPathForward, is_path_observed
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, ParameterSpace, Values
 from limber.recordings.recording import Pull
 

@@ -10,8 +10,7 @@ from scipy import sparse
 from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.dynamics.modes import subspace_round
-from limber.mechanics.dynamics.motion import NewmarkSettings
+from limber.mechanics.dynamics.motion import NewmarkSettings, subspace_round
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.loads.loaded_branch import is_stable
 from limber.mechanics.model import BranchModel

@@ -10,20 +10,252 @@ to an error of force, so the problem is well conditioned, and the more informati
 has more weight.
 """
 
-from dataclasses import replace
-from typing import Any, TypeGuard
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeGuard
 
 import numpy as np
+import scipy
 
+from limber.core.errors import WorkError
 from limber.core.not_none import present
-from limber.core.numerics.rigid import principal_axes
+from limber.core.numerics.rigid import any_normal, principal_axes, rotation_matrix
 from limber.core.numerics.sparse import NotPositiveDefiniteError
+from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.forward_model import Forward, Response, Simulated, compliance
-from limber.estimation.forward.quasi_static import FEW_KEYS, QuasiStaticForward
+from limber.estimation.forward.solved_pull import FEW_KEYS, QuasiStaticForward
 from limber.estimation.parameters import Values, equal_values, mechanics_names
+from limber.mechanics.dynamics.integration import NewmarkSettings, simulate_dynamics
+from limber.mechanics.dynamics.motion import DynamicResult
+from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces
 from limber.mechanics.statics.result import StaticResult
+from limber.mechanics.statics.solve import StaticSettings, solve_static
+
+# Path of a gripper in a virtual pull: that of the branch when it is pulled sideways.
+#
+# Slow pulls follow that path once. Fast ones shake the branch along it, or pull and release it. A
+# hung weight needs no path.
+#
+# A path drawn in space would compress a branch (it buckles) or stretch it (it tears), because its
+# length is fixed and its bending is not known beforehand. A hand feels that and yields. Here the
+# true branch is pulled by a force that grows and turns, and the motion of the grasp is the path.
+
+SETTINGS = StaticSettings(tolerance=1e-8)
+_FORCES = 20
+"""Most forces that are tried for a travel."""
+_TRIAL = StaticSettings(total_iterations=100, way_back=False)
+"""An equilibrium under a force takes some tens of iterations; a branch that folds, hundreds."""
+TURNED_PART = 0.7
+"""Fraction of the free rotation that a clamping gripper allows."""
+WAY_STATES = 12
+"""Number of static states that define the path of a shaken gripper."""
+SHAKES = 2.0
+"""Number of oscillations of a shaken gripper."""
+
+
+@dataclass(frozen=True)
+class MotionWanted:
+    """Requested motion of a virtual gripper from ``point`` [m]; ``axis`` is from base to grasp.
+
+    Attributes:
+        kind: ``pull`` (slow, the branch turns freely), ``turned`` (slow, rotation restrained),
+            ``shake`` (fast, along the path of a pull), ``release`` (fast, pulled by force and let
+            go), ``weight`` (a growing weight hangs on the grasp).
+        turn, phase: See :func:`sideways_forces`.
+        weight: The largest weight's force [N], shape [3].
+    """
+
+    kind: Literal["pull", "turned", "shake", "release", "weight"]
+    point: np.ndarray
+    axis: np.ndarray
+    travel: float
+    turn: float
+    phase: float
+    times: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class MotionMade:
+    """The motion at each time: poses of the grasp point [n, 6] [m, rad], wrenches on the branch [n,
+    6], torque about the pose, and displacements [node_count, 3] [m]."""
+
+    poses: np.ndarray
+    wrenches: np.ndarray
+    displacements: list[np.ndarray]
+
+
+def moved(model: BranchModel, grasp: Grasp, requested: MotionWanted, *,
+          progress: Progress = SILENT) -> MotionMade:
+    """Move a branch as requested. WorkError if no force moves the grasp that far, or the motion
+    cannot be computed."""
+    count = len(requested.times)
+    if requested.kind == "weight":
+        share = np.linspace(0.0, 1.0, count)
+        return _slow(model, grasp, requested, share[:, None] * requested.weight, progress)
+    if requested.kind == "release":
+        return _released(model, grasp, requested, progress)
+    states = WAY_STATES if requested.kind == "shake" else count
+    directions = sideways_forces(requested.axis, states, turn=requested.turn, phase=requested.phase)
+    size = force_for_travel(model, grasp, directions[-1], requested.travel)
+    slow = _slow(model, grasp, requested, size * directions, progress)
+    if requested.kind == "pull":
+        return slow
+    if requested.kind == "shake":
+        return _shaken(model, grasp, requested, slow, progress)
+    poses = slow.poses * np.r_[np.ones(3), np.full(3, TURNED_PART)]
+    held = _about_centre(grasp, requested.point, poses)
+    results, start = [], None
+    for pose in held:
+        results.append(solve_static(model, grasp=grasp, pose=pose, start=start,
+                                    settings=SETTINGS).require())
+        start = results[-1]
+    forces = np.array([result.reaction_force for result in results])
+    torques = np.array([result.reaction_torque for result in results])
+    return _made(poses, held, forces, torques, [result.displacement for result in results])
+
+
+def _slow(model: BranchModel, grasp: Grasp, requested: MotionWanted, forces: np.ndarray,
+          progress: Progress) -> MotionMade:
+    """Equilibria under forces of the gripper that exert no torque on the branch."""
+    displacements, start = [], None
+    for index, force in enumerate(forces):
+        progress(index / len(forces), "pulling", frame=index)
+        start = solve_static(model, grasp=grasp, grasp_force=force, start=start,
+                             settings=SETTINGS).require()
+        displacements.append(start.displacement)
+    poses, centres = _poses(model, grasp, requested.point, displacements)
+    return _made(poses, centres, forces, np.zeros_like(forces), displacements)
+
+
+def _shaken(model: BranchModel, grasp: Grasp, requested: MotionWanted, path: MotionMade,
+            progress: Progress) -> MotionMade:
+    """Out within a quarter of the time, back and forth over half the path, then at rest."""
+    share = requested.times / requested.times[-1]
+    out = np.clip(share / 0.25, 0.0, 1.0)
+    swing = np.clip((share - 0.25) / 0.5, 0.0, 1.0)
+    along = out**2 * (3 - 2 * out) * (0.75 + 0.25 * np.cos(2 * np.pi * SHAKES * swing))
+    poses = scipy.interpolate.CubicSpline(np.linspace(0.0, 1.0, len(path.poses)), path.poses)(along)
+    held = _about_centre(grasp, requested.point, poses)
+    result = simulate_dynamics(model, grasp=grasp, poses=held, times=requested.times,
+                               settings=NewmarkSettings(), progress=progress)
+    _require(result)
+    return _made(poses, held, result.reaction_force, result.reaction_torque,
+                 list(result.displacement))
+
+
+def _released(model: BranchModel, grasp: Grasp, requested: MotionWanted,
+              progress: Progress) -> MotionMade:
+    """A force that grows over a third of the time and is removed within a frame."""
+    direction = sideways_forces(requested.axis, 2, turn=0.0, phase=requested.phase)[-1]
+    size = force_for_travel(model, grasp, direction, requested.travel)
+    share = requested.times / requested.times[-1]
+    ramp = np.clip(share / 0.3, 0.0, 1.0)
+    forces = (ramp**2 * (3 - 2 * ramp) * (share < 0.4))[:, None] * size * direction
+    result = simulate_dynamics(model, grasp=grasp, grasp_forces=forces, times=requested.times,
+                               settings=NewmarkSettings(), progress=progress)
+    _require(result)
+    displacements = list(result.displacement)
+    poses, centres = _poses(model, grasp, requested.point, displacements)
+    return _made(poses, centres, forces, np.zeros_like(forces), displacements)
+
+
+def _require(result: DynamicResult) -> None:
+    if not result.converged:
+        raise WorkError("The motion of the simulated branch cannot be computed.",
+                        "It is too fast or too far for this branch.",
+                        "Reduce the reach, or increase the duration.")
+
+
+def _poses(model: BranchModel, grasp: Grasp, point: np.ndarray,
+           displacements: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of the grasp point, which moves with the patch, and of the patch's centre."""
+    centres = np.array([grasp.pose_of(model.mesh.nodes, displacement)
+                        for displacement in displacements])
+    if grasp.mode == "point":
+        # Held by its weighted mean: the position of the point, whatever the rotation.
+        poses = centres.copy()
+        poses[:, :3] += point - grasp.centre
+        return poses, centres
+    poses = centres.copy()
+    for pose in poses:
+        pose[:3] += rotation_matrix(pose[3:]) @ (point - grasp.centre)
+    return poses, centres
+
+
+def _about_centre(grasp: Grasp, point: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Poses of the patch's centre for those of the grasp point."""
+    held = poses.copy()
+    for pose in held:
+        turn = rotation_matrix(pose[3:]) if grasp.mode == "rigid" else np.eye(3)
+        pose[:3] += turn @ (grasp.centre - point)
+    return held
+
+
+def _made(poses: np.ndarray, held: np.ndarray, forces: np.ndarray, torques: np.ndarray,
+          displacements: list[np.ndarray]) -> MotionMade:
+    torques = torques + np.cross(held[:, :3] - poses[:, :3], forces)
+    return MotionMade(poses, np.hstack([forces, torques]), displacements)
+
+
+def sideways_forces(axis: np.ndarray, frame_count: int, *, turn: float, phase: float,
+                    ) -> np.ndarray:
+    """Return forces [n, 3] across ``axis`` (base to grasp) that grow from 0 to 1 N and rotate by
+    ``turn`` [rad] from ``phase`` [rad]."""
+    axis = axis / np.linalg.norm(axis)
+    first = any_normal(axis)
+    second = np.cross(axis, first)
+    share = np.linspace(0.0, 1.0, frame_count)
+    # Speed ramps up and down as a robot's does.
+    eased = 0.35 * share * share * (3 - 2 * share) + 0.65 * share
+    angle = phase + turn * eased
+    return eased[:, None] * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
+
+
+def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, travel: float,
+                     ) -> float:
+    """Return the factor of ``direction`` [N] that moves the grasp by ``travel`` [m], to 3 %.
+    WorkError if there is no such factor, or the branch does not carry its own weight."""
+    rest = solve_static(model).require().displacement
+    load = np.zeros_like(rest)
+    load[grasp.nodes] = grasp.weights[:, None] * direction
+    response = compliance(model, rest, load[None])[0]
+    slope = float(np.linalg.norm(grasp.weights @ response[grasp.nodes]))
+    if not slope > 0:
+        raise WorkError("No sideways force moves the grasp.", "It is where the branch is held.",
+                        "Hold the branch farther out.")
+    size, near, distance = travel / slope, None, 0.0
+    low, high, longest = 0.0, np.inf, 0.0
+    for _ in range(_FORCES):
+        result = solve_static(model, grasp=grasp, grasp_force=size * direction, start=near,
+                              settings=_TRIAL)
+        if result.converged:
+            shift = grasp.weights @ (result.displacement - rest)[grasp.nodes]
+            distance = float(np.linalg.norm(shift))
+            if abs(distance - travel) < 0.03 * travel:
+                return size
+        if result.converged and distance < travel:
+            low, near, longest = size, result, max(longest, distance)
+        else:
+            # Beyond its last equilibrium a branch folds: there is less force, not more travel.
+            high = size
+        if high - low < 0.01 * high:
+            break
+        if not result.converged:
+            size = (low + high) / 2
+        elif np.isinf(high):
+            # Bent, the branch stiffens.
+            size *= np.clip(travel / max(distance, 1e-12), 1.2, 3.0)
+        else:
+            size = np.clip(size * travel / distance, low + 0.1 * (high - low),
+                           high - 0.1 * (high - low))
+    raise WorkError(
+        f"No sideways force moves the grasp by {travel:.3g} m.",
+        f"With the largest force for which an equilibrium was found, it moves {longest:.3g} m. "
+        "Farther out the branch would fold, or it is too short or too stiff at the grasp.",
+        "Pull less far.")
+
 
 AT_REST_M = 5e-3
 """Distance of a first pose from the grasp point below which the branch is at rest; the sensor's

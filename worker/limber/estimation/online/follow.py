@@ -16,8 +16,14 @@ from limber.estimation.fitting.initial_modulus import scaled_start
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import gauss_newton
 from limber.estimation.forward.forward_model import under_its_weight
-from limber.estimation.online.filter import OnlineEstimator, OnlineFrame, OnlineState
-from limber.estimation.online.full_model import Beside, FullBranch, Here
+from limber.estimation.online.filter import (
+    Beside,
+    FullBranch,
+    Here,
+    OnlineEstimator,
+    OnlineFrame,
+    OnlineState,
+)
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.model_error import ModelError, geometry_error, total_interval

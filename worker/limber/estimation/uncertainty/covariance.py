@@ -10,8 +10,7 @@ from limber.core.errors import Command, Option, Text
 from limber.core.progress import SILENT, Progress
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.fitting.optimise import OUTLYING, Fit
-from limber.estimation.forward.dynamic_pull import DynamicForward
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.solved_pull import DynamicForward, QuasiStaticForward
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, YoungField
 from limber.estimation.uncertainty.drift import scale_steps
 from limber.recordings.recording import calibration_of

@@ -10,7 +10,7 @@ from limber.core.errors import InputError, Option
 from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.forward_model import Forward
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.recordings.recording import calibration_of
 

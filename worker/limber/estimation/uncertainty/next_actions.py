@@ -17,7 +17,7 @@ import numpy as np
 from limber.core.errors import Command, Option, Text
 from limber.core.not_none import present
 from limber.estimation.fitting.objective import Evaluation, Objective
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
 from limber.estimation.uncertainty.covariance import (
     InformationRows,

@@ -18,7 +18,7 @@ from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject
 from limber.estimation.fitting.nuisances import ErrorSlopes
 from limber.estimation.fitting.objective import Evaluation, Objective
-from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import Values
 from limber.estimation.uncertainty.model_error import WIDEST
 from limber.geometry.shape_samples import reshaped, sample_skeletons

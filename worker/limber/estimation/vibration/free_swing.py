@@ -27,8 +27,7 @@ from limber.estimation.uncertainty.creep import LIKELIER, TIME_SHARES, creep_sen
 from limber.estimation.uncertainty.model_error import MeshStiffness, mesh_error
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.dynamics.integration import simulate_dynamics
-from limber.mechanics.dynamics.modes import lowest_modes
-from limber.mechanics.dynamics.motion import NewmarkSettings
+from limber.mechanics.dynamics.motion import NewmarkSettings, lowest_modes
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel

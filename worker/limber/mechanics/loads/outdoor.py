@@ -15,7 +15,7 @@ from limber.core.errors import InputError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import PointMass
-from limber.mechanics.dynamics.modes import lowest_modes
+from limber.mechanics.dynamics.motion import lowest_modes
 from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator

@@ -8,7 +8,7 @@ The field also gives the natural rotation of the grasped piece, and the position
 tip.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,16 +21,6 @@ from limber.core.files.reading import read_arrays, require_shapes
 from limber.core.numerics.compiled import compiled
 from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart, mapped, pulled_back_size
-from limber.planning.field.fit_choice import (
-    CHARTS_TRIED,
-    SMOOTHING,
-    FitChoice,
-    chosen_fits,
-    cross_validated_errors,
-    misplaced_tips,
-    slopes_on,
-    with_slopes,
-)
 from limber.planning.field.radial import (
     LocalError,
     RadialInterpolant,
@@ -42,6 +32,164 @@ from limber.planning.field.radial import (
 )
 from limber.planning.field.stored_states import LOADS, GraspSamples
 from limber.planning.field.valid_region import TrustRegion, trusted_at
+
+# The kernel and the charts of a field's fit, chosen by cross-validation.
+
+KERNELS_TRIED = (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0), ("multiquadric", 2.0))
+CHARTS_TRIED = ((1.0, np.inf), (2.0, np.inf), (4.0, np.inf), (8.0, np.inf), (5.0, 0.02),
+                (12.0, 0.02), (30.0, 0.02), (12.0, 0.005), (30.0, 0.005), (80.0, 0.005))
+"""Stretch and depth; they depend on the curvature off the shell, for any kernel."""
+_FINALISTS = 3  # best charts with the first kernel; the other kernels are tried on them
+SMOOTHING = 1e-6  # fraction of the scaled system; more blurs, less invites rounding errors
+_CHOSEN_BY = ("energy_error_median", "energy_error_most", "force_error_median", "force_error_most")
+_MOST = 0.95  # quantile of the samples
+_MOST_TIPS = 0.9  # the same; beyond it the branch may buckle either way
+_CHOOSE_FROM = 150  # most samples; more change the choice little but take time
+
+
+@dataclass(frozen=True)
+class FitChoice:
+    """Choices of a field's fit: kernel and shape; stretch and depth of the chart (in radii)."""
+
+    kernel: str
+    shape: float
+    stretch: float = 1.0
+    depth: float = np.inf
+
+    def on(self, chart: Chart) -> Chart:
+        """Return the chart with this stretch and depth."""
+        return replace(chart, stretch=self.stretch, depth=self.depth * (chart.radius or 1.0))
+
+
+def chosen_fits(samples: GraspSamples, region: TrustRegion, charts: Sequence[tuple[float, float]],
+                progress: Progress) -> tuple[FitChoice, FitChoice]:
+    """Return the choices of least cross-validation error for the energy and for the shape;
+    ``charts`` are stretch and depth of those to try."""
+    chart = region.chart
+    picked = _spread_out(region.is_face(), _CHOOSE_FROM)
+    some, face = samples.take(picked), region.is_face()[picked]
+    sure = with_slopes(some)
+    bending, inside = some.take(sure), ~face[sure]
+
+    def energy_missed(choice: FitChoice) -> float:
+        errors = cross_validated_errors(some, choice.on(chart), choice, face)[0]
+        # Each relative to its own value: a few stiff poses, compressed and buckled, dominate means.
+        return float(np.prod([errors[name] for name in _CHOSEN_BY]))
+
+    def shape_missed(choice: FitChoice) -> float:
+        size = misplaced_tips(bending, choice, chart)[inside, 0]
+        return float(np.median(size) * np.quantile(size, _MOST_TIPS))
+
+    return (_least(energy_missed, charts, progress.part(0.0, 0.5)),
+            _least(shape_missed, charts, progress.part(0.5, 1.0)))
+
+
+def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, float]],
+           progress: Progress) -> FitChoice:
+    """Return the choice with the least ``missed``: the first kernel on all charts, then every other
+    kernel on the best of those."""
+    first, *others = KERNELS_TRIED
+    asked = [FitChoice(*first, *chart) for chart in charts]
+    scores: dict[FitChoice, float] = {}
+    while asked:
+        for choice in asked:
+            progress(len(scores) / (len(charts) + _FINALISTS * len(others)),
+                     "choosing the interpolation")
+            scores[choice] = missed(choice)
+        best = sorted(scores, key=scores.__getitem__)
+        asked = [replace(chosen, kernel=kernel, shape=shape) for kernel, shape in others
+                 for chosen in best[:_FINALISTS]] if len(scores) == len(charts) else []
+    return best[0]
+
+
+def misplaced_tips(samples: GraspSamples, choice: FitChoice, chart: Chart,
+                   channels: slice = slice(3)) -> np.ndarray:
+    """Return the tip's error at each sample in the fit to all the others [m], and its targets' with
+    more ``channels`` than those of the tip, shape [m, channels / 3]."""
+    chart = choice.on(chart)
+    slopes = slopes_on(chart, samples)
+    missed = RadialInterpolant.leave_one_out(
+        chart.map(samples.positions), samples.shape[:, 3:][:, channels],
+        None if slopes is None else slopes[:, :, 3:][:, :, channels],
+        kernel=choice.kernel, shape=choice.shape, smoothing=SMOOTHING)[:, 0]
+    return np.linalg.norm(missed.reshape(len(missed), -1, 3), axis=2)
+
+
+def with_slopes(samples: GraspSamples) -> np.ndarray:
+    """Return the samples of the shape's fit: those with known slopes, which are unknown at a snap;
+    all if hardly any are known."""
+    everything = np.arange(len(samples.poses))
+    if samples.shape_slopes is None:
+        return everything
+    known = np.flatnonzero(np.isfinite(samples.shape_slopes).all(axis=(1, 2)))
+    return known if len(known) >= 0.5 * len(everything) else everything
+
+
+def slopes_on(chart: Chart, samples: GraspSamples) -> np.ndarray | None:
+    """Return the slopes of the shape to the chart's coordinates, [m, 3, channels], if all known."""
+    if samples.shape_slopes is None or not np.isfinite(samples.shape_slopes).all():
+        return None
+    return np.stack([chart.push_forward(samples.positions, samples.shape_slopes[:, :, c])
+                     for c in range(samples.shape_slopes.shape[2])], axis=2)
+
+
+def _spread_out(face: np.ndarray, count: int) -> np.ndarray:
+    """Return at most ``count`` indices, those on the hull's face and others at even steps."""
+    if len(face) <= count:
+        return np.arange(len(face))
+    inner = np.flatnonzero(~face)
+    left = max(count - int(face.sum()), count // 2)
+    picked = inner[np.linspace(0, len(inner) - 1, min(left, len(inner))).astype(int)]
+    return np.sort(np.concatenate([np.flatnonzero(face), picked]))
+
+
+def cross_validated_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face: np.ndarray,
+                           ) -> tuple[dict[str, float], np.ndarray]:
+    """Errors of a fit at each sample left out, in closed form: :func:`error_measures`, and
+    prediction less truth of energy [J] and force [N] [m, 4]. Samples on the hull's ``face`` do not
+    count: the planner never leaves the hull."""
+    if not (~face).any():
+        raise WorkError(f"{len(samples.poses)} grasp poses are too few for cross-validation.",
+                        "The error of the energy field cannot be measured.",
+                        "Sample more poses.")
+    in_chart = chart.map(samples.positions)
+    missed = RadialInterpolant.leave_one_out(
+        in_chart, samples.energies, chart.push_forward(samples.positions, samples.forces),
+        kernel=choice.kernel, shape=choice.shape, smoothing=SMOOTHING)[:, :, 0]
+    energy = np.maximum(samples.energies - missed[:, 0], 0.0)
+    off = -chart.pull_back(samples.positions, missed[:, 1:])
+    inside = np.flatnonzero(~face)
+    measures = error_measures(samples.take(inside), energy[inside], (samples.forces + off)[inside])
+    return measures, np.column_stack([energy - np.maximum(samples.energies, 0.0), off])
+
+
+def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
+                   ) -> dict[str, float]:
+    """Errors of predictions. ``energy_error`` and ``force_error`` are root mean squares over that
+    of the truth; ``_median`` and ``_most`` (95 %) are of each sample's over its own value;
+    ``gentle_energy_error`` is over the half of least energy, where gentle paths run."""
+    true_energies = np.maximum(truth.energies, 0.0)
+    energy_off = np.abs(energy - true_energies)
+    force_off = np.linalg.norm(force - truth.forces, axis=1)
+    size = np.linalg.norm(truth.forces, axis=1)
+    felt = (true_energies > 1e-3 * true_energies.max()) & (size > 1e-3 * size.max())
+    gentle = true_energies <= np.median(true_energies)
+    energy_share, force_share = energy_off[felt] / true_energies[felt], force_off[felt] / size[felt]
+    return {
+        "energy_error": _rms(energy_off) / _rms(true_energies),
+        "force_error": _rms(force_off) / _rms(size),
+        "energy_error_median": float(np.median(energy_share)),
+        "force_error_median": float(np.median(force_share)),
+        "energy_error_most": float(np.quantile(energy_share, _MOST)),
+        "force_error_most": float(np.quantile(force_share, _MOST)),
+        "gentle_energy_error": _rms(energy_off[gentle]) / _rms(true_energies[gentle]),
+        "held_out_count": float(len(energy)),
+    }
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
 
 _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
@@ -247,18 +395,19 @@ class EnergyField:
             require_shapes(path, arrays, _SHAPES | {
                 name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays},
                            _WHAT, flags=("reduced",))
+            stored: dict[str, Any] = {name: arrays.get(key) for name, key in _OPTIONAL.items()}
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],
-                **{name: arrays.get(stored) for name, stored in _OPTIONAL.items()})
-            fits = [RadialInterpolant.from_arrays(arrays, f"{name}_")
-                    for name in ("energy_fit", "shape_fit", "load_fit")]
+                **stored)
+            energy, shape, loads = (RadialInterpolant.from_arrays(arrays, f"{name}_")
+                                    for name in ("energy_fit", "shape_fit", "load_fit"))
             region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3],
                                     arrays["chart_pivot_m"], float(arrays["chart_radius_m"]))
             if arrays["chart_layers"].shape != (2, 2):
                 raise ValueError("two charts are needed")
-            charts = [replace(region.chart, stretch=float(stretch), depth=float(depth))
-                      for stretch, depth in arrays["chart_layers"]]
+            chart, shape_chart = (replace(region.chart, stretch=float(stretch), depth=float(depth))
+                                  for stretch, depth in arrays["chart_layers"])
             missed, misplaced = _errors_in(arrays, samples)
             errors = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
                               strict=True))
@@ -267,7 +416,8 @@ class EnergyField:
                              Text("It was not written by ", Command("energy"), ", or is damaged."),
                              "Run ", Command("energy"), " again with ", Option("force", True),
                              ".") from error
-        return cls(samples, *charts, *fits, region, errors, missed, misplaced)
+        return cls(samples, chart, shape_chart, energy, shape, loads, region, errors, missed,
+                   misplaced)
 
 
 def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: float | None = None,
@@ -342,7 +492,7 @@ def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: T
                                    shape=choice.shape, smoothing=SMOOTHING)
     shape_chart = bent.on(region.chart)
     in_chart = shape_chart.map(samples.positions)
-    options = {"kernel": bent.kernel, "shape": bent.shape, "smoothing": SMOOTHING}
+    options: dict[str, Any] = {"kernel": bent.kernel, "shape": bent.shape, "smoothing": SMOOTHING}
     sure = with_slopes(samples)
     bending = samples.take(sure)
     shape = RadialInterpolant.fit(in_chart[sure], bending.shape, slopes_on(shape_chart, bending),
@@ -364,13 +514,13 @@ def _rows(points: np.ndarray) -> np.ndarray:
 
 
 @compiled
-def energy_at(point, field):
+def energy_at(point: np.ndarray, field: Any) -> float:
     """Return the energy [J], cut off at 0, at ``point`` [3]."""
     return max(value_at(mapped(point, *field.chart), 0, *field.energy), 0.0)
 
 
 @compiled
-def allowed_at(point, energy, field):
+def allowed_at(point: np.ndarray, energy: float, field: Any) -> bool:
     """Return whether ``point``, whose energy is known, is trusted and within the limits."""
     # The slack's chart is the plain one, which is the region's.
     if energy > field.max_energy - _slack(point, 0, field):
@@ -395,7 +545,7 @@ def allowed_at(point, energy, field):
 
 
 @compiled
-def _slack(point, row, field):
+def _slack(point: np.ndarray, row: int, field: Any) -> float:
     """Return by how much a limit is tighter at ``point`` [3]."""
     if field.slack.factors[row] == 0.0:
         return 0.0

@@ -18,7 +18,7 @@ from scipy.spatial import Delaunay
 
 from limber.core.errors import Command, ConvergenceError, Option, WorkError
 from limber.core.processes import Pool, core_budget, run_tasks, worker_count
-from limber.core.processes.pool_process import Task
+from limber.core.processes.pool import Task
 from limber.core.progress import SILENT, Progress
 from limber.mechanics import StaticResult
 from limber.planning.field.chart import Chart

@@ -9,7 +9,7 @@ import numpy as np
 from limber.core.constants import DATA_COLOURS
 from limber.estimation.uncertainty.covariance import OUTLIER
 from limber.estimation.uncertainty.identifiability import UNRESOLVED_DEVIATION
-from limber.results.report.charts import chart
+from limber.results.report.section import chart
 
 OBSERVED, SIMULATED, TRUE = (DATA_COLOURS[key] for key in ("measured", "simulated", "true"))
 FORCE = "#2e8b57"

@@ -1,16 +1,24 @@
-"""The report's own figures: scan and skeleton, radii, mesh, pull and energy samples."""
+"""Figures of the report: scan, skeleton, mesh, samples, planners, loads, swing, execution."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from limber.core.constants import MARK_COLOURS
+from limber.core.errors import InputError
+from limber.core.files.reading import read_arrays, require_shapes
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.planning.compared_planners import BASELINE, COMPARED, ComparedTrial
+from limber.planning.constraints.damage import DamageAlong
+from limber.planning.field.energy_field import EnergyField
+from limber.recordings.time_series import read_stream
 from limber.results.findings import modulus_origin
-from limber.results.report.charts import chart, draw_faces, two_views
+from limber.results.motion_files import read_pc2
 from limber.results.report.estimate_figures import AXIS_DOTS, AXIS_LINES, OBSERVED, SIMULATED
+from limber.results.report.section import chart, draw_faces, two_views
 from limber.store import Branch
 from limber.store.loading import load_skeleton
 
@@ -209,3 +217,179 @@ def _shade(corners: np.ndarray, depth: int) -> np.ndarray:
     length = np.linalg.norm(normal, axis=1)
     facing = np.abs(normal[:, depth]) / np.where(length > 0, length, 1.0)
     return 0.45 + 0.55 * facing
+
+
+# The paper's last figure: paths of two planners, coloured by the energy at their waypoints.
+
+_SHOWN = (BASELINE, "D-RRT*, not smoothed", "eikonal")
+_SHELL = 600  # poses of the field drawn behind the paths
+
+
+def planner_figure(field: EnergyField, trials: Sequence[ComparedTrial]) -> "Figure":
+    """Draw the paths of each planner in a separate view, over the field's energy."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.0 * len(_SHOWN), 4.2), layout="constrained")
+    behind = field.region.draw(_SHELL, np.random.default_rng(0))
+    energies = 1e3 * field.energy(behind)
+    most = float(np.quantile(energies, 0.95))
+    for number, name in enumerate(_SHOWN):
+        axes = figure.add_subplot(1, len(_SHOWN), number + 1, projection="3d")
+        axes.scatter(*behind.T, c=energies, s=3, alpha=0.12, vmin=0.0, vmax=most, cmap="viridis")
+        for trial in trials:
+            if (path := trial.paths.get(name)) is None:
+                continue
+            axes.plot(*path.T, color="black", lw=0.6)
+            dots = axes.scatter(*path.T, c=1e3 * field.energy(path), s=12, vmin=0.0, vmax=most,
+                                cmap="viridis", depthshade=False)
+        axes.set(title=COMPARED[name], xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+        axes.set_aspect("equal")
+        axes.locator_params(nbins=4)
+    figure.colorbar(dots, ax=figure.axes, label="deformation energy [mJ]", shrink=0.7)
+    return figure
+
+
+# The picture of where a planned path would damage the branch.
+
+_LEAST = 1e-4  # probabilities below look alike
+
+
+def damage_along_branch(damage: DamageAlong) -> "Figure":
+    """Draw the branch's axes from the front and the side, coloured by the probability of damage, or
+    by the largest strain if the strength is not known. The worst place is marked."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import LogNorm, Normalize
+
+    values, label = 100.0 * damage.strains, "largest strain along the path [%]"
+    norm: Normalize = Normalize(0.0, max(float(values.max()), 1e-9))
+    if damage.probabilities is not None:
+        values, label = 100.0 * damage.probabilities, "probability of damage here [%]"
+        norm = LogNorm(100.0 * _LEAST, 100.0, clip=True)
+    child = np.flatnonzero(damage.parents >= 0)
+    ends = damage.nodes[np.stack([damage.parents[child], child], axis=1)]
+    figure, views = two_views(damage.nodes)
+    worst = damage.nodes[int(np.argmax(damage.strains))]
+    for axis, across, _ in views:
+        lines = LineCollection(ends[:, :, [across, 2]], cmap="inferno_r", norm=norm, linewidths=4.0,
+                               capstyle="round")
+        lines.set_array(values[child])
+        axis.add_collection(lines)
+        axis.plot(worst[across], worst[2], "o", mfc="none", mec="black", ms=14)
+        axis.autoscale_view()
+    figure.colorbar(lines, ax=[axis for axis, _, _ in views], label=label)
+    return figure
+
+
+# Figures of wind, snow, fruit and cuts that act on a branch.
+
+def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
+    """Draw the branch as scanned (grey) and under the loads of ``frames/load-NAME.pc2``, coloured
+    by its largest strain in the ``.npz`` beside it; InputError if they are damaged or belong to
+    another mesh."""
+    import matplotlib.pyplot as plt
+
+    nodes, corners = np.unique(mesh.surface_faces(), return_inverse=True)
+    corners = corners.reshape(-1, 3)
+    positions, _, _ = read_pc2(frames)
+    values = read_arrays(frames.with_suffix(".npz"), "the fields of a motion")
+    arrays = {**values, "positions": positions}
+    require_shapes(frames, arrays, {"positions": (2, len(nodes), 3),
+                                    "principal_strain": (2, len(nodes))}, "the frames of a load")
+    strain = 100 * arrays["principal_strain"][1][corners].mean(axis=1)
+    shades = plt.get_cmap("inferno")
+    largest = max(float(strain.max()), 1e-9)
+    norm = plt.Normalize(0.0, largest)
+    figure, views = two_views(positions.reshape(-1, 3))
+    grey = np.tile((0.8, 0.8, 0.8, 1.0), (len(corners), 1))
+    for axis, across, depth in views:
+        for state, colours in zip(positions, (grey, shades(0.9 * norm(strain))), strict=True):
+            draw_faces(axis, state[corners], colours, across, depth)
+    scale = plt.cm.ScalarMappable(plt.Normalize(0.0, largest / 0.9), shades)
+    bar = figure.colorbar(scale, ax=figure.axes, label="largest principal strain [%]", shrink=0.7)
+    bar.ax.set_ylim(0.0, largest)
+    return figure
+
+
+def strain_along_path(along: np.ndarray) -> "Figure":
+    """Draw the largest strain of each piece of the main path: its ends from the root [m] and the
+    largest principal strain, [n, 3]."""
+    from matplotlib.figure import Figure
+
+    from_m, to_m, strain = along.T
+    figure = Figure(figsize=(6.0, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    axes.bar(from_m, 100 * strain, to_m - from_m, align="edge", edgecolor="white")
+    axes.set(xlabel="distance from the root along the main path [m]", ylabel="largest strain [%]")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+# The figure of a free swing that was fitted.
+
+def along_path(seen: np.ndarray, simulated: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the displacement [m] along its path of the marker with the largest swing, observed
+    (NaN if not) and simulated, shape [n] each, from those of all markers, [n, markers, 3]."""
+    most = int(np.argmax(np.ptp(simulated, axis=0).max(axis=1)))
+    direction = np.linalg.svd(simulated[:, most] - simulated[:, most].mean(axis=0))[2][0]
+    return seen[:, most] @ direction, simulated[:, most] @ direction
+
+
+def swing_over_time(times: np.ndarray, seen: np.ndarray, simulated: np.ndarray) -> "Figure":
+    """Draw observed and simulated displacement of the marker with the largest swing."""
+    from limber.results.report.estimate_figures import OBSERVED, SIMULATED
+
+    figure, axes = chart(5.2, 3.0, "time [s]", "displacement [mm]")
+    seen, simulated = along_path(seen, simulated)
+    axes.plot(times, 1e3 * seen, ".", ms=4, color=OBSERVED, label="observed")
+    axes.plot(times, 1e3 * simulated, color=SIMULATED, label="simulated")
+    axes.legend(frameon=False)
+    return figure
+
+
+# The figure of an execution by a robot: the measured force against the predicted one.
+
+_MOST_POINTS = 1500
+_GAP_SECONDS = 0.5
+_NAMES = [*(f"{kind}_f{axis}_n" for kind in ("smooth", "expected") for axis in "xyz"),
+          *(f"expected_{entry}_n2" for entry in ("xx", "yy", "zz"))]
+
+
+def force_along_path(path: Path) -> "Figure":
+    """Draw the measured force (smoothed), and the predicted one with its 95 % interval; InputError
+    if the log is damaged, or predicts no force."""
+    from matplotlib.figure import Figure
+
+    log = read_stream(path)
+    missing = [name for name in _NAMES if name not in log.columns]
+    if missing:
+        raise InputError(f"{path} has no column {missing[0]}.",
+                         "It is not the log of an execution.",
+                         "Execute the plan again.")
+    table = log.values[:, [log.columns.index(name) for name in _NAMES]]
+    known = np.isfinite(table).all(axis=1)
+    if not known.any():
+        raise InputError(f"{path} has no predicted force.",
+                         "The execution did not predict the force on the branch.",
+                         "Execute the plan again.")
+    known = np.flatnonzero(known)
+    known = known[::max(1, len(known) // _MOST_POINTS)]
+    times, table = log.times[known] - log.times[known[0]], table[known]
+    # The line is interrupted where no force was predicted.
+    after = np.flatnonzero(np.diff(times) > _GAP_SECONDS) + 1
+    times, table = np.insert(times, after, np.nan), np.insert(table, after, np.nan, axis=0)
+    felt, expected, variances = table[:, :3], table[:, 3:6], table[:, 6:]
+    figure = Figure(figsize=(9.0, 5.2), layout="constrained")
+    for axes, column, name in zip(figure.subplots(3, 1, sharex=True), range(3), "xyz",
+                                  strict=True):
+        half = 1.96 * np.sqrt(np.maximum(variances[:, column], 0.0))
+        axes.fill_between(times, expected[:, column] - half, expected[:, column] + half,
+                          color=SIMULATED, alpha=0.2, lw=0)
+        axes.plot(times, expected[:, column], color=SIMULATED, label="predicted, 95 % interval")
+        axes.plot(times, felt[:, column], ".", ms=2, color=OBSERVED, label="measured")
+        axes.set_ylabel(f"force {name} [N]")
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.25)
+        if name == "x":
+            axes.legend(frameon=False, ncols=2)
+    axes.set_xlabel("time since the robot started [s]")
+    return figure

@@ -13,8 +13,8 @@ from limber.planning.cost import arc_lengths
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.plan_file import PlanFile, PlanPath, read_plan
 from limber.planning.search_files import CostToGo, read_trees
-from limber.results.report.charts import chart
-from limber.results.report.damage_figure import damage_along_branch
+from limber.results.report.figures import damage_along_branch
+from limber.results.report.section import chart
 from limber.store import Branch
 
 if TYPE_CHECKING:

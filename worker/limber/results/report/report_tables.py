@@ -6,7 +6,7 @@ from itertools import count
 from operator import itemgetter
 from typing import Any
 
-from limber.core.labels import place_text, table_of
+from limber.core.units import place_text, table_of
 from limber.results.findings import ASSUMED
 
 
@@ -146,7 +146,6 @@ def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
         ("force [N]", "rms_force_n", ".3g"), ("relative to peak", "relative_force", ".1f %"),
         ("predicted by", lambda score: "the other pulls" if score.get("in_fit", True)
          else "this estimate"), missing="-")
-
 
 
 def share_rows(shares: Mapping[str, float]) -> list[list[str]]:

@@ -106,7 +106,7 @@ FORMAT = 2
 
 @dataclass
 class SceneData:
-    """Arrays by name and a dictionary that describes them; see limber.results.scene.contents"""
+    """Arrays by name and a dictionary that describes them; see limber.results.scene.animation"""
 
     arrays: dict[str, np.ndarray]
     info: dict[str, Any] = field(default_factory=dict)

@@ -201,10 +201,9 @@ class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
 
 
 def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[str, Any]:
-    from limber.estimation.control_point_count import is_open
     from limber.estimation.estimate_file import details, summary
     from limber.estimation.estimated_branch import tell_doubts
-    from limber.estimation.fit import fit_branch
+    from limber.estimation.fit import fit_branch, is_open
     from limber.estimation.fit_assessment import judge_model, require_result
     from limber.estimation.fitting.objective import EvaluationLog
     from limber.stages.moduli.other_skeletons import add_other_skeletons
@@ -285,8 +284,7 @@ def _with_supported_points(
         ) -> tuple[fit_assessment.Estimate, FitSpec, Subject, dict[int, float] | None]:
     """Fit with as many control points as the pulls support, from a fit with four on; return the
     fit, its settings and branch, and the log evidence by number of control points."""
-    from limber.estimation.control_point_count import supported
-    from limber.estimation.fit import complete, fit_branch
+    from limber.estimation.fit import complete, fit_branch, supported
     from limber.estimation.fitting.objective import EvaluationLog
     from limber.store.loading import load_subject
 

@@ -26,7 +26,7 @@ class Swing(Result):
     """Young's modulus and damping of a branch by a free swing."""
 
     heading = "Swing"
-    pictures = (Picture("swing_section.swing_over_time", "Displacement of the marker that swings "
+    pictures = (Picture("figures.swing_over_time", "Displacement of the marker that swings "
                         "most, along its path: observed (dots) and simulated.",
                         ("times", "seen", "simulated")),)
 

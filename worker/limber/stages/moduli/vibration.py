@@ -143,7 +143,7 @@ def young_of(model: BranchModel, seen: Ringing, density_sigma: float) -> dict[st
     """Return the factor on the modulus for which a model has the record's first frequency:
     ``young_factor``, ``deviation`` (of its logarithm), ``model_frequencies_hz``. WorkError if there
     is none."""
-    from limber.mechanics.dynamics.modes import lowest_modes
+    from limber.mechanics.dynamics.motion import lowest_modes
 
     target, factor, last = float(seen.frequencies[0]), 1.0, None
     for _ in range(_ROUNDS):

@@ -17,9 +17,9 @@ from limber.core.errors import InputError, Option, Text
 from limber.core.files.atomic import file_digest
 from limber.core.files.reading import read_json
 from limber.core.json_values import number_array
-from limber.core.labels import table_of
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups, possible_force
+from limber.core.units import table_of
 from limber.stages.result import (
     Interval,
     Numbers,
@@ -78,7 +78,7 @@ class Load(Result):
     """
 
     heading = "Load: {name}"
-    pictures = (Picture("loads_section.strain_along_path", "Largest strain of each piece of the "
+    pictures = (Picture("figures.strain_along_path", "Largest strain of each piece of the "
                         "main path.", ("along",)),)
     columns: ClassVar = {"along": "from_m to_m strain"}
 
@@ -121,7 +121,7 @@ class Load(Result):
             ("of the limit", lambda row: limit * row["strain"], ".0f %")))]
 
     def illustrate(self, section: Section, branch: Branch, key: str) -> None:
-        from limber.results.report.loads_section import bent_branch
+        from limber.results.report.figures import bent_branch
         from limber.store.loading import load_mesh
 
         super().illustrate(section, branch, key)
@@ -217,7 +217,7 @@ class ApplyLoads(KeptStage, BranchStage):
             WorkError: there is no equilibrium under it.
         """
         from limber.mechanics.added_masses import PointMass
-        from limber.mechanics.dynamics.modes import lowest_modes
+        from limber.mechanics.dynamics.motion import lowest_modes
         from limber.mechanics.loads.load_effects import blown, load_effects, with_peak
         from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
         from limber.store.loading import (

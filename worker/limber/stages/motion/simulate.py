@@ -265,8 +265,7 @@ def _replay(asked: Simulate, name: str) -> tuple[Simulate, PoseTable, float]:
 
 def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
     from limber.mechanics.dynamics.drive import PoseTable
-    from limber.recordings.robot_tables import robot_stream
-    from limber.recordings.tables import read_table, time_column
+    from limber.recordings.tables import read_table, robot_stream, time_column
 
     table = read_table(path)
     timed = time_column(table) is not None

@@ -10,9 +10,9 @@ from pydantic import Field
 
 from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.core.files.tables import table_text
-from limber.core.labels import table_of
 from limber.core.progress import Progress
 from limber.core.settings import POSITION, Groups
+from limber.core.units import table_of
 from limber.planning.settings import PlanSettings
 from limber.stages.result import Result, Table, shown
 from limber.stages.stage import About, KeptStage, PlacedStage, given
@@ -98,7 +98,7 @@ class ComparePlanners(KeptStage, PlacedStage):
         from limber.planning.compared_planners import run_trials, summarised
         from limber.planning.field.energy_field import EnergyField
         from limber.planning.goals.goal_kinds import near, second_arm_goal
-        from limber.results.report.planner_figure import planner_figure
+        from limber.results.report.figures import planner_figure
 
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", self.name):
             raise InputError(Text(Option("name"), f" {self.name!r} cannot name a comparison."),

@@ -50,7 +50,7 @@ class Execution(Result):
     """
 
     heading = "Executed by the robot: {name}"
-    pictures = (Picture("execution_section.force_along_path", "Force of the gripper on the branch: "
+    pictures = (Picture("figures.force_along_path", "Force of the gripper on the branch: "
                         "measured (smoothed), and predicted at the gripper's measured position. "
                         "The robot moves to the goal, waits and returns.", ("log",)),)
 
@@ -177,8 +177,7 @@ def planned_motion(asked: ExecutePlan, progress: Progress, *, is_to_move: bool) 
         require_watched,
         require_within_limits,
     )
-    from limber.stages.paths.plan_cell import KeptClear
-    from limber.stages.paths.plan_legs import legs_in_cell
+    from limber.stages.paths.plan_cell import KeptClear, legs_in_cell
     from limber.store.loading import load_grasp_model
 
     progress(0.02, "inverse kinematics")

@@ -165,7 +165,7 @@ class Plan(Result):
         Raises:
             InputError: the plan is of a version that did not compute it.
         """
-        from limber.results.report.damage_figure import damage_along_branch
+        from limber.results.report.figures import damage_along_branch
 
         if self.damage is None:
             raise InputError(f"The plan {self.name} has no strains along the branch.",
@@ -258,7 +258,7 @@ class PlanPaths(PlanSettings, Repeatable, PlacedStage):
         from limber.planning.make_plan import plan_motion
         from limber.planning.plan_file import whole_motion
         from limber.planning.timing import Pace
-        from limber.stages.paths.plan_legs import legs_without_cell
+        from limber.stages.paths.plan_cell import legs_without_cell
         from limber.stages.paths.plan_strength import (
             default_limit,
             strength_for,
@@ -413,8 +413,12 @@ class _InCell:
         branch of the inverse kinematics, or if the gripper meets an obstacle."""
         from limber.cell.reach_and_collision import blocked_by
         from limber.robot.motion.execution import robot_motion
-        from limber.stages.paths.plan_cell import predicted_ahead, robot_summary
-        from limber.stages.paths.plan_legs import legs_in_cell, surface_points
+        from limber.stages.paths.plan_cell import (
+            legs_in_cell,
+            predicted_ahead,
+            robot_summary,
+            surface_points,
+        )
 
         predicted, states, turning = predicted_ahead(motion), found.plan.ahead, None
         asked: dict[str, Any] = {"speed": found.pace.speed, "blocked": blocked_by(
@@ -424,7 +428,7 @@ class _InCell:
         except NoPathError:
             if settings.turn_slack is None:
                 raise
-            from limber.stages.paths.plan_turning import turned_by
+            from limber.stages.paths.plan_cell import turned_by
 
             progress(0.95, "turning the gripper beyond the branch's own rotation")
             held, turning = turned_by(self.cell, predicted, grasp_model, states,

@@ -1,6 +1,7 @@
-"""Requirements of a robot's cell on a plan: workspace, obstacles, and the arm's reach."""
+"""A plan in a robot's cell: workspace, obstacles, the arm's reach, the legs of the motion, and the
+gripper's rotation where the arm cannot follow the branch's own."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,21 +16,35 @@ from limber.cell.cell_file import (
 )
 from limber.cell.known_arms import arm_named
 from limber.cell.obstacles import Obstacle, cell_obstacles, closest
-from limber.cell.reach_and_collision import clearance_in, outer_reach, untaken
-from limber.core.errors import NoPathError
+from limber.cell.reach_and_collision import ArmSurroundings, clearance_in, outer_reach, untaken
+from limber.core.errors import Command, NoPathError, Option
 from limber.core.not_none import present
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics import BranchModel, Grasp, StaticResult, follow_poses
+from limber.mechanics.sensitivities import grasp_slopes
 from limber.planning.constraints.limits import Limits
-from limber.planning.field.grasp_model import GraspModel
+from limber.planning.cost import arc_lengths
+from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.goals.goal import Ball, CellPlace, position_text
 from limber.planning.goals.goal_kinds import View
+from limber.planning.path_on_full_model import SolvedPoses
 from limber.planning.plan_file import PlanPath
 from limber.robot.depth_camera import LiveView
-from limber.robot.motion.execution import RobotMotion
+from limber.robot.motion.execution import (
+    HELD,
+    Leg,
+    RobotMotion,
+    TurnCost,
+    Turned,
+    described,
+    legs_of,
+    turned,
+    turned_motion,
+)
 from limber.robot.motion.trajectory import Predicted
-from limber.stages.paths.plan_legs import surface_points
+from limber.stages.pulls.record_path import GRASP_RADIUS_M
 from limber.store import Branch
 
 _SIGHT_SPACING = 0.005  # [m] between points on a line of sight
@@ -176,3 +191,165 @@ def robot_summary(cell: Cell, found: RobotMotion) -> dict[str, Any]:
             "duration_s": found.approach.duration + found.path.duration,
             "singularity_distance": found.joints.singularity,
             "joint_limit_margin_rad": found.joints.limit_margin}
+
+
+# The legs of a plan's whole motion, each with its own check: times, loads and distances.
+
+_MOST_POSES = 60  # of a leg whose distances are computed
+_MOST_POINTS = 800  # of the branch's surface
+
+
+def surface_points(mesh: TetMesh, displacements: np.ndarray) -> np.ndarray:
+    """Return points [n, k, 3] of the branch's surface [m] at ``displacements`` [n, nodes, 3]."""
+    vertices = np.unique(mesh.surface_faces())
+    some = vertices[::-(-len(vertices) // _MOST_POINTS)]
+    return mesh.nodes[some] + displacements[:, some]
+
+
+def legs_without_cell(motion: PlanPath, hold: float) -> list[dict[str, Any]]:
+    """Return the legs of a plan without a robot: path, hold and return, as plain data."""
+    times = present(motion.times, "time of the motion")
+    phases = present(motion.phases, "phase of the motion")
+    torques = np.linalg.norm(present(motion.torques, "torque of the motion"), axis=1)
+    end = len(phases) - phases.count("return") - 1
+    found = []
+    for name, first, last in (("path", 0, end), ("hold", end, end),
+                              ("return", end, len(phases) - 1)):
+        rows = slice(first, last + 1)
+        steps = np.linalg.norm(np.diff(motion.poses[rows, :3], axis=0), axis=1)
+        taken = np.maximum(np.diff(times[rows]), 1e-9)
+        after = hold if name == "return" else 0.0
+        found.append({
+            "name": name, "start_s": float(times[first]) + after,
+            "duration_s": hold if name == "hold" else float(times[last] - times[first]),
+            "length_m": float(steps.sum()),
+            "peak_speed_m_s": float((steps / taken).max(initial=0.0)),
+            "peak_force_n": float(motion.force_sizes[rows].max()),
+            "peak_torque_nm": float(torques[rows].max())})
+    return found
+
+
+def legs_in_cell(cell: Cell, obstacles: tuple[Obstacle, ...], motion: RobotMotion,
+                 places: np.ndarray, surfaces: np.ndarray, hold: float, progress: Progress,
+                 ) -> list[dict[str, Any]]:
+    """Return the legs of a robot's motion as plain data, each checked for collisions, and warn
+    where a link of the arm would be in the branch, or in another; positions of the grasp from rest
+    to the path's end [m], [n, 3], and points of the surface there, branch frame [m], [n, k, 3]."""
+    around, along = ArmSurroundings(cell, obstacles, None), arc_lengths(places)
+    legs = legs_of(cell, motion, hold)
+    found = [row | _distances(around, leg, along, surfaces)
+             for leg, row in zip(legs, described(legs, cell), strict=True)]
+    for row in found:
+        for key, what in (("branch_distance_m", "the branch"), ("self_distance_m", "itself")):
+            if (row[key] or 0.0) < 0.0:
+                progress.warn(
+                    f"During {row['name']} a link of the arm would be {-1e3 * row[key]:.1f} mm "
+                    f"inside {what}, by its rough shape. Look at the motion in a scene (",
+                    Command("scene"), ") before the arm moves.")
+    return found
+
+
+def _distances(around: ArmSurroundings, leg: Leg, along: np.ndarray, surfaces: np.ndarray,
+               ) -> dict[str, float | None]:
+    """Return the least distances of a leg [m], with the branch's ``surfaces`` [n, k, 3] after
+    lengths ``along`` [n] of the path; None where nothing moves or is."""
+    moved = leg.trajectory
+    if moved is None or moved.joints is None:
+        return dict.fromkeys(("self_distance_m", "obstacle_distance_m", "branch_distance_m"))
+    some = _spread(len(moved.times), _MOST_POSES)
+    gone = arc_lengths(moved.poses[:, :3])[some] if leg.name in HELD else np.zeros(len(some))
+    gone = along[-1] - gone if leg.name == "return" else gone
+    shapes = surfaces[np.abs(gone[:, None] - along).argmin(axis=1)]
+    joints = moved.joints[some]
+    return around.least_distances(joints) | {
+        "branch_distance_m": float(around.links_from(joints, shapes).min())}
+
+
+def _spread(count: int, most: int) -> np.ndarray:
+    """Return at most ``most`` of ``count`` rows, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+
+
+# The gripper's rotation of a plan where the arm cannot follow the branch's own, and its torque.
+
+_OF_HARD = 0.8  # of the torque at which the guard stops the arm, that an offset may need
+_STATES = 6  # along the path, of which the stiffness is computed, and the turned ones solved
+
+
+@dataclass(frozen=True)
+class Clamped:
+    """The branch clamped by a rigid gripper (``firm``, ``grasp``) at the states ``rows`` [k] of a
+    plan, at its natural rotations: poses [m, rad], [k, 6], displacements [m], [nodes, 3] each,
+    wrenches and stiffness (``cost``)."""
+
+    firm: BranchModel
+    grasp: Grasp
+    rows: np.ndarray
+    poses: np.ndarray
+    displacements: list[np.ndarray]
+    cost: TurnCost
+
+    @classmethod
+    def of(cls, grasp_model: GraspModel, states: SolvedPoses) -> "Clamped":
+        """Solve the clamped branch at some of a plan's states; NoPathError if one has no
+        solution."""
+        grasp = Grasp.gripping(grasp_model.mesh, grasp_model.grasp.centre, GRASP_RADIUS_M)
+        firm = grasp_model.model.gripped(grasp)
+        rows = np.unique(np.linspace(0, len(states.poses) - 1, _STATES).astype(int))
+        solved = [_solved(firm, grasp, states.poses[row], states.displacements[row])
+                  for row in rows]
+        wrenches = np.array([np.r_[one.reaction_force, one.reaction_torque] for one in solved])
+        slopes = np.array([grasp_slopes(firm, grasp, one.displacement).wrench[:, 3:]
+                           for one in solved])
+        return cls(firm, grasp, rows, states.poses[rows], [one.displacement for one in solved],
+                   TurnCost(arc_lengths(states.poses[:, :3])[rows], wrenches, slopes))
+
+    def checked(self, offsets: np.ndarray, limits: Limits) -> dict[str, float]:
+        """Return the largest torque and force on the full model with ``offsets`` [k, 3] at these
+        states, and the error of the second-order function, as plain data. NoPathError if a state
+        has no solution, or breaks a limit."""
+        wrenches = []
+        for pose, begin in zip(turned(self.poses, offsets), self.displacements, strict=True):
+            one = _solved(self.firm, self.grasp, pose, begin)
+            wrenches.append(np.r_[one.reaction_force, one.reaction_torque])
+        found = np.array(wrenches)
+        force, torque = (np.linalg.norm(part, axis=1) for part in (found[:, :3], found[:, 3:]))
+        for size, limit, what in ((force, limits.force, "force [N]"),
+                                  (torque, limits.torque, "torque [N m]")):
+            if size.max() > limit:
+                raise NoPathError(
+                    f"With the gripper turned beyond the branch's own rotation the {what} is "
+                    f"{size.max():.3g} on the full model, and the limit is {limit:.3g}.",
+                    "The arm cannot follow the branch without that rotation.",
+                    "Move the robot's base, raise the limit, or reduce ", Option("turn_slack"), ".")
+        off = np.linalg.norm((found - self.cost.wrench(offsets))[:, 3:], axis=1)
+        return {"peak_torque_nm": float(torque.max()), "peak_force_n": float(force.max()),
+                "torque_error_nm": float(off.max())}
+
+
+def _solved(firm: BranchModel, grasp: Grasp, pose: np.ndarray, begin: np.ndarray) -> StaticResult:
+    found = follow_poses(firm, grasp, pose[None], start=begin)[0]
+    if (reason := refusal(found)) is not None:
+        place = ", ".join(f"{x:.3f}" for x in pose[:3])
+        raise NoPathError(f"The branch has no reliable state with the gripper turned at ({place}) "
+                          f"m ({reason}).", "The arm cannot follow it without turning it.",
+                          "Move the robot's base, or reduce ", Option("turn_slack"), ".")
+    return found
+
+
+def turned_by(cell: Cell, predicted: Predicted, grasp_model: GraspModel, states: SolvedPoses,
+              slack: float, limits: Limits, **asked: Any) -> tuple[Turned, dict[str, Any]]:
+    """Return the robot's motion with the gripper turned by at most ``slack`` [rad] beyond the
+    branch's own rotation, checked on the full model, its torque below the guard's stop, and a
+    plan's entry about it. NoPathError if no such rotation helps, or it breaks a limit."""
+    limits = replace(limits, torque=min(limits.torque, _OF_HARD * cell.limits.hard_torque_nm))
+    clamped = Clamped.of(grasp_model, states)
+    along = arc_lengths(states.poses[:, :3])
+    found = turned_motion(cell, predicted, grasp_model.reach.axis, clamped.cost.at(along), slack,
+                          (limits.force, limits.torque), **asked)
+    return found, {
+        "slack_rad": slack, "along_m": along, "offsets_rad": found.offsets,
+        "largest_rad": float(np.linalg.norm(found.offsets, axis=1).max()),
+        "peak_energy_j": float(found.energies.max()),
+        "peak_torque_nm": float(found.torques.max()),
+        "full_model": clamped.checked(found.offsets[clamped.rows], limits)}

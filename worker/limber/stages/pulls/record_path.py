@@ -55,7 +55,7 @@ def arc_path(branch: Branch, point: np.ndarray, direction: np.ndarray, distance:
     path and rotation under a growing force along ``direction`` [3]. The level of stiffness does not
     affect it, its course along the branch a little; without an estimate the modulus is one.
     WorkError if no force moves it so far."""
-    from limber.estimation.forward.gripper_path import force_for_travel
+    from limber.estimation.forward.observed_path import force_for_travel
     from limber.mechanics import Grasp, solve_static
     from limber.store.loading import load_branch
 

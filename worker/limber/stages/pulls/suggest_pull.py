@@ -8,9 +8,9 @@ import numpy as np
 from pydantic import Field
 
 from limber.core.errors import InputError, Option, Text
-from limber.core.labels import table_of
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
+from limber.core.units import table_of
 from limber.estimation.settings import FitSpec
 from limber.stages.result import Result, Table, Vector, filled
 from limber.stages.stage import About, BranchStage, KeptStage, given

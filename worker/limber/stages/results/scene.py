@@ -70,7 +70,7 @@ class MakeScene(BranchStage):
         """
         from limber.cell.cell_file import read_cell
         from limber.cell.obstacles import cell_obstacles
-        from limber.results.scene.contents import scene_data
+        from limber.results.scene.animation import scene_data
         from limber.results.scene.still_objects import add_cell
         from limber.store.loading import load_targets
 
