@@ -11,12 +11,14 @@ import warnings
 
 import pytest
 
-from limber.cli.main import Run, call
+from limber.cli.main import call
+from limber.cli.stage_command import StageCommand
 from limber.core.errors import DamagedCacheWarning
 from limber.core.files import caches
 from limber.core.numerics import compiled
 from limber.core.processes.pool import Pool
 from limber.core.progress import report_damage_to
+from limber.stages.registry import stage_class
 
 KERNEL = """
 from limber.core.numerics.compiled import compiled
@@ -260,14 +262,14 @@ def test_cache_clear_removes_empty_files_and_folders(kept, monkeypatch, capsys):
     assert run()[2] == []
 
 
-def test_a_command_says_it_once_as_its_own_warning():
+def test_a_command_says_it_once_as_its_own_warning(capsys):
     """One line, and among the warnings of its result, however many processes warn."""
-    said = []
-    run = Run(None, said.append)
-    with report_damage_to(run.progress.warn):
+    kept = []
+    with StageCommand(stage_class("target"))._progress("none", kept):
         for number in range(3):
             warnings.warn(f"file {number} was damaged", DamagedCacheWarning, stacklevel=1)
-    assert run.warnings == ["file 0 was damaged"] and said == ["warning: file 0 was damaged"]
+    assert kept == ["file 0 was damaged"]
+    assert capsys.readouterr().err == "warning: file 0 was damaged\n"
 
 
 def _damaged(number):
