@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from limber.core.errors import InputError, Option, Text
 from limber.stages.stage import Tool, argument, option
 
 if TYPE_CHECKING:
@@ -27,6 +30,16 @@ class ArmedTool(CellTool):
     """A command that moves the robot, if armed."""
 
     arm: bool = option("Move the robot. Default: a dry run.", False, switch=True, panel=False)
+
+
+def views_in_turn(count: int) -> Iterator[object]:
+    """Return what waits before each view but the first until the camera was moved; InputError
+    where several views have no terminal to ask in."""
+    if count > 1 and not sys.stdin.isatty():
+        raise InputError(Text(Option("views", count), " needs a terminal, and standard input is "
+                              "none."), "", "Run it in a terminal, or take one view at a time.")
+    return (number and input(f"View {number + 1} of {count}: move the camera, then press Enter ")
+            for number in range(count))
 
 
 def confirmed_by(word: str) -> Any:

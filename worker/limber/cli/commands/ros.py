@@ -6,7 +6,6 @@ own network alone.
 
 from __future__ import annotations
 
-import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from limber.cli.cell_tool import ArmedTool, CellTool
-from limber.core.errors import InputError, LimberError, Option, SafetyStop, Text
+from limber.cli.cell_tool import ArmedTool, CellTool, views_in_turn
+from limber.core.errors import InputError, LimberError, Option, SafetyStop
 from limber.core.progress import SILENT, Progress
 from limber.stages.stage import About, argument, given, option, required
 
@@ -103,7 +102,7 @@ class RosScan(_RosTool):
     topic: str = given("Topic of the camera's clouds (sensor_msgs/msg/PointCloud2).",
                        "/camera/depth/color/points")
     output: Path = given("PLY file to write.", Path("scan.ply"), group="output", short="-o")
-    views: int = Field(1, description=(
+    views: int = Field(1, ge=1, le=100, description=(
         "Number of clouds. Between them the arm or the branch is moved, and Enter pressed."))
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
@@ -111,27 +110,19 @@ class RosScan(_RosTool):
         from limber.robot.ros.bridge import Bridge
         from limber.robot.ros.messages import CloudTopic, Topics
 
-        cell, views = self.cell(), self.views
-        if views > 1 and not sys.stdin.isatty():
-            raise InputError(Text(Option("views", views), " needs a terminal, and standard input "
-                                  "is none."), "",
-                             "Run it in a terminal, or take one view at a time.")
-        found = []
+        cell, views = self.cell(), views_in_turn(self.views)
         bridge = Bridge(self.url)
         try:
             camera = CloudTopic(cell, bridge, self.topic, Topics().joint_states)
-            for number in range(views):
-                if number:
-                    input(f"View {number + 1} of {views}: move the camera, then press Enter ")
-                found.append(camera.next_cloud())
+            points = np.concatenate([camera.next_cloud() for _ in views])
         finally:
             bridge.close()
-        points = np.concatenate(found)
         if not len(points):
             raise InputError(f"The clouds on {self.topic} have no point within camera.range_m.",
                              "", "Check the camera and [camera] in the cell file.")
         Cloud(points, {}).write_ply(self.output)
-        return {"cloud": str(self.output), "point_count": len(points), "view_count": views}
+        return {"cloud": str(self.output), "point_count": len(points),
+                "view_count": self.views}
 
 
 class RosFollow(_RosTool, ArmedTool):

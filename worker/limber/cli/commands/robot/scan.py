@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
 
+from limber.cli.cell_tool import views_in_turn
 from limber.core.errors import InputError, Option, Text
 from limber.core.progress import SILENT, Progress
 from limber.stages.stage import About, Tool, given
@@ -68,15 +68,9 @@ def _seen(cell: Cell, count: int) -> np.ndarray:
     if cell.camera is None:
         raise InputError("The cell file has no [camera].", "The cloud would be in an unknown "
                          "frame.", "Add [camera] with pose and mount.")
-    if count > 1 and not sys.stdin.isatty():
-        raise InputError(Text(Option("views", count), " needs a terminal, and standard input is "
-                              "none."), "",
-                         "Run it in a terminal, or take one view at a time.")
-    found = []
+    views, found = views_in_turn(count), []
     with RealSense() as camera:
-        for number in range(count):
-            if number:
-                input(f"View {number + 1} of {count}: move the camera, then press Enter ")
+        for _ in views:
             flange = None
             if cell.camera.mount == "flange":
                 _, pose = stands(cell)
