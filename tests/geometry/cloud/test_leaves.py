@@ -158,9 +158,9 @@ def test_few_leaves_need_no_consent() -> None:
     """Up to a tenth of the points passes, more does not."""
     cloud = Cloud(np.random.default_rng(0).random((1000, 3)))
     prepared = prepare(cloud, 1.0, ReconstructSettings(keep=("sheets",)))
-    check_agreed(prepared, [Leaf(np.arange(len(prepared.cloud) // 10), 1e-3)], "m")
+    check_agreed(prepared, [Leaf(np.arange(len(prepared.cloud) // 10), 1e-3)])
     with pytest.raises(InputError, match="11 % of the points look like 1 leaf"):
-        check_agreed(prepared, [Leaf(np.arange(110), 1e-3)], "m")
+        check_agreed(prepared, [Leaf(np.arange(110), 1e-3)])
 
 
 def test_a_refusal_shows_its_points_by_class(tmp_path, monkeypatch) -> None:

@@ -281,13 +281,13 @@ def test_warnings_have_places_in_the_coordinates_of_the_file():
     cloud = _tube([0, 0, 0], [0, 0, 0.6], 0.01, 3000)
     cloud = cloud[np.abs(cloud[:, 2] - 0.3) > 0.015]
     result = skeletonise(cloud)
-    told = [text for text in result.warnings_at(lambda place: 1000 * (place + [5, 0, 0]))
+    told = [text for text in result.moved(lambda place: 1000 * (place + [5, 0, 0])).warnings
             if "gap" in text]
     place = [float(part) for part in re.search(r"\(([^)]*)\)", told[0])[1].split(",")]
     assert place == pytest.approx([5000, 0, 300], abs=60)
     odd = replace(result, root_ends=[{"at": result.skeleton.nodes[end], "probability": 0.5}
                                      for end in (0, -1)])
-    text = next(text for text in odd.warnings_at(lambda place: place + [5, 0, 0])
+    text = next(text for text in odd.moved(lambda place: place + [5, 0, 0]).warnings
                 if "--root" in text)
     assert "origin" not in text and text.count("(5.0") + text.count("(4.9") == 2
 

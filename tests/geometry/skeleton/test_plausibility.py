@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, places_moved
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.reconstruction import ReconstructSettings, reconstruct_cloud
 from limber.geometry.skeleton.plausibility import (
@@ -30,22 +30,24 @@ def test_rods_that_leaves_became_show_nothing_round() -> None:
 
 
 def test_points_off_all_axes_are_named_with_their_place() -> None:
-    """Their share, a place among them in the file's coordinates, and the options."""
+    """Their number, share and distance, a place among them in the file's coordinates, and the
+    options."""
     axis = np.stack([np.zeros(40), np.zeros(40), np.linspace(0, 0.5, 40)], axis=1)
     skeleton = Skeleton.from_edges(axis, np.arange(40) - 1, np.full(40, 0.01))
     points = axis + [0.01, 0.0, 0.0]
     points[30:, 0] = 0.1
     result = SimpleNamespace(skeleton=skeleton, node_of_point=np.arange(40), noise=0.001,
                              residual=points[:, 0] - 0.01, leafy=False)
-    check_explained(result, 0.3, points, lambda place: place, np.any)
-    check_explained(result, 0.2, points, lambda place: place, lambda off: False)
-    with pytest.raises(InputError, match=r"^25 % of the points.*--crop.*--unexplained 1") as no:
-        check_explained(result, 0.2, points, lambda place: 1000 * place + 7, np.any)
-    where = (np.array(no.value.place) - 7) / 1000
-    assert where[0] == pytest.approx(0.1) and 0.38 < where[2] <= 0.5
+    check_explained(result, 0.3, points, np.any)
+    check_explained(result, 0.2, points, lambda off: False)
+    with (pytest.raises(InputError, match=r"^10 points \(25 %\).* 90 mm.*--unexplained 1") as no,
+          places_moved(lambda place: 1000 * np.array(place) + 7)):
+        check_explained(result, 0.2, points, np.any)
+    assert f"{no.value.place[0]:.3f}" in str(no.value)
+    assert no.value.place[0] == pytest.approx(107) and 387 < no.value.place[2] <= 507
     result.residual = np.where(np.arange(40) < 18, 0.0, 0.09)
-    with pytest.raises(InputError, match=r"^55 %"):
-        check_explained(result, 0.3, points, lambda place: place, lambda off: False)
+    with pytest.raises(InputError, match=r"^22 points \(55 %\)"):
+        check_explained(result, 0.3, points, lambda off: False)
 
 
 @pytest.mark.slow

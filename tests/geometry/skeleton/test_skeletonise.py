@@ -153,7 +153,7 @@ def test_foliage_degrades_and_is_told():
     leaves = [np.array([0, 0.05 * (-1)**k, 0.1 + 0.08 * k]) + RNG.normal(0, 0.025, (600, 3)) * [
         1, 1, 0.1] for k in range(6)]
     result = skeletonise(np.vstack([_tube([0, 0, 0], [0, 0, 0.6], 0.008, 3000), *leaves]))
-    assert any("not belong to any round axis" in text for text in result.warnings)
+    assert any("lie off the round axes" in text for text in result.warnings)
 
 
 def test_cancel_between_iterations():

@@ -4,7 +4,8 @@ Every message has three parts: what was found, why it is wrong, what to do. They
 commands as data (:class:`Option`, :class:`Command`), which each interface shows in its own way.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -48,6 +49,18 @@ class Command:
                 "command": self.name, "text": str(self)}
 
 
+class Place(str):
+    """A position that a message names, in the frame of whoever writes it: :func:`places_moved`."""
+
+    place: tuple[float, ...]
+
+    def __new__(cls, position: Iterable[float]) -> Self:
+        place = tuple(float(value) for value in position)
+        text = super().__new__(cls, f"({', '.join(f'{value:.3f}' for value in place)})")
+        text.place = place
+        return text
+
+
 Part = str | Option | Command
 """A part of a message."""
 
@@ -89,6 +102,11 @@ class Text(str):
     def shown(self, show: Callable[[Option | Command], str]) -> str:
         """Return it with ``show(part)`` for each option and command."""
         return "".join(part if isinstance(part, str) else show(part) for part in self.parts)
+
+    def moved(self, move: Callable[[Any], Iterable[float]]) -> "Text":
+        """Return it with each :class:`Place` where ``move`` takes it."""
+        return Text(*(Place(move(part.place)) if isinstance(part, Place) else part
+                      for part in self.parts))
 
     def at(self, position: Iterable[float]) -> Self:
         """Set the position; returns the text itself."""
@@ -139,6 +157,17 @@ class LimberError(Exception):
         """Set the position, also for an error with the same ``seen``; returns the error itself."""
         self.place = self.seen.at(position).place
         return self
+
+
+@contextmanager
+def places_moved(move: Callable[[Any], Iterable[float]]) -> Iterator[None]:
+    """Take the places of an error out of the frame of what is done meanwhile."""
+    try:
+        yield
+    except LimberError as error:
+        error.seen = error.seen.moved(move)
+        error.place = error.seen.place
+        raise
 
 
 class InputError(LimberError):

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.core.constants import UNIT_METRES
-from limber.core.errors import InputError, Option, Text
+from limber.core.errors import InputError, Option, Place, Text
 from limber.geometry.cloud.cloud import thinned
 from limber.geometry.cloud.leaves import Leaf, find_leaves, leaf_like
 from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
@@ -74,9 +73,8 @@ def show_leaves(prepared: Prepared, off: np.ndarray) -> bool:
     return like.size > 0 and float(like.mean()) > _MOST
 
 
-def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
-    """Raise InputError if removing the leaves takes more than ``UNASKED`` of the scan; ``unit`` is
-    that of the file."""
+def check_agreed(prepared: Prepared, leaves: list[Leaf]) -> None:
+    """Raise InputError if removing the leaves takes more than ``UNASKED`` of the scan."""
     share = float(leaf_mask(leaves, len(prepared.cloud)).mean())
     if share <= UNASKED:
         return
@@ -84,15 +82,14 @@ def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
     # The median point: the middle of a curled blade is not on a point.
     blade = prepared.cloud.points[largest.points]
     nearest = blade[np.argmin(np.linalg.norm(blade - np.median(blade, axis=0), axis=1))]
-    point = (nearest + prepared.origin) / UNIT_METRES[unit]
     count = f"{len(leaves)} {'leaf' if len(leaves) == 1 else 'leaves'}"
     raise InputError(
-        f"{100 * share:.0f} % of the points look like {count}: they are flat and not round. The "
-        f"largest leaf is at ({', '.join(f'{value:.6g}' for value in point)}) and has "
-        f"{1e4 * largest.area:.3g} cm2.", "Flat wood may look like a leaf, so Limber removes more "
+        Text(f"{100 * share:.0f} % of the points look like {count}: they are flat and not round. "
+             "The largest leaf is at ", Place(nearest), f" and has {1e4 * largest.area:.3g} cm2."),
+        "Flat wood may look like a leaf, so Limber removes more "
         f"than {100 * UNASKED:.0f} % of a scan only on request.", "If these are leaves, remove "
         "them and keep their mass (", Option("leaves", "cut"), "). If they are wood, keep all "
-        "points (", Option("leaves", "keep"), ").").at(point)
+        "points (", Option("leaves", "keep"), ").")
 
 
 def _on_round_axes(found: SkeletonResult, points: np.ndarray) -> np.ndarray:

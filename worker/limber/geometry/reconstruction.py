@@ -9,7 +9,7 @@ import numpy as np
 
 from limber.core.alignment import Alignment
 from limber.core.constants import STANDARD_GRAVITY, UNIT_METRES
-from limber.core.errors import InputError, Option
+from limber.core.errors import InputError, Option, places_moved
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import Cloud
@@ -189,9 +189,8 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
                       "points. It is searched for again.")
         known = None
     named = "" if not supports else supports_text(
-        supports, len(prepared.cloud),
-        lambda place: (place + prepared.origin) / UNIT_METRES[settings.unit])
-    with named_if_refused(named):
+        supports, len(prepared.cloud)).moved(prepared.outside)
+    with named_if_refused(named), places_moved(prepared.outside):
         found, wood, leaves = (
             _searched(prepared, settings, own, supports, show, progress.part(0.02, 0.55))
             if known is None else _found_before(prepared, known, progress))
@@ -212,24 +211,22 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         keep(alignment, found.skeleton, FoundSkeleton(whole, leaves))
     share = 1.0  # who gives a skeleton states its radii
     if own is None:
-        scale = UNIT_METRES[settings.unit]
-        with named_if_refused(named), shown_if_refused(show, prepared, leaves, supports,
-                                                       off_axes(whole)):
+        with (named_if_refused(named), places_moved(prepared.outside),
+              shown_if_refused(show, prepared, leaves, supports, off_axes(whole))):
             check_explained(whole, _most_off(whole, settings, supports), wood.cloud.points,
-                            lambda place: (place + wood.origin) / scale,
                             lambda off: bool(supports) or (
                                 settings.leaves != "keep" and show_leaves(wood, off)))
             share = surface_share(whole.skeleton, whole.node_of_point, whole.residual)
             if not found.leafy:
                 check_surface_shown(share, len(wood.cloud), whole.skeleton.length)
         if is_open:
-            raise root_question(found.root_ends, alignment.undo)
+            raise root_question(found.moved(alignment.undo).root_ends)
     # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.
     warnings = list(prepared.warnings)
     if named:
         warnings.append(named)
         progress.warn(named)
-    texts = found.warnings_at(alignment.undo)
+    texts = found.moved(alignment.undo).warnings
     if share < RESOLVED:
         texts.append(surface_text(share))
     for text in texts:
@@ -278,7 +275,7 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
         return found, prepared, []
     if settings.leaves == "ask":
         with shown_if_refused(show, prepared, leaves, supports):
-            check_agreed(prepared, leaves, settings.unit)
+            check_agreed(prepared, leaves)
     return (_skeleton(wood, settings, own, progress.part(0.55, 1.0)), wood, leaves) if leaves else (
         found, prepared, [])
 
@@ -434,8 +431,7 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     root = None if settings.root in (None, "auto") else (
         np.array(settings.root) * scale - prepared.origin)
     return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),
-                       view=prepared.view, progress=progress, show_apart=show_apart,
-                       where=lambda place: (place + prepared.origin) / scale)
+                       view=prepared.view, progress=progress, show_apart=show_apart)
 
 
 def _aligned(prepared: Prepared, found: SkeletonResult, settings: ReconstructSettings,

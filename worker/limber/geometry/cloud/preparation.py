@@ -31,14 +31,20 @@ _COARSEST_STEP = 5e-3  # fraction of the cloud's size: the thickness of its twig
 
 @dataclass(frozen=True)
 class Prepared:
-    """A cleaned cloud [m] near the origin: ``origin`` [3] [m] in the file's axes was subtracted. It
-    counts dropped points by reason, and has a ``view`` if there was one depth camera."""
+    """A cleaned cloud [m] near the origin: ``origin`` [3] [m] in the file's axes was subtracted
+    from ``scale`` times its numbers. It counts dropped points by reason, and has a ``view`` if
+    there was one depth camera."""
 
     cloud: Cloud
     origin: np.ndarray
     counts: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     view: View | None = None
+    scale: float = 1.0
+
+    def outside(self, place: np.ndarray) -> np.ndarray:
+        """Return positions [m], shape [..., 3], in the coordinates of the file."""
+        return (place + self.origin) / self.scale
 
 
 def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = None, *,
@@ -89,7 +95,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     _enough(cloud, "After cropping and cleaning, the cloud")
     if view is not None:
         view = replace(view, eye=view.eye - origin)
-    return Prepared(cloud, origin, counts, _plausible(cloud.points, counts), view)
+    return Prepared(cloud, origin, counts, _plausible(cloud.points, counts), view, scale)
 
 
 def voxel_thinned(points: np.ndarray, size: float) -> np.ndarray:
@@ -276,9 +282,8 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
                      "make the axes better. Crop the scan before the export if finer twigs are "
                      "missing.")
     if counts.get("sheets"):
-        texts.append(Text(f"{counts['sheets']} of {counts['read']} points lie on a wide flat sheet "
-                          "(a wall or the ground?) and were removed (", Option("keep"), " sheets "
-                          "keeps them)."))
+        texts.append(Text(f"{counts['sheets']} of {counts['read']} points lie on wide flat sheets "
+                          "and were removed (", Option("keep"), " sheets keeps them)."))
     if counts.get("ground"):
         texts.append(Text(f"{counts['ground']} of {counts['read']} points lie on rough ground and "
                           "were removed (", Option("keep"), " sheets keeps them)."))

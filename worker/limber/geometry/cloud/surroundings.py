@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from scipy.spatial import cKDTree
 
-from limber.core.errors import InputError, Option, Text
+from limber.core.errors import InputError, Option, Place, Text
 from limber.core.numerics.rigid import principal_axes
 from limber.geometry.cloud.cloud import own_order
 
@@ -70,15 +70,12 @@ def find_supports(points: np.ndarray, up: np.ndarray) -> list[Support]:
     return found
 
 
-def supports_text(supports: list[Support], count: int, where: Callable[[np.ndarray], np.ndarray],
-                  ) -> str:
-    """Return a sentence that names the supports, at least one, of a scan of ``count`` points.
-    ``where`` takes a position to the user's coordinates."""
-    named = [f"a {each.kind} ({100 * len(each.points) / count:.0f} % of the points) at ("
-             + ", ".join(f"{value:.3f}" for value in where(each.at)) + ")" for each in supports]
-    return Text(f"The scan shows {' and '.join(named)}: remove such points from the scan (",
-                Option("crop"), ", or in another program), or they "
-                "count as the plant's.")
+def supports_text(supports: list[Support], count: int) -> Text:
+    """Return a sentence that names the supports, at least one, of a scan of ``count`` points."""
+    named = [Text(f"a {each.kind} ({100 * len(each.points) / count:.0f} % of the points) at ",
+                  Place(each.at)) for each in supports]
+    return Text("The scan shows ", Text.joined(" and ", named), ": remove such points from the "
+                "scan (", Option("crop"), ", or in another program), or they count as the plant's.")
 
 
 @contextmanager

@@ -6,14 +6,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.core.errors import InputError, Option, Text
+from limber.core.errors import InputError, Option, Place, Text
 from limber.geometry.skeleton.contraction import ContractionStatus
 from limber.geometry.skeleton.curve_graph import CurveGraph
 from limber.geometry.skeleton.qsm_tables import cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
-
-Where = Callable[[np.ndarray], np.ndarray]
-"""Transforms positions, shape [..., 3], to the coordinates of the scan's file."""
 
 _STOUT = 0.13  # median distance from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
 _ROUND = 0.3  # fraction of the radius by which points of a round branch may scatter
@@ -25,40 +22,37 @@ _FIX = Text("Crop the scan to one branch (", Option("crop"), "), or provide a "
             "skeleton (", Option("skeleton"), ").")
 
 
-def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
-                    where: Where) -> None:
+def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str) -> None:
     """InputError for a ball, and for two plants unless ``plants`` states which one to use
-    (``refuse``, ``largest``, ``joined``). ``where`` leads to the user's coordinates."""
+    (``refuse``, ``largest``, ``joined``)."""
     if len(graph.nodes) < 4:
         raise InputError(f"The cloud contracts to {len(graph.nodes)} points.",
-                         "The cloud does not have the shape of a branch: it has no axis (a ball "
-                         "or a blob?).", _FIX)
+                         "The cloud does not have the shape of a branch: it has no axis.", _FIX)
     length = float(np.linalg.norm(
         graph.nodes[graph.edges[:, 0]] - graph.nodes[graph.edges[:, 1]], axis=1).sum())
     thick = float(np.median(graph.thickness))
     if length < 4 * thick:
         raise InputError(
             f"The axes have a length of {length:.3g} m and a radius of {thick:.3g} m.",
-            "The cloud does not have the shape of a branch: it is too thick (a ball or a "
-            "fruit?).", _FIX)
+            "The cloud does not have the shape of a branch: it is too thick.", _FIX)
     if plants == "largest":
         return
     for plant in graph.plants:
         raise InputError(
-            f"The scan contains two plants, {plant['distance']:.3g} m apart at "
-            f"{_position_text(where(plant['at']))} in the scan's coordinates. "
-            f"{100 * plant['points'] / count:.0f} % of the points have a base of their own.",
+            Text(f"The scan contains two plants, {plant['distance']:.3g} m apart at ",
+                 Place(plant["at"]), " in the scan's coordinates. "
+                 f"{100 * plant['points'] / count:.0f} % of the points have a base of their own."),
             "A branch belongs to one plant, and the scan does not show which one is meant.",
             _FIX, " Or use the larger plant (", Option("plants", "largest"), "), or join them (",
-            Option("plants", "joined"), ").").at(where(plant["at"]))
+            Option("plants", "joined"), ").")
     for piece in graph.split_off:
         share = piece["points"] / count
         if share > 0.2 and piece["distance"] > 0.25 * diagonal:
-            raise InputError(f"The scan contains two distant clusters. {100 * share:.0f} % of the "
-                             f"points lie {piece['distance']:.3g} m from the rest, at "
-                             f"{_position_text(where(piece['at']))} in the scan's coordinates.",
-                             "A branch must be connected.", _FIX, " Or use the larger cluster (",
-                             Option("plants", "largest"), ").").at(where(piece["at"]))
+            raise InputError(Text(
+                f"The scan contains two distant clusters. {100 * share:.0f} % of the points lie "
+                f"{piece['distance']:.3g} m from the rest, at ", Place(piece["at"]), " in the "
+                "scan's coordinates."), "A branch must be connected.", _FIX, " Or use the larger "
+                "cluster (", Option("plants", "largest"), ").")
 
 
 def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
@@ -79,7 +73,7 @@ def check_no_sheet(points: np.ndarray) -> None:
     if share > 0.9:
         raise InputError(
             f"{100 * share:.0f} % of the points lie in wide flat sheets.",
-            "The cloud does not have the shape of a branch (a wall or the ground?).", _FIX)
+            "The cloud does not have the shape of a branch.", _FIX)
 
 
 def _sheet_share(points: np.ndarray, reach: float) -> float:
@@ -94,8 +88,8 @@ def _sheet_share(points: np.ndarray, reach: float) -> float:
     return float(np.mean(flat)) if flat else 0.0
 
 
-def warnings(result: Any, where: Where) -> list[str]:
-    """Return the warnings about a skeleton; ``where`` leads to the user's coordinates."""
+def warnings(result: Any) -> list[str]:
+    """Return the warnings about a skeleton, with places in its frame."""
     texts = []
     if result.contraction.status is ContractionStatus.given:
         far = float(np.mean(np.abs(result.residual) > 3 * result.skeleton.radius[
@@ -104,14 +98,14 @@ def warnings(result: Any, where: Where) -> list[str]:
             texts.append(f"{100 * far:.0f} % of the points are far from the given skeleton. Does "
                          "it have the coordinates and the unit of the cloud?")
         return texts
-    texts += _joining_texts(result, where) + _doubt_texts(result, where)
+    texts += _joining_texts(result) + _doubt_texts(result)
     misfit = unexplained_share(result)
     if misfit > 0.15:
-        most = int(np.argmax(np.bincount(result.node_of_point[_unexplained(result)])))
-        place = where(result.skeleton.nodes[most])
-        texts.append(Text(f"{100 * misfit:.0f} % of the points do not belong to any round axis "
-                          "(leaves, flying pixels or a second plant?), most of them around "
-                          f"{_position_text(place)}. The radii there are unreliable.").at(place))
+        off = _unexplained(result)
+        most = int(np.argmax(np.bincount(result.node_of_point[off])))
+        texts.append(Text(_off_text(result, off), ", most of them around ",
+                          Place(result.skeleton.nodes[most]),
+                          ". The radii there are unreliable."))
     elif not shows_round(result):
         texts.append(f"The points scatter by {1000 * result.noise:.2g} mm, more than {_ROUND:.0%} "
                      "of the radius of their axes. Leaves among them would therefore not be "
@@ -119,14 +113,13 @@ def warnings(result: Any, where: Where) -> list[str]:
     return texts
 
 
-def _joining_texts(result: Any, where: Where) -> list[str]:
+def _joining_texts(result: Any) -> list[str]:
     """Warnings about bridges, discarded pieces and loops."""
     texts: list[str] = []
     longest = sorted(result.bridges, key=lambda bridge: -bridge["length"])
     for bridge in longest[:_NAMED]:
-        place = where(bridge["to"])
-        texts.append(Text(f"A gap of {1000 * bridge['length']:.0f} mm was bridged at "
-                          f"{_position_text(place)}.").at(place))
+        texts.append(Text(f"A gap of {1000 * bridge['length']:.0f} mm was bridged at ",
+                          Place(bridge["to"]), "."))
     if len(longest) > _NAMED:
         texts.append(f"{len(longest) - _NAMED} shorter gaps were bridged "
                      f"(up to {1000 * longest[_NAMED]['length']:.0f} mm).")
@@ -134,11 +127,10 @@ def _joining_texts(result: Any, where: Where) -> list[str]:
     if lost:
         share = 100 * lost / len(result.contraction.points)
         largest = max(result.split_off, key=lambda piece: piece["points"])
-        place = where(largest["at"])
         texts.append(Text(
             f"{len(result.split_off)} pieces ({share:.1f} % of the points) were discarded, "
             "because they are too far from the rest for their size. The largest is "
-            f"{1000 * largest['distance']:.0f} mm away, at {_position_text(place)}.").at(place))
+            f"{1000 * largest['distance']:.0f} mm away, at ", Place(largest["at"]), "."))
     for loop in sorted(result.loops)[::-1][:_NAMED]:
         texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened where branches touch.")
     if len(result.loops) > _NAMED:
@@ -146,7 +138,7 @@ def _joining_texts(result: Any, where: Where) -> list[str]:
     return texts
 
 
-def _doubt_texts(result: Any, where: Where) -> list[str]:
+def _doubt_texts(result: Any) -> list[str]:
     """Warnings about dropped twigs, and about the root."""
     texts: list[str] = []
     if result.unlikely:
@@ -154,14 +146,15 @@ def _doubt_texts(result: Any, where: Where) -> list[str]:
         texts.append(f"{len(result.unlikely)} twigs (up to {1000 * longest:.0f} mm) were "
                      "discarded, because they probably do not exist.")
     if result.second_base is not None:
-        texts.append(Text("The plant has a second base at "
-                          f"{_position_text(where(result.second_base))}. Do two plants touch? Then "
-                          "crop the scan to one of them (", Option("crop"), ").").at(
-                              where(result.second_base)))
+        texts.append(Text("The plant has a second base at ", Place(result.second_base),
+                          ". If two plants touch, crop the scan to one of them (",
+                          Option("crop"), ")."))
     if len(result.root_ends) > 1:
-        texts.append(Text("Which end is the root is uncertain: "
-                          f"{_ends_text(result.root_ends, where)}. The first was taken. If it is "
-                          "another, state it with ", Option("root"), "."))
+        ends = [Text("the end at ", Place(end["at"]), " with a probability of "
+                     f"{end['probability']:.2f}") for end in result.root_ends]
+        texts.append(Text("Which end is the root is uncertain: ", Text.joined(", ", ends),
+                          ". The first was taken. If it is another, state it with ",
+                          Option("root"), "."))
     return texts
 
 
@@ -182,21 +175,17 @@ def surface_text(share: float) -> str:
             "stated, and masses and stiffnesses that follow from it are guesses.")
 
 
-def root_question(ends: list[dict], where: Where) -> InputError:
-    """Return the error that asks which of the likeliest ends is the root."""
-    ways = [Text(Option("root", tuple(round(float(v), 3) for v in where(end["at"]))),
+def root_question(ends: list[dict]) -> InputError:
+    """Return the error that asks which of the likeliest ends, in the scan's coordinates, is the
+    root."""
+    ways = [Text(Option("root", tuple(round(float(v), 3) for v in end["at"])),
                  f" (probability {end['probability']:.2f})") for end in ends]
     return InputError(
         f"The scan does not show which of {len(ends)} ends is the root.",
         "Their thickness and height, the taper of the axes and the directions of side branches do "
         "not decide between them. The fixed end and the radii depend on it.",
         "State a place near the root, in the scan's coordinates: ", Text.joined(", ", ways),
-        ". Or take the likeliest end (", Option("root", "auto"), ").").at(where(ends[0]["at"]))
-
-
-def _ends_text(ends: list[dict], where: Where) -> str:
-    return ", ".join(f"the end at {_position_text(where(end['at']))} with a probability of "
-                     f"{end['probability']:.2f}" for end in ends)
+        ". Or take the likeliest end (", Option("root", "auto"), ").").at(ends[0]["at"])
 
 
 def shows_round(result: Any) -> bool:
@@ -220,7 +209,7 @@ def off_axes(result: Any) -> np.ndarray:
     return result.residual > np.maximum(radius, 3 * result.noise)
 
 
-def check_explained(result: Any, limit: float, points: np.ndarray, where: Where,
+def check_explained(result: Any, limit: float, points: np.ndarray,
                     not_wood: Callable[[np.ndarray], bool]) -> None:
     """InputError if over ``limit`` of the points belong to no round axis. Noise alone puts up to
     half of them off thin branches: they are accepted, unless ``not_wood``, of a mask of the points,
@@ -231,14 +220,13 @@ def check_explained(result: Any, limit: float, points: np.ndarray, where: Where,
         return
     # The point nearest to the middle of these: the middle itself may be empty.
     stray = points[off]
-    place = where(stray[np.argmin(np.linalg.norm(stray - np.median(stray, axis=0), axis=1))])
-    raise InputError(f"{100 * share:.0f} % of the points do not belong to any round axis (allowed: "
-                     f"{100 * limit:.0f} %), among them those at {_position_text(place)} in the "
-                     "scan's coordinates.", "Leaves or a second plant would become rods, and the "
-                     "radii there are unreliable. A pot, a stake or a wire counts too.", "Remove "
-                     "these points from the scan (", Option("crop"), ", or in another program), "
-                     "remove leaves (", Option("leaves", "cut"), "), or accept the axes as they "
-                     "are (", Option("unexplained", 1), ").").at(place)
+    place = stray[np.argmin(np.linalg.norm(stray - np.median(stray, axis=0), axis=1))]
+    raise InputError(Text(_off_text(result, off), f" (allowed: {100 * limit:.0f} %), among them "
+                          "those at ", Place(place), " in the scan's coordinates."),
+                     "What is not round would become rods, and the radii there are unreliable.",
+                     "Remove these points from the scan (", Option("crop"), ", or in another "
+                     "program), remove leaves (", Option("leaves", "cut"), "), or accept the axes "
+                     "as they are (", Option("unexplained", 1), ").")
 
 
 def _unexplained(result: Any) -> np.ndarray:
@@ -248,8 +236,11 @@ def _unexplained(result: Any) -> np.ndarray:
     return np.abs(result.residual) > np.clip(3 * result.noise, 0.4 * radius, radius)
 
 
-def _position_text(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{v:.3f}" for v in point) + ")"
+def _off_text(result: Any, off: np.ndarray) -> str:
+    """How many points, of mask ``off`` [m], lie off the round axes, and how far."""
+    least = 1000 * float(np.abs(result.residual[off]).min())
+    return (f"{off.sum()} points ({100 * np.mean(off):.0f} %) lie off the round axes' surfaces by "
+            f"more than {least:.2g} mm")
 
 
 # How much of a skeleton's volume points show by lying on a surface, and not all through it.

@@ -24,7 +24,7 @@ from limber.geometry.skeleton.contraction import (
     Contraction,
     ContractionStatus,
 )
-from limber.geometry.skeleton.plausibility import Where, warnings
+from limber.geometry.skeleton.plausibility import warnings
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.skeleton import STATES, Skeleton
 from limber.geometry.skeleton.totals import totals
@@ -79,12 +79,8 @@ class SkeletonResult:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings for the user, with positions in the cloud's frame."""
-        return self.warnings_at(lambda place: place)
-
-    def warnings_at(self, where: Where) -> list[str]:
-        """Warnings for the user, with positions transformed by ``where`` to other coordinates."""
-        return warnings(self, where)
+        """Warnings for the user, with positions in the result's frame."""
+        return warnings(self)
 
     @property
     def doubts(self) -> SearchDoubts:

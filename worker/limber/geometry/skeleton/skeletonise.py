@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.core.errors import InputError
+from limber.core.errors import InputError, places_moved
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import OwnFrame, thinned
 from limber.geometry.cloud.single_view import View
@@ -24,7 +24,6 @@ from limber.geometry.skeleton.curve_graph import CurveGraph, curve_graph, rooted
 from limber.geometry.skeleton.joining import second_base
 from limber.geometry.skeleton.likeliest_tree import SEARCHED_POINTS, rival_tree
 from limber.geometry.skeleton.plausibility import (
-    Where,
     check_no_sheet,
     check_one_plant,
     check_round,
@@ -52,24 +51,24 @@ _FEW = 5_000
 
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                 root: np.ndarray | None = None, up: np.ndarray | None = None,
-                view: View | None = None, where: Where | None = None,
-                show_apart: Apart | None = None, twig_probability: float = _TWIG_PROBABILITY,
-                progress: Progress = SILENT) -> SkeletonResult:
+                view: View | None = None, show_apart: Apart | None = None,
+                twig_probability: float = _TWIG_PROBABILITY, progress: Progress = SILENT,
+                ) -> SkeletonResult:
     """Find the rooted skeleton of points [n, 3] [m]; InputError if they are no branch's. ``root``
-    [3] [m] is near the root; None: the likeliest end. ``where`` leads to the file's coordinates,
-    for errors. ``show_apart`` receives another plant's points if they are the reason."""
+    [3] [m] is near the root; None: the likeliest end. ``show_apart`` receives another plant's
+    points if they are the reason."""
     # In the cloud's own frame: bounding boxes and the triangles of the Laplacian would differ for a
     # rotated one.
     own = OwnFrame.of(points)
     up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
     original_order = np.argsort(own.order)
-    found = _of_ordered(own, settings or SkeletonSettings(),
-                        None if root is None else own.inside(root), up @ own.axes,
-                        None if view is None else replace(view, eye=own.inside(view.eye)),
-                        where or (lambda place: place),
-                        None if show_apart is None else (
-                            lambda apart: show_apart(apart[original_order])),
-                        twig_probability, progress)
+    with places_moved(own.outside):
+        found = _of_ordered(own.coordinates, settings or SkeletonSettings(),
+                            None if root is None else own.inside(root), up @ own.axes,
+                            None if view is None else replace(view, eye=own.inside(view.eye)),
+                            None if show_apart is None else (
+                                lambda apart: show_apart(apart[original_order])),
+                            twig_probability, progress)
     contraction = found.contraction
     return replace(found.moved(own.outside), contraction=replace(
         contraction, points=own.outside(contraction.points)),
@@ -126,12 +125,10 @@ class _Search:
                 "join_plants": settings.plants == "joined"}
 
 
-def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | None,
-                up: np.ndarray, view: View | None, where: Where,
-                show_apart: Apart | None, twig_probability: float, progress: Progress,
-                ) -> SkeletonResult:
+def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray | None,
+                up: np.ndarray, view: View | None, show_apart: Apart | None,
+                twig_probability: float, progress: Progress) -> SkeletonResult:
     """The skeleton of points in the cloud's own frame, as are ``root`` and ``up``."""
-    points = own.coordinates
     search = _Search(points, settings, up, float(np.linalg.norm(np.ptp(points, axis=0))))
     thin = points[thinned(points, _CONTRACTED_POINTS)]
     check_no_sheet(thin)
@@ -140,8 +137,7 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     progress(0.6, "connecting")
     graph = search.connected(thin, contraction.points)
     try:
-        check_one_plant(graph, len(thin), search.diagonal, settings.plants,
-                        lambda place: where(own.outside(place)))
+        check_one_plant(graph, len(thin), search.diagonal, settings.plants)
     except InputError:
         if show_apart is not None and (graph.plants or graph.split_off):
             show_apart(graph.owner[cKDTree(thin).query(points)[1]] < 0)
