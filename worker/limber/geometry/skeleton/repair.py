@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.confidence import KINK, assessed, doubted, turns
-from limber.geometry.skeleton.fused_limbs import separate_fused_forks, with_split_limbs
+from limber.geometry.skeleton.fused_limbs import separate_fused_forks
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
 from limber.geometry.skeleton.run_ends import (
@@ -543,8 +543,6 @@ PASSES = (
     LIMIT,
     Pass("separate fused forks", "Two limbs side by side have one axis, up to a fork too far out.",
          lambda now: now.of(separate_fused_forks(now.skeleton, now.points, now.noise)[0])),
-    Pass("split limbs", "Two limbs side by side have one axis up to their tips.",
-         lambda now: now.of(with_split_limbs(now.skeleton, now.points, now.noise)[0])),
     Pass("fit finely",
          "Axes and radii come from too few nodes, and from forks that have moved since.",
          lambda now: now.fitted(now.sampled(now.skeleton), uncertainty=False), until=0.8),
