@@ -6,7 +6,7 @@ import pytest
 from benchmarks.worlds.sources import bare_case, potted_case
 from limber.core.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.preparation import PreparationSettings, prepare
+from limber.geometry.cloud.preparation import PreparationSettings, Prepared, prepare
 from limber.geometry.cloud.surroundings import (
     find_ground,
     find_supports,
@@ -14,6 +14,7 @@ from limber.geometry.cloud.surroundings import (
     supports_text,
 )
 from limber.geometry.generated import generate_branch
+from limber.geometry.leaf_removal import without_leaves
 from limber.geometry.reconstruction import COLOURS
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -51,12 +52,15 @@ def test_two_stakes_and_nothing_else_are_two_stakes() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["monopodial", "opposite"])
 def test_pot_and_stake_of_a_potted_plant_are_named(source: str) -> None:
-    """With nearly all of their points and few of the plant's; the plant without them has none."""
+    """With nearly all of their points and few of the plant's, and the pot's side is no leaf; the
+    plant without them has none."""
     case = potted_case(7100, source)
     found = find_supports(case.points, np.array(case.settings["up"]))
     assert {each.kind for each in found} == {"pot", "stake"}
     named = np.concatenate([each.points for each in found])
     assert case.leaf[named].mean() > 0.9 and np.isin(np.flatnonzero(case.leaf), named).mean() > 0.9
+    prepared = Prepared(Cloud(case.points), np.zeros(3))
+    assert without_leaves(prepared)[1] and not without_leaves(prepared, supports=found)[1]
     bare = bare_case(7100, source, "round")
     assert find_supports(bare.points, np.array(bare.settings["up"])) == []
 

@@ -1,5 +1,6 @@
 """Leaves of a scan: removed before the wood is reconstructed, then attached to it as mass."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ from limber.core.errors import InputError, Option, Place, Text
 from limber.geometry.cloud.cloud import thinned
 from limber.geometry.cloud.leaves import Leaf, find_leaves, leaf_like
 from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
+from limber.geometry.cloud.surroundings import Support
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT
@@ -31,14 +33,15 @@ _ARC = np.sin(np.pi / 3) / (np.pi / 3)
 
 
 def without_leaves(prepared: Prepared, least: float = _LEAST, found: SkeletonResult | None = None,
-                   ) -> tuple[Prepared, list[Leaf]]:
+                   supports: Sequence[Support] = ()) -> tuple[Prepared, list[Leaf]]:
     """Return the wood of a scan, and the removed leaves: none if they have under ``least`` of the
-    points. Parts that are round by ``found``, the whole scan's skeleton, are no leaves."""
+    points. ``supports``, and what is round by ``found``, the whole scan's skeleton, are no leaves.
+    """
     points = prepared.cloud.points
-    leaves = _leaves_of(points)
-    if found is not None and leaves:
-        wood = _on_round_axes(found, points)
-        leaves = [leaf for leaf in leaves if wood[leaf.points].mean() < _MOST]
+    none = np.zeros(len(points), bool) if found is None else _on_round_axes(found, points)
+    for support in supports:
+        none[support.points] = True
+    leaves = [leaf for leaf in _leaves_of(points) if none[leaf.points].mean() < _MOST]
     if leaf_mask(leaves, len(points)).mean() < least:
         return prepared, []
     return cut_off(prepared, leaves)

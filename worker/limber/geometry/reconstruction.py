@@ -266,11 +266,11 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     if own is not None or settings.leaves == "keep":
         return found, prepared, []
     if _may_be_leafy(found, prepared, settings):
-        wood, leaves = without_leaves(prepared, found=found)
+        wood, leaves = without_leaves(prepared, found=found, supports=supports)
     elif prepared.view is None:
         # A few fat rods may explain curled leaves of few points, so the shape of most of a scan
         # decides.
-        wood, leaves = without_leaves(prepared, _MOSTLY, found)
+        wood, leaves = without_leaves(prepared, _MOSTLY, found, supports)
     else:
         return found, prepared, []
     if settings.leaves == "ask":
