@@ -18,7 +18,6 @@ from limber.geometry.skeleton.run_ends import (
     point_counts,
     steadied,
     tapered,
-    unpinched,
 )
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -112,11 +111,11 @@ def _branch(stem: np.ndarray = ALONG, twig: np.ndarray | None = None, at: int = 
     return Skeleton.from_edges(np.vstack([stem, twig]), parent[:len(thick)], thick)
 
 
-def _shell(low: float = 0.0, high: float = 0.4, wide: float = np.pi, radius: float = RADIUS,
+def _shell(low: float = 0.0, high: float = 0.4, radius: float = RADIUS,
            noise: float = NOISE) -> np.ndarray:
-    """Points around the stem, or on its side that faces x."""
+    """Points around the stem."""
     rng = np.random.default_rng(0)
-    angle, z = rng.uniform(-wide, wide, 2000), rng.uniform(low, high, 2000)
+    angle, z = rng.uniform(-np.pi, np.pi, 2000), rng.uniform(low, high, 2000)
     on = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
     return on + noise * rng.standard_normal(on.shape)
 
@@ -165,7 +164,6 @@ def _twig(start: float, count: int = 24, reach: float = 0.0) -> np.ndarray:
 
 def _of_pass(name: str) -> tuple[Repaired, Mended]:
     """A branch with what the pass repairs, and how to tell that it is repaired."""
-    strip = _shell(wide=1.2)
     folded = np.vstack([ALONG, [[0.004, 0, 0.398], [0.006, 0, 0.39], [0.007, 0, 0.38]]])
     blank = replace(_hair(slice(20, 40)), radius_state=np.where(
         np.isin(np.arange(81), range(20, 40)), INTERPOLATED, 0).astype(np.int8))
@@ -173,9 +171,6 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
     cases: dict[str, Callable[[], tuple[Repaired, Mended]]] = {
         "steady radii": lambda: (_before(_hair(slice(20, 40)), gap), _thick),
         "fit coarsely": lambda: (_before(_aside()), _centred),
-        "fit unpinched": lambda: (
-            _before(_hair(slice(0, 40), 0.001), strip, pinched=_hair(slice(0, 40), 0.001)),
-            lambda now: float(np.median(now.skeleton.radius[:20])) > 0.006),
         "attach twigs": lambda: (
             _before(_branch(twig=np.vstack([_twig(0.2, 1, 0.004) - [0, 0, 0.01],
                                             _twig(0.14, reach=0.018)]), at=39)),
@@ -186,15 +181,12 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
         "prune spurs": lambda: (_before(_branch(twig=_twig(0.2, 4, 0.003))), _one_run),
         "drop duplicate axes": lambda: (_before(_branch(twig=ALONG[42:60] + [0.003, 0, 0])),
                                         _one_run),
-        "unpinch radii": lambda: (_before(_hair(slice(0, 40)), strip, pinched=_branch()), _thick),
         "limit radii": lambda: (_before(_branch(radius=0.3)),
                                 lambda now: bool((now.skeleton.radius == 0.05).all())),
         "separate fused forks": lambda: (_before(two_in_one(0.2), two_limbs()), lambda now: float(
             now.skeleton.nodes[now.skeleton.forks()[0], 2]) < 0.17),
         "fit finely": lambda: (_before(_aside()), _centred),
         "settle": lambda: (_before(_aside(), duplicates=1), _centred),
-        "draw ends back": lambda: (_before(_branch(np.vstack([
-            [0, 0, -0.012], ALONG[1:-1], [0, 0, 0.412]]))), _ends(0.0, 0.4)),
         "find the likeliest axes and radii": lambda: (_before(blank, gap), _thick),
         "mend kinks": lambda: (_before(_branch(folded, radius=0.005)), lambda now: bool(
             turns(now.skeleton, now.skeleton.runs()[0]).max() <= KINK)),
@@ -217,14 +209,6 @@ def test_passes_have_names_of_their_own_and_say_what_they_repair() -> None:
     assert all(each.repairs.endswith(".") for each in passes)
     until = [each.until for each in PASSES if each.until is not None]
     assert until == sorted(until) and until[-1] == 1.0
-
-
-def test_passes_for_hidden_stems_leave_others_alone() -> None:
-    """Where all sides were seen, or leaves, no radius is widened."""
-    before = _before(_hair(slice(0, 40)))
-    for each in PASSES:
-        if each.name in ("fit unpinched", "unpinch radii"):
-            assert each.run(before) is before
 
 
 # Kinks that wood does not make are mended, and bends that it makes stay.
@@ -325,14 +309,6 @@ def test_a_foot_of_wide_interval_limits_no_twig() -> None:
     for sigma, limited in ((0.0002, True), (0.0016, False)):
         told = tapered(replace(stem, radius_sigma=np.where(np.arange(81) < 13, sigma, 0.0)))
         assert (told.radius_state == LIMITED).any() == limited
-
-
-def test_a_pinched_stretch_starts_as_thick_as_what_is_beyond() -> None:
-    """A tip as thin as that stays."""
-    points = _points()
-    np.testing.assert_allclose(unpinched(_stem(slice(21, 36)), points).radius, RUN_RADIUS)
-    tip = _stem(slice(60, 81))
-    np.testing.assert_array_equal(unpinched(tip, points).radius, tip.radius)
 
 
 @pytest.mark.slow

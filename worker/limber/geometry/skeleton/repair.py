@@ -15,10 +15,8 @@ from limber.geometry.skeleton.fused_limbs import separate_fused_forks
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
 from limber.geometry.skeleton.run_ends import (
-    ends_within,
     limited,
     steadied,
-    unpinched,
     with_full_tips,
     without_bare_ends,
 )
@@ -405,8 +403,6 @@ class Repaired:
         view: The depth camera's view of the points, if they are one's.
         rays: The points are one sensor's, evenly spaced across its sight and scattered along it.
         fit: The last fit.
-        pinched: Start of the first fit, where only one side of wood was seen: it may make a stem
-            far too thin.
         duplicates: Number of duplicate axes that the last search dropped.
         pruned: Number of twigs dropped.
         apart: How far apart the points are; None: not known yet.
@@ -418,7 +414,6 @@ class Repaired:
     view: View | None = None
     rays: bool = False
     fit: AxisFit | None = None
-    pinched: Skeleton | None = None
     duplicates: int = 0
     pruned: int = 0
     progress: Progress = SILENT
@@ -473,17 +468,8 @@ class Pass:
 def _fit_coarsely(now: Repaired) -> Repaired:
     after = now.fitted(now.sampled(now.skeleton, _COARSE), uncertainty=False)
     by_rays = fit_of_rays(after.last_fit, now.points, now.view is not None, now.view)
-    if by_rays is not None:
-        return replace(after, rays=True, fit=by_rays, skeleton=by_rays.skeleton)
-    # For leaves too, unpinched radii would make thick stems that seem to have no leaves.
-    may_be = after.last_fit.seen.one_sided and after.off_axis_fraction <= LEAF_SHARE
-    return replace(after, pinched=now.skeleton if may_be else None)
-
-
-def _fit_unpinched(now: Repaired) -> Repaired:
-    if now.pinched is None:
-        return now
-    return now.fitted(now.sampled(unpinched(now.pinched, now.points), _COARSE), uncertainty=False)
+    return after if by_rays is None else replace(
+        after, rays=True, fit=by_rays, skeleton=by_rays.skeleton)
 
 
 def _prune_spurs(now: Repaired) -> Repaired:
@@ -527,9 +513,6 @@ PASSES = (
     STEADY,
     Pass("fit coarsely", "The contracted axes lie beside the axes that the points show.",
          _fit_coarsely, until=0.4),
-    Pass("fit unpinched",
-         "Where most of a stem is hidden, the fit to the visible strip is far too thin.",
-         _fit_unpinched, until=0.5),
     Pass("attach twigs", "The contraction pulls a fork towards its twig.",
          lambda now: now.of(attached(now.skeleton))),
     DROP_BARE_ENDS,
@@ -538,8 +521,6 @@ PASSES = (
     Pass("prune spurs", "A twig hardly extends beyond its parent and the noise.", _prune_spurs),
     DROP_DUPLICATE_AXES,
     STEADY,
-    Pass("unpinch radii", "Where only a strip of a stem is visible, the radius is far too small.",
-         lambda now: now if now.pinched is None else now.of(unpinched(now.skeleton, now.points))),
     LIMIT,
     Pass("separate fused forks", "Two limbs side by side have one axis, up to a fork too far out.",
          lambda now: now.of(separate_fused_forks(now.skeleton, now.points, now.noise)[0])),
@@ -550,8 +531,6 @@ PASSES = (
     Pass("settle", "Noise, or a duplicate axis that was just dropped, leaves the fit unfinished.",
          _settle, until=1.0),
     DROP_BARE_ENDS,
-    Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
-         lambda now: now.of(ends_within(now.skeleton, now.points))),
     LIMIT,
     Pass("find the likeliest axes and radii",
          "A radius that few points, the spacing or the noise determine, or that no wood has, is "
