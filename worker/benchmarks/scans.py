@@ -332,7 +332,7 @@ SPARSE = {
     "sparse-real": Part(sparse_scans.real_rows, 60, sparse_scans.REAL, grows=True),
     "perturbations": Part(sparse_scans.perturbation_rows, 90, (sparse_scans.PERTURBATIONS,),
                           grows=True),
-    "peers": Part(peers.rows, 300, peers.PEERS, alone=True)}
+    "peers": Part(peers.rows, 60, peers.PEERS, alone=True)}
 PARTS = {
     **SPARSE,
     **WORLDS,

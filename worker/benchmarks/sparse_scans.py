@@ -259,8 +259,7 @@ def _thinned() -> list[str]:
 def _rows(asked: Sequence[Asked], trials: list[Trial], told: bool = False) -> list[Row]:
     """Axes, intervals and time of some scans; with what each one gave if ``told``."""
     done = sound(trials)
-    failed = [f"{run.task[0]} {run.task[2]}: {run.failure.splitlines()[0]}" for run in trials
-              if run.failure]
+    failed = [f"{run.task[0]} {run.task[2]}: {_why(run)}" for run in trials if run.failure]
     compared = [run for run in done if "found" in run.values]
     if not compared:
         return [Row(*each, "none reconstructed: " + "; ".join(failed), False, len(trials))
@@ -282,6 +281,11 @@ def _rows(asked: Sequence[Asked], trials: list[Trial], told: bool = False) -> li
         Row(*asked[2], " / ".join(f"{value:.1f} s" for value in (
             np.median([run["cpu_s"] for run in done]), max(run["cpu_s"] for run in done))),
             bool(max(run["cpu_s"] for run in done) <= _SECONDS), len(done))]
+
+
+def _why(trial: Trial) -> str:
+    """The first sentence of a failure."""
+    return trial.failure.splitlines()[0].partition(". ")[0]
 
 
 def _held_row(asked: Asked, compared: list[Trial], done: list[Trial]) -> Row:
@@ -316,8 +320,7 @@ def perturbation_rows(setting: Setting) -> list[Row]:
     done = runs(setting, [(name, change, seed) for name, seed in chosen
                           for change in (AS_IT_IS, *PERTURBED)])
     first = {(run.task[0], run.task[2]): run for run in sound(done) if run.task[1] == AS_IT_IS}
-    failed = [f"{run.task[0]} {run.task[1]}: {run.failure.splitlines()[0]}" for run in done
-              if run.failure]
+    failed = [f"{run.task[0]} {run.task[1]}: {_why(run)}" for run in done if run.failure]
     pairs = [(run, first[run.task[0], run.task[2]]) for run in sound(done)
              if run.task[1] != AS_IT_IS and (run.task[0], run.task[2]) in first]
     if not pairs:
