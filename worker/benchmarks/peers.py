@@ -98,7 +98,7 @@ def _of_peer(which: tuple[str, int, int], python: Path, tasks: list[tuple[str, s
         with contextlib.suppress(subprocess.TimeoutExpired):
             subprocess.run([str(python), "-P", peer_programs.__file__, which[0], place],
                            check=False, capture_output=True, cwd=place,
-                           timeout=120 + 10 * len(tasks), env=os.environ | {"MPLBACKEND": "agg"})
+                           timeout=90 + 2 * len(tasks), env=os.environ | {"MPLBACKEND": "agg"})
         return {"each": [_numbers(*pair) for pair in zip(known, files, strict=True)]}
 
 
@@ -118,7 +118,7 @@ def _numbers(known: Subject, file: Path) -> dict[str, Any]:
     """How right a program's axes are; its radii are NaN where it has none."""
     if not file.is_file():
         why = file.with_suffix(".txt")
-        return {"failure": why.read_text() if why.is_file() else "it crashed, or hung"}
+        return {"failure": why.read_text() if why.is_file() else "no answer in time, or it crashed"}
     turn, shift = _frame(known)
     with np.load(file) as given:
         segments, radii, seconds = (given[key] for key in ("segments", "radii", "seconds"))
