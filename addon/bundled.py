@@ -30,8 +30,8 @@ if __name__ == "__main__":
     os.environ["PYTHONPATH"] = os.pathsep.join(searched)
     sys.path[:1] = searched
     try:
-        from limber.cli.main import call
+        from limber.cli.main import run
     except ImportError as error:
         sys.exit(not_loaded(error))
 
-    sys.exit(call())
+    sys.exit(run())
