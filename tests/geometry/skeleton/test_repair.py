@@ -187,6 +187,8 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
             now.skeleton.nodes[now.skeleton.forks()[0], 2]) < 0.17),
         "fit finely": lambda: (_before(_aside()), _centred),
         "settle": lambda: (_before(_aside(), duplicates=1), _centred),
+        "draw ends back": lambda: (_before(_branch(np.vstack([
+            [0, 0, -0.012], ALONG[1:-1], [0, 0, 0.412]]))), _ends(0.0, 0.4)),
         "find the likeliest axes and radii": lambda: (_before(blank, gap), _thick),
         "mend kinks": lambda: (_before(_branch(folded, radius=0.005)), lambda now: bool(
             turns(now.skeleton, now.skeleton.runs()[0]).max() <= KINK)),

@@ -270,3 +270,19 @@ def test_an_end_is_not_left_beyond_the_points() -> None:
     axis = Skeleton.from_edges(np.stack([0 * z, 0 * z, z], axis=1), np.arange(31) - 1,
                                np.full(31, 0.01))
     assert abs(with_full_tips(axis, points, 0.001).nodes[0, 2]) < 0.008
+
+
+def test_an_end_that_slid_beyond_the_points_is_drawn_back() -> None:
+    """Both ends of an axis 12 mm past a tube: they come back to it; ends within it stay."""
+    from limber.geometry.skeleton.run_ends import ends_within
+
+    points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
+    for over, moved in ((0.012, True), (-0.002, False)):
+        z = np.concatenate([[-over], np.linspace(0.01, 0.29, 29), [0.3 + over]])
+        axis = Skeleton.from_edges(np.stack([0 * z, 0 * z, z], axis=1), np.arange(31) - 1,
+                                   np.full(31, 0.01))
+        ended = ends_within(axis, points).nodes[[0, -1], 2]
+        if moved:
+            assert abs(ended - [0.0, 0.3]).max() < 0.002
+        else:
+            assert ended == pytest.approx(axis.nodes[[0, -1], 2])

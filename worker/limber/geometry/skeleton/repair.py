@@ -15,6 +15,7 @@ from limber.geometry.skeleton.fused_limbs import separate_fused_forks
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
 from limber.geometry.skeleton.run_ends import (
+    ends_within,
     limited,
     steadied,
     with_full_tips,
@@ -531,6 +532,8 @@ PASSES = (
     Pass("settle", "Noise, or a duplicate axis that was just dropped, leaves the fit unfinished.",
          _settle, until=1.0),
     DROP_BARE_ENDS,
+    Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
+         lambda now: now.of(ends_within(now.skeleton, now.points))),
     LIMIT,
     Pass("find the likeliest axes and radii",
          "A radius that few points, the spacing or the noise determine, or that no wood has, is "

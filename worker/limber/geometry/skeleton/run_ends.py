@@ -8,7 +8,7 @@ from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders, point_
 from limber.geometry.skeleton.skeleton import LIMITED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths
 
-# Ends of runs: the contraction overshoots or shortens them.
+# Ends of runs: the contraction overshoots or shortens them, and a fit lets them slide.
 
 _REACHED = 0.98  # quantile of the points along an end at which it ends
 
@@ -32,6 +32,25 @@ def without_bare_ends(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
             break
         keep[root], parent[following], root = False, -1, following
     return skeleton.subset(keep, parent)
+
+
+def ends_within(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
+    """Shorten ends that slid along their axis beyond the points during a fit."""
+    nodes = skeleton.nodes.copy()
+    segment, _ = nearest_cylinders(skeleton, points)
+    inner = np.flatnonzero(skeleton.parent == 0)
+    ends = [(int(tip), int(skeleton.parent[tip])) for tip in skeleton.tips()]
+    for end, before in [*ends, *([(0, int(inner[0]))] if len(inner) == 1 else [])]:
+        step = nodes[end] - skeleton.nodes[before]
+        length = float(np.linalg.norm(step))
+        mine = points[np.isin(segment, [end, before] if end else [
+            before, *np.flatnonzero(skeleton.parent == before)])]
+        if length == 0 or len(mine) < 3:
+            continue
+        reach = float(np.quantile((mine - skeleton.nodes[before]) @ step / length, _REACHED))
+        if length > reach + 0.5 * skeleton.radius[end]:
+            nodes[end] = skeleton.nodes[before] + step * max(reach / length, 0.1)
+    return skeleton.moved(nodes)
 
 
 def with_full_tips(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
