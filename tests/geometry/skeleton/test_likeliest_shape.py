@@ -156,7 +156,7 @@ def test_errors_that_all_fits_share_widen_all_intervals() -> None:
     """Of a coarser scan, of registration, and of sections that one side shows."""
     plain = _told(_plant(), 0.0005, 0.0)
     for told, factor in ((_told(_plant(), 0.005, 0.0), 1.5),
-                         (_told(_plant(), 0.0005, 0.0, shared=0.0008), 1.5),
+                         (_told(_plant(), 0.0005, 0.0, common=0.0008), 1.5),
                          (_told(_plant(), 0.0005, 0.0, one_sided=True), 1.15)):
         assert (told.radius_sigma > factor * plain.radius_sigma)[5:_STEM - 5].all()
 

@@ -12,7 +12,7 @@ from limber.geometry.cloud.preparation import PreparationSettings, prepare
 from limber.geometry.cloud.single_view import View
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.radii import visible_sides
-from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes, shared_error
+from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.projected_widths import (
     by_projected_widths,
     sight_field,
@@ -243,19 +243,3 @@ def test_radii_of_one_side_are_not_too_thick(seed: int) -> None:
     case = one_sided_case(seed)
     volume = cylinder_volume(seen_part(case.truth, case.points))
     assert cylinder_volume(skeletonise(case.points).skeleton) == pytest.approx(volume, rel=0.03)
-
-
-@pytest.mark.parametrize(("shift", "error"), [(0.0, 0.0), (0.0006, 0.0004)])
-def test_errors_that_patches_share(shift: float, error: float) -> None:
-    """Independent errors share none; a second station ``shift`` [m] aside shows in its sides."""
-    rng = np.random.default_rng(8)
-    angle, height = rng.uniform(-np.pi, np.pi, 6000), rng.uniform(0, 0.5, 6000)
-    points = np.stack([0.008 * np.cos(angle), 0.008 * np.sin(angle), height], axis=1)
-    points += rng.normal(0, 0.0006, points.shape)
-    points[:, 1] += shift * np.sign(np.sin(2 * angle))
-    stem = np.stack([np.zeros(80), np.zeros(80), np.linspace(0, 0.5, 80)], axis=1)
-    skeleton = Skeleton.from_edges(stem, np.arange(-1, 79), np.full(80, 0.008))
-    assert shared_error(skeleton, points, 0.0006) == pytest.approx(error, abs=0.00012)
-    # Where noise blurs the ring, the means of its patches tell nothing.
-    assert shared_error(skeleton, points, 0.002) == 0.0
-    assert shared_error(skeleton, points[:40], 0.0006) == 0.0

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.geometry.cloud.single_view import View
-from limber.geometry.skeleton.radii.axis_fit import FORK, fit_with_steps, shared_error
+from limber.geometry.skeleton.radii.axis_fit import FORK, fit_with_steps
 from limber.geometry.skeleton.radii.fit_kernels import match_cylinders, nearest_cylinders
 from limber.geometry.skeleton.radii.projected_widths import sight_field, width_covariance
 from limber.geometry.skeleton.radii.sensor_effects import sensor_smoothing
@@ -58,13 +58,12 @@ class _Shown:
 
 
 def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool = False,
-             one_sided: bool = False, view: View | None = None) -> Skeleton:
+             one_sided: bool = False, view: View | None = None, common: float = 0.0) -> Skeleton:
     """Return the skeleton with the likeliest axes and radii, intervals, states, probabilities.
-    Points scatter by ``noise`` [m]; that of one sensor's ``rays`` widens no branch."""
+    Points scatter by ``noise`` [m]; that of one sensor's ``rays`` widens no branch. All radii are
+    off together by ``common`` [m] besides."""
     shown = _Shown.of(skeleton, points, noise)
     spacing, count = shown.spacing, shown.count
-    # A quarter of a circle is off together; the four average.
-    shared = shared_error(skeleton, points, noise) / 2
     pixel = None if view is None else view.pitch * np.linalg.norm(skeleton.nodes - view.eye, axis=1)
     if rays and view is None:
         pixel = spacing
@@ -77,8 +76,8 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float, *, rays: bool
         smoothing = sensor_smoothing(skeleton, typical_radius(skeleton, skeleton.radius), count,
                                      float(np.median(spacing)))
         skeleton, covariance = smoothing.undone(skeleton, covariance)
-    shape = ShapeEvidence(covariance, spacing, 0.0 if rays else noise, shared, rays or one_sided,
-                          pixel, smoothing)
+    shape = ShapeEvidence(covariance, spacing, 0.0 if rays else noise, rays or one_sided,
+                          pixel, smoothing, common)
     likeliest = likeliest_shape(skeleton, shape)
     # Wood hardly thickens outwards. What does so nevertheless, beyond its interval, is a bunch of
     # twigs or two limbs in one: it counts for nothing.

@@ -14,6 +14,7 @@ from limber.geometry.skeleton.confidence import KINK, assessed, doubted, turns
 from limber.geometry.skeleton.fused_limbs import separate_fused_forks
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
+from limber.geometry.skeleton.radii.stations import registered
 from limber.geometry.skeleton.run_ends import (
     ends_within,
     limited,
@@ -399,7 +400,7 @@ class Repaired:
     """A skeleton between two passes, and the state that they use.
 
     Attributes:
-        points: The scan, thinned [m], shape [m, 3].
+        points: The scan, thinned, its stations registered [m], shape [m, 3].
         radius_limits: Least and largest radius [m].
         view: The depth camera's view of the points, if they are one's.
         rays: The points are one sensor's, evenly spaced across its sight and scattered along it.
@@ -407,6 +408,7 @@ class Repaired:
         duplicates: Number of duplicate axes that the last search dropped.
         pruned: Number of twigs dropped.
         apart: How far apart the points are; None: not known yet.
+        common: Deviation of what all radii are off together by the stations' registration [m].
     """
 
     skeleton: Skeleton
@@ -419,6 +421,7 @@ class Repaired:
     pruned: int = 0
     progress: Progress = SILENT
     apart: PointSpacing | None = None
+    common: float = 0.0
 
     def of(self, skeleton: Skeleton) -> "Repaired":
         """The same with another skeleton."""
@@ -493,6 +496,15 @@ def _settle(now: Repaired) -> Repaired:
                       seen=now.last_fit.seen)
 
 
+def _register_stations(now: Repaired) -> Repaired:
+    seen = now.last_fit.seen
+    found = None if now.rays or seen.one_sided or seen.along_sight else registered(
+        now.skeleton, now.points, now.noise)
+    if found is None:
+        return now
+    return replace(now, points=found[0], common=found[1]).fitted(now.skeleton, settled=True)
+
+
 def _mend_kinks(now: Repaired) -> Repaired:
     skeleton, count = without_kinks(now.skeleton)
     # Where a folded end carried the run's number, the runs are others now: so is what they state.
@@ -530,7 +542,9 @@ PASSES = (
          lambda now: now.fitted(now.sampled(now.skeleton), uncertainty=False), until=0.8),
     DROP_DUPLICATE_AXES,
     Pass("settle", "Noise, or a duplicate axis that was just dropped, leaves the fit unfinished.",
-         _settle, until=1.0),
+         _settle, until=0.9),
+    Pass("register stations", "The stations of a merged scan are a little apart, so that all radii "
+         "are off together.", _register_stations, until=1.0),
     DROP_BARE_ENDS,
     Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
          lambda now: now.of(ends_within(now.skeleton, now.points))),
@@ -540,7 +554,7 @@ PASSES = (
          "treated as measured.",
          lambda now: now.of(assessed(
              now.skeleton, now.points, now.noise, rays=now.rays,
-             one_sided=now.last_fit.seen.one_sided, view=now.view))),
+             one_sided=now.last_fit.seen.one_sided, view=now.view, common=now.common))),
     Pass("mend kinks", "A branch turns more sharply than wood does.", _mend_kinks),
 )
 """In the order in which they run; some run again after a fit."""

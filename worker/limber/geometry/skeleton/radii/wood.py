@@ -222,19 +222,19 @@ class ShapeEvidence:
         covariance: Of each node's fitted position and radius [m^2], shape [n, 4, 4].
         spacing: Spacing of the points around each node [m], shape [n].
         noise: Standard deviation of the points across the branches [m].
-        shared: Standard deviation of what all points around a branch are off together [m].
         pixel: Distance of neighbouring rays at each node [m], shape [n], if the edges of branches
             determine the radii, as in one sensor's scan; None: they do not.
         smoothing: What the sensor's smoothing did, which the radii are without; None: nothing.
+        common: Standard deviation of what all radii are off together besides [m].
     """
 
     covariance: np.ndarray
     spacing: np.ndarray
     noise: float
-    shared: float = 0.0
     one_sided: bool = False
     pixel: np.ndarray | None = None
     smoothing: Smoothing | None = None
+    common: float = 0.0
 
 
 def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
@@ -242,8 +242,8 @@ def likeliest_shape(skeleton: Skeleton, evidence: ShapeEvidence) -> Skeleton:
     states. Nodes whose state is not measured count for nothing."""
     first = radius = skeleton.radius
     fitted = np.column_stack([skeleton.nodes, np.log(first)])
-    resolution = _RESOLUTION * evidence.spacing if evidence.pixel is None else (
-        _EDGE * evidence.pixel)
+    resolution = np.hypot(evidence.common, _RESOLUTION * evidence.spacing if (
+        evidence.pixel is None) else _EDGE * evidence.pixel)
     measured = skeleton.radius_state == MEASURED
     evidence = replace(evidence, covariance=_coupled(evidence.covariance, first, measured))
     independent = np.clip(skeleton.steps / first, DISTINCT, _APART) / _APART
@@ -349,7 +349,7 @@ def _of_runs(skeleton: Skeleton, evidence: ShapeEvidence, radius: np.ndarray,
     radius = typical_radius(skeleton, radius)
     noise = _BIAS * np.minimum(evidence.noise / radius, 1.0)**2
     coarse = np.minimum(_COARSE * evidence.spacing / radius, 1.0)
-    off = np.sqrt(_OVAL**2 + noise**2 + coarse**2 + (evidence.shared / radius)**2)
+    off = np.sqrt(_OVAL**2 + noise**2 + coarse**2)
     return sparse.coo_matrix((off, (4 * np.arange(len(off)) + 3, skeleton.branch)),
                              (4 * len(off), skeleton.branch_count)).tocsr()
 
