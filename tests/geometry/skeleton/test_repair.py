@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects import stations
 
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.confidence import KINK, DoubtfulKind, doubtful_parts, turns
 from limber.geometry.skeleton.fused_limbs import separate_fused_forks
-from limber.geometry.skeleton.radii.axis_fit import AxisFit
+from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
 from limber.geometry.skeleton.repair import PASSES, Pass, Repaired, untied, without_kinks
 from limber.geometry.skeleton.run_ends import (
@@ -129,6 +130,12 @@ def _before(skeleton: Skeleton, points: np.ndarray | None = None, **found: objec
     return replace(Repaired(skeleton, points, (1e-4, 0.05), fit=fit), **found)
 
 
+def _apart() -> Repaired:
+    tree, points = stations.merged(stations.SHIFTS, stations.EYES)
+    fit = fit_axes(tree, points)
+    return _before(fit.skeleton, points, fit=fit)
+
+
 def _hair(part: slice, thin: float = 4e-4) -> Skeleton:
     radius = np.full(81, RADIUS)
     radius[part] = thin
@@ -189,6 +196,8 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
         "settle": lambda: (_before(_aside(), duplicates=1), _centred),
         "draw ends back": lambda: (_before(_branch(np.vstack([
             [0, 0, -0.012], ALONG[1:-1], [0, 0, 0.412]]))), _ends(0.0, 0.4)),
+        "register stations": lambda: (_apart(), lambda now: abs(float(
+            np.median(now.skeleton.radius)) - stations.RADIUS) < min(1.6e-4, 2 * now.common)),
         "find the likeliest axes and radii": lambda: (_before(blank, gap), _thick),
         "mend kinks": lambda: (_before(_branch(folded, radius=0.005)), lambda now: bool(
             turns(now.skeleton, now.skeleton.runs()[0]).max() <= KINK)),
