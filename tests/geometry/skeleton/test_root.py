@@ -5,6 +5,7 @@ import numpy as np
 from limber.geometry.skeleton.curve_graph import CurveGraph
 from limber.geometry.skeleton.plausibility import OPEN, root_question
 from limber.geometry.skeleton.root_end import root_node
+from limber.geometry.skeleton.skeletonise import skeletonise
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -93,3 +94,16 @@ def test_the_root_is_asked_for_where_two_ends_are_near_even():
     asked = str(root_question(choice.ends))
     for text in ("which of 2 ends", "--root auto", "--root 0 0 0 (", "--root 1 0 0 ("):
         assert text in asked
+
+
+def test_near_even_radii_hold_for_either_root() -> None:
+    """Wood tapers away from the root, and few points determine the end of a rod."""
+    rng = np.random.default_rng(3)
+    along, angle = rng.uniform(0, 0.5, 2500), rng.uniform(0, 2 * np.pi, 2500)
+    points = np.column_stack([along, 0.006 * np.cos(angle), 0.006 * np.sin(angle)])
+    points += rng.normal(0, 4e-4, points.shape)
+    asked = skeletonise(points)
+    stated = skeletonise(points, root=asked.root_ends[0]["at"])
+    assert asked.root_probability < OPEN
+    share = asked.skeleton.radius_sigma / stated.skeleton.radius_sigma
+    assert share.min() >= 1 and share.max() > 1.5

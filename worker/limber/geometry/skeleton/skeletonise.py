@@ -12,7 +12,7 @@ from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import OwnFrame, thinned
 from limber.geometry.cloud.single_view import View
 from limber.geometry.settings import SkeletonSettings
-from limber.geometry.skeleton.confidence import likely
+from limber.geometry.skeleton.confidence import assessed, likely
 from limber.geometry.skeleton.contraction import (
     POINT_LIMIT,
     contract,
@@ -21,15 +21,17 @@ from limber.geometry.skeleton.contraction import (
     through_leaves,
 )
 from limber.geometry.skeleton.curve_graph import CurveGraph, curve_graph, rooted
+from limber.geometry.skeleton.edits import SetRoot, edited
 from limber.geometry.skeleton.joining import second_base
 from limber.geometry.skeleton.likeliest_tree import SEARCHED_POINTS, rival_tree
 from limber.geometry.skeleton.plausibility import (
+    OPEN,
     check_no_sheet,
     check_one_plant,
     check_round,
 )
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
-from limber.geometry.skeleton.repair import LEAF_SHARE, SPUR_REACH, prune_spurs, repaired
+from limber.geometry.skeleton.repair import LEAF_SHARE, SPUR_REACH, Repaired, prune_spurs, repaired
 from limber.geometry.skeleton.root_end import RootChoice, root_node
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -169,7 +171,21 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
             (skeleton, noise, count), unlikely = rival, []
     if skeleton is not fitted.skeleton:
         segment, residual = nearest_cylinders(skeleton, points)
+    if len(ends) > 1 and ends[0]["probability"] < OPEN and not leafy:
+        skeleton = _of_either_root(skeleton, fitted, ends)
     progress(1.0, "skeleton", nodes=skeleton.node_count)
     return SkeletonResult(skeleton, contraction, segment, residual, noise, graph.bridges,
                           graph.split_off, graph.loops, count, second_base(skeleton, up), ends,
                           leafy, unlikely)
+
+
+def _of_either_root(skeleton: Skeleton, fitted: Repaired, ends: list[dict[str, Any]]) -> Skeleton:
+    """The skeleton with deviations of the radii that hold for the next likely root too: wood tapers
+    away from it."""
+    seen = fitted.last_fit.seen
+    rooted_there = edited(fitted.skeleton, [SetRoot(at=tuple(ends[1]["at"].tolist()))], [])
+    other = assessed(rooted_there, fitted.points, fitted.noise, rays=fitted.rays,
+                     one_sided=seen.one_sided, view=fitted.view, common=fitted.common)
+    off = other.radius[cKDTree(other.nodes).query(skeleton.nodes)[1]] - skeleton.radius
+    return replace(skeleton, radius_sigma=np.hypot(
+        skeleton.radius_sigma, np.sqrt(1 - ends[0]["probability"]) * off))
