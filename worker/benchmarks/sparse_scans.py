@@ -304,8 +304,8 @@ def _held_row(asked: Asked, compared: list[Trial], done: list[Trial]) -> Row:
         shares += [volume, radius]
         text += (f", {volume:.0%}, {radius:.0%} (volume ratio {np.median(ratio):.2f}, "
                  f"{ratio.min():.2f} to {ratio.max():.2f})")
-    return Row(*asked, f"{text}; {'over 1,000' if width > 1000 else f'{width:.1f}'}; "
-               f"{len(done) - len(stated)} of {len(done)} state no volume",
+    told = "-" if not stated else "over 1,000" if width > 1000 else f"{width:.1f}"
+    return Row(*asked, f"{text}; {told}; {len(done) - len(stated)} of {len(done)} state no volume",
                bool(min(shares) >= _HELD[0] and width <= _WIDTH), len(compared))
 
 
