@@ -44,7 +44,6 @@ from limber.geometry.skeleton.plausibility import (
     OPEN,
     RESOLVED,
     check_explained,
-    check_surface_shown,
     off_axes,
     root_question,
     surface_share,
@@ -217,8 +216,6 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
                             lambda off: bool(supports) or (
                                 settings.leaves != "keep" and show_leaves(wood, off)))
             share = surface_share(whole.skeleton, whole.node_of_point, whole.residual)
-            if not found.leafy:
-                check_surface_shown(share, len(wood.cloud), whole.skeleton.length)
         if is_open:
             raise root_question(found.moved(alignment.undo).root_ends)
     # Kept apart from the mesh's warnings, which are made again after edits of the skeleton.

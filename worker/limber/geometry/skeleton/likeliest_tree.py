@@ -18,16 +18,16 @@ from scipy.special import ive
 
 from limber.core.numerics.compiled import compiled_exactly
 from limber.core.progress import SILENT, Progress
+from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.confidence import assessed, doubted
 from limber.geometry.skeleton.radii.axis_fit import TargetDistances, data_terms
 from limber.geometry.skeleton.radii.fit_kernels import match_cylinders, nearest_cylinders
+from limber.geometry.skeleton.radii.projected_widths import by_projected_widths
 from limber.geometry.skeleton.radii.wood import Bends, Wood, turn_cost, turn_variance
 from limber.geometry.skeleton.repair import PointSpacing, resampled, without_kinks
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.tree_likelihood import PointLikelihood, Scatter
 
-SEARCHED_POINTS = 1_500
-"""Most points of a scan that is searched so: a limit of time."""
 _SPACING = 1.5  # radii between nodes
 _PASSES, _STEPS, _LAST_STEPS = 6, 6, 10  # rounds of proposals; steps of a fit between and after
 # Length of the main path over the radius at its base, and the deviation of its logarithm, where
@@ -43,20 +43,25 @@ _POSITIONS = (2 * np.arange(24) + 1) / 24 - 1  # around an axis, within so many 
 _WIDE = 4.5
 
 
-def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, progress: Progress = SILENT,
-               ) -> tuple[Skeleton, float, int] | None:
+def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View | None = None,
+               progress: Progress = SILENT) -> tuple[Skeleton, float, int] | None:
     """Return the likeliest tree found from the ``first``, that of the contracted points with all
-    its spurs, the noise [m] and the number of twigs left out, if it scores more than the ``known``
-    with axes and radii fitted alike; ``points`` [m, 3] [m] are the scan's."""
+    its spurs, or from the ``known``, the noise [m] and the number of twigs left out, if it scores
+    more than the known with axes and radii fitted alike; ``points`` [m, 3] [m] are the scan's."""
     apart = PointSpacing.of(points)
     scan = PointLikelihood.of(points).where_seen(known)
-    skeleton, count = likeliest_tree(first, scan, apart, progress)
+    tried = [likeliest_tree(start, scan, apart, progress.part(part, part + 0.5))
+             for part, start in ((0.0, first), (0.5, known))]
+    skeleton, count = max(tried, key=lambda one: scan.score(one[0]))
     alike = fitted(_spaced(known, apart), scan, _LAST_STEPS)
     if scan.score(skeleton) <= scan.score(alike):
         return None
     residual = nearest_cylinders(skeleton, points)[1]
     noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
-    found = assessed(skeleton, points, noise, one_sided=scan.sight is not None)
+    if rays := scan.sight is not None:
+        # One sensor's rays show widths, which the noise along its sight leaves as they are.
+        skeleton, _ = by_projected_widths(skeleton, points, view)
+    found = assessed(skeleton, points, noise, rays=rays, view=view if rays else None)
     even, kinks = without_kinks(found)
     return doubted(even, points, noise) if kinks else found, noise, count
 

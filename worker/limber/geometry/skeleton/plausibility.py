@@ -158,21 +158,12 @@ def _doubt_texts(result: Any) -> list[str]:
     return texts
 
 
-def check_surface_shown(share: float, count: int, length: float) -> None:
-    """InputError if no points show a surface: ``share`` is the fraction of the volume that they
-    show, ``length`` that of all axes [m]."""
-    if share == 0:
-        raise InputError(f"The {count} points show no surface along {length:.3g} m of axes.",
-                         "Around every axis they scatter as points all through its section would, "
-                         "so they show neither a radius nor a volume.", "Scan more densely or with "
-                         "less noise, or give a skeleton with radii (", Option("skeleton"), ").")
-
-
 def surface_text(share: float) -> str:
     """Warning that the volume is unresolved."""
     return (f"The points show a surface for {100 * share:.0f} % of the volume only. Elsewhere they "
-            "scatter as points all through the sections would. The volume is unresolved and not "
-            "stated, and masses and stiffnesses that follow from it are guesses.")
+            "scatter as points all through the sections would, and radii there are those that wood "
+            "of this length usually has. The volume is unresolved and not stated, and masses and "
+            "stiffnesses that follow from it are guesses.")
 
 
 def root_question(ends: list[dict]) -> InputError:

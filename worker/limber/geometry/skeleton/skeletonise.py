@@ -23,7 +23,7 @@ from limber.geometry.skeleton.contraction import (
 from limber.geometry.skeleton.curve_graph import CurveGraph, curve_graph, rooted
 from limber.geometry.skeleton.edits import SetRoot, edited
 from limber.geometry.skeleton.joining import second_base
-from limber.geometry.skeleton.likeliest_tree import SEARCHED_POINTS, rival_tree
+from limber.geometry.skeleton.likeliest_tree import rival_tree
 from limber.geometry.skeleton.plausibility import (
     OPEN,
     check_no_sheet,
@@ -49,6 +49,7 @@ _CONTRACTED_POINTS = 12_000  # more are thinned evenly: the fit, not contraction
 # twigs of a real branch of 784. Of 9,000 and 20,000 points contraction makes more false twigs, or
 # finds less.
 _FEW = 5_000
+_SEARCHED = 1_500  # most points of a scan whose likeliest tree is searched: a limit of time
 
 
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
@@ -165,10 +166,11 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
         skeleton = through_leaves(first, some, fitted.noise, fitted.radius_limits)
     skeleton, unlikely = likely(skeleton, twig_probability)
     noise, count = fitted.noise, pruned + more
-    if view is None and not leafy and len(points) <= SEARCHED_POINTS:
-        rival = rival_tree(search.unpruned(graph, start), skeleton, some, progress.part(0.95, 1.0))
+    if len(points) <= _SEARCHED:
+        rival = rival_tree(search.unpruned(graph, start), skeleton, some, view,
+                           progress.part(0.95, 1.0))
         if rival is not None:
-            (skeleton, noise, count), unlikely = rival, []
+            (skeleton, noise, count), unlikely, leafy = rival, [], False
     if skeleton is not fitted.skeleton:
         segment, residual = nearest_cylinders(skeleton, points)
     if len(ends) > 1 and ends[0]["probability"] < OPEN and not leafy:
