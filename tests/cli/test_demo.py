@@ -30,6 +30,10 @@ def stages(monkeypatch):
     def run(arguments, _progress):
         seen[arguments[0]] = arguments
         seen.setdefault("order", []).append(arguments[0])
+        if arguments[0] == "reconstruct":
+            folder = next(Path(each) for each in arguments if each.endswith(".branch"))
+            if not folder.exists():
+                Branch.create(folder)
         if arguments[0] in seen["fail"]:
             raise NoPathError(Text("There is no path (", Option("max_strain", 0.01), ")."),
                               "Walls.", "Raise ", Option("max_force"), " or ",
