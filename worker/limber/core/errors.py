@@ -60,6 +60,9 @@ class Place(str):
         text.place = place
         return text
 
+    def __getnewargs__(self) -> tuple[tuple[float, ...]]:
+        return (self.place,)
+
 
 Part = str | Option | Command
 """A part of a message."""
