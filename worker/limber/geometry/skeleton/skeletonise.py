@@ -166,11 +166,11 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
         skeleton = through_leaves(first, some, fitted.noise, fitted.radius_limits)
     skeleton, unlikely = likely(skeleton, twig_probability)
     noise, count = fitted.noise, pruned + more
-    if len(points) <= _SEARCHED:
+    if not leafy and len(points) <= _SEARCHED:  # the score knows no leaves
         rival = rival_tree(search.unpruned(graph, start), skeleton, some, view,
                            progress.part(0.95, 1.0))
         if rival is not None:
-            (skeleton, noise, count), unlikely, leafy = rival, [], False
+            (skeleton, noise, count), unlikely = rival, []
     if skeleton is not fitted.skeleton:
         segment, residual = nearest_cylinders(skeleton, points)
     if len(ends) > 1 and ends[0]["probability"] < OPEN and not leafy:
