@@ -27,7 +27,8 @@ CHAPTERS = {
         "scans that are as sparse, or thinned. The generator `drooping` was never used for a "
         "constant or a fit. PyTLidar (TreeQSM in Python) and PC-skeletor get the same clouds, "
         "turned so that the true root is the lowest; Limber finds its root. Lengths, volumes and "
-        "radii are medians, over the truth.")),
+        "radii are medians, over the truth. The rows of the programs side by side are older than "
+        "the others: Limber then took fewer proposals.")),
     "mechanics": ("Bending and motion", (
         "The finite elements against solutions that are known: rigid motions, the elastica by "
         "shooting, a manufactured solution for the order of convergence, a beam's frequency.")),
