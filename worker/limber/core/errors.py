@@ -60,8 +60,8 @@ class Place(str):
         text.place = place
         return text
 
-    def __getnewargs__(self) -> tuple[tuple[float, ...]]:
-        return (self.place,)
+    def __reduce__(self) -> tuple[type, tuple[tuple[float, ...]]]:
+        return Place, (self.place,)
 
 
 Part = str | Option | Command
