@@ -1,7 +1,8 @@
 """Sparse scans: branches of 300 to 1,500 points with truth, and real ones beside curated axes.
 
-The source on which nothing was set comes first. The same scans are changed a little: results must
-change little, and stated intervals must overlap.
+The source that no constant was fitted on comes first; the search was designed looking at scans of
+it, of other seeds. The same scans are changed a little: results must change little, and stated
+intervals must overlap.
 """
 
 import resource
@@ -196,7 +197,7 @@ def _processor_seconds() -> float:
 
 # --- rows -------------------------------------------------------------------------------------
 
-GROUPS = {f"{NEW} (nothing was set on it)": (NEW,), "the six sources of the worlds": tuple(
+GROUPS = {f"{NEW} (no fit, but looked at)": (NEW,), "the six sources of the worlds": tuple(
     SOURCES)}
 
 

@@ -84,9 +84,9 @@ ROWS = (
      "six other generators, each left out of what was learnt: {other forks, one side} of the "
      "forks from one side, {other forks, around} from all around; radius bias {other bias, one "
      "side} and {other bias, around}; real scans against others' skeletons: length {real length} "
-     "off (median), stated interval holds {real held}; 300 to 1,500 points, a generator never used "
-     "before: axes found / own {sparse}, length's interval holds {sparse held}; our own generator, "
-     "one side: {forks} of the forks, radii {radius} off",
+     "off (median), stated interval holds {real held}; 300 to 1,500 points, a generator without "
+     "fitted constants: axes found / own {sparse}, length's interval holds {sparse held}; "
+     "our own generator, one side: {forks} of the forks, radii {radius} off",
      "`tests/geometry`; `scripts/bench scans`"),
     ("bending and motion", "{elastica} off the elastica at worst, first frequency {frequency} off",
      "`tests/mechanics`; `scripts/bench mechanics`"),
