@@ -27,7 +27,8 @@ CHAPTERS = {
         "scans that are as sparse, or thinned. No constant was fitted on the generator "
         "`drooping`, but the search for the likeliest tree was designed looking at its scans of "
         "other seeds, and at both scans of puu. So neither is unseen. The first six rows have "
-        "seed 611, at which nobody looked before. PyTLidar (TreeQSM in Python) and PC-skeletor get the same clouds, "
+        "seed 611, at which nobody looked before. PyTLidar (TreeQSM in Python) and "
+        "PC-skeletor get the same clouds, "
         "turned so that the true root is the lowest; Limber finds its root. Lengths, volumes and "
         "radii are medians, over the truth. The rows of the programs side by side are older than "
         "the others: Limber then took fewer proposals.")),
