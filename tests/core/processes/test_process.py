@@ -81,5 +81,5 @@ def test_cancel_ends_the_child(stand_in):
 def test_missing_branch_folder_is_an_input_error(tmp_path):
     """Through the real command line: exit code 2 with what to do becomes InputError."""
     with pytest.raises(InputError, match="limber reconstruct") as error:
-        child.run_stage(["verify", str(tmp_path / "none.branch")])
+        child.run_stage(["verify", "--", str(tmp_path / "none.branch")])
     assert not isinstance(error.value, BranchFolderError)

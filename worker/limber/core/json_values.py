@@ -90,7 +90,5 @@ def json_object(line: str | bytes) -> dict[str, Any] | None:
 
 
 def json_objects(lines: Iterable[str | bytes]) -> Iterator[dict[str, Any]]:
-    """Yield the objects of those lines that contain one."""
-    for line in lines:
-        if (content := json_object(line)) is not None:
-            yield content
+    """Iterate over the objects of those lines that contain one."""
+    return (content for content in map(json_object, lines) if content is not None)

@@ -56,11 +56,7 @@ def trim(folder: Path, most_bytes: float) -> int:
 def clear(folder: Path) -> int:
     """Remove every file below ``folder``, and subfolders then empty; return the bytes freed. Files
     that another program holds open are skipped."""
-    freed = 0
-    for _, size, path in _files(folder):
-        with contextlib.suppress(OSError):
-            path.unlink()
-            freed += size
+    freed = trim(folder, -1)
     for parent, _folders, _names in os.walk(folder, topdown=False):
         # The folder of each cache is kept: a running program may be about to write to it.
         if len(Path(parent).relative_to(folder).parts) > 1:

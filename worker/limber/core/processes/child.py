@@ -190,10 +190,12 @@ def run_stage(arguments: Sequence[str], progress: Progress = SILENT) -> dict[str
     return its JSON result; ``progress`` gets its reports, and ends it when cancelled, as Ctrl-C
     does. LimberError of the stage by its exit code; WorkError if it crashed or exceeded its
     limits."""
-    command = [sys.executable, "-m", "limber", *map(str, arguments),
-               "--json", "--progress", "json"]
+    # What follows "--" is no option.
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    command = [sys.executable, "-m", "limber", *arguments[:end], "--json", "--progress", "json",
+               *arguments[end:]]
     return run_json_process(arguments[0], command, progress,
-                            fix=f"Run it alone to see more: limber {' '.join(map(str, arguments))}")
+                            fix=f"Run it alone to see more: limber {' '.join(arguments)}")
 
 
 def run_json_process(name: str, command: Sequence[str], progress: Progress = SILENT, *,
