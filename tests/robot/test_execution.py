@@ -51,18 +51,6 @@ def test_a_base_is_found_from_touched_points():
     assert fit.residual < 1e-3
 
 
-@pytest.mark.parametrize("spoil, told", [
-    (lambda a, b: (a[:2], b[:2]), "Four or more"),
-    (lambda a, b: (a, np.outer(np.arange(6), [0, 0, 0.1])), "across their line"),
-    (lambda a, b: (a[[1, 0, 2, 3, 4, 5]], b), "only when 1 and 2 are swapped"),
-    (lambda a, b: (1000 * a, b), r"multiplied by 0\.001\."),
-])
-def test_bad_points_are_named(spoil, told):
-    points = np.random.default_rng(0).uniform(-0.2, 0.3, (6, 3))
-    with pytest.raises(InputError, match=told):
-        fit_base(*spoil(points, points + 0.1))
-
-
 def predicted(poses: np.ndarray, forces: np.ndarray, stiffness: float = 0.0) -> Predicted:
     """A gripper that feels forces [n, 3], as stiff [N/m] in every direction."""
     count = len(poses)

@@ -13,7 +13,7 @@ from limber.cell.cell_file import CameraEntry, Cell
 from limber.cell.ur_arms import ARMS
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotation_vector
 from limber.core.numerics.rigid_kernels import pose_of
-from limber.robot.calibration import CameraOn, View, fit_base, fit_pictures, touched_point
+from limber.robot.calibration import CameraOn, View, fit_base, fit_pictures, gripper_pose
 from limber.robot.interface import Sample
 from limber.robot.ur.factory_calibration import one_arm
 
@@ -74,7 +74,7 @@ def _by_points(seed: int) -> dict[str, float]:
     for joints in np.array(arm.home) + rng.uniform(-0.35, 0.35, (_POINTS, 6)):
         sample = Sample(1.0, 1.0, joints, nothing, pose_of(arm.forward(joints) @ tool), nothing,
                         nothing, 7, 1, 2, 1.0, np.array(_CELL.tool.grasp_pose))
-        touched.append(touched_point(_CELL, sample))
+        touched.append(gripper_pose(_CELL, sample)[:3])
     places = np.array(touched)
     on_branch = places @ base[:3, :3].T + base[:3, 3]
     fit = fit_base(places, on_branch + _TOUCH_M * rng.standard_normal(on_branch.shape))

@@ -12,7 +12,7 @@ import scipy
 from scipy.spatial.transform import Rotation
 
 from limber.cell.cell_file import CameraEntry, Cell
-from limber.core.errors import InputError, Option
+from limber.core.errors import InputError, Option, Text
 from limber.core.numerics.rigid import (
     inverted,
     matrices,
@@ -28,6 +28,10 @@ from limber.robot.interface import Sample
 _FEWEST_POINTS = 4
 _LEAST_SPREAD = 0.02  # m, of the second principal direction
 _LEAST_OUT_OF_PLANE = 0.005  # m, of the third
+# Expected deviation of a touched coordinate over the largest residual, so many degrees of freedom
+# worth, the chance that a sound point is refused, and the difference of log likelihoods below which
+# two points are named.
+_TOUCHING, _TOUCHES, _DOUBTED, _EVEN = 0.1, 6, 0.02, 3.0
 
 
 @dataclass(frozen=True)
@@ -78,9 +82,8 @@ def require_frame(points: np.ndarray, names: Sequence[str], which: str,
     if spread[1] < _LEAST_SPREAD:
         raise InputError(
             f"The points {which} are nearly collinear: they spread by {1000 * spread[1]:.1f} mm "
-            f"across their line (root mean square), and {1000 * _LEAST_SPREAD:.0f} mm are "
-            "needed.", "The frame could rotate about "
-                                                                   "that line.",
+            f"across their line (root mean square), and {1000 * _LEAST_SPREAD:.0f} mm are needed.",
+            "The frame could rotate about that line.",
             "Touch points beside it, such as twigs and the rim of the pot.")
     needed = least_depth(largest_residual)
     if spread[2] < needed:
@@ -90,11 +93,6 @@ def require_frame(points: np.ndarray, names: Sequence[str], which: str,
             "A mirrored frame would fit equally well.",
             "Touch points above and below it, such as the rim of the pot and the tip of the "
             "branch.")
-
-
-def touched_point(cell: Cell, sample: Sample) -> np.ndarray:
-    """Return the position of the gripper's middle by :func:`gripper_pose` [m], shape [3]."""
-    return gripper_pose(cell, sample)[:3]
 
 
 def gripper_pose(cell: Cell, sample: Sample) -> np.ndarray:
@@ -124,19 +122,22 @@ def fit_base(touched: np.ndarray, on_branch: np.ndarray, *, largest_residual: fl
              names: Sequence[str] | None = None) -> BaseFit:
     """Fit the rigid transform from the robot's base to the branch's frame (Kabsch 1976), from
     points [m], shape [n, 3], touched by the tip and on the branch. InputError for fewer than four,
-    in a plane, too close, mirrored, or one farther off than ``largest_residual`` [m], which was
-    mixed up."""
+    in a plane, too close, mirrored, mixed up, or touched beside their place: off by more than
+    ``largest_residual`` [m], or by much more than others that are expected to be off by a tenth of
+    it."""
     touched, on_branch = np.asarray(touched, float), np.asarray(on_branch, float)
     if touched.shape != on_branch.shape or touched.ndim != 2 or touched.shape[1] != 3:
         raise InputError(f"{len(touched)} points were touched, but {len(on_branch)} are given on "
-                         "the branch.",
-                         "Each point needs its counterpart.", "Correct the list.")
+                         "the branch.", "Each point needs its counterpart.", "Correct the list.")
     names = [str(number + 1) for number in range(len(touched))] if names is None else names
     require_frame(on_branch, names, "on the branch", largest_residual)
     require_frame(touched, names, "as they were touched", largest_residual)
     frame, residuals = _registered(touched, on_branch)
+    beside = _beside(touched, on_branch, names, largest_residual)
     if residuals.max() > largest_residual:
-        raise _inaccurate(residuals, touched, on_branch, names, largest_residual)
+        raise _inaccurate(residuals, touched, on_branch, names, beside, largest_residual)
+    if beside is not None:
+        raise beside
     # Six unknowns are fitted to 3 n numbers.
     sigma = float(np.sqrt((residuals**2).sum() / (3 * len(touched) - 6)))
     return BaseFit(pose_vectors(frame), residuals, sigma / np.sqrt(len(touched)),
@@ -150,9 +151,37 @@ def _registered(touched: np.ndarray, on_branch: np.ndarray) -> tuple[np.ndarray,
     return frame, np.linalg.norm(touched @ frame[:3, :3].T + frame[:3, 3] - on_branch, axis=1)
 
 
+def _beside(touched: np.ndarray, on_branch: np.ndarray, names: Sequence[str],
+            largest_residual: float) -> InputError | None:
+    """Return which point is not where all the others put it, by how well those agree (F test of
+    each point left out), None if all are. A fit of few points bends to one that is off."""
+    count = len(names)
+    degrees = 3 * count - 9 + _TOUCHES
+    expected = _TOUCHES * (_TOUCHING * largest_residual)**2
+    left = [(frame, residuals.max(), (residuals**2).sum() + expected) for frame, residuals in (
+        _registered(np.delete(touched, k, 0), np.delete(on_branch, k, 0)) for k in range(count))]
+    squares = np.array([sum_ for _, _, sum_ in left])
+    k = int(squares.argmin())
+    whole = (_registered(touched, on_branch)[1]**2).sum() + expected
+    if scipy.stats.f.sf((whole / squares[k] - 1) * degrees / 3, 3, degrees) * count >= _DOUBTED:
+        return None
+    frame, agreed, _ = left[k]
+    away = float(np.linalg.norm(frame[:3, :3] @ touched[k] + frame[:3, 3] - on_branch[k]))
+    others = [names[other] for other in np.flatnonzero(
+        0.5 * degrees * np.log(squares / squares[k]) < _EVEN) if other != k]
+    return InputError(
+        f"Point {names[k]} is {1000 * away:.1f} mm from where the other points put it; those agree "
+        f"within {1000 * agreed:.1f} mm." + "".join(f" It may also be {name}." for name in others),
+        "It was touched beside its place, or the branch moved.",
+        Text("Touch it again or omit it. If all points were touched roughly, give a larger value "
+             "of ", Option("largest_residual"), "."))
+
+
 def _inaccurate(residuals: np.ndarray, touched: np.ndarray, on_branch: np.ndarray,
-                names: Sequence[str], largest_residual: float) -> InputError:
-    """Return why points [n, 3] do not fit: the change that would make them fit."""
+                names: Sequence[str], beside: InputError | None,
+                largest_residual: float) -> InputError:
+    """Return why points [n, 3] do not fit: the change that would make them fit, or the one that
+    is ``beside`` its place."""
     off = ", ".join(f"{name} {1000 * value:.1f}"
                     for name, value in zip(names, residuals, strict=True))
 
@@ -176,10 +205,9 @@ def _inaccurate(residuals: np.ndarray, touched: np.ndarray, on_branch: np.ndarra
                               f"swapped. As they are, the residuals [mm] are: {off}.",
                               "So they were touched in another order.",
                               "Swap them in the list, or touch them again.")
-    worst = int(residuals.argmax())
-    return InputError(f"Point {names[worst]} has a residual of {1000 * residuals[worst]:.1f} mm; "
-                      f"all residuals [mm]: {off}.", "It was confused with another point, or "
-                      "touched beside its place.", "Touch it again, or omit it.")
+    return beside or InputError(
+        f"The points do not fit; their residuals [mm] are: {off}.",
+        "More than one was touched beside its place, or the branch moved.", "Touch them again.")
 
 
 def _size(points: np.ndarray) -> float:

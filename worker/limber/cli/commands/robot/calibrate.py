@@ -254,7 +254,7 @@ def _is_number(text: str) -> bool:
 def _touch(cell: Cell, names: list[str]) -> tuple[np.ndarray, str]:
     """Read the tool's position at each point; the arm is guided by hand, no command is sent to it.
     """
-    from limber.robot.calibration import touched_point
+    from limber.robot.calibration import gripper_pose
     from limber.robot.ur.rtde import SampleStream
 
     touched = []
@@ -267,7 +267,7 @@ def _touch(cell: Cell, names: list[str]) -> tuple[np.ndarray, str]:
             samples = stream.read(1.0)
             if not samples:
                 raise WorkError("The robot sends no data.", "", "Restart its controller.")
-            touched.append(touched_point(cell, samples[-1]))
+            touched.append(gripper_pose(cell, samples[-1])[:3])
     finally:
         stream.close()
     return np.array(touched), version
