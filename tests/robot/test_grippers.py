@@ -11,11 +11,11 @@ from limber.core.progress import SILENT
 from limber.robot.operator_decisions import _opened_without_driver, grip
 from limber.robot.ur.grippers import HELD_CLOSING, RobotiqGripper, drive_gripper, holds
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.payload import Nothing, RobotiqRegisters
+from limber.robot.virtual.payload import Load, RobotiqRegisters
 from limber.robot.virtual.server import Server, new_loop
 
 
-class Stick(Nothing):
+class Stick(Load):
     """Something that is there to be held."""
 
     state = "free"

@@ -12,7 +12,7 @@ from limber.robot.driver.guard import ForceErrors, noise_at_rest, not_seen, whit
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.payload import Nothing
+from limber.robot.virtual.payload import Load
 from limber.stages.paths.execute_path import require_watched
 
 TOOL = np.array([0.0, 0.0, 0.15])
@@ -41,7 +41,7 @@ def followed_with(fault: str, peak: float, seed: int = 1, **cell: object) -> dic
     stiffness = peak / WAY_M * softness
     kind = OffSpring if fault == "pressed aside" else Spring
     load = kind(TOOL, start[:3].copy(), stiffness / (3 if "softer" in fault else 1))
-    controller.load = Nothing() if fault == "nothing held" else load
+    controller.load = Load() if fault == "nothing held" else load
     if fault == "sensor a tenth":
         traits = controller.sensor.traits
         controller.sensor.gain *= 0.1

@@ -33,7 +33,7 @@ from limber.robot.virtual.branch_solver import BranchSolver
 from limber.robot.virtual.controller import Controller, RuntimeState
 from limber.robot.virtual.gripped_branch import HeldBranch
 from limber.robot.virtual.launch import ACTIONS, state_of
-from limber.robot.virtual.payload import Nothing
+from limber.robot.virtual.payload import Load
 from limber.robot.virtual.server import (
     FT300_PORT,
     FT300_SECONDS,
@@ -54,7 +54,7 @@ _LOADED_LATE = ("limber.robot.operator_decisions", "limber.stages.pulls.record",
                 "limber.cli.commands.robot.moves", "limber.cli.commands.robot.weigh")
 
 
-class Wall(Nothing):
+class Wall(Load):
     """A stiff plane in the tool's way.
 
     Args:
@@ -76,7 +76,7 @@ class Wall(Nothing):
         return np.concatenate((force, crossed(self._tool, force)))
 
 
-class Spring(Nothing):
+class Spring(Load):
     """A held branch near its rest: a linear spring, stiff along its axis.
 
     Args:
@@ -106,7 +106,7 @@ class BranchHere(HeldBranch):
         self._pipe: Any = _Solved(BranchSolver(self.setting))
 
     def close(self) -> None:
-        """Nothing runs."""
+        """Load runs."""
 
 
 class _Solved:
@@ -388,7 +388,7 @@ class _Socket(asyncio.Transport):
     settimeout = setblocking
 
     def setsockopt(self, *_option: int) -> None:
-        """Nothing is delayed."""
+        """Load is delayed."""
 
     def __enter__(self) -> "_Socket":
         return self

@@ -29,7 +29,7 @@ from limber.robot.recorder import (
     nudge_direction,
 )
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.payload import Nothing
+from limber.robot.virtual.payload import Load
 
 RETREAT_ROW = Asked("retreats from random stops on branch and wall: force under 1 N at the end, or "
                     "why not", "50 of 50")
@@ -132,10 +132,10 @@ def direction(rng: np.random.Generator) -> np.ndarray:
     return way / np.linalg.norm(way)
 
 
-class _Misread(Nothing):
+class _Misread(Load):
     """A load whose force the sensor misreads by a matrix [3, 3]."""
 
-    def __init__(self, load: Nothing, matrix: np.ndarray):
+    def __init__(self, load: Load, matrix: np.ndarray):
         self._load, self._matrix = load, matrix
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:

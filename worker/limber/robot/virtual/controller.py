@@ -25,7 +25,6 @@ from limber.robot.virtual.payload import (
     FT300,
     ForceSensor,
     Load,
-    Nothing,
     RobotiqRegisters,
 )
 from limber.robot.virtual.step_kernels import servo_step, tool_state
@@ -309,7 +308,7 @@ class Controller:
         self.ft300_reading = np.zeros(6)
         self.tracker_off = _TRACKER_SIGMA_M * rng.standard_normal(3)
         """Offset of the simulated tracker's frame from the base's [m], shape [3]."""
-        self.load: Load = load or Nothing()
+        self.load = load or Load()
         self.robotiq = RobotiqRegisters(
             self._drive_gripper, lambda: self.load.report().get("branch", "")) if robotiq else None
         self.fault = SensorFault()

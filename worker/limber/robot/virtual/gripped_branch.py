@@ -24,6 +24,7 @@ from limber.robot.virtual.branch_solver import (
     Solution,
     solve_for_ever,
 )
+from limber.robot.virtual.payload import Load
 from limber.robot.virtual.step_kernels import steer
 
 _BLEND_SECONDS = 0.05
@@ -32,7 +33,7 @@ _LONGEST_LEAD = 0.5  # s
 _PAST = 5  # past solutions kept: the robot may move slowly
 
 
-class HeldBranch:
+class HeldBranch(Load):
     """The gripper's load: a branch, once the gripper is closed on it."""
 
     def __init__(self, setting: BranchSetting):

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -78,83 +78,41 @@ _AT_POSITION, _HELD_AT = 3, 200  # of 255: where an object stops the fingers
 _SETTING = re.compile(r"([A-Z]{3}) (\d+)")
 
 
+class Load:
+    """The gripper's load; this one is nothing."""
 
-class Load(Protocol):
-    """The gripper's load: returns the wrench on the tool at a pose of the flange."""
-
-    def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
-        """Return force and torque of the load on the flange, flange frame, shape [6]."""
-        ...
-
-    def grasp(self) -> None:
-        """Close the gripper."""
-        ...
-
-    def release(self) -> None:
-        """Open the gripper."""
-        ...
-
-    def lose(self, how: str) -> None:
-        """Lose the load: ``slipped`` or ``broken``."""
-        ...
-
-    def slide(self, part: float) -> None:
-        """Let the load slide back by a fraction of its displacement."""
-        ...
-
-    def seen(self) -> list[list[float]]:
-        """Return the positions of the points that a tracker sees, base frame [m]."""
-        ...
-
-    @property
-    def picture(self) -> bytes | None:
-        """The requested depth image, once it is available."""
-        ...
-
-    def look(self, camera: dict[str, Any]) -> None:
-        """Ask for a depth image."""
-        ...
-
-    def report(self) -> dict[str, Any]:
-        """Return the state of the load, as plain data."""
-        ...
-
-    def close(self) -> None:
-        """End the simulation."""
-        ...
-
-
-class Nothing:
-    """An empty gripper."""
+    picture: bytes | None = None
+    """The requested depth image, once it is available."""
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
+        """Return force and torque of the load on the flange at its pose, its frame, shape [6]."""
         return np.zeros(6)
 
     def grasp(self) -> None:
-        """Nothing is between the jaws."""
+        """Close the gripper."""
 
     def release(self) -> None:
-        """Nothing is held."""
+        """Open the gripper."""
 
     def lose(self, how: str) -> None:
-        """Nothing is held."""
+        """Lose the load: ``slipped`` or ``broken``."""
 
     def slide(self, part: float) -> None:
-        """Nothing is held."""
+        """Let the load slide back by a fraction of its displacement."""
 
     def seen(self) -> list[list[float]]:
+        """Return the positions of the points that a tracker sees, base frame [m]."""
         return []
 
-    picture = None
-
     def look(self, camera: dict[str, Any]) -> None:
-        """Nothing is seen."""
+        """Ask for a depth image."""
 
     def report(self) -> dict[str, Any]:
+        """Return the state of the load, as plain data."""
         return {"branch": "none"}
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """End the simulation."""
 
 
 class RobotiqRegisters:
