@@ -14,7 +14,7 @@ import pytest
 
 from benchmarks import robot_rosbridge
 from benchmarks.machine_stalls import HELD_UP_SECONDS, Witness
-from benchmarks.robot_cells import sideways
+from benchmarks.robot_cells import cell_file, sideways
 from benchmarks.robot_faults import new_robot, restored
 from benchmarks.robot_rosbridge import RosBridge, SteppedBridge
 from benchmarks.robot_stepped import SteppedRobot
@@ -26,6 +26,7 @@ from limber.robot.driver.real_time import claim_real_time, may_use_two_processor
 from limber.robot.ros import guarded_robot
 from limber.robot.ros.guarded_robot import RosRobot, Topics
 from limber.robot.virtual.controller import Controller
+from limber.stages.paths.execute import ExecutePlan
 from limber.store import Branch
 from limber.store.loading import load_grasp_model, load_skeleton
 
@@ -319,3 +320,14 @@ def first_in_line():
     gc.unfreeze()
     if hasattr(os, "sched_setscheduler"):
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def dry_run(folder, cell: Cell, tmp_path) -> dict:
+    """The result of a dry run; its table's joints bring the gripper to where the table has it."""
+    result = ExecutePlan(branch_folder=folder, name="path", cell=cell_file(cell, tmp_path)).run()
+    table = np.genfromtxt(folder / "executions" / "path-preview.csv", delimiter=",", names=True)
+    joints = np.column_stack([table[f"q{number}_rad"] for number in range(1, 7)])
+    assert cell.grasp_frames(cell.arm.forward(joints))[:, :3, 3].T == pytest.approx(
+        np.array([table["x_m"], table["y_m"], table["z_m"]]), abs=1e-6)
+    assert result["armed"] is False and result["robot"] == cell.arm.name
+    return result

@@ -4,9 +4,9 @@ import shutil
 
 import numpy as np
 import pytest
-from tests.robot.conftest import Registers
+from tests.robot.conftest import Registers, dry_run
 
-from benchmarks.robot_cells import cell_file, standing_at
+from benchmarks.robot_cells import standing_at
 from benchmarks.robot_faults import cell_for, straight, tared
 from benchmarks.robot_stepped import SteppedRobot
 from limber.cell.cell_file import Cell, read_cell, write_cell
@@ -19,7 +19,6 @@ from limber.robot.driver.link import RobotLink
 from limber.robot.motion.joint_path import follow, joint_path
 from limber.robot.motion.trajectory import densely
 from limber.robot.virtual.controller import Controller
-from limber.stages.paths.execute import ExecutePlan
 from limber.store import Branch
 
 UR5 = ARMS["ur5"]
@@ -242,15 +241,7 @@ def test_a_missing_file_is_said(tmp_path):
 @pytest.mark.slow
 def test_a_plan_is_checked_for_it_and_its_dry_run_written(planned_folder, tmp_path, arm):
     cell = standing_at(Branch.open(planned_folder), "127.0.0.97", model=arm.name)
-    result = ExecutePlan(branch_folder=planned_folder, name="path",
-                         cell=cell_file(cell, tmp_path)).run()
-    assert result["armed"] is False and result["predicted_peak_force_n"] > 0.1
-    table = np.genfromtxt(planned_folder / "executions" / "path-preview.csv", delimiter=",",
-                          names=True)
-    joints = np.column_stack([table[f"q{number}_rad"] for number in range(1, 7)])
-    places = cell.grasp_frames(arm.forward(joints))[:, :3, 3]
-    told = np.column_stack([table[column] for column in ("x_m", "y_m", "z_m")])
-    assert places == pytest.approx(told, abs=1e-6)
+    assert dry_run(planned_folder, cell, tmp_path)["predicted_peak_force_n"] > 0.1
 
 
 def test_the_virtual_controller_moves_it_as_a_ur5(ur5_file):

@@ -24,7 +24,6 @@ from limber.stages.stage import About, argument, given
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell
-    from limber.robot.driver.link import RobotLink
     from limber.robot.interface import Sample
     from limber.robot.motion.trajectory import Trajectory
 
@@ -122,21 +121,12 @@ class Release(ArmedTool):
     confirm: str | None = confirmed_by("release")
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
-        from limber.robot.driver.link import RobotLink
         from limber.robot.motion.joint_path import away_from_branch
-        from limber.robot.operator_decisions import grip, require_confirmation
 
         cell = self.cell()
         sample, pose = stands(cell)
         motion = away_from_branch(cell, sample.joints, pose)
-        result = _motion_summary(motion) | {"armed": self.arm}
-        if not self.arm:
-            return result
-        require_confirmation("release", self.confirm, cell, progress)
-        with RobotLink(cell) as link:
-            link.wait_for_samples()
-            grip(cell, link, close=False, progress=progress)
-            return _followed(self, link, motion, result)
+        return _followed(self, cell, motion, _motion_summary(motion), progress, opens=True)
 
 
 class Open(ArmedTool):
@@ -179,9 +169,7 @@ def _to(move: Home | GotoStart, cell: Cell, folder: Path | None, goal: np.ndarra
     """Plan the path of the empty arm to joint angles ``goal`` [n], and follow it if armed."""
     from limber.cell.obstacles import cell_obstacles
     from limber.cell.reach_and_collision import ArmSurroundings
-    from limber.robot.driver.link import RobotLink
     from limber.robot.motion.joint_path import is_at, to_joints
-    from limber.robot.operator_decisions import require_confirmation
     from limber.store import Branch
     from limber.store.loading import load_skeleton
 
@@ -196,26 +184,31 @@ def _to(move: Home | GotoStart, cell: Cell, folder: Path | None, goal: np.ndarra
         return {"armed": move.arm, "duration_s": 0.0}
     motion = to_joints(cell, sample.joints, goal, around)
     assert motion.joints is not None
-    result = _motion_summary(motion) | {"armed": move.arm, "clearance_m": float(
-        around.clearance(motion.joints).min())}
+    return _followed(move, cell, motion, _motion_summary(motion) | {"clearance_m": float(
+        around.clearance(motion.joints).min())}, progress)
+
+
+def _followed(move: Home | GotoStart | Release, cell: Cell, motion: Trajectory,
+              result: dict[str, Any], progress: Progress, *, opens: bool = False) -> dict[str, Any]:
+    """Follow a motion of the empty gripper if armed, and log it; ``opens`` the gripper before."""
+    from limber.robot.driver.link import RobotLink
+    from limber.robot.operator_decisions import grip, require_confirmation
+
+    result |= {"armed": move.arm}
     if not move.arm:
         return result
     require_confirmation(move.about.name.rpartition(" ")[2], move.confirm, cell, progress)
     with RobotLink(cell) as link:
         link.wait_for_samples()
-        return _followed(move, link, motion, result)
-
-
-def _followed(move: ArmedTool, link: RobotLink, motion: Trajectory, result: dict[str, Any],
-              ) -> dict[str, Any]:
-    """Tare, follow a motion of the empty gripper, and log it."""
-    link.tare(_TARE_SECONDS)
-    try:
-        event = link.follow(motion)
-    except KeyboardInterrupt:
-        # Ctrl-C stops the arm before anything else.
-        link.stop()
-        raise
+        if opens:
+            grip(cell, link, close=False, progress=progress)
+        link.tare(_TARE_SECONDS)
+        try:
+            event = link.follow(motion)
+        except KeyboardInterrupt:
+            # Ctrl-C stops the arm before anything else.
+            link.stop()
+            raise
     result |= {"reached": event["event"] == "reached", "stop_reason": event.get("reason")}
     log_move(move, result)
     if not result["reached"]:
