@@ -220,6 +220,15 @@ def test_a_new_cell_says_what_is_to_be_filled_in_instead_of_zero(tmp_path, capfd
     assert read_cell(path).tool.mass_kg == 0.9
 
 
+@pytest.mark.parametrize("options, rated", [
+    (["--model", "ur3e"], ("controller", 30, 10)), (["--model", "ur10"], ("ft300", 300, 30)),
+    (["--model", "ur30", "--sensor", "ft300_usb"], ("ft300_usb", 300.0, 30.0))])
+def test_a_new_cell_has_the_range_of_its_sensor(options, rated, tmp_path, capfd):
+    assert answer("robot", "new-cell", tmp_path / "a.toml", "--gripper", "none", *options)[0] == 0
+    sensor = read_cell(tmp_path / "a.toml").sensor
+    assert (sensor.kind, sensor.force_range_n, sensor.torque_range_nm) == rated
+
+
 def test_the_schema_of_a_cell_names_its_sections(capfd):
     assert call(["schema", "cell"]) == 0
     told = json.loads(capfd.readouterr().out)

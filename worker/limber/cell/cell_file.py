@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from limber.cell.arm import MOST_SPEED, MOST_TURN_SPEED, Arm, greatest_force, greatest_torque
 from limber.cell.known_arms import arm_named
+from limber.cell.ur_arms import NAMES
 from limber.cell.urdf_arm import ENDING
 from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.atomic import write_atomically
@@ -26,6 +27,8 @@ from limber.core.numerics.rigid import inverted, matrices
 RIGID_N_PER_M = 2e5
 """Stiffness with which a gripper meets a rigid thing: that of the arm and its joints [N/m]."""
 
+FAR = 20.0
+"""Greatest distance from the branch [m] of any object that an arm works with."""
 Vector = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float]
 
@@ -51,8 +54,8 @@ class _Entry(BaseModel):
 class RobotEntry(_Entry):
     """Robot model and address."""
 
-    model: str = Field(description="ur3, ur5, ur10, ur3e, ur5e, ur10e or "
-                       "ur16e; the URDF file of another arm, beside the cell file.")
+    model: str = Field(description=f"One of {NAMES}; or the URDF file of another arm, beside the "
+                       "cell file.")
     address: str = Field("127.0.0.1", min_length=1, description="Address of the controller.")
     version: str | None = Field(None, pattern=r"^\d+\.\d+(\.\d+)*$",
                                 description="Controller version at the calibration.")
@@ -230,20 +233,16 @@ class WorkspaceEntry(_Entry):
         return self
 
 
+_Edge = Annotated[float, Field(gt=0, le=FAR)]
+
+
 class BoxEntry(_Entry):
     """A box as an obstacle."""
 
     kind: Literal["box"] = "box"
     name: str = ""
-    size_m: Vector = Field(description="Edge lengths.")
+    size_m: tuple[_Edge, _Edge, _Edge] = Field(description="Edge lengths [m].")
     pose: Pose = Field(description="Pose of its centre in the branch's frame.")
-
-    @field_validator("size_m")
-    @classmethod
-    def _solid(cls, value: Vector) -> Vector:
-        if min(value) <= 0 or max(value) > FAR:
-            raise ValueError("edge lengths must be positive and in metres")
-        return value
 
 
 class MeshEntry(_Entry):
@@ -400,8 +399,6 @@ def _without_none(value: Any) -> Any:
     return value
 
 
-FAR = 20.0
-"""Greatest distance from the branch [m] of any object that an arm works with."""
 _FAR_FROM_ARM = 10.0  # m; distance of the branch's origin beyond the arm's reach
 _AT_FLANGE = 1.0  # m; a tool is nearer to the flange
 _WHOLE_TURN = 2 * math.pi + 1e-6

@@ -36,11 +36,6 @@ def _link(table: np.ndarray, joint: int, angle: float) -> np.ndarray:
 
 
 @compiled
-def forward(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(link_frames(table, joints)[:, 5])
-
-
-@compiled
 def link_frames(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
     frames = np.empty((len(joints), 6, 4, 4))
     for n in range(len(joints)):
@@ -164,8 +159,9 @@ Series = Literal["cb3", "e"]
 # Offsets along and twists about x between the joints' axes: the same layout in every arm.
 _TWIST = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 _QUICK, _SLOW, _WRIST = math.pi, 2 * math.pi / 3, 2 * math.pi
-# Housings of the joints: three sizes of arm.
+# Housings of the joints: four sizes of arm.
 _SMALL, _MIDDLE, _LARGE = (0.055, 0.045, 0.035), (0.06, 0.06, 0.045), (0.075, 0.06, 0.055)
+_HEAVY = (0.1, 0.085, 0.055)  # the maker's meshes: 0.09, 0.077, 0.05; upper arm 0.089
 _UPPER_TUBE, _FORE_TUBE = 0.9, 0.75  # radii of the two long tubes over those of their housings
 _DRAWN = 0.05  # radius of the drawn links over the length of the two tubes
 
@@ -240,9 +236,7 @@ class UrArm:
         return 125.0 if self.series == "cb3" else 500.0
 
     def forward(self, joints: np.ndarray) -> np.ndarray:
-        joints = np.asarray(joints, float)
-        frames = forward(self.table, for_kernels(joints.reshape(-1, 6)))
-        return frames.reshape(*joints.shape[:-1], 4, 4)
+        return np.ascontiguousarray(self.link_frames(joints)[..., 5, :, :])
 
     def link_frames(self, joints: np.ndarray) -> np.ndarray:
         """Return the frames of all six links in the base's, the last of them the flange's,
@@ -269,8 +263,8 @@ class UrArm:
 
     def jacobian(self, joints: np.ndarray) -> np.ndarray:
         joints = np.asarray(joints, float)
-        slopes = jacobian(self.table, for_kernels(joints.reshape(-1, 6)))
-        return slopes.reshape(*joints.shape[:-1], 6, 6)
+        return jacobian(self.table, for_kernels(joints.reshape(-1, 6))).reshape(
+            *joints.shape[:-1], 6, 6)
 
     def singularity_distance(self, joints: np.ndarray) -> np.ndarray:
         """Return the distance of each joint pose from each singularity, shape [..., 3].
@@ -315,7 +309,7 @@ def _arm(name: str, d: tuple[float, float, float, float], a: tuple[float, float]
          housing: tuple[float, float, float], *, elbow: float = _QUICK,
          endless: bool = False) -> UrArm:
     shoulder, wrist = speeds
-    return UrArm(name, "e" if name.endswith("e") else "cb3", (d[0], 0.0, 0.0, *d[1:]),
+    return UrArm(name, "cb3" if name in ("ur3", "ur5", "ur10") else "e", (d[0], 0.0, 0.0, *d[1:]),
                (0.0, a[0], a[1], 0.0, 0.0, 0.0), (shoulder,) * 2 + (elbow,) + (wrist,) * 3,
                payload, lateral, housing, endless)
 
@@ -329,10 +323,15 @@ ARMS: dict[str, UrArm] = {arm.name: arm for arm in (
          (0.220941, 0.049042), _LARGE),
     _arm("ur3e", (0.15185, 0.13105, 0.08535, 0.0921), (-0.24355, -0.2132), (_QUICK, _WRIST), 3.0,
          (0.12, 0.027), _SMALL, endless=True),
-    _arm("ur5e", (0.1625, 0.1333, 0.0997, 0.0996), (-0.425, -0.3922), (_QUICK, _QUICK), 5.0,
-         (0.138, 0.007), _MIDDLE),
-    _arm("ur10e", (0.1807, 0.17415, 0.11985, 0.11655), (-0.6127, -0.57155), (_SLOW, _QUICK), 12.5,
-         (0.1762, 0.0393), _LARGE),
+    *(_arm(name, (0.1625, 0.1333, 0.0997, 0.0996), (-0.425, -0.3922), (_QUICK, _QUICK), payload,
+           (0.138, 0.007), _MIDDLE) for name, payload in (("ur5e", 5.0), ("ur7e", 7.5))),
+    *(_arm(name, (0.1807, 0.17415, 0.11985, 0.11655), (-0.6127, -0.57155), (_SLOW, _QUICK), 12.5,
+           (0.1762, 0.0393), _LARGE) for name in ("ur10e", "ur12e")),
     _arm("ur16e", (0.1807, 0.17415, 0.11985, 0.11655), (-0.4784, -0.36), (_SLOW, _QUICK), 16.0,
          (0.176, 0.04), _LARGE),
+    *(_arm(name, (0.2363, 0.201, 0.1593, 0.1543), lengths, (_SLOW, 7 * math.pi / 6), payload,
+           (0.26, 0.043), _HEAVY, elbow=5 * math.pi / 6)
+      for name, lengths, payload in (("ur20", (-0.862, -0.7287), 20.0),
+                                     ("ur30", (-0.637, -0.5037), 30.0))),
 )}
+NAMES = ", ".join(ARMS)

@@ -27,8 +27,8 @@ class VirtualRobot(Tool):
     branch_folder: Path | None = argument("A branch for the gripper to hold.", default=None)
     cell: Path | None = given("Cell file with model, address and base. Required with a branch.")
     model: str = Field("ur5e", description=(
-        "ur3, ur5, ur10 (125 Hz), ur3e, ur5e, ur10e, ur16e (500 Hz); or the URDF file of another "
-        "arm with six joints (500 Hz)."))
+        "Model as in a cell file (ur3, ur5 and ur10: 125 Hz, others: 500 Hz); or the URDF file of "
+        "another arm with six joints (500 Hz)."))
     address: str = Field("127.0.0.1", description=(
         "Loopback address on which the controller listens."))
     young: tuple[float, ...] = Field((), description="True Young's moduli of the branch [Pa].")

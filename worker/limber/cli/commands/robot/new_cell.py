@@ -4,18 +4,22 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import ValidationError
+
 from limber.cell.cell_file import Cell, SensorEntry, ToolEntry, cell_template, not_stated, slips
 from limber.cell.known_arms import arm_named
+from limber.cell.ur_arms import NAMES
 from limber.core.errors import InputError
 from limber.core.files.atomic import write_atomically
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.stages.stage import About, Tool, argument, given
 
-_ASKED = {"model": ("Model of the robot (ur3, ur5, ur10, ur3e, ur5e, ur10e, ur16e)", "ur5e"),
-          "address": ("Address of its controller", "127.0.0.1"),
-          "gripper": ("Gripper (none, digital_output, robotiq, by_hand)", "by_hand"),
-          "mass_kg": ("Mass of the gripper with the sensor [kg]", None),
-          "grasp_distance": ("Distance from the flange to the middle of the fingers [m]", None)}
+_ASKED = ("model", "address", "sensor", "gripper", "mass_kg", "grasp_distance")
+_USUAL = {"model": "ur5e", "address": "127.0.0.1", "gripper": "by_hand"}
+_RATED = {"ft300": (300.0, 30.0), "ur3e": (30.0, 10.0), "ur5e": (50.0, 10.0),
+          "ur10e": (100.0, 10.0), "ur16e": (160.0, 10.0)}
+"""Ranges [N, N m] by the makers' data sheets; other arms have the usual ones of a cell file."""
 
 
 class NewCell(Tool):
@@ -29,8 +33,10 @@ class NewCell(Tool):
     about = About("robot new-cell")
 
     cell_file: Path = argument("The cell file to write.")
-    model: str | None = given("Model of the robot, or the URDF file of another arm.")
+    model: str | None = given(f"Model of the robot ({NAMES}), or the URDF file of another arm.")
     address: str | None = given("Address of its controller.")
+    sensor: Literal["controller", "ft300", "ft300_usb", "none"] | None = given(
+        "Force-torque sensor. Default: the arm's own, where it has one.")
     gripper: Literal["none", "digital_output", "robotiq", "by_hand"] | None = given(
         "How the gripper is moved.")
     mass_kg: float | None = given("Mass of the gripper with the sensor [kg].")
@@ -41,42 +47,38 @@ class NewCell(Tool):
         if self.cell_file.exists():
             raise InputError(f"{self.cell_file} exists already.", "A cell file is never "
                              "overwritten.", "Give another name.")
-        answers = {name: _answer(name, getattr(self, name)) for name in _ASKED}
-        sensor = "controller" if arm_named(answers["model"]).measures_force else "ft300"
-        mass, distance = _number(answers, "mass_kg"), _number(answers, "grasp_distance")
-        cell = Cell(robot={"model": answers["model"], "address": answers["address"]},
-                    base={"pose": (0.6, 0.1, 0.0, 0.0, 0.0, 1.2)}, sensor=SensorEntry(kind=sensor))
+        try:
+            told = NewCell(cell_file=self.cell_file,
+                           **{name: self._answer(name) for name in _ASKED})
+        except ValidationError as error:
+            wrong = error.errors()[0]
+            raise InputError(f"{wrong['input']!r} is not possible for {wrong['loc'][0]}: "
+                             f"{wrong['msg']}.", "", "Give another value.") from error
+        arm = arm_named(present(told.model, "model"))
+        kind = told.sensor or ("controller" if arm.measures_force else "ft300")
+        force, torque = _RATED.get(arm.name if kind == "controller" else kind[:5], (100.0, 10.0))
+        cell = Cell(robot={"model": told.model, "address": told.address},
+                    base={"pose": (0.6, 0.1, 0.0, 0.0, 0.0, 1.2)}, sensor=SensorEntry(
+                        kind=kind, force_range_n=force, torque_range_nm=torque,
+                        device="/dev/ttyUSB0" if kind == "ft300_usb" else None))
         # Not validated together before it is complete.
         cell = cell.model_copy(update={"tool": ToolEntry(
-            mass_kg=mass, gripper=answers["gripper"],
-            grasp_pose=(0.0, 0.0, distance or 0.0, 0.0, 0.0, 0.0))})
+            mass_kg=told.mass_kg, gripper=told.gripper,
+            grasp_pose=(0.0, 0.0, told.grasp_distance or 0.0, 0.0, 0.0, 0.0))})
         left = [f"tool.{name}" for name in not_stated(cell)]
-        if not left and (wrong := list(slips(cell))):
-            raise InputError("; ".join(wrong) + ".", "", "Give other values.")
+        if not left and (slipped := list(slips(cell))):
+            raise InputError("; ".join(slipped) + ".", "", "Give other values.")
         write_atomically(self.cell_file, cell_template(cell))
         if left:
             progress.warn(f"{' and '.join(left)} {'are' if len(left) > 1 else 'is'} to be filled "
                           f"in: measure the gripper, and state it in {self.cell_file}.")
-        return {"cell": str(self.cell_file), "model": cell.arm.name, "sensor": sensor,
+        return {"cell": str(self.cell_file), "model": cell.arm.name, "sensor": kind,
                 "to_fill_in": left}
 
-
-def _number(answers: dict[str, Any], name: str) -> float | None:
-    """An answer as a number; None where it was left open."""
-    if answers[name] is None:
-        return None
-    try:
-        return float(answers[name])
-    except ValueError as error:
-        raise InputError(f"{answers[name]!r} is no number ({_ASKED[name][0]}).", "",
-                         "Give a number.") from error
-
-
-def _answer(name: str, value: Any) -> Any:
-    """The given value, else the one typed at a terminal, else the usual one."""
-    if value is not None:
-        return value
-    text, usual = _ASKED[name]
-    if not sys.stdin.isatty():
-        return usual
-    return input(f"{text} [{usual or 'not known yet'}]: ").strip() or usual
+    def _answer(self, name: str) -> Any:
+        """The given value, else the one typed at a terminal, else the usual one."""
+        value, usual = getattr(self, name), _USUAL.get(name)
+        if value is not None or not sys.stdin.isatty():
+            return usual if value is None else value
+        about = (type(self).model_fields[name].description or name).rstrip(".")
+        return input(f"{about} [{usual or 'not known yet'}]: ").strip() or usual
