@@ -36,9 +36,8 @@ def test_a_call_that_never_comes_back_is_told_as_a_safety_stop(resting_robot):
 
 
 @pytest.mark.slow
-def test_a_driver_that_does_not_start_is_told_from_a_robot_that_is_silent(resting_robot,
-                                                                          monkeypatch):
-    monkeypatch.setattr("limber.robot.driver.link._CONNECT_SECONDS", 0.01)
+def test_a_driver_that_does_not_start_is_told_from_a_silent_robot(resting_robot, monkeypatch):
+    monkeypatch.setattr("limber.robot.driver.link._START_SECONDS", 0.01)
     with pytest.raises(WorkError, match=r"did not start within.*This computer is too busy"):
         RobotLink(cell_for(resting_robot.address))
 
@@ -49,11 +48,13 @@ def test_a_path_that_starts_elsewhere_is_refused(stepped):
     with RobotLink(cell_for(stepped.address)) as link:
         with pytest.raises(SafetyStop, match=r"starts 20\.0 mm"):
             link.start(moved)
+        stepped.ask("slider", value=0.6)
+        with pytest.raises(SafetyStop, match=r"slider is at 60 %.*Raise it to 100 %"):
+            link.follow(line)
 
 
 @pytest.mark.parametrize("action, values, error, told", [
     ("local", {}, SafetyStop, "remote control"),
-    ("slider", {"value": 0.0}, SafetyStop, "slider"),
     ("protective_stop", {}, SafetyStop, "not ready"),
     ("silent", {"value": True}, WorkError, "does not answer"),
 ])
@@ -65,8 +66,7 @@ def test_a_robot_that_cannot_be_moved_is_refused(stepped, action, values, error,
 
 def test_the_wrong_robot_is_refused(stepped):
     for model, told in (("ur10e", "reports that it is a UR5"), ("ur5", "different series")):
-        cell = Cell(robot={"model": model, "address": stepped.address},
-                    base={"pose": (0,) * 6})
+        cell = Cell(robot={"model": model, "address": stepped.address}, base={"pose": (0,) * 6})
         with pytest.raises(InputError, match=told):
             RobotLink(cell).close()
 

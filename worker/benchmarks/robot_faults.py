@@ -125,7 +125,7 @@ _WORDS = {
     "torque limit": "torque", "clock jump": "clock jumped", "worker killed": "driver has ended",
     "add-on closed": "program that drives the robot|driver", "200 ms cable delay": "no data",
     "keep-alive starved": "no data|program", "two clients": "program", "drift of 4 N": "force",
-    "slider at 0": "scales the speed to 0", "slider at a fifth": "left its path",
+    "slider at 0": "scales the speed to 0", "slider at a fifth": "speed slider",
     "paused on the pendant": "program", "safeguard stop": "safeguard stop",
     "reduced mode": "reduced mode", "arm switched off": "not running|program",
     "emergency stop, reset at once": "emergency stop|program",

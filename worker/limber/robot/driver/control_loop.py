@@ -187,6 +187,10 @@ class Driver:
     def _begin(self, trajectory: Trajectory, start_joints: np.ndarray | None) -> None:
         sample = self._require_sample()
         require_tool(self.cell, sample)
+        if sample.slider < 1.0:
+            raise SafetyStop(f"The speed slider is at {100 * sample.slider:.0f} %.", "The arm "
+                             "would fall behind the targets that it is sent, and leave its path.",
+                             "Raise it to 100 % on the pendant; a motion is slowed by its speed.")
         # Poses computed from joint angles have the arm's nominal dimensions, not its own.
         start = sample.pose if trajectory.by_joints else trajectory.poses[0]
         require_start(sample.pose, sample.joints, start, start_joints, self.cell.arm.joint_names)

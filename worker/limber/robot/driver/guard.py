@@ -561,7 +561,9 @@ class Guard:
         if sent is not None and self.state == State.MOVING:
             off = length(sample.pose[:3] - sent)
             if off > settings.off_path:
-                return self._stop("the robot left its path [m]", off, settings.off_path)
+                return self._stop("the robot left its path [m]" if sample.slider >= 1.0 else
+                                  "the speed slider is below 100 %: the robot fell behind its path "
+                                  "[m]", off, settings.off_path)
         return GO
 
     def _check_expected(self, sample: Sample, wrench: np.ndarray, expected: np.ndarray | None,

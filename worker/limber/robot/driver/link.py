@@ -23,7 +23,7 @@ from limber.robot.driver.controls import stop_from_outside
 from limber.robot.driver.real_time import CALL_SECONDS, ended_by_deadline
 from limber.robot.motion.trajectory import Trajectory
 
-_CONNECT_SECONDS = 25.0
+_START_SECONDS, _CONNECT_SECONDS = 120.0, 25.0
 _BEAT_SECONDS = 0.2
 _STANDS_SECONDS = 0.3
 _DASHBOARD_SECONDS = 0.5
@@ -51,7 +51,6 @@ class RobotLink:
         self._on_samples = on_samples
         self._fresh: np.ndarray | None = None
         self.warnings: list[str] = []
-        self._has_started = False
         self._cell = cell
         self._closing = threading.Event()
         command = [sys.executable, "-m", "limber.robot.driver.driver"]
@@ -59,15 +58,15 @@ class RobotLink:
         self.process = self._child.process
         self._write(cell.model_dump_json())
         try:
+            # The robot is not asked before that: on a busy computer it may take its time.
+            if self._child.wait(lambda: self._taken(("starting",)), _START_SECONDS) is None:
+                raise WorkError(f"The robot's driver did not start within {_START_SECONDS:.0f} s; "
+                                "the robot was not asked yet.", "This computer is too busy, or its "
+                                "disk is slow: loading the driver takes about two seconds.",
+                                "End other programs and try again.")
             self.facts = self.wait("connected", seconds=_CONNECT_SECONDS)
-        except BaseException as error:
-            was_slow = not self._has_started
+        except BaseException:
             self.close()
-            if isinstance(error, WorkError) and was_slow:
-                raise WorkError(f"The robot's driver did not start within {_CONNECT_SECONDS:.0f} "
-                                "s; the robot was not asked yet.", "This computer is too busy, or "
-                                "its disk is slow: loading the driver takes about two seconds.",
-                                "End other programs and try again.") from error
             raise
         threading.Thread(target=self._beat, name="robot keep-alive", daemon=True).start()
 
@@ -218,7 +217,6 @@ class RobotLink:
 
     def _hear(self, content: dict[str, Any]) -> bool:
         if "samples" not in content:
-            self._has_started = True
             return False
         rows = np.array([[np.nan if x is None else x for x in row]
                          for row in content["samples"]], float)

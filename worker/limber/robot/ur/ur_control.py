@@ -191,9 +191,6 @@ def _first_sample(stream: SampleStream) -> Sample:
                          f"mode {sample.robot_mode}.", "Limber neither releases stops nor "
                          "switches an arm on.",
                          "Check the robot, then release or switch it on at the pendant.")
-    if sample.slider <= 0.0:
-        raise SafetyStop("The speed slider is at 0.", "The robot would not move.",
-                         "Raise it on the pendant.")
     return sample
 
 
