@@ -85,7 +85,7 @@ def test_the_mesh_error_foretells_how_a_much_finer_mesh_differs(small):
 
 def test_parts_add_up_in_squares():
     """3 % by sensors, 4 % by radii and none by the mesh: 5 %, and the interval is 1.96 of that."""
-    error = ModelError(np.array([0.04]), np.array([0.0]))
+    error = ModelError({"geometry": np.array([0.04])}, np.array([0.0]))
     assert error.total(np.array([0.03])) == pytest.approx([0.05])
     sensor = 1e7 * np.exp([[-1.96 * 0.03, 1.96 * 0.03]])
     interval = total_interval(np.array([1e7]), sensor, error)

@@ -9,21 +9,20 @@ from tests.estimation.test_nuisances import TRUTH, objective_of
 from benchmarks.paper_branches import Bench, PaperBranch, exact_pull, measured
 from limber.estimation.estimated_branch import subject_of
 from limber.estimation.fit import equal_fractions, fit_branch, is_open, supported
+from limber.estimation.fitting import nuisances
+from limber.estimation.fitting.nuisances import Action, Cause, Unknown
 from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import PullSpec, simulate_pull
-from limber.estimation.uncertainty.covariance import uncertainty
+from limber.estimation.uncertainty.covariance import largest, uncertainty, variance_parts
 from limber.estimation.uncertainty.model_error import ModelError, path_error
-from limber.estimation.uncertainty.next_actions import (
-    ANOTHER_PULL,
-    TORQUE_SIGMA_NM,
-    Prospects,
-)
+from limber.estimation.uncertainty.next_actions import ANOTHER_PULL, TORQUE_SIGMA_NM, Prospects
 from limber.geometry.skeleton.skeleton import FRACTIONS
 from limber.recordings.recording import EXACT, CalibrationEntry
 from limber.recordings.synchronisation import frames_of
+from limber.results.report.report_tables import cause_rows
 
 CELL = CalibrationEntry(force_bias_sigma_n=0.5, force_drift_sigma_n=0.5, repeat_sigma=0.03)
 UNIT = {"variance_factor": 1.0, "repetition": 1.0}
@@ -98,7 +97,7 @@ def test_a_recorded_torque_gives_what_was_promised(small, small_bench, pose_sigm
         evaluation = objective.evaluate(np.log(TRUTH), jacobian=True)
         sure = replace(uncertainty(evaluation, objective), recording_spread=0.03, **UNIT)
         path = path_error(evaluation, objective) if error else None
-        return Prospects(evaluation, objective, sure, ModelError(path=path), TRUTH)
+        return Prospects(evaluation, objective, sure, ModelError().having(path=path), TRUTH)
 
     poor = prospects_with(None, pose_sigma > 0)
     chosen = next(each for each in poor.best(9) if each["action"] == "record the torque")
@@ -117,7 +116,7 @@ def test_the_best_come_first_and_the_idle_do_not_come(today, small_bench, noisy)
     shares = [each["width_share"] for each in today.best(9)]
     assert shares == sorted(shares) and shares[-1] < 0.98
     assert "scan again" not in {each["action"] for each in today.best(9)}
-    rough = prospects(small_bench, [noisy], ModelError(geometry=np.full(4, 0.5)))
+    rough = prospects(small_bench, [noisy], ModelError().having(geometry=np.full(4, 0.5)))
     best = rough.best(1)[0]
     assert best["action"] == "scan again" and best["width_share"] == pytest.approx(0.5, abs=0.1)
 
@@ -174,3 +173,29 @@ def test_given_control_points_stay_and_other_methods_have_four():
                   {"field": "inverse_distance"}):
         assert not is_open(FitSpec(**given))
         assert FitSpec(**given).initial_fractions == FRACTIONS
+
+
+def test_a_new_source_of_error_is_one_entry(small_bench, noisy, monkeypatch):
+    """A gripper's backlash, added here: fit, covariance, causes, actions, records and table."""
+    backlash = Unknown(
+        Cause("backlash", "preload the gripper"), lambda forward: [f"backlash of {forward.name}"],
+        "", lambda known: 10 * known.force_gain_sigma,
+        lambda pull: {"forces": pull.share[:, None, None] * pull.forces[..., None]},
+        is_shared=False, measured=(Action("measure the backlash", "with a gauge"), 1e-3))
+    plain = prospects(small_bench, [noisy])
+    monkeypatch.setattr(nuisances, "UNKNOWNS", [*nuisances.UNKNOWNS, backlash])
+    objective = objective_of(small_bench, noisy)
+    evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)),
+                                    jacobian=True)
+    assert len(evaluation.errors.values) == len(objective.cell_errors.nuisances)
+    parts = variance_parts(evaluation, objective)
+    assert np.all(parts["backlash"] > 1e-8)
+    causes = largest(parts, 20)
+    assert "preload the gripper" in {row[-1] for row in cause_rows({"causes": causes})}
+    record = nuisances.nuisance_records(objective.cell_errors.nuisances, evaluation.errors,
+                                        np.zeros((objective.space.size,) * 2))[-1]
+    assert record["name"] == "backlash of pull-1" and record["prior_sigma"] == pytest.approx(0.2)
+    now = prospects(small_bench, [noisy])
+    assert np.all(now._now > plain._now)
+    assert np.all(now._deviation(now._measured(backlash.measured[0])) < now._now)
+    assert backlash.measured[0] in now._factors()

@@ -11,9 +11,10 @@ from limber.estimation.estimated_branch import Subject
 from limber.estimation.fit_assessment import Estimate
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.settings import FitSpec
-from limber.estimation.uncertainty.covariance import largest, outliers
-from limber.estimation.uncertainty.drift import drift, pull_moduli, scale_steps
+from limber.estimation.uncertainty.covariance import Cause, largest, outliers
+from limber.estimation.uncertainty.drift import Drift, PullModulus, drift, pull_moduli, scale_steps
 from limber.estimation.uncertainty.model_error import bending_interval, total_interval
+from limber.estimation.uncertainty.next_actions import NextAction
 from limber.recordings.recording import Pull
 
 _Positive = Annotated[float, Field(gt=0)]
@@ -29,49 +30,12 @@ class _Told(BaseModel):
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
 
-class _Cause(_Told):
-    cause: str
-    share: float
-    deviation: float
-    advice: str
-
-
 class _Score(_Told):
     rms_m: _Maybe = None
     rms_force_n: _Maybe = None
     relative_distance: _Maybe = None
     relative_force: _Maybe = None
     in_fit: bool = True
-
-
-class _Deviation(_Told):
-    sensor: list[_Maybe] | None = None
-    geometry: list[_Maybe] | None = None
-    mesh: list[_Maybe] | None = None
-    path: list[_Maybe] | None = None
-    hung: list[_Maybe] | None = None
-    grip: list[_Maybe] | None = None
-    graph: list[_Maybe] | None = None
-    total: list[_Maybe] | None = None
-
-
-class _Action(_Told):
-    action: str
-    how: str
-    young_interval_pa: list[tuple[_Maybe, _Maybe]]
-    width_share: float
-
-
-class _PullModulus(_Told):
-    pull: str
-    recorded: str | None = None
-    factor: float
-    interval: tuple[float, float]
-
-
-class _Drift(_Told):
-    per_day: float
-    interval: tuple[float, float]
 
 
 class _Creep(_Told):
@@ -132,7 +96,7 @@ class _Estimate(_Told):
     bending_stiffness_nm2: list[_Positive] | None = None
     bending_stiffness_interval_nm2: list[tuple[_Maybe, _Maybe]] | None = None
     bending_stiffness_share: list[list[_Share]] | None = None
-    young_deviation: _Deviation | None = None
+    young_deviation: dict[str, list[_Maybe] | bool | None] = {}
     poisson: float = Field(gt=-1, lt=0.5)
     density: _Positive | None = None
     loss_m2: _Maybe
@@ -146,11 +110,11 @@ class _Estimate(_Told):
     orders: bool = False
     section: dict[str, float] = {}
     order_moduli: list[_OrderModulus] = []
-    causes: list[_Cause] | None = None
-    next_actions: list[_Action] | None = None
+    causes: list[Cause] | None = None
+    next_actions: list[NextAction] | None = None
     held_out: dict[str, _Score] | None = None
-    pull_moduli: list[_PullModulus] | None = None
-    drift: _Drift | None = None
+    pull_moduli: list[PullModulus] | None = None
+    drift: Drift | None = None
     warnings: list[str] = []
     control_points_m: list[_Vector]
     fractions: list[_Share]
@@ -165,7 +129,6 @@ class _Estimate(_Told):
     @model_validator(mode="after")
     def _of_one_branch(self) -> "_Estimate":
         count = len(self.young_pa)
-        deviation = self.young_deviation or _Deviation()
         lists = {
             "young_mesh_pa": self.young_mesh_pa, "young_interval_pa": self.young_interval_pa,
             "young_interval_sensor_pa": self.young_interval_sensor_pa,
@@ -174,9 +137,8 @@ class _Estimate(_Told):
             "bending_stiffness_share": self.bending_stiffness_share,
             "control_points_m": self.control_points_m, "fractions": self.fractions,
             "groups": self.groups,
-            **{f"young_deviation.{name}": getattr(deviation, name)
-               for name in ("sensor", "geometry", "mesh", "path", "hung", "grip", "graph",
-                            "total")}}
+            **{f"young_deviation.{name}": values for name, values in self.young_deviation.items()
+               if isinstance(values, list)}}
         for name, values in lists.items():
             if values and len(values) != count:
                 raise ValueError(f"{name} has {len(values)} entries for {count} moduli")

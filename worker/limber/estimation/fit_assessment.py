@@ -12,7 +12,13 @@ from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.estimated_branch import Subject, forwards_of, neck
 from limber.estimation.fitting.initial_modulus import held_out, without
-from limber.estimation.fitting.nuisances import CREEP, in_words, nuisance_records, unlikely
+from limber.estimation.fitting.nuisances import (
+    CREEP,
+    OTHER_CAUSES,
+    in_words,
+    nuisance_records,
+    unlikely,
+)
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.fitting.optimise import Fit, FitStatus, gauss_newton
 from limber.estimation.forward.forward_model import Forward
@@ -119,10 +125,8 @@ class Estimate:
         groups = list(self.objective.space.groups)
         sensor = np.minimum(np.sqrt(np.diag(self.uncertainty.covariance))[groups], 35.0)
         error = self.model_error
-        return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
-                "path": error.path, "hung": error.hung, "grip": error.grip,
-                "graph": error.graph,
-                "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
+        return {"sensor": sensor, **error.parts, "axis_is_exact": error.axis_is_exact,
+                "total": error.total(sensor)}
 
     @property
     def young(self) -> np.ndarray:
@@ -154,18 +158,9 @@ class Estimate:
         sure = self.uncertainty
         parts = variance_parts(self.fit.evaluation, self.objective,
                                sure.variance_factor * sure.repetition)
-        if self.model_error.geometry is not None:
-            parts["shape of the scan"] = self.model_error.geometry**2
-        if self.model_error.mesh is not None:
-            parts["mesh"] = self.model_error.mesh**2
-        if self.model_error.hung is not None:
-            parts["mass of twigs and leaves"] = self.model_error.hung**2
-        if self.model_error.grip is not None:
-            parts["length in the gripper"] = self.model_error.grip**2
-        if self.model_error.graph is not None:
-            parts["skeleton of the scan"] = self.model_error.graph**2
-        if self.model_error.path is not None:
-            parts["gripper frame"] = parts.get("gripper frame", 0.0) + self.model_error.path**2
+        for name, deviation in self.model_error.parts.items():
+            cause = OTHER_CAUSES[name].name
+            parts[cause] = parts.get(cause, 0.0) + deviation**2
         return parts
 
     @property
@@ -382,9 +377,9 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
         stiff = mesh_error(model, held, seen, subject.weights, found.values.young,
                            steady_loads(forwards))
         if stiff is not None:
-            error = replace(error, mesh=stiff.deviation, mesh_factor=stiff.factor)
-    found.model_error = replace(
-        error, path=_path_error(found, progress),
+            error = replace(error.having(mesh=stiff.deviation), mesh_factor=stiff.factor)
+    found.model_error = error.having(
+        path=_path_error(found, progress),
         hung=hung_error(found.fit.evaluation, found.objective, settings.hung_sigma),
         grip=grip_error(found.fit.evaluation, found.objective))
     _tell_largest_part(found.causes, progress)
@@ -419,11 +414,11 @@ def _geometry_error(subject: Subject, found: Estimate, settings: FitSpec,
         return ModelError()
     radii = geometry_error(axes, subject.mesh, subject.weights)
     if radii is None or cloud is None:
-        return ModelError(radii)
+        return ModelError().having(geometry=radii)
     drawn = shape_error(found.fit.evaluation, found.objective, subject, cloud, settings.shapes,
                         present(found.sections, "sections of the branch"), progress=progress)
-    return (ModelError(radii) if drawn is None else
-            ModelError(drawn[0], bending=drawn[1], axis_is_exact=False))
+    return (ModelError({"geometry": radii}) if drawn is None else
+            ModelError({"geometry": drawn[0]}, bending=drawn[1], axis_is_exact=False))
 
 
 def _tell_largest_part(parts: dict[str, np.ndarray], progress: Progress) -> None:

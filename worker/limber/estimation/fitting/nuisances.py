@@ -11,10 +11,12 @@ errors have their own covariance.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from limber.core.errors import Command, Option, Text
 from limber.core.not_none import present
 from limber.estimation.forward.forward_model import Forward
 from limber.recordings.recording import CalibrationEntry, PullEntry, calibration_of
@@ -39,13 +41,49 @@ CREEP_SIGMA = 0.1
 """Prior deviation of the force's fall under a lasting bend: some percent in green wood."""
 
 
-@dataclass(frozen=True)
-class Nuisance:
-    """An error that is constant during a recording, and its prior deviation in ``unit`` (m, rad, N,
-    N m, s, or empty: relative). ``pull`` has it; None: the cell, in one calibration."""
+class Cause(NamedTuple):
+    """A cause of uncertainty, and what would reduce it."""
 
     name: str
+    advice: str
+
+
+class Action(NamedTuple):
+    """A measurement of unknowns that are otherwise known by priors alone, and how to make it."""
+
+    name: str
+    how: str
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A kind of error that is constant during a recording. This entry is all that fit, covariance,
+    causes, next actions and tables need of it.
+
+    Attributes:
+        names: Of its errors in a pull; none where it does not act.
+        unit: m, rad, N, N m, s, or empty: relative.
+        sigma: Standard deviation of each in ``unit``, by the pull's calibration.
+        slopes: Change of the measurements by each, as in :class:`ErrorSlopes`.
+        is_shared: The cell has it, in one calibration; else each pull its own.
+        measured: What measures it, and to which deviation.
+    """
+
+    cause: Cause
+    names: Callable[[Forward], Sequence[str]]
     unit: str
+    sigma: Callable[[CalibrationEntry], float]
+    slopes: Callable[["_Pull"], dict[str, np.ndarray]]
+    is_shared: bool = True
+    measured: tuple[Action, float] | None = None
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """An error of a fit, and its prior deviation; ``pull`` has it, None: the cell."""
+
+    name: str
+    unknown: Unknown
     sigma: float
     pull: str | None
 
@@ -98,17 +136,6 @@ def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.nd
 
 
 @dataclass(frozen=True)
-class _Source:
-    """Errors that belong together, and their slopes."""
-
-    names: tuple[str, ...]
-    unit: str
-    sigma: tuple[float, ...]
-    is_shared: bool
-    slopes: Callable[["_Pull"], dict[str, np.ndarray]]
-
-
-@dataclass(frozen=True)
 class _Pull:
     """The data of a pull that its errors depend on."""
 
@@ -119,6 +146,7 @@ class _Pull:
     directions: np.ndarray | None
     positions: np.ndarray
     forces: np.ndarray
+    creep_time: float | None = None
 
     @property
     def grip_axis(self) -> np.ndarray:
@@ -137,35 +165,35 @@ class CellErrors:
 
     def __init__(self, forwards: Sequence[Forward]):
         self.nuisances: list[Nuisance] = []
-        self._indexed_sources: list[list[tuple[_Source, np.ndarray]]] = []
+        self._places: list[list[tuple[Unknown, float, np.ndarray]]] = []
         self._forwards = forwards
         known: dict[tuple[object, ...], int] = {}
         self._pivots: dict[CalibrationEntry, np.ndarray] = {}
         for forward in forwards:
-            indexed = []
-            calibration = calibration_of(forward.entry)
+            calibration, indexed = calibration_of(forward.entry), []
             self._pivots.setdefault(calibration, np.array(forward.entry.grasp.point_m))
-            for source in _sources(forward, calibration):
-                used = np.empty(len(source.names), int)
-                for k, (name, sigma) in enumerate(zip(source.names, source.sigma,
-                                                      strict=True)):
-                    pull = None if source.is_shared else forward.name
+            for unknown in UNKNOWNS:
+                sigma, names = unknown.sigma(calibration), unknown.names(forward)
+                if not names or not sigma > 0:
+                    continue
+                pull = None if unknown.is_shared else forward.name
+                for name in names:
                     key = (name, pull if pull is not None else calibration)
                     if key not in known:
                         known[key] = len(self.nuisances)
-                        self.nuisances.append(Nuisance(name, source.unit, sigma, pull))
-                    used[k] = known[key]
-                indexed.append((source, used))
-            self._indexed_sources.append(indexed)
+                        self.nuisances.append(Nuisance(name, unknown, sigma, pull))
+                used = [known[name, pull if pull is not None else calibration] for name in names]
+                indexed.append((unknown, sigma, np.array(used)))
+            self._places.append(indexed)
 
     @property
     def known(self) -> np.ndarray:
         """Parts of the errors that the simulations already have, in deviations, shape [k]."""
         parts = np.zeros(self.count)
-        for forward, places in zip(self._forwards, self._indexed_sources, strict=True):
-            for source, used in places:
-                if source.slopes is _along:
-                    parts[used] = forward.point_shifts / np.array(source.sigma)
+        for forward, places in zip(self._forwards, self._places, strict=True):
+            for unknown, sigma, used in places:
+                if unknown.slopes is _along:
+                    parts[used] = forward.point_shifts / sigma
         return parts
 
     @property
@@ -180,63 +208,12 @@ class CellErrors:
                  **{kind: np.zeros((len(frames), 3, count))
                     for kind in ("forces", "torques", "grasps")}}
         pull = _Pull(forward.entry, frames, self._pivots[calibration_of(forward.entry)],
-                     forward.grasp_tangent, forward.point_directions, positions, forces)
-        for source, used in self._indexed_sources[index]:
-            for kind, slope in source.slopes(pull).items():
-                total[kind][..., used] += slope * np.array(source.sigma)
+                     forward.grasp_tangent, forward.point_directions, positions, forces,
+                     forward.creep_time)
+        for unknown, sigma, used in self._places[index]:
+            for kind, slope in unknown.slopes(pull).items():
+                total[kind][..., used] += slope * sigma
         return ErrorSlopes(**total)
-
-
-def _sources(forward: Forward, known: CalibrationEntry) -> list[_Source]:
-    found = []
-
-    def add(names: Sequence[str], unit: str, sigma: float | Sequence[float], is_shared: bool,
-            slopes: Callable[[_Pull], dict[str, np.ndarray]]) -> None:
-        each = tuple(np.broadcast_to(sigma, len(names)).tolist())
-        if any(value > 0 for value in each):
-            found.append(_Source(tuple(names), unit, each, is_shared, slopes))
-
-    if forward.frames.positions.shape[1]:
-        add([f"camera position {axis}" for axis in AXES], "m", known.camera_sigma_m, True, _shifted)
-        add([f"camera rotation about {axis}" for axis in AXES], "rad", known.camera_sigma_rad, True,
-            _turned)
-        # Scan and observation locate a point each in its own way, in each pull, and the scanned
-        # axis has an error: only a stated position is exact across the branch.
-        points, off = range(1, 1 + forward.frames.positions.shape[1]), known.point_sigma_m
-        add([f"position of point {each} along the branch" for each in points], "m", off, False,
-            _along)
-        if forward.entry.rest_points_m is None:
-            add([f"position of point {each} across the branch ({way})" for each in points
-                 for way in (1, 2)], "m", off, False, _across)
-        if len(forward.frames) > 3:
-            add(["camera clock"], "s", known.clock_sigma_s, False, _late)
-    seconds = forward.creep_time
-    if seconds is not None and forward.uses_force and not forward.force_is_stated:
-        add([CREEP], "", CREEP_SIGMA, True, lambda pull: {
-            "forces": -relaxed(pull.frames.times, pull.forces, seconds)[..., None]})
-    if forward.uses_force and not forward.force_is_stated:
-        add(["force gain"], "", known.force_gain_sigma, True,
-            lambda pull: {"forces": pull.forces[..., None]})
-        add([f"force zero {axis}" for axis in AXES], "N", known.force_bias_sigma_n, False,
-            lambda pull: {"forces": _alike(pull, np.ones(len(pull.frames)))})
-        add([f"force drift {axis}" for axis in AXES], "N", known.force_drift_sigma_n, False,
-            lambda pull: {"forces": _alike(pull, pull.share)})
-        add([f"curvature of the force drift {axis}" for axis in AXES], "N",
-            BEND_OF_DRIFT * known.force_drift_sigma_n, False,
-            lambda pull: {"forces": _alike(pull, 4 * pull.share * (1 - pull.share))})
-        if forward.uses_torque:
-            add([f"torque zero {axis}" for axis in AXES], "N m", known.torque_bias_sigma_nm,
-                False, lambda pull: {"torques": _alike(pull, np.ones(len(pull.frames)))})
-    if forward.watches_pose:
-        add([f"gripper position {axis}" for axis in AXES], "m", known.pose_sigma_m, True,
-            lambda pull: {"grasps": _alike(pull, np.ones(len(pull.frames)))})
-        add([f"gripper rotation about {axis}" for axis in AXES], "rad", known.pose_sigma_rad, True,
-            lambda pull: {"grasps": _rotations(pull.frames.poses[:, :3] - pull.pivot)})
-        add(["grasp position along the branch"], "m", known.pose_sigma_m, False,
-            lambda pull: {"grasps": pull.grip_axis[..., None]})
-        add(["slip of the grasp along the branch"], "m", known.slip_sigma_m, False,
-            lambda pull: {"grasps": (pull.share[:, None] * pull.grip_axis)[..., None]})
-    return found
 
 
 def _alike(pull: _Pull, course: np.ndarray) -> np.ndarray:
@@ -247,10 +224,6 @@ def _alike(pull: _Pull, course: np.ndarray) -> np.ndarray:
 def _rotations(arms: np.ndarray) -> np.ndarray:
     """Change of arms [..., 3] by a small rotation about each axis, shape [..., 3, 3]."""
     return np.stack([np.cross(axis, arms) for axis in np.eye(3)], axis=-1)
-
-
-def _shifted(pull: _Pull) -> dict[str, np.ndarray]:
-    return {"points": np.broadcast_to(np.eye(3), (*pull.positions.shape, 3))}
 
 
 def _turned(pull: _Pull) -> dict[str, np.ndarray]:
@@ -299,6 +272,142 @@ def relaxed(times: np.ndarray, forces: np.ndarray, seconds: float) -> np.ndarray
     return found
 
 
+# The list of all unknowns, and of the other causes.
+
+_CAMERA = Cause("camera frame", "register the camera to the branch (fixed markers), or add a "
+                "second view")
+_PLACES = Cause("places of the points", Text(
+    "mark the points on the branch before the scan, and give their positions (", Option("nominal"),
+    " of import-pull)"))
+_ZERO = Cause("zero of the force sensor", "tare the sensor before each pull, and state it under "
+              "[calibration]")
+_GRIPPER = Cause("gripper frame", "calibrate the gripper's frame against the branch's (hand-eye), "
+                 "and state its standard deviation under [calibration] in pull.toml")
+REGISTER = Action("register the camera", "to 1 mm and 0.06 degrees (camera_sigma_m, "
+                  "camera_sigma_rad)")
+_MARK = Action("mark the points", Text("on the branch before the scan, to 0.5 mm (", Option(
+    "nominal"), " of import-pull, point_sigma_m)"))
+_TARE = Action("tare the force sensor", "right before the pull, to 0.05 N with a drift of 0.1 N "
+               "(force_bias_sigma_n, force_drift_sigma_n)")
+_HAND_EYE = Action("calibrate the gripper", "to 0.2 mm and 0.2 degrees against the branch's frame, "
+                   "stated under [calibration] (pose_sigma_m, pose_sigma_rad)")
+
+
+def _three(name: str, acts: Callable[[Forward], bool]) -> Callable[[Forward], list[str]]:
+    return lambda forward: [f"{name} {axis}" for axis in AXES] if acts(forward) else []
+
+
+def _one(name: str, acts: Callable[[Forward], bool]) -> Callable[[Forward], list[str]]:
+    return lambda forward: [name] if acts(forward) else []
+
+
+def _points(forward: Forward) -> range:
+    return range(1, 1 + forward.frames.positions.shape[1])
+
+
+def _has_points(forward: Forward) -> bool:
+    return bool(_points(forward))
+
+
+def _reads_force(forward: Forward) -> bool:
+    return forward.uses_force and not forward.force_is_stated
+
+
+def _watches(forward: Forward) -> bool:
+    return forward.watches_pose
+
+
+UNKNOWNS = [
+    Unknown(_CAMERA, _three("camera position", _has_points), "m",
+            lambda known: known.camera_sigma_m, lambda pull: {"points": np.broadcast_to(
+                np.eye(3), (*pull.positions.shape, 3))}, measured=(REGISTER, 1e-3)),
+    Unknown(_CAMERA, _three("camera rotation about", _has_points), "rad",
+            lambda known: known.camera_sigma_rad, _turned, measured=(REGISTER, 1e-3)),
+    # Scan and observation locate a point each in its own way, in each pull, and the scanned axis
+    # has an error: only a stated position is exact across the branch.
+    Unknown(_PLACES, lambda forward: [f"position of point {each} along the branch"
+                                      for each in _points(forward)], "m",
+            lambda known: known.point_sigma_m, _along, is_shared=False, measured=(_MARK, 5e-4)),
+    Unknown(_PLACES, lambda forward: [] if forward.entry.rest_points_m is not None else [
+                f"position of point {each} across the branch ({way})"
+                for each in _points(forward) for way in (1, 2)], "m",
+            lambda known: known.point_sigma_m, _across, is_shared=False, measured=(_MARK, 5e-4)),
+    Unknown(Cause("clock", "record all sensors with one clock"),
+            _one("camera clock", lambda forward: _has_points(forward) and len(forward.frames) > 3),
+            "s", lambda known: known.clock_sigma_s, _late, is_shared=False),
+    Unknown(Cause("creep of the branch", "hold the branch at the end of the pull, or pull there "
+                  "and back"), _one(CREEP, lambda forward: forward.creep_time is not None
+                                    and _reads_force(forward)), "", lambda _: CREEP_SIGMA,
+            lambda pull: {"forces": -relaxed(pull.frames.times, pull.forces, present(
+                pull.creep_time, "time constant of creep"))[..., None]}),
+    Unknown(Cause("force gain", "check the sensor with a known weight"),
+            _one("force gain", _reads_force), "", lambda known: known.force_gain_sigma,
+            lambda pull: {"forces": pull.forces[..., None]},
+            measured=(Action("check the force sensor", "with a known weight, to 0.5 % "
+                             "(force_gain_sigma)"), 5e-3)),
+    Unknown(_ZERO, _three("force zero", _reads_force), "N", lambda known: known.force_bias_sigma_n,
+            lambda pull: {"forces": _alike(pull, np.ones(len(pull.frames)))}, is_shared=False,
+            measured=(_TARE, 0.05)),
+    Unknown(_ZERO, _three("force drift", _reads_force), "N",
+            lambda known: known.force_drift_sigma_n,
+            lambda pull: {"forces": _alike(pull, pull.share)}, is_shared=False,
+            measured=(_TARE, 0.1)),
+    Unknown(_ZERO, _three("curvature of the force drift", _reads_force), "N",
+            lambda known: BEND_OF_DRIFT * known.force_drift_sigma_n,
+            lambda pull: {"forces": _alike(pull, 4 * pull.share * (1 - pull.share))},
+            is_shared=False, measured=(_TARE, 0.03)),
+    Unknown(_ZERO, _three("torque zero", lambda forward: _reads_force(forward)
+                          and forward.uses_torque), "N m",
+            lambda known: known.torque_bias_sigma_nm,
+            lambda pull: {"torques": _alike(pull, np.ones(len(pull.frames)))}, is_shared=False,
+            measured=(_TARE, 5e-3)),
+    Unknown(_GRIPPER, _three("gripper position", _watches), "m", lambda known: known.pose_sigma_m,
+            lambda pull: {"grasps": _alike(pull, np.ones(len(pull.frames)))},
+            measured=(_HAND_EYE, 2e-4)),
+    Unknown(_GRIPPER, _three("gripper rotation about", _watches), "rad",
+            lambda known: known.pose_sigma_rad,
+            lambda pull: {"grasps": _rotations(pull.frames.poses[:, :3] - pull.pivot)},
+            measured=(_HAND_EYE, 3.5e-3)),
+    Unknown(_GRIPPER, _one("grasp position along the branch", _watches), "m",
+            lambda known: known.pose_sigma_m, lambda pull: {"grasps": pull.grip_axis[..., None]},
+            is_shared=False, measured=(_HAND_EYE, 2e-4)),
+    Unknown(Cause("slip of the grasp", "grasp without slip, or put a marker at the grasp"),
+            _one("slip of the grasp along the branch", _watches), "m",
+            lambda known: known.slip_sigma_m,
+            lambda pull: {"grasps": (pull.share[:, None] * pull.grip_axis)[..., None]},
+            is_shared=False)]
+"""All errors of cell and sensors, in the order in which a fit has them."""
+
+OTHER_CAUSES = {
+    "form": Cause("modulus between the control points", "add markers along the branch, or pull at "
+                  "another point"),
+    "poisson": Cause("Poisson's ratio", Text("give it (", Option("poisson"), " of reconstruct); "
+                                             "pulls do not determine it")),
+    "density": Cause("density", Text("weigh a piece of the branch (", Option("density"), ", ",
+                                     Option("density_sigma"), " of reconstruct)")),
+    "link": Cause("moduli that the pulls do not determine", "pull at a point farther out"),
+    "points": Cause("noise of the points", "use more frames, more pulls, or more visible markers"),
+    "force": Cause("noise of the force", "pull farther, or slower with more readings"),
+    "poses": Cause("noise of the gripper's poses", "use more pulls"),
+    "geometry": Cause("shape of the scan", "scan from more sides, or with less noise"),
+    "mesh": Cause("mesh", Text("use a finer mesh (", Option("mesh_spacing"), " of reconstruct)")),
+    "path": _GRIPPER,
+    "hung": Cause("mass of twigs and leaves", Text("mesh more twigs (", Option("twig_radius"),
+                                                   " of reconstruct)")),
+    "grip": Cause("length in the gripper", "measure it, and state it under [grasp] (radius_m: half "
+                  "of it) and [calibration] (held_length_sigma_m) in pull.toml"),
+    "graph": Cause("skeleton of the scan", Text(
+        "look at the alternatives (", Command("skeleton"), "), and confirm or edit the doubtful "
+        "parts"))}
+"""Causes of the free vector's priors, of noise, and of what no residual shows."""
+
+
+def advice_on(cause: str) -> str:
+    """Return what would reduce a cause of uncertainty."""
+    return next(each.advice for each in (*(unknown.cause for unknown in UNKNOWNS),
+                                         *OTHER_CAUSES.values()) if each.name == cause)
+
+
 def nuisance_records(nuisances: Sequence[Nuisance], found: Eliminated,
                      free: np.ndarray) -> list[dict]:
     """Return each error with its value, 95 % interval and prior deviation in its own unit; ``free``
@@ -307,7 +416,7 @@ def nuisance_records(nuisances: Sequence[Nuisance], found: Eliminated,
     listed = []
     for nuisance, value, sure in zip(nuisances, found.values, deviation, strict=True):
         middle, width = value * nuisance.sigma, 1.96 * sure * nuisance.sigma
-        listed.append({"name": nuisance.name, "unit": nuisance.unit, "pull": nuisance.pull,
+        listed.append({"name": nuisance.name, "unit": nuisance.unknown.unit, "pull": nuisance.pull,
                        "value": middle, "interval": [middle - width, middle + width],
                        "prior_sigma": nuisance.sigma,
                        "explains_misfit": bool(abs(value) > NAMED * sure

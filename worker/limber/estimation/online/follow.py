@@ -133,7 +133,7 @@ def _with_radii(axes: Path | None, subject: Subject, last: OnlineState) -> dict[
         return {}
     radii = geometry_error(axes, subject.mesh, subject.weights)
     return {"young_interval_sensor_pa": last.interval, "young_interval_pa": total_interval(
-        last.young, last.interval, ModelError(geometry=radii))}
+        last.young, last.interval, ModelError().having(geometry=radii))}
 
 
 @dataclass(frozen=True)

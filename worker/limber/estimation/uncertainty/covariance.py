@@ -1,13 +1,13 @@
 """Uncertainty of an estimate: covariance and intervals, and measurements that do not fit."""
 
 from dataclasses import dataclass, replace
-from typing import TypedDict
 
 import numpy as np
 import scipy
+from typing_extensions import TypedDict
 
-from limber.core.errors import Command, Option, Text
 from limber.core.progress import SILENT, Progress
+from limber.estimation.fitting.nuisances import OTHER_CAUSES, advice_on
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.fitting.optimise import OUTLYING, Fit
 from limber.estimation.forward.solved_pull import DynamicForward, QuasiStaticForward
@@ -221,50 +221,6 @@ def marginal_step(evaluation: Evaluation, space: ParameterSpace, field: YoungFie
 # the result through the fit. The unknown zero of a force sensor uses up part of the information;
 # that is included in the part of the measurements that determine it.
 
-ADVICE = {
-    "noise of the points": "use more frames, more pulls, or more visible markers",
-    "noise of the force": "pull farther, or slower with more readings",
-    "noise of the gripper's poses": "use more pulls",
-    "gripper frame": "calibrate the gripper's frame against the branch's (hand-eye), and state "
-                     "its standard deviation under [calibration] in pull.toml",
-    "force gain": "check the sensor with a known weight",
-    "zero of the force sensor": "tare the sensor before each pull, and state it under "
-                                "[calibration]",
-    "camera frame": "register the camera to the branch (fixed markers), or add a second view",
-    "places of the points": Text("mark the points on the branch before the scan, and give their "
-                                 "positions (", Option("nominal"), " of import-pull)"),
-    "clock": "record all sensors with one clock",
-    "slip of the grasp": "grasp without slip, or put a marker at the grasp",
-    "modulus between the control points": "add markers along the branch, or pull at another point",
-    "Poisson's ratio": Text("give it (", Option("poisson"), " of reconstruct); pulls do not "
-                            "determine it"),
-    "density": Text("weigh a piece of the branch (", Option("density"), ", ",
-                    Option("density_sigma"), " of reconstruct)"),
-    "moduli that the pulls do not determine": "pull at a point farther out",
-    "shape of the scan": "scan from more sides, or with less noise",
-    "skeleton of the scan": Text("look at the alternatives (", Command("skeleton"), "), and "
-                                 "confirm or edit the doubtful parts"),
-    "mass of twigs and leaves": Text("mesh more twigs (",
-                                     Option("twig_radius"), " of reconstruct)"),
-    "length in the gripper": "measure it, and state it under [grasp] (radius_m: half of it) and "
-                             "[calibration] (held_length_sigma_m) in pull.toml",
-    "creep of the branch": "hold the branch at the end of the pull, or pull there and back",
-    "mesh": Text("use a finer mesh (", Option("mesh_spacing"), " of reconstruct)"),
-    "clamp": "scan farther down, so that the clamped position is known",
-}
-"""Advice to narrow an interval, by cause."""
-
-_GROUPS = (("camera clock", "clock"), ("camera", "camera frame"), ("gripper", "gripper frame"),
-           ("grasp position", "gripper frame"), ("position of point", "places of the points"),
-           ("slip", "slip of the grasp"),
-           ("force gain", "force gain"), ("force", "zero of the force sensor"),
-           ("curvature of the force", "zero of the force sensor"),
-           ("torque", "zero of the force sensor"),
-           ("creep", "creep of the branch"),
-           ("form", "modulus between the control points"),
-           ("poisson", "Poisson's ratio"), ("density", "density"))
-
-
 @dataclass(frozen=True)
 class InformationRows:
     """Rows of information from one origin over free vector, errors and force unknowns. ``name`` is
@@ -307,13 +263,8 @@ def largest(parts: dict[str, np.ndarray], count: int = 3) -> list[Cause]:
              for cause, part in parts.items()}
     order = sorted(parts, key=lambda cause: -share[cause])[:count]
     return [{"cause": cause, "share": share[cause],
-             "deviation": float(np.sqrt(np.max(parts[cause]))), "advice": ADVICE[cause]}
+             "deviation": float(np.sqrt(np.max(parts[cause]))), "advice": advice_on(cause)}
             for cause in order if share[cause] > 0.01]
-
-
-def cause_of(name: str) -> str:
-    """Return the cause to which an unknown of this name belongs."""
-    return next(cause for start, cause in _GROUPS if name.startswith(start))
 
 
 def information_rows(evaluation: Evaluation, objective: Objective, scale: float,
@@ -339,12 +290,14 @@ def information_rows(evaluation: Evaluation, objective: Objective, scale: float,
     for number, nuisance in enumerate(objective.cell_errors.nuisances):
         row = np.zeros((1, width))
         row[0, space.size + number] = 1.0
-        rows.append(InformationRows(cause_of(nuisance.name), row, nuisance.name))
+        rows.append(InformationRows(nuisance.unknown.cause.name, row, nuisance.name))
     own, _ = space.own_rows()
     names = [name for name, _, _ in space.priors] + [""] * len(space.links)
     for name, row in zip(names, own, strict=True):
-        cause = cause_of(name) if name else "moduli that the pulls do not determine"
-        rows.append(InformationRows(cause, np.r_[row, np.zeros(width - space.size)][None], name))
+        # The field's form has several unknowns.
+        cause = OTHER_CAUSES["form" if name.startswith("form") else name or "link"]
+        wide = np.r_[row, np.zeros(width - space.size)][None]
+        rows.append(InformationRows(cause.name, wide, name))
     return rows
 
 

@@ -7,9 +7,9 @@ errors. A branch that dries stiffens, one that grows too; the steps over the day
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import TypedDict
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from limber.estimation.fitting.objective import Evaluation, Objective
 

@@ -7,7 +7,7 @@ this one.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,30 +42,28 @@ slowly.
 
 @dataclass(frozen=True)
 class ModelError:
-    """Relative deviations [K] of E that no residual shows; None: no such error, or not measured.
-    ``bending`` is what is left of ``geometry`` in E I, 0 if radii err alike over a section; if
-    ``axis_is_exact``, geometry is of radii alone. ``mesh_factor`` is the material's modulus over
-    the model's."""
+    """Relative deviations [K] of E that no residual shows, by their names in OTHER_CAUSES: those
+    that exist and were measured. ``bending`` is what is left of ``geometry`` in E I, 0 if radii err
+    alike over a section; if ``axis_is_exact``, geometry is of radii alone. ``mesh_factor`` is the
+    material's modulus over the model's."""
 
-    geometry: np.ndarray | None = None
+    parts: dict[str, np.ndarray] = field(default_factory=dict)
     bending: np.ndarray | float = 0.0
-    mesh: np.ndarray | None = None
     axis_is_exact: bool = True
     mesh_factor: np.ndarray | float = 1.0
-    path: np.ndarray | None = None
-    hung: np.ndarray | None = None
-    grip: np.ndarray | None = None
-    graph: np.ndarray | None = None
+
+    def having(self, **parts: np.ndarray | None) -> "ModelError":
+        """Return it with other parts; None: without that one."""
+        return replace(self, parts={name: part for name, part in (self.parts | parts).items()
+                                    if part is not None})
 
     def total(self, sensor: np.ndarray) -> np.ndarray:
         """Standard deviation of log E with that of the sensors, shape [K]."""
-        parts = [part for part in (sensor, self.geometry, self.mesh, self.path, self.hung,
-                                   self.grip, self.graph) if part is not None]
-        return np.sqrt(np.sum(np.square(parts), axis=0))
+        return np.sqrt(np.sum(np.square([sensor, *self.parts.values()]), axis=0))
 
     def total_of_bending(self, sensor: np.ndarray) -> np.ndarray:
         """Standard deviation of log E I with that of the sensors, shape [K]."""
-        return replace(self, geometry=self.bending + np.zeros(len(sensor))).total(sensor)
+        return self.having(geometry=self.bending + np.zeros(len(sensor))).total(sensor)
 
 
 def geometry_error(cylinders: Path, mesh: TetMesh, weights: np.ndarray) -> np.ndarray | None:

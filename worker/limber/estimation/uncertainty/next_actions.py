@@ -9,13 +9,14 @@ the causes of the variance alone do not show: two causes that hide each other mu
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TypedDict
+from dataclasses import replace
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from limber.core.errors import Command, Option, Text
 from limber.core.not_none import present
+from limber.estimation.fitting.nuisances import REGISTER, Action
 from limber.estimation.fitting.objective import Evaluation, Objective
 from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
@@ -35,38 +36,11 @@ SHAPE_SHARE = 0.5
 TORQUE_SIGMA_NM = 0.02
 """Standard deviation of one reading of a wrist sensor's torque: assumed."""
 ANOTHER_PULL = "another pull"
-REGISTER = "register the camera"
 
 
-@dataclass(frozen=True)
-class _Measurement:
-    """A measurement of unknowns that are known by priors alone: how, where to state it, and the
-    deviation afterwards by beginning of their names, in their units."""
-
-    action: str
-    how: str
-    sigmas: dict[str, float]
-
-
-_MEASUREMENTS = (
-    _Measurement("calibrate the gripper", "to 0.2 mm and 0.2 degrees against the branch's frame, "
-                 "stated under [calibration] (pose_sigma_m, pose_sigma_rad)",
-                 {"gripper position": 2e-4, "gripper rotation": 3.5e-3, "grasp position": 2e-4}),
-    _Measurement("tare the force sensor", "right before the pull, to 0.05 N with a drift of 0.1 N "
-                 "(force_bias_sigma_n, force_drift_sigma_n)",
-                 {"force zero": 0.05, "force drift": 0.1, "curvature of the force": 0.03,
-                  "torque zero": 5e-3}),
-    _Measurement("check the force sensor", "with a known weight, to 0.5 % (force_gain_sigma)",
-                 {"force gain": 5e-3}),
-    _Measurement(REGISTER, "to 1 mm and 0.06 degrees (camera_sigma_m, camera_sigma_rad)",
-                 {"camera position": 1e-3, "camera rotation": 1e-3}),
-    _Measurement("mark the points", Text("on the branch before the scan, to 0.5 mm (",
-                                         Option("nominal"), " of import-pull, point_sigma_m)"),
-                 {"position of point": 5e-4}),
-    _Measurement("weigh a piece of the branch", Text("to 2 % (", Option("density"), ", ",
-                                                     Option("density_sigma", 0.02), " of "
-                                                     "reconstruct)"),
-                 {"density": 0.02}))
+_WEIGH = Action("weigh a piece of the branch", Text("to 2 % (", Option("density"), ", ", Option(
+    "density_sigma", 0.02), " of reconstruct)"))
+_WEIGHED = 0.02
 
 
 class NextAction(TypedDict):
@@ -75,7 +49,7 @@ class NextAction(TypedDict):
 
     action: str
     how: str
-    young_interval_pa: list[list[float]]
+    young_interval_pa: list[list[float | None]]
     width_share: float
 
 
@@ -98,9 +72,8 @@ class Prospects:
         """Return the actions that narrow the intervals most, best first."""
         found = [self._result("scan again", "from more sides or with less noise, so that the "
                               "error of the shape halves", self._with_better_shape())]
-        for each in _MEASUREMENTS:
-            found.append(self._result(each.action, each.how,
-                                      self._deviation(self._measured(each.sigmas))))
+        for each in self._factors():
+            found.append(self._result(each.name, each.how, self._deviation(self._measured(each))))
         if (then := self._with_torque()) is not None:
             found.append(self._result("record the torque", f"of the clamping gripper to "
                                       f"{TORQUE_SIGMA_NM:g} N m, stated as torque_sigma_nm under "
@@ -116,8 +89,7 @@ class Prospects:
 
     def cost_of_the_frame(self) -> float:
         """Fraction by which the intervals would be narrower with a registered camera."""
-        sigmas = next(each.sigmas for each in _MEASUREMENTS if each.action == REGISTER)
-        return 1.0 - float((self._deviation(self._measured(sigmas)) / self._now).mean())
+        return 1.0 - float((self._deviation(self._measured(REGISTER)) / self._now).mean())
 
     def after_another_pull(self) -> np.ndarray:
         """Standard deviation of log E after the last pull is repeated, shape [K]."""
@@ -141,25 +113,26 @@ class Prospects:
         return (error or self._error).total(np.sqrt(sensor))
 
     def _with_better_shape(self) -> np.ndarray:
-        geometry = self._error.geometry
-        return self._deviation(self._rows, error=replace(
-            self._error, geometry=None if geometry is None else SHAPE_SHARE * geometry))
+        geometry = self._error.parts.get("geometry")
+        return self._deviation(self._rows, error=self._error.having(
+            geometry=None if geometry is None else SHAPE_SHARE * geometry))
 
-    def _measured(self, sigmas: dict[str, float]) -> list[InformationRows]:
-        return [self._narrowed(each, sigmas) for each in self._rows]
+    def _factors(self) -> dict[Action, dict[str, float]]:
+        """By action, the factor by which it narrows the prior of each unknown that it measures."""
+        found: dict[Action, dict[str, float]] = {}
+        for each in self._objective.cell_errors.nuisances:
+            if each.unknown.measured is not None:
+                action, after = each.unknown.measured
+                found.setdefault(action, {})[each.name] = max(each.sigma / after, 1.0)
+        for name, _, sigma in self._objective.space.priors:
+            if name == "density":
+                found[_WEIGH] = {name: max(sigma / _WEIGHED, 1.0)}
+        return found
 
-    def _narrowed(self, each: InformationRows, sigmas: dict[str, float]) -> InformationRows:
-        """The prior of an unknown that was measured; anything else as it is."""
-        after = next((sigma for start, sigma in sigmas.items()
-                      if each.name.startswith(start)), None)
-        if after is None:
-            return each
-        return replace(each, rows=each.rows * max(self._prior_sigma(each.name) / after, 1.0))
-
-    def _prior_sigma(self, name: str) -> float:
-        known = {each.name: each.sigma for each in self._objective.cell_errors.nuisances}
-        return known.get(name) or next(
-            sigma for prior, _, sigma in self._objective.space.priors if prior == name)
+    def _measured(self, action: Action) -> list[InformationRows]:
+        """The rows with narrower priors; anything else as it is."""
+        factors = self._factors().get(action, {})
+        return [replace(each, rows=factors.get(each.name, 1.0) * each.rows) for each in self._rows]
 
     def _seen_twice(self) -> list[InformationRows]:
         """Two cameras with independent errors see the mean of both as one with smaller errors."""
@@ -193,7 +166,7 @@ class Prospects:
         size = by_frame.shape[1]
         rows = np.block([[by_free, by_frame], [np.zeros((size, by_free.shape[1])), np.eye(size)]])
         return self._deviation([InformationRows("", rows)],
-                               error=replace(self._error, path=None))
+                               error=self._error.having(path=None))
 
     def _with_repetition(self, number: int) -> list[InformationRows]:
         """Measurements of a pull once more, with its own errors and its own course of the force."""

@@ -84,13 +84,12 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     """Return the sources of each modulus's uncertainty (``young_deviation``: ``sensor``,
     ``geometry``, ``mesh``, ``total``, [K] of log E, None if not examined), as standard deviations
     in percent."""
+    from limber.estimation.fitting.nuisances import OTHER_CAUSES
+
     parts = estimate.get("young_deviation") or {}
-    known = {"sensor": "from sensors", "geometry": "from the scan's shape", "mesh": "from the mesh",
-             **({"path": "from the gripper's path"} if parts.get("path") else {}),
-             **({"hung": "from the mass of twigs"} if parts.get("hung") else {}),
-             **({"grip": "from the length in the gripper"} if parts.get("grip") else {}),
-             **({"graph": "from other skeletons"} if parts.get("graph") else {}),
-             "total": "together"}
+    known = {"sensor": "from sensors", **{
+        name: f"from the {cause.name}" for name, cause in OTHER_CAUSES.items()
+        if name in ("geometry", "mesh") or parts.get(name)}, "total": "together"}
     if not any(parts.get(name) for name in known):
         return []
     rows = [["control point", "position (0 base, 1 tip)", *known.values()]]

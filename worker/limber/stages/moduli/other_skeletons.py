@@ -68,8 +68,8 @@ def add_other_skeletons(found: Estimate, branch: Branch, pulls: Sequence[Pull],
                       f"{values} MPa. The intervals include the difference.")
     if changes:
         share = np.array(weights) / np.sum(weights)
-        found.model_error = replace(
-            found.model_error, graph=np.sqrt(share[1:] @ np.square(changes)))
+        found.model_error = found.model_error.having(
+            graph=np.sqrt(share[1:] @ np.square(changes)))
 
 
 def _graphs(branch: Branch) -> list[_Graph]:
