@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from tests.estimation.test_nuisances import TRUTH as TOLD
 from tests.estimation.test_nuisances import subject_of
 from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force, without_cell
@@ -23,8 +22,6 @@ from limber.estimation.simulated_pull import marked_points
 from limber.estimation.uncertainty.covariance import uncertainty
 from limber.estimation.uncertainty.identifiability import (
     identifiability,
-    other_frame,
-    require_own_frame,
     require_scale,
 )
 from limber.estimation.uncertainty.model_error import total_interval
@@ -57,32 +54,6 @@ def test_a_small_force_is_named_with_its_assumed_errors(small_bench, pull):
     objective = small_bench.objective([none], SETTINGS)
     with pytest.raises(InputError, match="zero in all frames"):
         require_scale(judged, objective, evaluation)
-
-
-@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1)])
-def test_a_force_in_another_frame_is_named(small_bench, pull, axis):
-    """Turned by a right angle it explains the motion; as given it does not."""
-    turn = Rotation.from_rotvec(np.pi / 2 * np.array(axis))
-    turned = with_force(pull, turn.inv().apply)
-    forward = small_bench.objective([turned], SETTINGS).forwards[0]
-    values = Values(TRUTH, 0.36, 900.0)
-    found = other_frame(forward, values)
-    change, at, seen = small_bench.objective([pull], SETTINGS).forwards[0].linear_motion(values)
-    across = turn.inv().apply(change) @ at
-    if np.sum(across * seen) < 0.5 * np.linalg.norm(across) * np.linalg.norm(seen):
-        assert f"90 degrees about {'xyz'[int(np.argmax(axis))]}" in found
-        loud = with_force(turned, lambda force: 50 * force / np.abs(force).max())
-        with pytest.raises(InputError, match="does not belong to the motion"):
-            require_own_frame(small_bench.objective([loud], SETTINGS), values)
-    else:
-        assert found is None
-
-
-def test_a_force_in_its_own_frame_is_left_alone(objective, small_bench, pull):
-    values = Values(np.full(4, 1e7), 0.36, 900.0)
-    assert other_frame(objective.forwards[0], values) is None
-    loud = with_force(pull, lambda force: 50 * force / np.abs(force).max())
-    require_own_frame(small_bench.objective([loud], SETTINGS), values)
 
 
 def test_a_failed_fit_names_what_is_wrong_with_the_branch(small, small_bench, objective):

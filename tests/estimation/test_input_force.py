@@ -170,7 +170,7 @@ def test_a_gripper_that_compresses_the_branch_is_not_replaced_by_its_force(small
     modulus 11 times too large, outside its interval, without a word.
     """
     settings = PullSpec(young=small.young, poisson=0.36, frames=6, phase=0.5, seed=4,
-                        mode="rigid", pose_sigma=1e-5, position_noise=0.0,
+                        mode="rigid", known={"pose_sigma_m": 1e-5}, position_noise=0.0,
                         force_noise=0.0, torque_noise=0.0, gravity=False)
     pull = simulate_pull(small.truth(), "pull-1", settings)[0]
     values = Values(np.array(small.young), 0.36, 900.0)

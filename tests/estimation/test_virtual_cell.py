@@ -74,7 +74,8 @@ def test_errors_scatter_as_the_calibration_states():
 
 def test_a_virtual_pull_states_what_was_drawn(branch_folder):
     """The calibration goes into the fit's prior, the drawn errors into the truth alone."""
-    settings = PullSpec(frames=4, cell_errors="realistic", force_bias_sigma=0.0, seed=2)
+    settings = PullSpec(frames=4, cell_errors="realistic", seed=2,
+                        known={"force_bias_sigma_n": 0.0})
     SpecifiedPull.of(settings, branch_folder=branch_folder, name="real").run()
     entry = read_pull(branch_folder / "pulls" / "real").entry
     assert entry.calibration == CalibrationEntry().model_copy(update={"force_bias_sigma_n": 0.0})

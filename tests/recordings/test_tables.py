@@ -189,7 +189,7 @@ def _franka():
 
 
 def _angles(titles, order, degrees):
-    return (["x", "y", "z", *titles, "fx", "fy", "fz", "tx", "ty", "tz"],
+    return (["x", "y", "z", *titles, "fx_n", "fy_n", "fz_n", "tx", "ty", "tz"],
             np.column_stack([_PLACES, _TURNS.as_euler(order, degrees), _WRENCHES]))
 
 

@@ -68,7 +68,6 @@ from limber.estimation.uncertainty.identifiability import (
     force_is_measured,
     identifiability,
     link_unresolved,
-    require_own_frame,
     require_scale,
 )
 from limber.geometry.skeleton.skeleton import FRACTIONS
@@ -211,7 +210,6 @@ def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
     nothing (:func:`complete`). It starts from ``near`` if that has an equilibrium; ``far`` ends it
     if points are far off. ``cache`` and ``digest`` belong to reduced bases."""
     require_scale_in_principle(objective.forwards)
-    require_own_frame(objective, start)
     reduction = (Reduction(objective.forwards, cache, digest) if settings.forward == "reduced"
                  else None)
     first = None if near is None else objective.evaluate(objective.space.pack(near),

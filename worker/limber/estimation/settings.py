@@ -208,10 +208,6 @@ class VirtualPullSettings(Settings):
         return (CalibrationEntry() if self.cell_errors == "realistic"
                 else read_calibration(Path(self.cell_errors)))
 
-    @property
-    def frame_count(self) -> int:
-        return self.frames or (60 if self.motion == "dynamic" else 24)
-
     _young = field_validator("young")(possible_young)
 
 
@@ -256,50 +252,25 @@ class PullSpec(VirtualPullSettings):
     torque_noise: float = Field(
         0.02, ge=0, description="Noise of the torque as a fraction of its largest value (rigid).")
     outliers: float = Field(0.0, ge=0, lt=0.5, description="Fraction of points displaced by 5 cm.")
-    pose_sigma: float | None = Field(
-        None, ge=0, description="Error of the position of the gripper's frame, each axis [m].")
-    pose_turn_sigma: float | None = Field(
-        None, ge=0, description="Error of the rotation of the gripper's frame, each axis [rad].")
-    force_gain_sigma: float | None = Field(None, ge=0, description="Relative error of the force.")
-    force_bias_sigma: float | None = Field(
-        None, ge=0, description="Zero offset of the force, each axis [N].")
-    force_drift_sigma: float | None = Field(
-        None, ge=0, description="Drift of the force's zero over the recording, each axis [N].")
-    torque_bias_sigma: float | None = Field(
-        None, ge=0, description="Zero offset of the torque, each axis [N m].")
-    camera_sigma: float | None = Field(
-        None, ge=0, description="Error of the position of the observer's frame, each axis [m].")
-    camera_turn_sigma: float | None = Field(
-        None, ge=0, description="Error of the rotation of the observer's frame, each axis [rad].")
-    point_sigma: float | None = Field(
-        None, ge=0, description="Distance of each observed point along the branch from its control "
-        "point [m].")
-    clock_sigma: float | None = Field(
-        None, ge=0, description="Offset of the observer's clock from the robot's [s].")
+    known: dict[str, float] = Field(
+        {}, description="Standard deviations in place of those of cell_errors, by their names in "
+        "[calibration] of pull.toml.")
 
     _density = field_validator("density")(possible_density)
     _force = field_validator("weight")(possible_force)
 
     @property
     def times(self) -> "np.ndarray":
-        """Time stamps [s], shape [frame_count]."""
+        """Time stamps [s], shape [n]."""
         import numpy as np
 
-        duration = self.duration or (1.5 if self.motion == "dynamic" else 6.0)
-        return np.linspace(0.0, duration, self.frame_count)
+        duration, count = (1.5, 60) if self.motion == "dynamic" else (6.0, 24)
+        return np.linspace(0.0, self.duration or duration, self.frames or count)
 
     @property
     def calibration(self) -> "CalibrationEntry":
         """Standard deviations of the cell's errors, each as requested."""
-        sigmas = {"pose_sigma_m": self.pose_sigma, "pose_sigma_rad": self.pose_turn_sigma,
-                  "force_gain_sigma": self.force_gain_sigma,
-                  "force_bias_sigma_n": self.force_bias_sigma,
-                  "force_drift_sigma_n": self.force_drift_sigma,
-                  "torque_bias_sigma_nm": self.torque_bias_sigma,
-                  "camera_sigma_m": self.camera_sigma, "camera_sigma_rad": self.camera_turn_sigma,
-                  "point_sigma_m": self.point_sigma, "clock_sigma_s": self.clock_sigma}
-        return super().calibration.model_copy(update={
-            name: value for name, value in sigmas.items() if value is not None})
+        return super().calibration.model_copy(update=self.known)
 
 
 class PredictSettings(Settings):

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations, permutations
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +17,17 @@ from limber.core.files.reading import read_text, read_toml
 from limber.core.not_none import present
 from limber.core.numerics.rigid import rigid_fit, rotation_matrix
 from limber.core.progress import SILENT, Progress
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.recordings.recording import (
     CalibrationEntry,
     GraspEntry,
     Observations,
-    Pull,
     PullEntry,
     SensorEntry,
     entry_with,
 )
 from limber.recordings.settings import ImportSpec
+from limber.recordings.slips import Frames, likely_slip, require_named_in_order
 from limber.recordings.tables import LENGTH_UNITS_M, same_label, scale_of, split_title
 from limber.recordings.time_series import Stream
 
@@ -194,102 +195,33 @@ def _consistent(points: np.ndarray, target: np.ndarray) -> np.ndarray:
 JointPoses = Callable[[tuple[str, ...], np.ndarray], np.ndarray]
 """From names and angles [rad] of joints, [n, k], to poses of the gripper in the base, [n, 6]."""
 
-# Slips in hand-made tables of a pull: exchanged tables or titles, units, frames, no force.
-
-_FASTEST_M_S, _LONGEST_S = 5.0, 3600.0
-"""Of a robot's tool; of a pull."""
-_THOUSAND = (300.0, 3000.0)
-"""Ratios of two durations that show milliseconds beside seconds."""
-
-
-def require_no_slip(pull: Pull) -> Pull:
-    """Return the pull, with a warning if it has no force. InputError, with the likely slip, if
-    times, positions, rotations or forces cannot be those of a robot."""
-    name, times, poses = pull.name, pull.times, pull.poses
-    length = float(np.ptp(times))
-    seen = None if pull.observations is None else float(np.ptp(pull.observations.times))
-    for what, one, other in (() if not seen or not length else (
-            ("gripper", length, seen), ("markers", seen, length))):
-        if _THOUSAND[0] < one / other < _THOUSAND[1]:
-            raise InputError(f"{name}: the times of the {what} span {one:.4g} s, those of the "
-                             f"other table {other:.4g} s.", "They are likely milliseconds.",
-                             "Name the unit in the title of that column, such as t_ms.")
-    if length > _LONGEST_S:
-        raise InputError(f"{name}: the times of the gripper span {length:.4g} s.",
-                         "No pull lasts longer than an hour. They are likely milliseconds.",
-                         "Name the unit in the title of the column, such as t_ms.")
-    turn = float(np.nanmax(np.linalg.norm(poses[:, 3:], axis=1), initial=0.0))
-    if turn > 2 * np.pi:
-        raise InputError(f"{name}: the gripper's rotation vector has a length of {turn:.4g} rad.",
-                         "A rotation has at most 6.28 rad. The columns are likely in degrees.",
-                         "Name the unit in their titles: rx_deg, ry_deg, rz_deg.")
-    speed = float(np.nanmax(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) / np.diff(times),
-                            initial=0.0))
-    if speed > _FASTEST_M_S:
-        raise InputError(f"{name}: the gripper moves at up to {speed:.3g} m/s.",
-                         f"No robot's tool moves faster than {_FASTEST_M_S:g} m/s. The positions "
-                         "are likely in millimetres, or the times in another unit.",
-                         "Name the units in the titles, such as x_mm and t_ms.")
-    force = pull.wrenches[:, :3]
-    if not np.isfinite(force).any():
-        return pull.warned(
-            f"{name}: the table has no force (columns fx_n, fy_n, fz_n). Without it a pull does "
-            "not determine the modulus, only its course along the branch.")
-    if not np.nan_to_num(force).any():
-        raise InputError(f"{name}: the force is zero in all {len(force)} rows.",
-                         "A sensor that was read has noise. It was not connected, or not recorded.",
-                         "Record it again with the force; or, if there was no sensor, remove the "
-                         "columns of the force and torque.")
-    return pull
-
-
-def likely_slip(points: np.ndarray, nodes: np.ndarray, alignment: Alignment, near: float) -> str:
-    """Return which slip explains points [m], shape [n, 3], farther than ``near`` [m] from the
-    branch's nodes [k, 3], as a sentence; "" if none does. ``alignment``: from the scan's
-    coordinates."""
-    def fits(moved: np.ndarray) -> bool:
-        return all(np.linalg.norm(nodes - point, axis=1).min() <= near for point in moved)
-
-    for factor, unit in ((1e-3, "millimetres"), (1e-2, "centimetres")):
-        if fits(factor * points):
-            return f"They fit as {unit}: name the unit in the titles, such as x_{unit[0]}m."
-    if fits(alignment.apply_metres(points)):
-        return Text("They fit in the frame of the scan: state it with ",
-                    Option("coordinates", "scan"), " and ", Option("frame_pose", (0,) * 6),
-                    " for the gripper, ", Option("marker_frame", (0,) * 6), " for markers.")
-    for order in permutations(range(3)):
-        if order != (0, 1, 2) and fits(points[:, order]):
-            return (f"They fit with the titles x, y, z exchanged: the columns titled x, y, z are "
-                    f"likely {', '.join('xyz'[order.index(k)] for k in range(3))}.")
-    return ""
-
-
 @dataclass(frozen=True)
 class BranchFrame:
     """Properties of the branch that an import needs: alignment from the scan's coordinates, gravity
-    [m/s^2], the main path's nodes from base to tip [m], shape [m, 3]; of the mesh, if there is one,
-    the nodes [m], shape [n, 3], and the number of control points."""
+    [m/s^2], its skeleton; of the mesh, if there is one, the nodes [m], shape [n, 3], and the
+    control points [m], shape [k, 3]."""
 
     alignment: Alignment = field(default_factory=Alignment)
     gravity: tuple[float, float, float] = GRAVITY
     nodes: np.ndarray | None = None
-    path: np.ndarray | None = None
-    control_points: int | None = None
+    skeleton: Skeleton | None = None
+    control_points: np.ndarray | None = None
 
     def at(self, distance: float) -> np.ndarray:
         """Return the point at a distance from the base along the main path [m], shape [3];
         InputError without a skeleton, or if the path is shorter."""
-        if self.path is None:
+        if self.skeleton is None:
             raise InputError("The branch has no skeleton.",
                              "A distance is measured along the main path.",
                              "Give ", Option("grasp_point"), ", or reconstruct the branch first.")
-        along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(self.path, axis=0), axis=1))]
+        path = self.skeleton.nodes[self.skeleton.main_path()]
+        along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))]
         if distance > along[-1]:
             raise InputError(f"The position of the grasp is {distance:g} m from the base, but the "
                              f"main path is {along[-1]:.3g} m long.", "There is no branch to hold "
                              "at that distance.", "Check the distance and its unit, or give ",
                              Option("grasp_point"), ".")
-        return np.array([np.interp(distance, along, axis) for axis in self.path.T])
+        return np.array([np.interp(distance, along, axis) for axis in path.T])
 
 
 @dataclass(frozen=True)
@@ -329,6 +261,12 @@ class ImportRequest:
         """Names of the settings that differ from their defaults."""
         return {name for name, field in ImportSpec.model_fields.items()
                 if getattr(self.settings, name) != field.default}
+
+    @property
+    def frames(self) -> Frames:
+        """Rotations of the poses' frame and the scan's to the branch's."""
+        pose = self.settings.frame_pose or (0,) * 6
+        return Frames(rotation_matrix(np.array(pose[3:])), np.array(self.branch.alignment.rotation))
 
     def in_branch(self, points: np.ndarray) -> np.ndarray:
         """Transform points [m] from the user's frame to the branch's, shape [n, 3]."""
@@ -372,10 +310,13 @@ class ImportRequest:
             require_near(at_rest, self.name, self.branch)
             return Placed(replace(seen, positions=fit.apply(seen.positions[:, fit.used])), at_rest,
                           [labels[k] for k in fit.used], fit.rms, fit.warnings)
+        points = self.branch.control_points
         is_control_points = self.settings.marker_frame is None and (
-            self.branch.control_points in (None, seen.point_count))
+            points is None or len(points) == seen.point_count)
         if rest is None and found.is_table and is_control_points:
             require_near(start, self.name, self.branch)
+            if points is not None:
+                require_named_in_order(labels, start, points, self.name)
             return Placed(seen, None, labels)
         there = np.isfinite(start).all(axis=1)
         if not there.any():
@@ -468,8 +409,8 @@ def require_on_branch(grasp: GraspEntry, name: str, branch: BranchFrame) -> None
             Option("coordinates"), ", and check ", Option("unit"), ".").at(grasp.point_m)
 
 
-def require_near(rest: np.ndarray, name: str, branch: BranchFrame) -> None:
-    """Refuse markers that are not at the branch, such as those in a capture system's own frame:
+def require_near(rest: np.ndarray, name: str, branch: BranchFrame, what: str = "a marker") -> None:
+    """Refuse markers, or a gripper, that are not at the branch, but in another frame:
     InputError if one is farther from the mesh than a quarter of its extent."""
     nodes, seen = branch.nodes, rest[np.isfinite(rest).all(axis=1)]
     if nodes is None or not len(seen):
@@ -479,8 +420,11 @@ def require_near(rest: np.ndarray, name: str, branch: BranchFrame) -> None:
     if off.max() > 0.25 * extent:
         slip = likely_slip(seen, nodes, branch.alignment, 0.25 * extent)
         raise InputError(
-            f"{name}: at rest a marker is {off.max() * 1e3:.0f} mm away from the branch, which is "
+            f"{name}: at rest {what} is {off.max() * 1e3:.0f} mm away from the branch, which is "
             f"{extent * 1e3:.0f} mm long.",
             f"The recording has another frame of reference or another unit. {slip}".rstrip(),
-            "Give the markers' positions on the branch with ", Option("nominal"), ", or the pose "
-            "of their frame with ", Option("marker_frame"), ", and check ", Option("unit"), ".")
+            *(("Give the markers' positions on the branch with ", Option("nominal"),
+               ", or the pose of their frame with ", Option("marker_frame"))
+              if what == "a marker" else
+              ("Give the pose of the frame of the gripper's poses with ", Option("frame_pose"))),
+            ", and check ", Option("unit"), ".")

@@ -33,7 +33,7 @@ from limber.recordings.import_request import (
     ImportRequest,
     Placed,
     Recorded,
-    require_no_slip,
+    require_near,
     require_on_branch,
 )
 from limber.recordings.recording import (
@@ -57,7 +57,8 @@ from limber.recordings.recording_formats import (
     RecordingFormat,
     recording_format,
 )
-from limber.recordings.sensor_checks import clean
+from limber.recordings.sensor_checks import clean, force_unit_suspicion
+from limber.recordings.slips import require_bent_as_pulled, require_followed, require_no_slip
 from limber.recordings.synchronisation import DETERMINED_S, estimate_offset
 from limber.recordings.tables import (
     LENGTH_UNITS_M,
@@ -149,7 +150,8 @@ def import_recording(kind: str, request: ImportRequest) -> dict[str, Any]:
         request: The import's source, target and settings.
 
     Returns:
-        ``frame_count``, ``point_count``, ``time_offset_s``; for a steady load ``displacement_m``,
+        ``frame_count``, ``point_count``, ``time_offset_s``, ``young_beam_pa`` (the modulus that
+        force and motion imply by beam theory); for a steady load ``displacement_m``,
         ``settled_s`` and ``registration_rms_m``; for a force table without a mesh or the
         position of the load ``slope_n_per_m``, ``slope_interval_n_per_m`` and ``why_no_modulus``.
 
@@ -216,12 +218,22 @@ def _pull(request: ImportRequest, entry: PullEntry, robot: Stream, seen: Observa
 def _moved_by_robot(found: Recorded | Pull, request: ImportRequest) -> dict[str, Any]:
     """Write the pull, with the faults of its sensors told, and its clocks' offset."""
     pull = found if isinstance(found, Pull) else _of_robot(found, request)
+    frame = request.settings.force_frame
     if request.replaced:
         pull = replace(pull, entry=request.as_stated(pull.entry))
-    if not (request.folder / "pull.toml").exists():
+    if frame is not None:
+        pull = replace(pull, wrenches=request.frames.on_branch(frame, pull.poses, pull.wrenches))
+    if frame is not None or not (request.folder / "pull.toml").exists():
         write_pull(request.folder, pull)
     elif request.replaced:
         write_entry(request.folder / "pull.toml", pull.entry)
+    skeleton = request.branch.skeleton
+    young = None
+    if skeleton is not None and frame is None:
+        _require_there(pull, request)
+        young = require_bent_as_pulled(pull, skeleton, request.frames)
+        if young is not None and (suspicion := force_unit_suspicion(young)):
+            request.progress.warn(suspicion)
     cleaned = clean(pull)
     _tell(request, cleaned.warnings)
     entry, seen = pull.entry, cleaned.observations
@@ -229,9 +241,19 @@ def _moved_by_robot(found: Recorded | Pull, request: ImportRequest) -> dict[str,
             and request.settings.time_offset is None):
         entry = _with_offset(cleaned, seen.times, request)
         write_entry(request.folder / "pull.toml", entry)
+    if skeleton is not None:
+        require_followed(replace(cleaned, entry=entry), skeleton, request.frames,
+                         is_placed=request.settings.marker_frame is not None,
+                         is_timed=request.settings.time_offset is not None)
     return {"frame_count": len(seen.times) if seen is not None else len(pull.times),
             "point_count": seen.point_count if seen is not None else 0,
-            "time_offset_s": entry.time_offset_s}
+            "time_offset_s": entry.time_offset_s, "young_beam_pa": young}
+
+
+def _require_there(pull: Pull, request: ImportRequest) -> None:
+    """Refuse a gripper that is never near where it holds the branch."""
+    away = np.linalg.norm(pull.poses[:, :3] - pull.entry.grasp.point_m, axis=1)
+    require_near(pull.poses[[away.argmin()], :3], pull.name, request.branch, "the gripper")
 
 
 def _of_robot(found: Recorded, asked: ImportRequest) -> Pull:

@@ -1,5 +1,6 @@
 """Settings of an import; this module imports no heavy package."""
 
+from itertools import permutations
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
@@ -16,6 +17,8 @@ from limber.core.settings import (
 )
 from limber.recordings.recording_formats import kind_names
 
+_AXES = ["-?" + ",-?".join(axes) for axes in permutations("xyz")]
+
 
 class ImportSettings(Settings):
     """Settings for reading a recording."""
@@ -23,7 +26,7 @@ class ImportSettings(Settings):
     groups: ClassVar[Groups] = {
         "input": ("kind", "robot", "unit", "force_unit", "rate_hz", "nominal", "marker_frame",
                   "coordinates", "time_offset", "yolo_weights", "yolo_prompt"),
-        "bags and robot logs": ("cell", "frame_pose", "topic", "bag_clock"),
+        "bags and robot logs": ("cell", "frame_pose", "force_frame", "topic", "bag_clock"),
         "grasp and loads": ("grasp_point", "grasp_distance", "grasp_radius", "grasp_mode",
                             "direction", "weight", "load", "own_weight"),
         "simulation": ("motion", "swing_start"),
@@ -98,6 +101,12 @@ class ImportSettings(Settings):
     frame_pose: tuple[float, float, float, float, float, float] | None = Field(
         None, description="Pose of the frame in which the gripper's poses, forces and torques are "
         "given: [m] and rotation vector [rad]. Default: the cell's base, else the branch's frame.")
+    force_frame: Annotated[str, Field(
+        pattern=f"^({'|'.join(['poses', 'tool', 'scan', *_AXES])})$")] | None = Field(
+        None, description="Frame of forces and torques: poses, that of the poses; tool, the "
+        "gripper's own; scan, that of the scan's file; or x, y, z by the columns, such as y,-x,z. "
+        "Default: poses, and an import is refused if another explains how the branch bends much "
+        "better.")
     topic: tuple[Annotated[str, Field(pattern="^(wrench|pose|points)=.+")], ...] = Field(
         (), description="A topic of a bag, if there are several for one of these. wrench=TOPIC: of "
         "the wrench. pose=TOPIC: of the gripper's pose, or its TF frame. points=TOPIC: of markers, "

@@ -169,7 +169,7 @@ def _not_found(name: str, start: float, low: float, high: float) -> InputError:
         f"Offsets of {start - SEARCH_S:.4g} to {start + SEARCH_S:.4g} s were tried.",
         f"{several}, so the pull does not determine the offset between the clocks.",
         "Check that both tables are of the same pull and that their times are in the stated unit; "
-        "then state the offset with ", Option("time_offset"), ".")
+        "then state the offset with ", Option("time_offset", float(f"{(low + high) / 2:.3f}")), ".")
 
 
 @dataclass(frozen=True)

@@ -643,6 +643,9 @@ def robot_stream(path: str | Path, force_unit: str | None = None,
         raise InputError(f"{path} lacks {', '.join(missing)}.",
                          "The gripper's pose in the branch's frame is needed.",
                          f"Columns: t_s, {', '.join(POSE_COLUMNS + WRENCH_COLUMNS)}.")
+    if force_unit is None and any(title.plain == "fx" and not title.unit for title in titles):
+        warnings.append(Text(f"{Path(path).name}: the columns of the force state no unit. Newtons "
+                             "are assumed; state another with ", Option("force_unit", "kgf"), "."))
     _add_rotation(values, titles, stream, warnings, Path(path))
     unmeasured = np.full(len(stream), np.nan)
     found = np.column_stack([values.get(name, unmeasured) for name in _ALIASES])

@@ -4,28 +4,16 @@ import copy
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from limber.core.errors import InputError, Option
-from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.fitting.objective import Evaluation, Objective
-from limber.estimation.forward.forward_model import Forward
-from limber.estimation.forward.solved_pull import QuasiStaticForward
-from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.parameters import ParameterSpace
 from limber.recordings.recording import calibration_of
 
 # Why a measured force does not determine the scale of Young's modulus.
 
 POORER = ((1.0, 0.1), (0.1, 1.0), (0.1, 0.1), (1.0, 0.01), (0.01, 1.0), (0.01, 0.01))
 """Factors on the stated noise, and on zero and drift, that are tried."""
-ASTRAY, EXPLAINED = 0.5, 0.9
-"""Cosine between the motion that a force would cause and the observed one, below which the force
-does not explain it, and above which it does. Chosen."""
-ALIKE = 0.02
-"""Difference of such cosines below which two frames explain the motion as well."""
-CLEAR = 3.0
-"""Assumed errors above which the direction of a force is known."""
-
 
 def too_little_said(objective: Objective, evaluation: Evaluation, limit: float) -> InputError:
     """Return why recorded forces leave the scale of the moduli open: the deviation of log E must be
@@ -42,8 +30,6 @@ def too_little_said(objective: Objective, evaluation: Evaluation, limit: float) 
     known, noise = calibration_of(forward.entry), forward.entry.sensor.force_sigma_n
     seen = (f"{forward.name}: the force was recorded, up to {peaks[largest]:.3g} N, but it does "
             "not determine the overall scale of Young's modulus.")
-    turned = other_frame(forward, objective.space.unpack(evaluation.free))
-    hint = "" if turned is None else f" {turned}"
     for by_noise, by_zero in POORER:
         deviation = _scale_deviation(objective, evaluation, by_noise, by_zero)
         if deviation > limit:
@@ -57,64 +43,14 @@ def too_little_said(objective: Objective, evaluation: Evaluation, limit: float) 
                       ] * (by_zero < 1)
         return InputError(
             seen, f"It is small against its assumed errors (standard deviations: {errors}). If you "
-            f"know {' and '.join(better)}, the scale is known to {100 * deviation:.0f} %.{hint}",
+            f"know {' and '.join(better)}, the scale is known to {100 * deviation:.0f} %.",
             f"State the true ones in pulls/{forward.name}/pull.toml, or import the recording with ",
             Option("force_sigma"), " and ", Option("pull_toml"), ". Or pull farther.")
     return InputError(
         seen, "Even with a hundredth of its assumed errors it would not: in the simulation the "
-        f"force hardly depends on the modulus.{hint}",
+        "force hardly depends on the modulus.",
         "Check the columns and the unit of the force, and the grasp point. Then import the "
         "recording again.")
-
-
-def require_own_frame(objective: Objective, values: Values) -> None:
-    """Refuse a force that is far above its errors and clearly given in another frame. The
-    InputError says which."""
-    for forward in objective.forwards:
-        if not forward.uses_force or forward.force_is_stated:
-            continue
-        known, force = calibration_of(forward.entry), forward.frames.wrenches[:, :3]
-        error = np.hypot(known.force_bias_sigma_n, known.force_drift_sigma_n)
-        error = np.hypot(error, forward.entry.sensor.force_sigma_n)
-        if np.nanmax(np.linalg.norm(force, axis=1)) < CLEAR * error:
-            continue
-        if (turned := other_frame(forward, values)) is not None:
-            raise InputError(
-                f"{forward.name}: the force does not belong to the motion.", turned,
-                "Give force and torque in the same frame as the gripper's poses and import the "
-                "recording again. If both are in another frame than the branch, state its pose (",
-                Option("frame_pose"), ", or ", Option("cell"), ").")
-
-
-def other_frame(forward: Forward, values: Values) -> str | None:
-    """Return the frame in which the force would explain the motion, as sentences. None: the force
-    explains it as given, or in no frame."""
-    if not isinstance(forward, QuasiStaticForward) or forward.entry.drive != "pose":
-        return None
-    change, at, seen = forward.linear_motion(values)
-    change, at = change[:, :3], at[:3]
-    own = _cosine(change @ at, seen)
-    if own >= ASTRAY:
-        return None
-    known = np.isfinite(forward.frames.wrenches[:, :3]).all(axis=1)
-    by_tool = np.einsum("nij,nj->ni", [rotation_matrix(pose[3:]) for pose in
-                                       forward.frames.poses[known]],
-                        forward.frames.wrenches[known, :3])
-    found = [(_cosine((by_tool - by_tool[0]) @ at, seen), 0.0, "given in the gripper's own axes")]
-    for turn in Rotation.create_group("O"):
-        size, name = float(turn.magnitude()), f"turned by {_name(turn.as_rotvec())}"
-        cosine = _cosine(turn.apply(change) @ at, seen)
-        found.append((cosine, size, name))
-        found.append((-cosine, size, "with the opposite sign" + (
-            "" if size < 0.1 else f" and {name}")))
-    best = max(each[0] for each in found)
-    if best < EXPLAINED:
-        return None
-    alike = sorted((size, text) for cosine, size, text in found if cosine > best - ALIKE)
-    names = " or ".join(text for _, text in alike[:3])
-    return (f"As given, it would move the branch in another direction than it moved (cosine "
-            f"{own:.2f}). {names[0].upper()}{names[1:]}, it would move it as observed "
-            f"({best:.2f}).")
 
 
 def _scale_deviation(objective: Objective, evaluation: Evaluation, by_noise: float,
@@ -136,20 +72,6 @@ def _scale_deviation(objective: Objective, evaluation: Evaluation, by_noise: flo
     along = again.slopes[:, :objective.space.group_count].sum(axis=1)
     information = float(along @ along)
     return information**-0.5 if information > 0 else np.inf
-
-
-def _cosine(one: np.ndarray, other: np.ndarray) -> float:
-    size = float(np.linalg.norm(one) * np.linalg.norm(other))
-    return float(np.sum(one * other)) / size if size > 0 else 0.0
-
-
-def _name(turn: np.ndarray) -> str:
-    """A rotation by its angle and axis."""
-    angle = float(np.linalg.norm(turn))
-    axis = turn / max(angle, 1e-12)
-    parts = [f"{'-' if part < 0 else ''}{name}" for part, name in zip(axis, "xyz", strict=True)
-             if abs(part) > 0.1]
-    return f"{np.degrees(angle):.0f} degrees about {' + '.join(parts)}"
 
 
 UNRESOLVED_DEVIATION = 0.5

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from limber.core.errors import Cancelled, InputError, LimberError, Option, Text, WorkError
+from limber.core.errors import Cancelled, LimberError, Option, WorkError
 from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
@@ -148,9 +148,6 @@ class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
     bag: Path | None = option(
         "Import this recording first (MCAP, rosbag2, RTDE log) as a pull with the file's name, and "
         "estimate from it. `limber import-pull` has more options.", group="input", common=True)
-    cell: Path | None = option(
-        "With --bag: the robot's cell file, which states its base and how well gripper and force "
-        "sensor are known.", group="input")
     resume: bool = option(
         "Start from the best result of a stopped run. Otherwise that result is ignored.", False,
         switch=True)
@@ -177,10 +174,6 @@ class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
         """
         if self.bag is not None:
             return self._with_bag(self.bag, progress).run(progress)
-        if self.cell is not None:
-            raise InputError(Text(Option("cell"), " was given without ", Option("bag"), "."),
-                             "A pull in the branch folder already states how well its robot is "
-                             "known.", "Omit ", Option("cell"), ".")
         if self.follow:
             return follow(self, progress)
         branch = Branch.open(self.branch_folder)
@@ -194,10 +187,10 @@ class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
         from limber.stages.pulls.import_pull import ImportPull
 
         name = re.sub(r"[^A-Za-z0-9_.-]+", "-", bag.stem).strip("-.") or "bag"
-        ImportPull(branch_folder=self.branch_folder, source=bag, name=name,
-                   cell=self.cell).run(progress.part(0.0, 0.05))
+        ImportPull(branch_folder=self.branch_folder, source=bag, name=name).run(
+            progress.part(0.0, 0.05))
         return self.model_copy(update={
-            "pull": tuple(dict.fromkeys((*self.pull, name))), "bag": None, "cell": None})
+            "pull": tuple(dict.fromkeys((*self.pull, name))), "bag": None})
 
 
 def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[str, Any]:
@@ -206,6 +199,7 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
     from limber.estimation.fit import fit_branch, is_open
     from limber.estimation.fit_assessment import judge_model, require_result
     from limber.estimation.fitting.objective import EvaluationLog
+    from limber.recordings.slips import slips_of
     from limber.stages.moduli.other_skeletons import add_other_skeletons
     from limber.store.loading import (
         density_digest,
@@ -229,6 +223,8 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
     heard = progress.keeping(warnings)
     pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
     tell_doubts(pulls, subject, heard)
+    for each in [slip for pull in pulls for slip in slips_of(pull, subject.skeleton)]:
+        heard.warn(each)
     log_path = branch.folder / EVALUATIONS
     if asked.force or not asked.resume:
         log_path.unlink(missing_ok=True)

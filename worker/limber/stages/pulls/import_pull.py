@@ -96,7 +96,8 @@ class ImportPull(ImportSettings, KeptStage, BranchStage):
     about = About(
         "import-pull", 50, Pull, key="pull:{name}", writes=("pulls/{name}/",),
         found=("Pull {pull} ({kind}): {frame_count} frames of {point_count} points.", _moved,
-               "Force over displacement: {slope_n_per_m:.3g} N/m."),
+               "Force over displacement: {slope_n_per_m:.3g} N/m.",
+               "By beam theory, force and motion imply a modulus of about {young_beam_pa:.2g} Pa."),
         then="limber estimate {branch_folder}", step="pulls", label="Import Pull")
 
     source: Path = argument(f"A recording: {listed(RECORDINGS.readers())}.")
@@ -203,16 +204,14 @@ def _frame(branch: Branch, settings: ImportSettings) -> BranchFrame:
     from limber.store.loading import load_mesh, load_skeleton
 
     loaded = settings.weight is not None or settings.load is not None
-    path = None
-    if branch.has("skeleton.swc"):
-        skeleton = load_skeleton(branch)
-        path = skeleton.nodes[skeleton.main_path()]
+    skeleton = load_skeleton(branch) if branch.has("skeleton.swc") else None
     if not (loaded or branch.has("mesh.vtu")):
-        return BranchFrame(branch.manifest.alignment, branch.gravity, path=path)
+        return BranchFrame(branch.manifest.alignment, branch.gravity, skeleton=skeleton)
     mesh = load_mesh(branch)
     marks = mesh.point_data.get("control_point")
-    return BranchFrame(branch.manifest.alignment, branch.gravity, mesh.nodes, path,
-                       None if marks is None else int(marks.max()) + 1)
+    return BranchFrame(branch.manifest.alignment, branch.gravity, mesh.nodes, skeleton,
+                       None if marks is None else np.array([
+                           mesh.nodes[marks == k].mean(axis=0) for k in range(marks.max() + 1)]))
 
 
 def _digest(path: Path) -> str:
