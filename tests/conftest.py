@@ -16,13 +16,7 @@ from tests.subjects.meshes import box_mesh
 from benchmarks.paper_branches import Bench, PaperBranch, exact_pull
 from limber.estimation.simulated_pull import TrueBranch
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.recordings.recording import (
-    GraspEntry,
-    Observations,
-    Pull,
-    PullEntry,
-    SensorEntry,
-)
+from limber.recordings.recording import GraspEntry, Observations, Pull, PullEntry, SensorEntry
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Started in the background of a shell, or under one that ignores Ctrl-C: the programs that

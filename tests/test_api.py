@@ -177,7 +177,7 @@ def test_a_table_is_one_of_pandas(example):
 
 def test_a_picture_says_what_it_needs(example, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    with pytest.raises(MissingDependencyError, match=r"pip install .*\[report\]"):
+    with pytest.raises(MissingDependencyError, match=r"(--with |pip install .*\[)report"):
         example.results["estimate"].plot()
 
 

@@ -116,7 +116,7 @@ def bare_beam(tmp_path: Path) -> BeamBranch:
 @pytest.fixture()
 def bpy():
     """The bpy module with an empty file."""
-    module = pytest.importorskip("bpy", reason="NO BPY: scripts/setup brings it")
+    module = pytest.importorskip("bpy", reason="NO BPY: scripts/setup --with-blender")
     module.ops.wm.read_factory_settings(use_empty=True)
     return module
 

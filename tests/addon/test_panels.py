@@ -101,8 +101,7 @@ def panels(worker_here):
     return panel
 
 
-STEPS = ("scan", "skeleton", "mesh", "material", "pulls", "estimate", "plan", "robot",
-         "report")
+STEPS = ("scan", "skeleton", "mesh", "material", "pulls", "estimate", "plan", "robot", "report")
 
 
 def _step(bpy, name):
@@ -118,8 +117,7 @@ def _draw_step(bpy, name):
 
 def test_every_panel_is_in_the_tab(bpy, panels):
     """All steps stand in the sidebar tab Limber, in order; each can be drawn."""
-    kinds = [panels("job"), panels("result"), *(_step(bpy, name) for name in STEPS),
-             panels("play")]
+    kinds = [panels("job"), panels("result"), *(_step(bpy, name) for name in STEPS), panels("play")]
     assert {kind.bl_category for kind in kinds} == {"Limber"}
     orders = [kind.bl_order for kind in kinds]
     assert orders == sorted(set(orders))
@@ -141,8 +139,7 @@ def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, first
         "limber.from_cursor", "limber.from_object")]
     others = [f"limber.{stage.name.replace('-', '_')}" for stage in stages.values()
               if stage.step == name]
-    assert shown == [first, *more,
-                     *(button for button in others if button not in (first, *more))]
+    assert shown == [first, *more, *(button for button in others if button not in (first, *more))]
     step = _step(bpy, name).step
     common = drawn.names("prop")
     bpy.context.scene.limber.show_expert = True

@@ -5,11 +5,13 @@ import os
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
 from tests.subjects.leafy import curved_leaves
 
 from limber.core import optional
@@ -91,10 +93,25 @@ def test_the_advice_is_for_the_way_limber_was_installed(monkeypatch, tmp_path, i
     assert asked == ["limber-branch"]
 
 
-def test_in_a_checkout_the_advice_names_the_checkout():
-    """With the Python at hand, not with that of the PATH."""
+@pytest.mark.parametrize("prefix, advice", [
+    ("", f"Install with `{PIP} -e {shlex.quote(f'{CHECKOUT}[report]')}`."),
+    (".venv", f"Run `{shlex.quote(f'{CHECKOUT}/scripts/setup')} --with report`.")])
+def test_in_a_checkout_the_advice_names_the_checkout(monkeypatch, prefix, advice):
+    """With the Python at hand, not with that of the PATH; in .venv by what made that."""
+    monkeypatch.setattr(sys, "prefix", str(CHECKOUT / prefix))
     with pytest.raises(MissingDependencyError) as caught:
         optional.require_extra("report", ("no_such_package",), "The report")
     assert str(caught.value) == (
-        "no_such_package is not installed. The report needs it. Install with "
-        f"`{PIP} -e {shlex.quote(f'{CHECKOUT}[report]')}`.")
+        f"no_such_package is not installed. The report needs it. {advice}")
+
+
+@pytest.mark.parametrize("extra", ["planning", "robot", "blender"])
+def test_an_extra_without_a_wheel_is_said_by_its_python(monkeypatch, extra):
+    """Which ones lack, the markers of pyproject.toml say as well."""
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
+    for minor in range(11, 15):
+        monkeypatch.setattr(sys, "version_info", SimpleNamespace(minor=minor))
+        there = {"python_version": f"3.{minor}", "sys_platform": "linux"}
+        has = any(Requirement(need).marker.evaluate(there)
+                  for need in project["optional-dependencies"][extra])
+        assert has == ("no wheel" not in optional.how_to_install(extra))

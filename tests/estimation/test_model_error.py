@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import FRACTIONS, Bench
-from benchmarks.silicone_beam import (
-    DENSITY,
-    LOAD_POINT_M,
-    NOMINAL_M,
-    POISSON,
-    TIPS,
-    box_mesh,
-)
+from benchmarks.silicone_beam import DENSITY, LOAD_POINT_M, NOMINAL_M, POISSON, TIPS, box_mesh
 from limber.estimation.estimated_branch import Subject, forwards_of, parameter_space
 from limber.estimation.fitting.objective import Objective
 from limber.estimation.parameters import Values

@@ -33,8 +33,7 @@ def prospects(bench, pulls, error=None):
     parts = [objective_of(bench, pull) for pull in pulls]
     objective = Objective([part.forwards[0] for part in parts], parts[0].space,
                           force_sigma=[part.force_sigma[0] for part in parts])
-    evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)),
-                                    jacobian=True)
+    evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)), jacobian=True)
     sure = replace(uncertainty(evaluation, objective), recording_spread=0.03, **UNIT)
     return Prospects(evaluation, objective, sure, error or ModelError(), TRUTH)
 
@@ -123,8 +122,7 @@ def test_the_best_come_first_and_the_idle_do_not_come(today, small_bench, noisy)
 
 # As many control points as the pulls support.
 
-QUICK = FitSpec(key_frames=6, hold_out=False, mesh_check=False, gravity=False,
-                poisson=0.35)
+QUICK = FitSpec(key_frames=6, hold_out=False, mesh_check=False, gravity=False, poisson=0.35)
 
 
 class _OnTheFitsMesh(PaperBranch):

@@ -16,12 +16,7 @@ from limber.geometry.cloud.preparation import Prepared, prepare
 from limber.geometry.cloud.surroundings import Support
 from limber.geometry.generated import generate_branch
 from limber.geometry.io.clouds import read_cloud
-from limber.geometry.leaf_removal import (
-    _on_round_axes,
-    check_agreed,
-    show_leaves,
-    without_leaves,
-)
+from limber.geometry.leaf_removal import _on_round_axes, check_agreed, show_leaves, without_leaves
 from limber.geometry.reconstruction import (
     _MOSTLY,
     COLOURS,

@@ -18,6 +18,10 @@ DISTRIBUTION = "limber-branch"
 """Name by which pip knows Limber: ``limber`` is another program there."""
 
 
+_PYTHONS = {"planning": (11, 12, 13), "robot": (11, 12), "blender": (11, 13)}
+"""Minor versions of Python 3 for which an extra's packages have wheels, where some lack."""
+
+
 def require_extra(extra: str, packages: tuple[str, ...], what: str) -> None:
     """Check that an extra's packages, by their import names, are installed before work on ``what``
     begins; MissingDependencyError if one is not."""
@@ -30,7 +34,12 @@ def require_extra(extra: str, packages: tuple[str, ...], what: str) -> None:
 
 def how_to_install(extra: str) -> str:
     """Return how an extra comes to this Python, by the way in which Limber came to it."""
+    minor, known = sys.version_info.minor, _PYTHONS.get(extra)
+    if known and minor not in known:
+        return f"It has no wheel for Python 3.{minor}: use Limber with Python 3.{known[-1]} for it."
     checkout = Path(__file__).resolve().parents[3]
+    if Path(sys.prefix) == checkout / ".venv":
+        return f"Run `{shlex.join([str(checkout / 'scripts' / 'setup'), '--with', extra])}`."
     if (checkout / "pyproject.toml").is_file():
         return pip_install("-e", f"{checkout}[{extra}]")
     try:

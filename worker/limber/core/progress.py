@@ -169,8 +169,7 @@ class LogSink:
     """Writes a line to standard error every ten seconds, during a long step too as a thread does
     it: for a log, where no bar can be drawn."""
 
-    def __init__(self, title: str, stream: TextIO | None = None, *,
-                 interval_seconds: float = 10.0):
+    def __init__(self, title: str, stream: TextIO | None = None, *, interval_seconds: float = 10.0):
         self._title, self._interval = title, interval_seconds
         self._stream = stream or sys.stderr
         self._last = (0.0, "", "")
@@ -201,8 +200,7 @@ class LogSink:
 class LineSink:
     """Rewrites one line of text: for a notebook, whose output does not support a bar."""
 
-    def __init__(self, title: str, stream: TextIO | None = None, *,
-                 interval_seconds: float = 0.1):
+    def __init__(self, title: str, stream: TextIO | None = None, *, interval_seconds: float = 0.1):
         self._title = title
         self._stream = stream or sys.stderr
         self._interval = interval_seconds
