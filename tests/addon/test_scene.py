@@ -275,16 +275,33 @@ def test_command_makes_scene_and_picture(bpy, beam, tmp_path, capsys):
     assert np.nonzero(yellow)[0].mean() > np.nonzero(violet)[0].mean(), "the base is below"
 
 
-def test_command_says_what_is_missing(beam, tmp_path, monkeypatch, capsys):
-    """Neither bpy nor Blender: exit code 3 and what to install; no output: exit code 2."""
-    import importlib.util
+def test_without_blender_the_scene_is_gltf(beam, tmp_path, monkeypatch, capsys):
+    """It has the branch in its colours, and its paths, in metres with y up; the picture is the
+    report's, and what brings Blender is said. Only a turntable is an error. No output: exit code 2.
+    """
+    import trimesh
 
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec",
+                        lambda name: None if name == "bpy" else find(name))
     monkeypatch.setenv("PATH", str(tmp_path))
     for name in ("LIMBER_BLENDER", "LIMBER_SCENE_BLENDER"):
         monkeypatch.delenv(name, raising=False)
-    assert call(["scene", str(beam.folder), "-o", str(tmp_path / "scene.blend")]) == 3
-    assert "LIMBER_BLENDER" in capsys.readouterr().err
+    blend, picture = tmp_path / "scene.blend", tmp_path / "scene.png"
+    words = ["scene", str(beam.folder), "-o", str(blend), "--json"]
+    assert call([*words, "--turntable", str(tmp_path / "turn.gif")]) == 3
+    capsys.readouterr()
+    assert call([*words, "--render", str(picture)]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert not blend.exists() and told["scene"] == str(tmp_path / "scene.glb")
+    assert "scene.glb" in told["warnings"][0] and "LIMBER_BLENDER" in told["warnings"][0]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    made = trimesh.load(tmp_path / "scene.glb")
+    assert {"Branch", "gentle", "shortest"} <= made.geometry.keys()
+    np.testing.assert_allclose(made.geometry["Branch"].bounds, [
+        beam.frames[0].min(axis=0), beam.frames[0].max(axis=0)], atol=1e-5)
+    np.testing.assert_allclose(made.graph["Branch"][0][:3, :3], [[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    assert len(np.unique(made.geometry["Branch"].visual.vertex_colors, axis=0)) > 1
     assert call(["scene", str(beam.folder)]) == 2
     (tmp_path / "file").write_text("")
     assert call(["scene", str(beam.folder), "-o", str(tmp_path / "file" / "x.blend")]) == 2

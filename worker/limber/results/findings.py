@@ -166,8 +166,7 @@ def failure_sentence(strain_over_limit: float) -> str:
 
 
 def _over_arm(path: str, plan: Mapping[str, Any]) -> str:
-    return force_remark(float(plan[path]["peak_force_n"]),
-                        (plan.get("robot") or {}).get("model"))
+    return force_remark(float(plan[path]["peak_force_n"]), (plan.get("robot") or {}).get("model"))
 
 
 def _over_wood(path: str, plan: Mapping[str, Any]) -> str:

@@ -210,8 +210,7 @@ def _parameter(model: type[Settings], name: str) -> click.Parameter:
     if "metavar" in extra:
         common["metavar"] = extra["metavar"]
     if kind is bool and extra.get("switch"):
-        return GroupedOption([*flags, name], is_flag=True,
-                             **common | {"help": field.description})
+        return GroupedOption([*flags, name], is_flag=True, **common | {"help": field.description})
     if kind is bool:
         return GroupedOption([f"{flag}/--no-{flag[2:]}", name], **common)
     if typing.get_origin(kind) is tuple:

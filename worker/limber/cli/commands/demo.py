@@ -92,7 +92,7 @@ class _Demo:
     def show(self) -> None:
         """Write the report, then scene and picture, unless they show the current branch; the report
         needs no Blender, and gets the picture once there is one."""
-        title, note = "a Blender scene and its picture", self.folder / "demo.json"
+        title, note = "a scene and its picture", self.folder / "demo.json"
         origin = {"branch": self._digest(), "limber": VERSION}
         scene, picture = self.folder / "scene.blend", self.folder / "scene.png"
         if scene.is_file() and picture.is_file() and _read_note(note) == origin:
@@ -111,6 +111,8 @@ class _Demo:
         except LimberError as error:
             self.progress.warn(f"There is no scene and no picture: {error}")
             return
+        if self.written()["scene"] != scene:
+            return  # Without Blender; the next demo tries again.
         write_atomically(note, json.dumps(origin) + "\n")
         if self.reports:
             run_stage([str(word) for word in pictured], self.progress.part(1.0, 1.0))
@@ -118,8 +120,8 @@ class _Demo:
     def written(self) -> dict[str, Path | None]:
         """Return the paths of report, scene and picture, as far as this demo has them."""
         shown = "scene" in self.kept or "scene" in self.results
-        paths = (self.branch / "report.html", self.folder / "scene.blend",
-                 self.folder / "scene.png")
+        paths = (self.branch / "report.html", Path(self.results.get("scene", {}).get(
+            "scene", self.folder / "scene.blend")), self.folder / "scene.png")
         return {name: path if made else None for name, path, made in zip(
             _FILES, paths, (self.reports, shown, shown), strict=True)}
 
@@ -246,8 +248,7 @@ def _closed_loop(asked: Demo, folder: Path, progress: Progress) -> dict[str, Any
     result = ClosedLoop(folder, asked.seed, progress=progress).run()
     for title, rows in comparison(result):
         progress.say(table_text(title, rows))
-    demo = _Demo(folder, Path(result["branch"]), progress, frozenset(), reports,
-                 done=_ENDS["plan"])
+    demo = _Demo(folder, Path(result["branch"]), progress, frozenset(), reports, done=_ENDS["plan"])
     demo.show()
     return result | demo.written() | {"demo_seconds": round(time.perf_counter() - started, 1),
                                       "found": [_loop_sentence(result)]}
@@ -335,8 +336,7 @@ def _found(demo: _Demo) -> list[str]:
 
 def _loop_sentence(result: Mapping[str, Any]) -> str:
     held = sum(result["covered"])
-    flower = ("was brought to its goal" if result["flower_in_goal"] else
-              "did not reach its goal")
+    flower = ("was brought to its goal" if result["flower_in_goal"] else "did not reach its goal")
     return (f"{held} of {len(result['covered'])} intervals contain the true modulus; the flower "
             f"{flower}; the force along the path was within 5 % of the peak, or its interval, on "
             f"{100 * result['force_within_share']:.1f} % of it.")

@@ -94,8 +94,7 @@ def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
     least = 1e-4
     axes.barh(rows - 0.2, np.clip(before[:len(names)], least, 1e3), 0.38, color=_BEFORE,
               label="before the fit")
-    axes.barh(rows + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED,
-              label="after the fit")
+    axes.barh(rows + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED, label="after the fit")
     axes.axvline(UNRESOLVED_DEVIATION, color=TRUE, lw=0.8)
     axes.set_xscale("log")
     axes.set_yticks(rows, names)
@@ -162,8 +161,7 @@ def loss_over_evaluations(estimate: dict[str, Any]) -> Any:
                      for entry in estimate["history"]], float)
     count = np.arange(1, len(loss) + 1)
     axes.semilogy(count, loss, ".", color="#999999")
-    axes.semilogy(count, np.fmin.accumulate(loss), color=SIMULATED,
-                  label=estimate["method"])
+    axes.semilogy(count, np.fmin.accumulate(loss), color=SIMULATED, label=estimate["method"])
     axes.legend(frameon=False)
     return figure
 

@@ -16,7 +16,7 @@ from limber.planning.constraints.damage import DamageAlong
 from limber.planning.field.energy_field import EnergyField
 from limber.recordings.time_series import read_stream
 from limber.results.findings import modulus_origin
-from limber.results.motion_files import read_pc2
+from limber.results.motion_files import node_average, read_pc2
 from limber.results.report.estimate_figures import AXIS_DOTS, AXIS_LINES, OBSERVED, SIMULATED
 from limber.results.report.section import chart, draw_faces, two_views
 from limber.store import Branch
@@ -203,13 +203,7 @@ def _cloud_points(branch: Branch) -> np.ndarray:
 def _coloured_faces(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     """Boundary faces and the modulus of the tetrahedra behind them, from nodal averages."""
     faces = mesh.surface_faces()
-    corners = mesh.tets[:, :4]
-    total = np.zeros(mesh.node_count)
-    count = np.zeros(mesh.node_count)
-    np.add.at(total, corners, mesh.cell_data["young"][:, None])
-    np.add.at(count, corners, 1.0)
-    nodal = total / np.maximum(count, 1.0)
-    return faces, nodal[faces].mean(axis=1)
+    return faces, (node_average(mesh) @ mesh.cell_data["young"])[faces].mean(axis=1)
 
 
 def _shade(corners: np.ndarray, depth: int) -> np.ndarray:
@@ -379,8 +373,7 @@ def force_along_path(path: Path) -> "Figure":
     times, table = np.insert(times, after, np.nan), np.insert(table, after, np.nan, axis=0)
     felt, expected, variances = table[:, :3], table[:, 3:6], table[:, 6:]
     figure = Figure(figsize=(9.0, 5.2), layout="constrained")
-    for axes, column, name in zip(figure.subplots(3, 1, sharex=True), range(3), "xyz",
-                                  strict=True):
+    for axes, column, name in zip(figure.subplots(3, 1, sharex=True), range(3), "xyz", strict=True):
         half = 1.96 * np.sqrt(np.maximum(variances[:, column], 0.0))
         axes.fill_between(times, expected[:, column] - half, expected[:, column] + half,
                           color=SIMULATED, alpha=0.2, lw=0)

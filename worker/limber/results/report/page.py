@@ -14,10 +14,7 @@ from limber.geometry.skeleton import qsm_tables
 from limber.geometry.skeleton.alternatives import SearchDoubts, open_questions
 from limber.geometry.skeleton.confidence import DoubtfulPart, doubtful_parts
 from limber.geometry.skeleton.qsm_tables import Caliper
-from limber.results.findings import (
-    ASSUMED,
-    simulated_pull,
-)
+from limber.results.findings import ASSUMED, simulated_pull
 from limber.results.report import figures
 from limber.results.report.report_tables import (
     action_rows,

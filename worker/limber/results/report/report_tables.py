@@ -10,8 +10,7 @@ from limber.core.units import place_text, table_of
 from limber.results.findings import ASSUMED
 
 
-def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
-                 ) -> list[list[str]]:
+def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,) -> list[list[str]]:
     """Return estimated Young's modulus [Pa] per control point, with truth and error if the pull, of
     ``limber virtual-pull``, has ``young_true_pa``; ``young_assumed``: of a scan without a real
     pull."""

@@ -396,8 +396,7 @@ def add_frame_scalar(data: SceneData, name: str, values: np.ndarray, title: str,
                      colours: str, *, is_from_zero: bool = False) -> None:
     """Add a value in each frame [frames, v], and the worst of all frames, on one scale."""
     values = values.astype(np.float32)
-    worst, word = (values.min(axis=0), "least") if name == "det_f" else (
-        values.max(axis=0), "peak")
+    worst, word = (values.min(axis=0), "least") if name == "det_f" else (values.max(axis=0), "peak")
     spanned = np.append(np.maximum(worst, 0.0), 0.0) if is_from_zero else worst
     scale = colour_scale(spanned, title, unit, colours)
     add_scalar(data, name, worst.astype(float), {**scale, "title": f"{word} {title}"})
@@ -625,8 +624,7 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
         if not plans:
             return None
         plan = max(plans, key=lambda name: branch.manifest.stages[f"plan:{name}"].finished)
-    summary = read_plan_summary(
-        branch.require(f"plans/{plan}.json", "plan", Option("name", plan)))
+    summary = read_plan_summary(branch.require(f"plans/{plan}.json", "plan", Option("name", plan)))
     for key, name in (("plan", plan), ("baseline", f"{plan}-baseline")):
         if not branch.has(f"plans/{name}.csv"):
             continue

@@ -122,6 +122,26 @@ class SceneData:
         np.savez(content, info=np.array(text), **self.arrays)
         write_atomically(path, content.getvalue())
 
+    def write_gltf(self, path: Path, color: str) -> int:
+        """Write the branch in the colours of ``color``, its paths and the scan as binary glTF, in
+        metres; return the number of objects."""
+        import trimesh
+
+        solids = {"Branch": ("vertices", "faces", f"color:{color}")} | {
+            self.info["paths"][key]["title"]: (f"rods:{key}", f"rod_faces:{key}",
+                                               f"rod_color:{key}")
+            for key in self.info["paths"] if key in self.info["rods"]}
+        things = {title: trimesh.Trimesh(*(self.arrays[part] for part in names[:2]), process=False,
+                                         vertex_colors=self.arrays[names[2]])
+                  for title, names in solids.items()}
+        if "cloud" in self.arrays:
+            things["Scan"] = trimesh.PointCloud(self.arrays["cloud"])
+        # Its y points up.
+        scene = trimesh.Scene(things).apply_transform(
+            [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+        write_atomically(path, scene.export(file_type="glb"))
+        return len(things)
+
 
 # Lines and points of a scene as thin rods and small balls, coloured by a value at each point.
 

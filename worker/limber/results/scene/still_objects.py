@@ -117,8 +117,7 @@ def add_marks(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:
         if len(fixed):
             middle = (fixed.min(axis=0) + fixed.max(axis=0)) / 2
             radius = np.linalg.norm((fixed - middle)[:, :2], axis=1).max()
-            data.info["base"] = {"centre_m": middle, "top_m": fixed[:, 2].max(),
-                                 "radius_m": radius}
+            data.info["base"] = {"centre_m": middle, "top_m": fixed[:, 2].max(), "radius_m": radius}
 
 
 def add_targets(data: SceneData, targets: Sequence[NamedTarget]) -> None:
@@ -392,8 +391,7 @@ def _add_energy_grid(data: SceneData, branch: Branch) -> None:
     path = branch.path("energy.npz")
     content = read_arrays(path, "an energy field")
     if {"chart_base_m", "arc_length_m"} <= set(content):
-        require_shapes(path, content, {"chart_base_m": (3,), "arc_length_m": ()},
-                       "an energy field")
+        require_shapes(path, content, {"chart_base_m": (3,), "arc_length_m": ()}, "an energy field")
         _add_hemisphere(data, content["chart_base_m"], float(content["arc_length_m"]))
     try:
         field = EnergyField.read(path)

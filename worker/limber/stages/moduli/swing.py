@@ -91,12 +91,7 @@ class FitSwing(SwingSettings, KeptStage, BranchStage):
         from limber.estimation.forward.forward_model import under_its_weight
         from limber.estimation.vibration.free_swing import SwingSeen, fit_swing
         from limber.recordings.recording import grasp_on
-        from limber.store.loading import (
-            density_digest,
-            density_sigma,
-            load_subject,
-            pulls_digest,
-        )
+        from limber.store.loading import density_digest, density_sigma, load_subject, pulls_digest
 
         branch = Branch.open(self.branch_folder)
         with branch.writing("limber swing"):

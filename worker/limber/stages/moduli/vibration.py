@@ -117,8 +117,7 @@ class FitVibration(KeptStage, BranchStage):
                        "mesh geometry": mesh.geometry_digest()} | density_digest(branch)
             if self.is_kept(branch, digests=digests):
                 return branch.manifest.stages["vibration"].result
-            seen = identify(rung.times, rung.values, self.start,
-                            rate_deviation=rung.rate_deviation)
+            seen = identify(rung.times, rung.values, self.start, rate_deviation=rung.rate_deviation)
             for text in seen.warnings:
                 progress.warn(text)
             if not _SLOWEST_HZ < seen.frequencies[0] < _FASTEST_HZ:

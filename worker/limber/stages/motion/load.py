@@ -294,8 +294,7 @@ def _keep(branch: Branch, settings: ApplyLoads, inputs: dict[str, Any], model: B
             "frame_count": len(displacements), "rate": 1.0,
             "largest_principal_strains": [float(state.principal_strain[:, -1].max())
                                           for state in states]}), encoding="utf-8")
-        stage.result.update({key: value for key, value in plain(result).items()
-                             if key != "along"})
+        stage.result.update({key: value for key, value in plain(result).items() if key != "along"})
 
 
 def _gusts(settings: ApplyLoads) -> Gusts | None:

@@ -152,8 +152,7 @@ def _simulated(asked: Simulate, progress: Progress, along: PoseTable | None,
     law = material_named(asked.material)
     if not law.is_compiled:
         digests["material"] = law_digest(law)
-    reads = [name for name in ("mesh.vtu", "point_masses.json", "targets.json")
-             if branch.has(name)]
+    reads = [name for name in ("mesh.vtu", "point_masses.json", "targets.json") if branch.has(name)]
     stored = branch.manifest.stages.get(key)
     if stored and stored.result.get("converged") and asked.is_kept(
             branch, key, reads=reads, digests=digests):

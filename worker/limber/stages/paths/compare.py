@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
     from limber.planning.compared_planners import ComparedTrial
 
-_COLUMNS = ("trial", "planner", "length_m", "energy_sum_nmm", "energy_integral_jm",
-            "peak_energy_j")
+_COLUMNS = ("trial", "planner", "length_m", "energy_sum_nmm", "energy_integral_jm", "peak_energy_j")
 
 
 class Comparison(Result):
@@ -69,8 +68,7 @@ class ComparePlanners(KeptStage, PlacedStage):
         writes=("comparisons/{name}.csv", "comparisons/{name}.png"),
         found=("{planned_count} of {trial_count} random starts were planned.", _saving),
         then="limber report {branch_folder}", step="plan", label="Compare Planners")
-    groups: ClassVar[Groups] = {"trials": ("trials", "goal", "seed"),
-                                "solver": ("max_detour",)}
+    groups: ClassVar[Groups] = {"trials": ("trials", "goal", "seed"), "solver": ("max_detour",)}
     common = ("trials", "goal")
 
     name: str = given("Name of the comparison's files.", "planners", group="output")
@@ -113,8 +111,7 @@ class ComparePlanners(KeptStage, PlacedStage):
         goal = (second_arm_goal(field) if self.goal is None
                 else near(np.array(self.goal), asked.goal_tolerance))
         with branch.stage(self.entry, self, reads=reads) as stage:
-            trials = run_trials(field, goal, asked, self.trials,
-                                progress=progress)
+            trials = run_trials(field, goal, asked, self.trials, progress=progress)
             good = [trial for trial in trials if trial.scores]
             if not good:
                 raise NoPathError(f"None of {len(trials)} trials has a path.", trials[0].trouble,

@@ -8,12 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.cell.cell_file import (
-    CameraEntry,
-    Cell,
-    check_branch,
-    read_cell,
-)
+from limber.cell.cell_file import CameraEntry, Cell, check_branch, read_cell
 from limber.cell.known_arms import arm_named
 from limber.cell.obstacles import Obstacle, cell_obstacles, closest
 from limber.cell.reach_and_collision import ArmSurroundings, clearance_in, outer_reach, untaken

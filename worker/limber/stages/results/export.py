@@ -58,8 +58,7 @@ def _write_links(branch: Branch, path: Path, settings: Export, progress: Progres
         sites = {target.name: target.position for target in load_targets(branch)}
         if loaded.grasp_point is not None:
             sites = {"grasp": loaded.grasp_point, **sites}
-        text = mjcf_text(tree, damping, branch.name,
-                         {"tip": tuple(skeleton.nodes[end]), **sites})
+        text = mjcf_text(tree, damping, branch.name, {"tip": tuple(skeleton.nodes[end]), **sites})
     path.write_bytes(text.encode())
     return {"link_count": tree.count, "mass_kg": float(tree.mass.sum()),
             "stiffness_factor": factor, "damping_stiffness_s": damping.stiffness}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -9,10 +10,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from pydantic import Field
 
 from limber.core.errors import Command, InputError, Option, Text, WorkError
+from limber.core.files.atomic import write_atomically
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.core.settings import Groups
-from limber.stages.result import Written
+from limber.stages.result import Written, drawn
 from limber.stages.stage import About, BranchStage, given
 from limber.store import Branch
 
@@ -29,6 +31,7 @@ class MakeScene(BranchStage):
     about = About(
         "scene", 120, Written, reads=("mesh.vtu",),
         found=("{object_count} objects and {frame_count} frames, made by Blender {blender}.",
+               "{mesh_count} objects as glTF, without Blender.",
                "Data of {vertex_count:count} vertices.", "Picture {picture}.",
                "Turntable {turntable}."))
     groups: ClassVar[Groups] = {
@@ -38,7 +41,8 @@ class MakeScene(BranchStage):
     cell: Path | None = given(
         "The robot's cell file. Its arm, gripper, camera, obstacles and workspace are shown as "
         "well.")
-    output: Path | None = given("The .blend to write.", group="output", common=True, short="-o")
+    output: Path | None = given("The .blend to write, or a .glb (glTF), which takes no Blender.",
+                                group="output", common=True, short="-o")
     render: Path | None = given(
         "Also render a picture (PNG) of the end of the path.", group="output", common=True)
     turntable: Path | None = given(
@@ -62,7 +66,8 @@ class MakeScene(BranchStage):
             "Default: 0.6 % of Young's modulus, as of green wood (0.5 to 0.7 %)."))
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
-        """Make a Blender scene of a branch, or only its content as arrays.
+        """Make a Blender scene of a branch, or only its content as arrays. Where there is no
+        Blender, a warning says so and the scene is written as glTF.
 
         Raises:
             InputError: not exactly one of output and data is given, or there is nothing to show.
@@ -70,6 +75,7 @@ class MakeScene(BranchStage):
         """
         from limber.cell.cell_file import read_cell
         from limber.cell.obstacles import cell_obstacles
+        from limber.core.errors import MissingDependencyError
         from limber.results.scene.animation import scene_data
         from limber.results.scene.still_objects import add_cell
         from limber.store.loading import load_targets
@@ -80,8 +86,7 @@ class MakeScene(BranchStage):
                              "It states what to write.", "Give -o scene.blend.")
         progress(0.0, "reading the branch folder")
         branch = Branch.read(self.branch_folder)
-        data = scene_data(branch, self.plan, self.motion, load_targets(branch),
-                          self.strength)
+        data = scene_data(branch, self.plan, self.motion, load_targets(branch), self.strength)
         if self.cell is not None:
             cell = read_cell(self.cell)
             add_cell(data, cell, cell_obstacles(cell, self.cell.parent))
@@ -96,11 +101,29 @@ class MakeScene(BranchStage):
         if turntable is not None and turntable.suffix.lower() not in _MOVING:
             raise InputError(f"{turntable.name} has no suffix of an animation.", "",
                              f"Name it {' or '.join(_MOVING)}.")
-        result = _made(data, output, self, progress.part(0.1, 1.0))
+        if output.suffix.lower() == ".glb":
+            return self._as_gltf(branch, data, output)
+        try:
+            result = _made(data, output, self, progress.part(0.1, 1.0))
+        except MissingDependencyError as error:
+            if turntable is not None:
+                raise
+            output = output.with_suffix(".glb")
+            progress.warn(f"{error} Without, {output.name} (glTF) is written, and as picture the "
+                          "report's of the mesh.")
+            return self._as_gltf(branch, data, output)
         if not output.is_file():
             raise WorkError(f"Blender ended without an error but did not write {output}.", "",
                             Command("doctor"), " states which Blender was used.")
         return result | {"scene": output, "picture": self.render, "turntable": turntable}
+
+    def _as_gltf(self, branch: Branch, data: SceneData, output: Path) -> dict[str, Any]:
+        from limber.results.report.figures import mesh_by_modulus
+
+        if self.render is not None:
+            _writable(self.render).write_bytes(drawn(lambda: mesh_by_modulus(branch))._repr_png_())
+        count = data.write_gltf(_writable(output), self.color)
+        return {"scene": output, "picture": self.render, "mesh_count": count}
 
 
 def _made(data: SceneData, output: Path, asked: MakeScene, progress: Progress) -> dict[str, Any]:
@@ -132,14 +155,11 @@ def _write_moving(path: Path, pictures: list[Path]) -> None:
         raise WorkError("Blender ended without an error but rendered nothing.", "",
                         Command("doctor"), " states which Blender was used.")
     images = [Image.open(picture).convert("RGB") for picture in pictures]
-    beside = path.with_name(f".{path.name}.part")
-    try:
-        images[0].save(beside, format="PNG" if path.suffix.lower() == ".png" else path.suffix[1:],
-                       save_all=True, append_images=images[1:], loop=0,
-                       duration=round(1000 * _TURN_SECONDS / len(images)))
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+    content = io.BytesIO()
+    images[0].save(content, format="PNG" if path.suffix.lower() == ".png" else path.suffix[1:],
+                   save_all=True, append_images=images[1:], loop=0,
+                   duration=round(1000 * _TURN_SECONDS / len(images)))
+    write_atomically(path, content.getvalue())
 
 
 def _writable(path: Path) -> Path:

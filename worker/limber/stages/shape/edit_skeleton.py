@@ -119,8 +119,7 @@ class ReviewSkeleton(BranchStage):
             branch = Branch.open(self.branch_folder)
             edits = _applied(branch) if self.edits is None else _requested_edits(
                 branch, self.edits, self.frame, self.append)
-            chosen = [] if self.alternative is None else _edits_of(branch,
-                                                                          self.alternative)
+            chosen = [] if self.alternative is None else _edits_of(branch, self.alternative)
             _remade(branch, [*edits, *chosen], progress)
         branch = Branch.read(self.branch_folder)
         skeleton, alignment, mesh = _latest(branch)

@@ -46,8 +46,7 @@ class MeshQuality(Result):
     surface_distance_mean: float | None = shown(
         "mean distance between mesh and surface", ".4g local radii",
         meaning="mean distance between mesh and surface, in local radii")
-    surface_distance_max: float | None = shown("largest distance between mesh and surface",
-                                               ".4g m")
+    surface_distance_max: float | None = shown("largest distance between mesh and surface", ".4g m")
     fork_distance_mean: float | None = shown("mean distance at forks", ".4g local radii",
                                              meaning="the same at forks")
     fork_distance_max: float | None = shown("largest distance at forks", ".4g local radii",

@@ -168,8 +168,7 @@ def _of_scan(asked: Reconstruct, progress: Progress) -> dict[str, Any]:
         progress.warn(f"The points are coloured by class in {place}, in metres: wood brown, leaves "
                       "green, points on no round axis red, a pot grey, stakes, posts "
                       "and wires blue, another plant violet.")
-    with branch.dropped_if_empty(), branch.stage(
-            "reconstruct", asked, digests=digests) as stage:
+    with branch.dropped_if_empty(), branch.stage("reconstruct", asked, digests=digests) as stage:
         own = None if asked.skeleton is None else read_skeleton(
             asked.skeleton, scale=UNIT_METRES[asked.unit])
         try:

@@ -113,8 +113,7 @@ def _check_request(asked: SetTarget) -> None:
                          "Give ", Option("at"), " X Y Z in metres.")
 
 
-def _placed(mesh: Any, name: str, at: tuple[float, float, float], mass: float,
-            ) -> dict[str, Any]:
+def _placed(mesh: Any, name: str, at: tuple[float, float, float], mass: float,) -> dict[str, Any]:
     """Return the target and its attachment to the branch."""
     from limber.mechanics.loads.loaded_branch import NamedTarget
     from limber.mechanics.points import nearest_inside
