@@ -131,9 +131,10 @@ class SceneData:
             self.info["paths"][key]["title"]: (f"rods:{key}", f"rod_faces:{key}",
                                                f"rod_color:{key}")
             for key in self.info["paths"] if key in self.info["rods"]}
-        things = {title: trimesh.Trimesh(*(self.arrays[part] for part in names[:2]), process=False,
-                                         vertex_colors=self.arrays[names[2]])
-                  for title, names in solids.items()}
+        things: dict[str, Any] = {
+            title: trimesh.Trimesh(self.arrays[points], self.arrays[faces], process=False,
+                                   vertex_colors=self.arrays[colours])
+            for title, (points, faces, colours) in solids.items()}
         if "cloud" in self.arrays:
             things["Scan"] = trimesh.PointCloud(self.arrays["cloud"])
         # Its y points up.

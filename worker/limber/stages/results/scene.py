@@ -121,7 +121,7 @@ class MakeScene(BranchStage):
         from limber.results.report.figures import mesh_by_modulus
 
         if self.render is not None:
-            _writable(self.render).write_bytes(drawn(lambda: mesh_by_modulus(branch))._repr_png_())
+            drawn(lambda: mesh_by_modulus(branch)).savefig(_writable(self.render), format="png")
         count = data.write_gltf(_writable(output), self.color)
         return {"scene": output, "picture": self.render, "mesh_count": count}
 
