@@ -315,8 +315,7 @@ def test_import_stands_in_the_file_menu(bpy, registered):
     assert bpy.types.LIMBER_FH_cloud.bl_import_operator == "limber.import_cloud"
 
 
-def test_a_scan_of_more_units_than_a_plant_has_metres_is_in_millimetres(
-        bpy, registered, tmp_path):
+def test_a_scan_of_more_units_than_a_plant_has_metres_is_in_millimetres(bpy, registered, tmp_path):
     """From the worker's limit on: guessed and asked, unless the user has set the unit."""
     limit = importlib.import_module("limber_addon.stages").longest_m()
     assert limit == LONGEST

@@ -21,8 +21,7 @@ from limber.stages.motion.simulate import Simulate
 from limber.store import Branch
 from limber.store.loading import load_model
 
-KEYS = {"converged", "frame_count", "energy_j", "grasp_force_n", "tip_displacement_m",
-        "min_det_f"}
+KEYS = {"converged", "frame_count", "energy_j", "grasp_force_n", "tip_displacement_m", "min_det_f"}
 
 
 @pytest.fixture
@@ -42,8 +41,7 @@ def folder(tmp_path):
 
 def test_motion_writes_what_the_design_says(folder):
     """A pull in time: keys, PC2 of the surface, first frame the scan, skipped when current."""
-    settings = SimulateSettings(move=(0.02, 0, -0.001), duration=0.2, hold=0.1,
-                                grasp_mode="point")
+    settings = SimulateSettings(move=(0.02, 0, -0.001), duration=0.2, hold=0.1, grasp_mode="point")
     result = Simulate.of(settings, branch_folder=folder).run()
     assert result.keys() >= KEYS
     assert result["converged"]
@@ -283,8 +281,7 @@ def test_a_way_from_a_table_is_followed(folder, tmp_path):
     part = np.linspace(0, 1, 7)
     rows = [f"{5 + p:.9f},{1 + 20 * p:.9f},{2:.1f},{3 - p:.9f}" for p in part]
     way.write_text("\n".join(["t_s,x_mm,y_mm,z_mm", *rows]) + "\n")
-    common = ["--kind", "static", "--grasp-mode", "point", "--no-gravity",
-              "--progress", "none"]
+    common = ["--kind", "static", "--grasp-mode", "point", "--no-gravity", "--progress", "none"]
     assert call(["simulate", str(folder), "--along", str(way), "--name", "way", *common]) == 0
     assert call(["simulate", str(folder), "--move", "0.02", "0", "-0.001", *common]) == 0
     assert _frames(folder, "way")["energies_j"] == pytest.approx(

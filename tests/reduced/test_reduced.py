@@ -20,8 +20,7 @@ from limber.reduced.reduced_model import ReducedModel, ReducedSettings, ReducedS
 from limber.reduced.training import TrainingSettings
 
 YOUNG = np.array([1.2e8, 0.8e8])
-TRAINING = TrainingSettings(grasp_count=28, young_spread=3.0, vibration_every=10,
-                            vibration_count=3)
+TRAINING = TrainingSettings(grasp_count=28, young_spread=3.0, vibration_every=10, vibration_count=3)
 
 
 @pytest.fixture(scope="module")
@@ -124,8 +123,7 @@ def test_the_grasp_follows_the_pose_exactly(model):
         q = np.concatenate([held.at(pose), rng.normal(size=26 - held.count)])
         moved = np.tensordot(q, basis.columns, 1)[grasp.nodes]
         if mode == "rigid":
-            np.testing.assert_allclose(moved, grasp.displacement(model.mesh.nodes, pose),
-                                       atol=1e-9)
+            np.testing.assert_allclose(moved, grasp.displacement(model.mesh.nodes, pose), atol=1e-9)
         else:
             np.testing.assert_allclose(grasp.weights @ moved, pose[:3] - grasp.centre, atol=1e-9)
         modes = basis.columns[held.count:].reshape(26 - held.count, -1, 3)
@@ -249,8 +247,7 @@ def test_a_search_ends_with_its_iterations(trained, grasp):
     first = reduced.solve_static(pose, settings=replace(doubted, start_count=1))
     assert first.converged
     assert reduced.solve_static(pose, settings=doubted).iterations > first.iterations
-    short = reduced.solve_static(
-        pose, settings=replace(doubted, iteration_limit=first.iterations))
+    short = reduced.solve_static(pose, settings=replace(doubted, iteration_limit=first.iterations))
     assert short.converged and short.iterations == first.iterations
     assert np.array_equal(short.coordinates, first.coordinates)
     shorter = reduced.solve_static(

@@ -227,8 +227,7 @@ class SafetyStop(LimberError):
 
     exit_code = 4
 
-    def __init__(self, seen: str, why: str = "", *fix: Part,
-                 result: dict[str, Any] | None = None):
+    def __init__(self, seen: str, why: str = "", *fix: Part, result: dict[str, Any] | None = None):
         super().__init__(seen, why, *fix)
         self.result = result or {}
 

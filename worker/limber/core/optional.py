@@ -34,8 +34,8 @@ def require_extra(extra: str, packages: tuple[str, ...], what: str) -> None:
 
 def how_to_install(extra: str) -> str:
     """Return how an extra comes to this Python, by the way in which Limber came to it."""
-    minor, known = sys.version_info.minor, _PYTHONS.get(extra)
-    if known and minor not in known:
+    minor = sys.version_info.minor
+    if minor not in (known := _PYTHONS.get(extra, (minor,))):
         return f"It has no wheel for Python 3.{minor}: use Limber with Python 3.{known[-1]} for it."
     checkout = Path(__file__).resolve().parents[3]
     if Path(sys.prefix) == checkout / ".venv":

@@ -29,11 +29,8 @@ def cache_folder() -> Path:
 
 def known_caches() -> list[Cache]:
     """Return the existing caches by name."""
-    folder = cache_folder()
-    if not folder.is_dir():
-        return []
     found = []
-    for path in sorted(path for path in folder.iterdir() if path.is_dir()):
+    for path in sorted(path for path in cache_folder().glob("*") if path.is_dir()):
         sizes = [size for _, size, _ in _files(path)]
         found.append(Cache(path.name, path, len(sizes), sum(sizes), sizes.count(0)))
     return found

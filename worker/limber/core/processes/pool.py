@@ -409,8 +409,7 @@ class Pool:
                          + sum(w.job is not None for w in self._workers))
             missing = needed - len(self._workers)
         for _ in range(missing):
-            self._workers.append(Worker(self._context, self._begin, self._cores_each,
-                                        self.name))
+            self._workers.append(Worker(self._context, self._begin, self._cores_each, self.name))
         for worker in self._workers:
             with self._guard:
                 while worker.is_idle and self._waiting:
