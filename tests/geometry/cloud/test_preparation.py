@@ -104,7 +104,8 @@ def test_ground_and_walls_are_cut_out(turned):
     prepared = prepare(both, 1.0)
     assert prepared.counts["sheets"] > 0.99 * len(plane)
     assert len(prepared.cloud) > 0.97 * len(branch)
-    assert any("flat sheet" in text for text in prepared.warnings)
+    (told,) = (text for text in prepared.warnings if "flat sheet" in text)
+    assert np.abs(plane - told.place).sum(axis=1).min() < 1e-3
     assert len(prepare(both, 1.0, PreparationSettings(keep=("sheets",))).cloud) == len(both)
 
 
@@ -117,6 +118,20 @@ def test_branches_are_no_sheets():
         assert prepare(cloud, 1.0).counts["sheets"] == 0, spec
         flat = cloud.points * [1.0, 0.2, 1.0]  # as a trained fruit tree is
         assert prepare(Cloud(flat), 1.0).counts.get("sheets", 0) == 0, spec
+
+
+@pytest.mark.parametrize("count", [400, 1400, 20_000])
+def test_a_fan_is_no_wall_and_a_shadowed_wall_is(count):
+    """Twigs side by side in a plane fill it by cells of few points; once they were taken out. A
+    wall with the shadows of twigs is one, however few of its points were scanned."""
+    foot, flat = RNG.uniform(0, 1, (2, count))
+    twig, slope = RNG.integers(0, 9, count), RNG.uniform(-0.3, 0.3, 9)
+    wide = 0.1 * twig + slope[twig] * flat + RNG.normal(0, 3e-3, count)
+    fan = np.column_stack([wide, RNG.normal(0, 1e-3, count), flat])
+    assert find_sheet(fan, 0.08 * count) is None
+    wall = np.column_stack([foot, RNG.normal(0, 1e-3, count), flat])
+    wall = wall[np.abs(foot - 0.5 - 0.3 * (flat - 0.5)) > 0.03]
+    assert find_sheet(wall, 0.08 * count).mean() > 0.9
 
 
 def test_two_flat_neighbourhoods_are_no_plane():

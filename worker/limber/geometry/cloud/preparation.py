@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.core.constants import UNIT_METRES
-from limber.core.errors import InputError, Option, Text
+from limber.core.errors import InputError, Option, Place, Text
 from limber.geometry.cloud.cloud import Cloud, own_axes
 from limber.geometry.cloud.single_view import Sight, View, find_sight, flying_pixels, scan_line_view
 from limber.geometry.cloud.surroundings import find_ground, find_sheet
@@ -81,10 +81,12 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
                          "A branch has a thickness.",
                          "Check the columns and the number of digits of the export.")
     cloud = cloud.with_points(points)
-    keep = _without_outliers(points)
+    keep, flat = _without_outliers(points), None
     if "sheets" not in settings.keep:
         beside = np.flatnonzero(keep)[_beside_plant(points[keep], up, counts)]
         if len(beside):
+            middle = np.linalg.norm(points[beside] - np.median(points[beside], axis=0), axis=1)
+            flat = Place((points[beside[np.argmin(middle)]] + origin) / scale)
             # What is usual for a plant does not depend on the ground around it.
             rest = np.setdiff1d(np.arange(len(points)), beside)
             keep[:] = False
@@ -95,7 +97,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     _enough(cloud, "After cropping and cleaning, the cloud")
     if view is not None:
         view = replace(view, eye=view.eye - origin)
-    return Prepared(cloud, origin, counts, _plausible(cloud.points, counts), view, scale)
+    return Prepared(cloud, origin, counts, _plausible(cloud.points, counts, flat), view, scale)
 
 
 def voxel_thinned(points: np.ndarray, size: float) -> np.ndarray:
@@ -271,7 +273,7 @@ def _rounding(points: np.ndarray) -> float:
     return steps[0] if max(steps) < 1.01 * min(steps) and near < 1.5 * steps[0] else 0.0
 
 
-def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
+def _plausible(points: np.ndarray, counts: dict[str, int], flat: Place | None) -> list[str]:
     texts = []
     if counts.get("not_finite"):
         texts.append("Points with coordinates that are not finite (NaN or infinity) were "
@@ -281,12 +283,11 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
                      f"kept, {counts['read'] - counts['thinned_on_reading']} in all: more do not "
                      "make the axes better. Crop the scan before the export if finer twigs are "
                      "missing.")
-    if counts.get("sheets"):
-        texts.append(Text(f"{counts['sheets']} of {counts['read']} points lie on wide flat sheets "
-                          "and were removed (", Option("keep"), " sheets keeps them)."))
-    if counts.get("ground"):
-        texts.append(Text(f"{counts['ground']} of {counts['read']} points lie on rough ground and "
-                          "were removed (", Option("keep"), " sheets keeps them)."))
+    if flat is not None:
+        count = counts["sheets"] + counts.get("ground", 0)
+        texts.append(Text(f"{count} of {counts['read']} points lie on wide flat sheets or rough "
+                          "ground, as at ", flat, ", and were removed (", Option("keep"),
+                          " sheets keeps them)."))
     step = _rounding(points)
     if step > 0:
         texts.append(f"The coordinates are rounded to {1000 * step:.4g} mm, which limits the "

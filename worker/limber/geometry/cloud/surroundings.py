@@ -333,7 +333,6 @@ _FLAT, _ELONGATED = 0.01, 0.3  # variance across and along a sheet, over the nex
 _TRIES = 200
 _IN_PLANE = 3  # fewest flat neighbourhoods that span a plane
 _BROAD = 0.11  # smallest standard deviation across a sheet, over the diagonal; leaves have 0.08
-_FILLED = 0.25  # smallest fraction of its bounding box that a sheet fills
 
 
 def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
@@ -372,20 +371,35 @@ def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
     axes = principal_axes(middles[best])
     offset = (points - middle) @ axes.T
     on = np.abs(offset[:, 2]) < thick
-    if on.sum() < least or not _is_broad(offset[on][:, :2], diagonal):
+    if on.sum() < least or not _is_broad(offset[order[on[order]], :2], diagonal):
         return None
     return on
 
 
 def _is_broad(flat: np.ndarray, diagonal: float) -> bool:
-    """Whether points of a plane, shape [n, 2], fill an area, not a line or a fan of lines."""
-    if flat.std(axis=0).min() < _BROAD * diagonal:
+    """Whether points of a plane, shape [n, 2], fill an area evenly, and are no flat-grown plant.
+
+    Twice as far around a point there are four times as many of an even sheet, also beside its
+    border, and twice as many of a curve. Each scale between a few points and the sheet's size
+    is asked which of the two explains its counts: twigs are curves up to the gap between them.
+    """
+    size = flat.std(axis=0).min()
+    if size < _BROAD * diagonal:
         return False
-    low, high = np.quantile(flat, [0.02, 0.98], axis=0)
-    side = np.sqrt(np.prod(high - low) / min(400, len(flat) / 8))
-    cells = np.unique(np.floor((flat - low) / side).astype(np.int64)[
-        ((flat >= low) & (flat <= high)).all(axis=1)], axis=0)
-    return len(cells) * side**2 > _FILLED * float(np.prod(high - low))
+    tree, some = cKDTree(flat), flat[:20 * _SAMPLE:5]
+    least = max(3, len(flat) // 200)  # wider than a scanner's lines are apart
+    near = float(np.median(tree.query(some, k=least + 1)[0][:, -1]))
+    while 0 < 2 * near <= size:
+        left, inner, both = some, 0, 0
+        while len(left):
+            off = np.linalg.norm(flat - left[0], axis=1)
+            inner += int((off < near).sum()) - 1
+            both += int((off < 2 * near).sum()) - 1
+            left = left[np.linalg.norm(left - left[0], axis=1) > 4 * near]
+        if inner * np.log(2) > (both - inner) * np.log(1.5):
+            return False
+        near *= np.sqrt(2)
+    return True
 
 
 # Ground in a scan, rough or on a slope: one layer of points below everything else.
@@ -395,7 +409,7 @@ def _is_broad(flat: np.ndarray, diagonal: float) -> bool:
 # is not ground: points continue above it.
 
 _CELL = 0.03  # fraction of the cloud's diagonal
-_LEAST_CELLS = 40
+_LEAST_CELLS, _FILLED = 40, 0.25  # fewest cells of ground, and how much of their box they fill
 _STEEPEST = np.deg2rad(40.0)
 _ROUGH = 0.03  # largest deviation of the ground from its plane, over the diagonal
 _BELOW, _NOTHING = 4.0, 0.03  # standard deviations below the plane; largest fraction of cells there
@@ -415,7 +429,7 @@ def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray 
     _, cell = np.unique(np.ravel_multi_index(tuple(index.T), shape), return_inverse=True)
     count = np.bincount(cell)
     middle = np.stack([np.bincount(cell, values) for values in flat.T], axis=1) / count[:, None]
-    if not _are_cells_broad(middle, diagonal):
+    if len(count) < _LEAST_CELLS or middle.std(axis=0).min() < _BROAD * diagonal:
         return None
     low = np.full(len(count), np.inf)
     np.minimum.at(low, cell, height)
@@ -438,23 +452,15 @@ def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray 
     top = float(np.median(over[near])) + _LAYER * thick
     ground = over < top
     next_layer = np.bincount(cell[(over > top) & (over < 2 * top)], minlength=len(count)) > 0
-    if ground.sum() < least or np.mean(next_layer) > _ABOVE or not _are_cells_broad(
-            middle[np.bincount(cell[ground], minlength=len(count)) > 0], diagonal):
-        return None
-    return ground
+    cells = middle[np.bincount(cell[ground], minlength=len(count)) > 0]
+    is_ground = ground.sum() >= least and np.mean(next_layer) <= _ABOVE and len(cells) * (
+        _CELL * diagonal)**2 > _FILLED * float(np.prod(np.ptp(cells, axis=0)))
+    return ground if is_ground else None
 
 
 def _known_median(values: np.ndarray) -> float:
     known = values[~np.isnan(values)]
     return float(np.median(known)) if len(known) else np.nan
-
-
-def _are_cells_broad(middle: np.ndarray, diagonal: float) -> bool:
-    """Whether cells [k, 2] fill an area in both directions."""
-    if len(middle) < _LEAST_CELLS or middle.std(axis=0).min() < _BROAD * diagonal:
-        return False
-    box = float(np.prod(np.ptp(middle, axis=0)))
-    return len(middle) * (_CELL * diagonal)**2 > _FILLED * box
 
 
 def _plane(middle: np.ndarray, low: np.ndarray):
