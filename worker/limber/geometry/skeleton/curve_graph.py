@@ -19,7 +19,6 @@ from limber.geometry.skeleton.joining import (
     join_pieces,
     specks,
 )
-from limber.geometry.skeleton.repair import untied
 
 _Z = np.array([0.0, 0.0, 1.0])
 
@@ -71,7 +70,6 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
     length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
     graph = CurveGraph(nodes, edges, radius, support)
     graph.edges, graph.loops = _spanning_forest(nodes, edges, length, radius)
-    graph.edges = untied(nodes, graph.edges, radius)
     typical = float(np.median(np.linalg.norm(
         nodes[graph.edges[:, 0]] - nodes[graph.edges[:, 1]], axis=1))) if len(edges) else spacing
     joined = join_pieces(graph.nodes, graph.edges, radius, support, spreads(points, owner, nodes),
