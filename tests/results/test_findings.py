@@ -16,6 +16,7 @@ from limber.results.findings import (
     path_sentence,
     peaks_line,
     remarks_on,
+    telling_sentence,
 )
 from limber.results.report import estimate_figures, plan_figures
 from limber.results.report.section import two_views
@@ -39,6 +40,18 @@ def test_moduli_stand_with_their_intervals():
             "young_interval_pa": [[k * 9e5, k * 2e6] for k in range(1, 9)]}
     assert "1 (0.9 to 2), 8 (7.2 to 16) MPa" in modulus_sentence(many)
     assert "; assumed)." in modulus_sentence(many, "assumed")
+
+
+def test_which_of_both_the_pulls_tell_stands_first():
+    """E I where the scan leaves the radius open; with what it is good for."""
+    one = {"young_interval_pa": [[1e9, 2e9], [1e8, 3e8]],
+           "bending_stiffness_interval_nm2": [[1.0, 1.3], [0.1, 0.12]]}
+    told = telling_sentence(one)
+    assert "the flexural rigidity E I to within 13 % and Young's modulus E to within a" in told
+    assert "factor of 1.7: good for plans and forces." in told and "need E I alone" in told
+    both = telling_sentence(one | {"bending_stiffness_interval_nm2": [[1.0, 3.0]] * 2})
+    assert "Both follow alike" in both and "first plan with a wide margin" in both
+    assert "with no limit: only an order" in telling_sentence({"young_interval_pa": [[1e9, None]]})
 
 
 def test_a_path_stands_with_its_numbers_and_what_is_proven():

@@ -191,11 +191,11 @@ def _across(response: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class _Explained:
-    """How a frame fits: chi-squared, the relative misfit, and its modulus [Pa]."""
+    """How a frame fits: chi-squared, the relative misfit, and its modulus [Pa] if sure."""
 
     chi_squared: float
     misfit: float
-    young: float = np.nan
+    young: float | None = None
 
 
 def _blocks(pull: Pull) -> tuple[np.ndarray, np.ndarray, int]:
@@ -244,8 +244,10 @@ def explained_forces(pull: Pull, beam: Cantilever, known: Frames) -> dict[str, _
         target = np.r_[((parts[0] + parts[1]) @ weight).ravel(), np.zeros(3)]
         solved = scipy.optimize.lsq_linear(rows, target, ([0.0] + 6 * [-np.inf], np.inf))
         chi_squared = 2.0 * float(solved.cost)
+        without = scipy.optimize.lsq_linear(rows[:, 1:], target)
+        is_sure = 2.0 * float(without.cost) > chi_squared + _MUCH_BETTER
         return _Explained(chi_squared, error * (chi_squared / _FRAMES_COUNT)**0.5,
-                          float(solved.x[0]))
+                          float(solved.x[0]) if is_sure else None)
 
     is_turned = not np.allclose(known.scan, np.eye(3))
     return {frame: explained(frame) for frame in (AS_POSES, "tool", *["scan"] * is_turned, *AXES)

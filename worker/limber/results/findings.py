@@ -1,6 +1,7 @@
 """Findings as sentences that report, scene and terminal share."""
 
 from collections.abc import Mapping, Sequence
+from math import exp, inf, log
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,33 @@ def modulus_sentence(estimate: Mapping[str, Any], assumed: str = "") -> str:
         words = "from base to tip"
     return (f"Young's modulus {words}: {', '.join(values)} MPa (95 % intervals"
             f"{f'; {assumed}' if assumed else ''}).")
+
+
+def telling_sentence(estimate: Mapping[str, Any]) -> str:
+    """Return which of E and E I the pulls tell, to how much, and what that is good for."""
+    names = {"young_interval_pa": "Young's modulus E",
+             "bending_stiffness_interval_nm2": "the flexural rigidity E I"}
+    wide = {name: max((log(high / low) / 2 if low and high else inf for low, high in estimate[key]))
+            for key, name in names.items() if estimate.get(key)}
+    best = min(wide, key=lambda name: wide[name])
+    use = next(use for limit, use in _USES if wide[best] <= limit)
+    each = " and ".join(f"{name} {_within(wide[name])}" for name in sorted(
+        wide, key=lambda name: wide[name]))
+    both = ("" if len(wide) < 2 else " Both follow alike." if wide[best] > 0.8 * max(wide.values())
+            else " The rest of E's uncertainty is the radius of the scan. Forces, energies and "
+            "plans need E I alone.")
+    return f"These pulls tell {each}: {use}.{both}"
+
+
+def _within(wide: float) -> str:
+    return ("with no limit" if wide == inf else f"to within a factor of {exp(wide):.2g}"
+            if wide > 0.5 else f"to within {100 * wide:.0f} %")
+
+
+_USES = ((0.2, "good for plans and forces"), (0.5, "good for plans, and for forces with a margin"),
+         (1.0, "good for comparing branches and for a first plan with a wide margin"),
+         (inf, "only an order of magnitude, and no plan should rely on it"))
+"""By the half width of the better known one's logarithm, of 95 %. Chosen."""
 
 
 def plan_sentences(plan: Mapping[str, Any]) -> list[str]:

@@ -14,7 +14,7 @@ from limber.geometry.skeleton import qsm_tables
 from limber.geometry.skeleton.alternatives import SearchDoubts, open_questions
 from limber.geometry.skeleton.confidence import DoubtfulPart, doubtful_parts
 from limber.geometry.skeleton.qsm_tables import Caliper
-from limber.results.findings import ASSUMED, simulated_pull
+from limber.results.findings import ASSUMED, simulated_pull, telling_sentence
 from limber.results.report import figures
 from limber.results.report.report_tables import (
     action_rows,
@@ -167,10 +167,8 @@ def _held_back(branch: Branch) -> list[Section]:
     if not rows:
         return []
     actions = action_rows(estimate)
-    total = max((estimate.get("young_deviation") or {}).get("total") or [float("nan")])
     return [Section("What limits the estimate", text=[
-        f"The largest standard deviation of Young's modulus along the branch is {100 * total:.1f} "
-        "%. Its main causes follow, largest first."],
+        f"{telling_sentence(estimate)} The main causes follow, largest first."],
         tables=[("", rows), *([("What to do next, best first", actions)] if actions else [])])]
 
 

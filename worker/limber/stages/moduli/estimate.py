@@ -99,11 +99,11 @@ class Estimate(Result):
             ("Pulls predicted by a fit without them: RMS errors", rows_of.held_out_rows(known)))
 
     def sentences(self, branch: Branch) -> list[str]:
-        from limber.results.findings import ASSUMED_PULL, modulus_sentence, simulated_pull
+        from limber.results import findings
 
-        pull = simulated_pull(branch)
-        assumed = ASSUMED_PULL if pull and pull["young_assumed"] else ""
-        return [modulus_sentence(self.file or self.values, assumed)]
+        pull, known = findings.simulated_pull(branch), self.file or self.values
+        assumed = findings.ASSUMED_PULL if pull and pull["young_assumed"] else ""
+        return [findings.telling_sentence(known), findings.modulus_sentence(known, assumed)]
 
     def section(self, branch: Branch, key: str) -> Section:
         from limber.results.findings import ASSUMED, simulated_pull
@@ -131,7 +131,7 @@ class Estimate(Result):
 
 
 def _moduli_line(values: Mapping[str, Any]) -> str:
-    return Estimate.of(values).sentences(Branch.read(values["branch_folder"]))[0]
+    return "\n".join(Estimate.of(values).sentences(Branch.read(values["branch_folder"])))
 
 
 class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
