@@ -178,7 +178,8 @@ def _flipped(path):
 
 DAMAGES = {"empty": lambda path: path.write_bytes(b""), "cut": _half,
            "of other bytes": lambda path: path.write_bytes(os.urandom(500)),
-           "with other bytes inside": _flipped}
+           "with other bytes inside": _flipped, "whole, but of another name": lambda path:
+               path.write_bytes(max({*path.parent.iterdir()} - {path}).read_bytes())}
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

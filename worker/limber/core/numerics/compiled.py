@@ -122,9 +122,9 @@ class _FirstStart(Listener):
 
 
 class _CheckedFile(IndexDataCacheFile):
-    """numba's files of one kernel, each with a checksum: numba unpickles and links them, and one
-    truncated by a full disk or a crash would end every command, or the process. Here it counts as
-    missing."""
+    """numba's files of one kernel, each with a checksum of name and content: numba unpickles and
+    links them, and one truncated by a full disk or a crash, or another's, would end every command,
+    or the process. Here it counts as missing."""
 
     def _load_index(self) -> dict:
         return super()._load_index() if self._is_whole(self._index_path) else {}
@@ -141,13 +141,13 @@ class _CheckedFile(IndexDataCacheFile):
         with super()._open_for_write(filepath) as stream:
             content = io.BytesIO()
             yield content
-            stream.write(content.getvalue() + hashlib.sha256(content.getvalue()).digest())
+            stream.write(content.getvalue() + _checksum(filepath, content.getvalue()))
 
     def _is_whole(self, path: str) -> bool:
         """Whether a file is undamaged or missing; a damaged one is removed."""
         try:
             content = Path(path).read_bytes()
-            if content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest():
+            if content.endswith(_checksum(path, content[:-32])):
                 return True
             os.unlink(path)
             _tell_damage(f"The compiled code stored in {path} is damaged. It is compiled again.")
@@ -161,7 +161,9 @@ class _CheckedFile(IndexDataCacheFile):
         return False
 
 
-_DIGEST = hashlib.sha256().digest_size
+def _checksum(path: str, content: bytes) -> bytes:
+    """SHA-256 of a file's name and content, 32 bytes: one kernel's whole code is not another's."""
+    return hashlib.sha256(os.path.basename(path).encode() + content).digest()
 
 
 _reported_damage: list[str] = []
