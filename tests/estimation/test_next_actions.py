@@ -167,7 +167,7 @@ def test_a_modulus_that_goes_up_and_down_needs_more_than_four():
 
 def test_given_control_points_stay_and_other_methods_have_four():
     assert is_open(FitSpec()) and FitSpec().initial_fractions == FRACTIONS
-    for given in ({"fractions": FRACTIONS}, {"method": "nelder-mead"}, {"forward": "reduced"},
+    for given in ({"fractions": FRACTIONS}, {"method": "nelder-mead"},
                   {"field": "inverse_distance"}):
         assert not is_open(FitSpec(**given))
         assert FitSpec(**given).initial_fractions == FRACTIONS

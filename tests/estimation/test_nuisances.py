@@ -15,9 +15,7 @@ from limber.estimation.fit import fit_branch, fit_pulls
 from limber.estimation.fitting.initial_modulus import (
     far_points,
     fitted_frame,
-    prescribed_start,
     put_right,
-    standing_start,
 )
 from limber.estimation.fitting.nuisances import (
     _across,
@@ -87,6 +85,7 @@ def objective_of(bench, pull, poisson=0.36):
         np.array(pull.entry.rest_points_m),
         key_count=6,
     )
+    forward.skeleton = bench.branch.skeleton
     space = ParameterSpace.separate(Values(np.full(4, 1e7), poisson, 900.0))
     return Objective([forward], space, force_sigma=[pull.entry.sensor.force_sigma_n])
 
@@ -351,74 +350,6 @@ def test_a_force_that_leads_nowhere_says_how_well_it_is_known(small_bench, small
     monkeypatch.setattr(Objective, "evaluate", lambda *_, **__: None)
     with pytest.raises(WorkError, match=r"zero is known to 1 N and drifts by 1 N.*Tare the sensor"):
         fit_pulls(objective, objective.space.base, SETTINGS.model_copy(update={"young": 1e7}))
-
-
-def test_a_branch_is_led_along_its_path_whatever_its_sensor_reads(small_bench, small_pull):
-    """Its force is then that which truly acted, across the branch; of wrong moduli their share."""
-    pull = replace(small_pull, entry=small_pull.entry.model_copy(update={"calibration": None}),
-                   wrenches=small_pull.wrenches * [-3.0, 2.0, -5.0, 1.0, 1.0, 1.0])
-    forward = objective_of(small_bench, pull).forwards[0]
-    for factor in (1.0, 10.0):
-        values = Values(factor * TRUTH, 0.36, 900.0)
-        assert forward.lead_along_path(values)
-        found = forward.simulate(values, (), False)
-        off = np.linalg.norm(found.grasps - pull.poses[:, :3], axis=1)
-        size = np.linalg.norm(found.forces, axis=1).max() / np.linalg.norm(
-            small_pull.wrenches[:, :3], axis=1).max()
-        assert off.max() < 3e-3 and size == pytest.approx(factor, rel=0.15)
-
-
-@pytest.mark.slow
-def test_a_start_without_equilibrium_is_led_along_the_path(small_bench, small_pull, monkeypatch):
-    """So is one that explains nothing; the better one of it and the uniform modulus leads."""
-    pull = replace(small_pull, entry=small_pull.entry.model_copy(update={"calibration": None}))
-    objective = objective_of(small_bench, pull)
-    evaluate, tried = Objective.evaluate, []
-
-    def refusing(self, free, **options):
-        tried.append(self.space.unpack(free).young)
-        return evaluate(self, free, **options) if len(tried) > 1 else None
-
-    monkeypatch.setattr(Objective, "evaluate", refusing)
-    uniform = objective.space.base
-    near = replace(uniform, young=TRUTH / 1.6)
-    for explains in (True, False):
-        start = standing_start(objective, near, uniform, explains=explains)[0]
-        assert start == near and len(tried) == 3
-        tried[1:] = []
-
-
-@pytest.mark.slow
-def test_a_first_fit_that_explains_nothing_says_so(small_bench, small_pull):
-    """Its force is not followed either: under the moduli it ran off to a branch folds up."""
-    seen = small_pull.observations
-    swapped = replace(small_pull, observations=replace(seen, positions=seen.positions[:, ::-1]))
-    for pull, is_good in ((small_pull, True), (swapped, False)):
-        pull = replace(pull, entry=pull.entry.model_copy(update={"calibration": None}))
-        objective = objective_of(small_bench, pull)
-        uniform = replace(objective.space.base, young=np.full(4, np.exp(np.log(TRUTH).mean())))
-        _, explains = prescribed_start(objective, uniform)
-        assert explains == is_good
-
-
-@pytest.mark.slow
-def test_a_force_that_misleads_a_first_fit_is_not_followed(small_bench, small_pull, monkeypatch):
-    """Where its linearisation overshoots, the branch stays under the force that was read."""
-    objective = objective_of(small_bench, small_pull)
-    forward = objective.forwards[0]
-
-    def overshooting(self, _evaluation):
-        forward._drives = [3 * drive for drive in forward._drives]
-        forward._values = None
-        self.forget()
-        return True
-
-    monkeypatch.setattr(Objective, "follow_forces", overshooting)
-    uniform = replace(objective.space.base, young=np.full(4, np.exp(np.log(TRUTH).mean())))
-    found, explains = prescribed_start(objective, uniform)
-    assert explains and np.abs(np.log(found.young / TRUTH)).max() < 0.5
-    assert np.ptp(np.array(forward._drives) - forward._measured, axis=0) == pytest.approx(
-        0.0, abs=0.05 * np.abs(forward._measured).max())
 
 
 def test_calibration_survives_a_pull_file(tmp_path, small_pull):

@@ -11,7 +11,6 @@ from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError
 from limber.core.progress import SILENT, Progress
 from limber.estimation import fit
-from limber.estimation.fitting import reduced_fit
 from limber.estimation.parameters import Values
 from limber.estimation.settings import FitSpec
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -117,15 +116,11 @@ def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("forward", ["full", pytest.param("reduced", marks=pytest.mark.campaign)])
-def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, monkeypatch,
-                                                      forward: str):
+def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path):
     """Killed at its third evaluation, or at its end before anything was entered: the next run
     ends as one in a folder where nothing had happened.
     """
-    for name, few in (("SIZE", 10), ("STATES_PER_PULL", 6), ("STATES_AROUND", 6)):
-        monkeypatch.setattr(reduced_fit, name, few)
-    settings = FitSpec(forward=forward, key_frames=4, shapes=0)
+    settings = FitSpec(key_frames=4, shapes=0)
     clean, early, late = (tmp_path / name for name in ("clean", "early", "late"))
     for folder in (clean, early, late):
         shutil.copytree(branch_folder, folder)

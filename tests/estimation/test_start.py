@@ -9,12 +9,24 @@ from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force, without_cel
 
 from limber.core.errors import WorkError
 from limber.core.progress import Progress
-from limber.estimation.fitting.initial_modulus import scaled_start
+from limber.estimation.estimated_branch import forwards_of, lumped, subject_of
+from limber.estimation.fitting.initial_modulus import (
+    SECTIONS,
+    Beam,
+    beam_start,
+    beams_of,
+    scaled_start,
+    standing_start,
+)
 from limber.estimation.fitting.objective import Evaluation, EvaluationLog, Objective
 from limber.estimation.fitting.optimise import LONGEST_STEP, gauss_newton
 from limber.estimation.forward.observed_path import force_for_travel
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, ParameterSpace, Values
-from limber.estimation.settings import FitSpec
+from limber.estimation.settings import FitSpec, PullSpec
+from limber.estimation.simulated_pull import TrueBranch, simulate_pull
+from limber.geometry.reconstruction import mesh_skeleton
+from limber.geometry.settings import ReconstructSettings
+from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.statics.solve import solve_static
 from limber.store import Branch
@@ -51,6 +63,65 @@ def test_a_start_carries_the_weight(small_bench, pull, young):
     assert not forward.stands(replace(start, young=0.25 * start.young))
 
 
+def test_a_beam_bends_as_the_branch_does(objective, small_bench, pull):
+    """Its sections' places from base to grasp, far bent, against the tetrahedra at the truth."""
+    forward, values = objective.forwards[0], Values(TRUTH, 0.36, 900.0)
+    beam = Beam(forward)
+    moved, turns = beam.bent([values])
+    seen = beam.seen[:, -1] - beam.seen[0, -1]
+    off = moved[0, :, -1] - moved[0, 0, -1] - seen
+    assert np.linalg.norm(seen, axis=1).max() > 0.15
+    # The force has 2 % of noise.
+    assert np.median(np.linalg.norm(off, axis=1)) < 0.05 * np.linalg.norm(seen, axis=1).max()
+    assert np.swapaxes(turns, -1, -2) @ turns == pytest.approx(
+        np.broadcast_to(np.eye(3), turns.shape), abs=1e-12)
+
+
+def test_a_beam_under_a_small_force_is_bernoullis(objective):
+    """F L^3 / 3 E I of its sections' radii, where it hardly bends."""
+    beam = Beam(objective.forwards[0])
+    along = np.linspace(0.0, 0.5, SECTIONS + 1)
+    beam.axis = np.column_stack([0 * along, 0 * along, along])
+    beam._second = np.full(SECTIONS, 1e-9)
+    beam.rest, beam._at = beam.axis[[-1]], np.array([SECTIONS])
+    beam.force, beam.torque = np.array([[1e-3, 0.0, 0.0]]), np.zeros((1, 3))
+    beam.place = beam.axis[[-1]]
+    moved, _ = beam.bent([Values(np.full(4, 1e7), 0.36, 900.0)])
+    assert moved[0, 0, 0, 0] == pytest.approx(1e-3 * 0.5**3 / (3 * 1e7 * 1e-9), rel=2e-3)
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0, 1e3])
+def test_a_beam_scales_with_the_force(objective, factor):
+    """A force so many times as large gives moduli so many times as large, within their bounds."""
+    begun = beam_start(beams_of(objective.forwards), Values(np.full(4, 1e7), 0.36, 900.0))
+    assert begun.explained > 0.9
+    beams = beams_of(objective.forwards)
+    beams[0].force = factor * beams[0].force
+    found = beam_start(beams, Values(np.full(4, 1e7), 0.36, 900.0)).values
+    assert found.young == pytest.approx(np.clip(factor * begun.values.young, 1e4, 1e11), rel=0.05)
+
+
+def test_a_force_that_cannot_have_moved_the_branch_explains_nothing(objective):
+    """Turned by 180 degrees no modulus answers it; of its frame the user is told."""
+    beams = beams_of(objective.forwards)
+    beams[0].force = -beams[0].force
+    assert beam_start(beams, Values(np.full(4, 1e7), 0.36, 900.0)).explained < 0.3
+
+
+def test_a_start_without_equilibrium_is_stiffened(objective, monkeypatch):
+    """Threefold a time, not over decades, until one stands."""
+    evaluate, tried = Objective.evaluate, []
+
+    def refusing(self, free, **options):
+        tried.append(free[0])
+        return evaluate(self, free, **options) if len(tried) > 2 else None
+
+    monkeypatch.setattr(Objective, "evaluate", refusing)
+    found, _ = standing_start(objective, Values(TRUTH, 0.36, 900.0))
+    assert np.diff(tried) == pytest.approx(LONGEST_STEP)
+    assert found.young == pytest.approx(TRUTH * np.exp(2 * LONGEST_STEP))
+
+
 def test_decades_without_equilibrium_are_no_minimum(objective, monkeypatch):
     """Without force the scale is searched; what fails there is too soft."""
     def evaluate(self, free, **_options):
@@ -59,7 +130,7 @@ def test_decades_without_equilibrium_are_no_minimum(objective, monkeypatch):
         return known
 
     monkeypatch.setattr(Objective, "evaluate", evaluate)
-    monkeypatch.setattr(type(objective.forwards[0]), "force_ratio", lambda *_: None)
+    monkeypatch.setattr(objective.forwards[0], "skeleton", None)
     for young in (1e4, 1e8, 1e10):
         start = scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
         assert start.young == pytest.approx(1e8, rel=0.3)
@@ -162,6 +233,62 @@ def test_bounds_are_named():
 
 
 # What a fit starts from.
+
+
+@pytest.fixture(scope="module")
+def twiggy():
+    """A hanging branch with five twigs, a pull of it as a rod, and its whole and lumped subject."""
+    rng = np.random.default_rng(5)
+    along = np.linspace(0.0, 1.0, 41)
+    stem = np.column_stack([0.2 * along**2, 0.05 * np.sin(3 * along), 0.5 * along])
+    nodes, parents, radii = [stem], [np.arange(-1, 40)], [0.008 - 0.004 * along]
+    for number, foot in enumerate((8, 14, 20, 26, 31)):
+        out = rng.standard_normal(3) * [1, 1, 0.3]
+        first = 41 + 10 * number
+        nodes.append(stem[foot] + np.linspace(0.1, 1.0, 10)[:, None] * 0.15 * out
+                     / np.linalg.norm(out))
+        parents.append(np.r_[foot, np.arange(first, first + 9)])
+        radii.append(np.full(10, 0.003))
+    skeleton = Skeleton.from_edges(np.vstack(nodes), np.concatenate(parents), np.concatenate(radii))
+    mesh = mesh_skeleton(skeleton, ReconstructSettings()).mesh
+    mesh = mesh.with_data(cell_data={name: np.full(mesh.tet_count, value) for name, value in (
+        ("young", 1e8), ("poisson", 0.35), ("density", 900.0))})
+    settings = FitSpec(hold_out=False, key_frames=6)
+    gravity = (0.0, 0.0, -9.80665)
+    subject = subject_of(mesh, skeleton, (), gravity, settings)
+    truth = TrueBranch(mesh, skeleton, subject.control_points, FRACTIONS, TRUTH * 100, gravity)
+    pull, _ = simulate_pull(truth, "pull-1", PullSpec(
+        model="rod", position_noise=0.0, force_noise=0.0, frames=20, reach=0.2))
+    return subject, lumped(subject, [pull], settings), pull, settings
+
+
+def test_twigs_that_no_pull_reaches_are_rigid(twiggy):
+    """The pull, its weight and its slopes are those of the whole branch."""
+    whole, part, pull, settings = twiggy
+    assert part.mesh.tet_count < 0.7 * whole.mesh.tet_count
+    assert part.lumping.error < 5e-3
+    values, found = replace(whole.start, young=TRUTH * 100), []
+    for subject in (whole, part):
+        forward = forwards_of([pull], subject, settings.model_copy(update={"drive": "force"}))[0]
+        found.append(forward.simulate(values, (), True))
+    moved = np.abs(found[0].positions - found[0].positions[0]).max()
+    assert moved > 0.03
+    assert np.abs(found[1].positions - found[0].positions).max() < 0.01 * moved
+    assert np.abs(found[1].d_positions - found[0].d_positions).max() < 0.02 * np.abs(
+        found[0].d_positions).max()
+    heavy, light = (each.model.prestress.total.base.sum(axis=0) for each in (whole, part))
+    assert light == pytest.approx(heavy, rel=1e-3, abs=1e-3)
+
+
+def test_a_reached_twig_stays_meshed(twiggy):
+    """One on which a point is observed."""
+    whole, part, pull, settings = twiggy
+    tip = whole.skeleton.nodes[50]
+    seen = pull.entry.model_copy(update={"rest_points_m": (*map(
+        tuple, whole.control_points), tuple(tip))})
+    kept = lumped(whole, [replace(pull, entry=seen)], settings)
+    near = np.linalg.norm(kept.mesh.nodes - tip, axis=1).min()
+    assert near < 0.005 < np.linalg.norm(part.mesh.nodes - tip, axis=1).min()
 
 
 def test_left_out_twigs_weigh_on_the_branch_that_is_fitted(branch_folder):

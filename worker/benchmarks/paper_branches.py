@@ -1,7 +1,6 @@
 """The paper's three branches: its table of E and nu as truth, on geometry of that size."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -142,20 +141,20 @@ class Bench:
                                        frames_of(pull), np.array(pull.entry.rest_points_m
                                                                  or self.points),
                                        key_count=settings.key_frames) for pull in pulls]
+        for forward in forwards:
+            forward.skeleton = self.branch.skeleton
         poisson = 0.35 if settings.poisson is None else settings.poisson
         extra = ("poisson",) if "poisson" in settings.also else ()
         start = Values(np.full(len(self.points), 1e7), poisson, 900.0)
         return Objective(forwards, ParameterSpace.separate(start, extra),
                          force_sigma=[pull.entry.sensor.force_sigma_n for pull in pulls])
 
-    def fit(self, pulls: list[Pull], settings: FitSpec, *, cache: Path | None = None,
-            ) -> Estimate:
-        """Fit as ``limber estimate`` does; warnings are in the result, bases in ``cache``."""
+    def fit(self, pulls: list[Pull], settings: FitSpec) -> Estimate:
+        """Fit as ``limber estimate`` does; warnings are in the result."""
         objective = self.objective(pulls, settings)
         messages: list[str] = []
         found = fit_pulls(objective, objective.space.base, settings,
-                          Progress(on_warning=messages.append), cache=cache,
-                          digest=self.branch.name)
+                          Progress(on_warning=messages.append))
         found.warnings = messages
         return found
 

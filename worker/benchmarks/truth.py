@@ -269,6 +269,6 @@ PARTS = {
     "beam": Part(silicone_beam.beam_rows, 60, silicone_beam.BEAM_ROWS),
     "real-beam": Part(silicone_beam.real_row, 60, (silicone_beam.REAL_ROW,)),
     "second-pull": Part(lambda setting: estimation.speed_rows(setting)[3:], 120,
-                        estimation.SECOND_PULL),
+                        (estimation.FOLLOWED,)),
     "reduced": Part(reduced.flagged_rows, 60, reduced.FLAGGED_ROWS, grows=True)}
 """The table, in order of importance."""

@@ -181,8 +181,8 @@ def summary(found: Estimate, settings: FitSpec) -> dict[str, Any]:
         "forward_count": found.objective.forward_count, "converged": found.fit.converged,
         "stopped": found.stopped, "is_weightless": found.is_weightless, "held_out": found.held_out,
         "variance_factor": sure.variance_factor, "warnings": found.warnings,
-        "creep": found.creep, "orders": "orders" in settings.also, "section": settings.section,
-        "forward": settings.forward} | _bending(found) | _reduced_error(found) | _by_pull(found)
+        "creep": found.creep, "orders": "orders" in settings.also, "section": settings.section
+    } | _bending(found) | _by_pull(found)
 
 
 def _bending(found: Estimate) -> dict[str, Any]:
@@ -204,16 +204,6 @@ def _by_pull(found: Estimate) -> dict[str, Any]:
     recorded = [objective.forwards[each.pull].entry.recorded for each in steps]
     return {"pull_moduli": pull_moduli(steps, objective),
             "drift": drift(steps, recorded, sure.recording_spread)}
-
-
-def _reduced_error(found: Estimate) -> dict[str, Any]:
-    """Error of the reduced model before its correction by the full one."""
-    errors = [error for forward in found.objective.forwards
-              if (error := forward.reduction_error) is not None]
-    if not errors:
-        return {}
-    position, force = np.max(errors, axis=0)
-    return {"reduced_error_m": position, "reduced_error_force_share": force}
 
 
 def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, Any]:

@@ -4,9 +4,8 @@
 :mod:`limber.estimation.estimate_file` selects the written values.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,30 +27,30 @@ from limber.estimation.fit_assessment import (
     require_one_explanation,
 )
 from limber.estimation.fitting.initial_modulus import (
+    EXPLAINED,
     ROUNDS,
     SMALL_RAD,
-    FarPoints,
-    FarPointsError,
+    beam_start,
+    beams_of,
+    far_from_stated,
+    far_points,
     fitted_frame,
-    prescribed_start,
     put_right,
     scaled_start,
-    set_all_keys,
-    set_rough_keys,
+    standing,
     standing_start,
+    unexplained,
 )
 from limber.estimation.fitting.objective import Evaluation, EvaluationLog, Objective, Stopped
 from limber.estimation.fitting.optimise import (
     EVALUATION_LIMIT,
-    ROUGH_ENDING,
     Fit,
     FitStatus,
     best_so_far,
     gauss_newton,
     nelder_mead,
 )
-from limber.estimation.fitting.reduced_fit import Reduction, fit_reduced
-from limber.estimation.forward.forward_model import Forward, under_its_weight
+from limber.estimation.forward.forward_model import under_its_weight
 from limber.estimation.forward.observed_path import is_path_observed
 from limber.estimation.parameters import LINK_DEVIATION, Values, bump_deviations, hats, stations_of
 from limber.estimation.settings import FitSpec
@@ -74,6 +73,9 @@ from limber.geometry.skeleton.skeleton import FRACTIONS
 from limber.recordings.recording import Pull, calibration_of
 from limber.recordings.sensor_checks import force_unit_suspicion
 
+SOFTER = 0.5
+"""A fit begins without weight if a beam then leaves less than this part of what it leaves with it.
+"""
 FAR_FROM_FOLDING = 0.25
 """Factor on the moduli under which a branch still stands if its weight matters little. Chosen."""
 
@@ -83,13 +85,13 @@ class _ForceLeadsNowhereError(WorkError):
 
 
 def fit_branch(pulls: list[Pull], subject: Subject, settings: FitSpec, *,
-               log: EvaluationLog, cache: Path | None = None, near: Values | None = None,
-               quick: bool = False, progress: Progress = SILENT) -> Estimate:
+               log: EvaluationLog, near: Values | None = None, quick: bool = False,
+               progress: Progress = SILENT) -> Estimate:
     """Estimate Young's modulus of a branch from its pulls.
 
     Args:
         log: Stores the evaluations. Those of a stopped run are reused.
-        cache, near, quick: As for :func:`fit_pulls`.
+        near, quick: As for :func:`fit_pulls`.
 
     Raises:
         InputError: the pulls cannot determine Young's modulus.
@@ -98,129 +100,154 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: FitSpec, *,
     """
     if log.resumed_count:
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run are reused.")
+    found = _Strategy(pulls, subject, settings, near, progress).fitted(log)
+    if not quick:
+        complete(found, settings, progress)
+    return found
 
-    def once(branch: Subject, chosen: FitSpec, log: EvaluationLog) -> Estimate:
-        if "frame" not in chosen.also:
-            return in_frame(pulls, branch, chosen, log)
-        found = _in_free_frame(pulls, lambda seen: in_frame(
-            seen, branch, chosen, log if seen is pulls else EvaluationLog(None, "")))
-        as_stated = chosen.model_copy(update={
-            "also": tuple(part for part in chosen.also if part != "frame")})
+
+@dataclass(frozen=True)
+class _Strategy:
+    """How pulls of a branch are fitted: with its weight or without; driven by their force, or along
+    their path; the observer's frame put right; points placed where they were seen."""
+
+    pulls: list[Pull]
+    subject: Subject
+    settings: FitSpec
+    near: Values | None
+    progress: Progress
+
+    def fitted(self, log: EvaluationLog) -> Estimate:
+        """The estimate with the weight; without it if the weight cannot be carried."""
+        if not (self.subject.hangs and any(under_its_weight(
+                self.subject.model, pull.entry).prestress is not None for pull in self.pulls)):
+            return self._driven(log)
+        if self._is_too_soft():
+            return self._weightless()
+        heavy: Estimate | None = None
+        failure: Exception | None = None
         try:
-            other = in_frame(pulls, branch, as_stated, EvaluationLog(None, ""))
+            heavy = self._driven(log)
+            sound = heavy.uncertainty.variance_factor < MISFIT_FACTOR
+            # A much softer branch would carry the weight too: then it is no cause of a misfit.
+            margin = 1.0 if sound else FAR_FROM_FOLDING
+            if heavy.stopped or self.subject.carries_itself(
+                    replace(heavy.values, young=margin * heavy.values.young)):
+                return heavy
+        except (WorkError, NotPositiveDefiniteError) as error:
+            failure = error
+        try:
+            found = self._weightless()
+        except (WorkError, InputError):
+            if heavy is None:
+                raise
+            return heavy
+        if self.subject.carries_itself(found.values):
+            # The weight was not the cause.
+            if failure is not None:
+                raise failure
+            return present(heavy, "estimate with the weight")
+        return found
+
+    def _is_too_soft(self) -> bool:
+        """Whether beams without weight, too soft to carry it, explain the pulls far better."""
+        forwards = forwards_of(self.pulls, self.subject, self.settings)
+        heavy, light = (beams_of(forwards, weighs=weighs) for weighs in (True, False))
+        if len(light) < len(forwards):
+            return False
+        bare = beam_start(light, self.subject.start)
+        return not self.subject.carries_itself(bare.values) and 1 - bare.explained < SOFTER * (
+            1 - beam_start(heavy, self.subject.start).explained)
+
+    def _weightless(self) -> Estimate:
+        """The estimate without the weight, with a warning if it tells a scale."""
+        found = replace(self, subject=self.subject.without_weight())._driven(
+            EvaluationLog(None, ""))
+        found.is_weightless = not self.subject.carries_itself(found.values)
+        if found.is_weightless and found.scale_deviation <= SCALE_DEVIATION:
+            # Otherwise nothing is known of how soft it is, and the estimate is refused.
+            self.progress.warn(
+                "The branch is too soft to carry its own weight in the scanned shape. The estimate "
+                "ignores its weight. Check the density, gravity and the unit of the force.")
+        return found
+
+    def _driven(self, log: EvaluationLog) -> Estimate:
+        """The fit by the measured force; along the recorded path where that leads nowhere."""
+        try:
+            return self._framed(log)
+        except _ForceLeadsNowhereError as error:
+            self.progress.warn(f"{error.seen} {error.why} The gripper's recorded path is "
+                               "prescribed instead.")
+            try:
+                # Force-driven evaluations do not apply here.
+                return self._with(drive="pose")._framed(EvaluationLog(None, ""))
+            except WorkError as second:
+                raise error from second
+
+    def _framed(self, log: EvaluationLog) -> Estimate:
+        """The fit in the observer's frame; a free one, which may be far turned, is put right."""
+        if "frame" not in self.settings.also:
+            return self._placed(log)
+        step, found = self, self._placed(log)
+        for _ in range(ROUNDS - 1):
+            shift, turn = fitted_frame(found.cell_errors)
+            if found.stopped or np.linalg.norm(turn) < SMALL_RAD:
+                break
+            step = replace(step, pulls=[put_right(pull, shift, turn) for pull in step.pulls])
+            found = step._placed(EvaluationLog(None, ""))
+        try:
+            other = self._with(also=tuple(part for part in self.settings.also if part != "frame")
+                               )._placed(EvaluationLog(None, ""))
         except (WorkError, InputError):
             return found
         require_one_explanation(found, other)
         return found
 
-    def in_frame(pulls: list[Pull], branch: Subject, chosen: FitSpec,
-                 log: EvaluationLog) -> Estimate:
-        shifts: dict[str, np.ndarray] = {}
-        begin, earlier = near, None
+    def _placed(self, log: EvaluationLog) -> Estimate:
+        """The fit with points where the branch shows that they are, if that is far from where they
+        are stated: an error along a bent branch is not linear."""
+        forwards = forwards_of(self.pulls, self.subject, self.settings)
+        start, near, shifts = None, self.near, {}
+        beams = [] if any(forward.is_dynamic for forward in forwards) else beams_of(forwards)
+        if beams:
+            begun = beam_start(beams, self.subject.start)
+            start = begun.values
+            if begun.explained < EXPLAINED:
+                self.progress.warn(unexplained(begun))
+            shifts = far_from_stated(beams, start)
         for rounds_left in reversed(range(ROUNDS)):
-            forwards = forwards_of(pulls, branch, chosen, shifts)
-            if earlier is not None:
-                earlier.begin(forwards)
-            try:
-                return of_forwards(forwards, branch, chosen, log, begin,
-                                   FarPoints(shifts) if rounds_left else None)
-            except FarPointsError as far:
-                shifts, begin, earlier, log = far.shifts, far.values, far, EvaluationLog(None, "")
+            if shifts:
+                forwards = forwards_of(self.pulls, self.subject, self.settings, shifts)
+            objective = Objective(
+                forwards, parameter_space(self.subject, forwards, self.settings), log=log,
+                force_sigma=[pull.entry.sensor.force_sigma_n for pull in self.pulls],
+                progress=self.progress,
+                expected_count=20 if self.settings.method == "gauss-newton" else 200)
+            found = fit_pulls(objective, self.subject.start, self.settings, self.progress,
+                              near=near, scaled=start, quick=True)
+            far = far_points(found.cell_errors, shifts)
+            if far is None or found.stopped or not rounds_left:
+                return found
+            shifts, near, log = far, found.values, EvaluationLog(None, "")
         raise AssertionError("the last round looks for no far points")
 
-    def of_forwards(forwards: list[Forward], branch: Subject, chosen: FitSpec,
-                    log: EvaluationLog, near: Values | None, far: FarPoints | None) -> Estimate:
-        objective = Objective(forwards, parameter_space(branch, forwards, chosen),
-                              log=log, force_sigma=[pull.entry.sensor.force_sigma_n
-                                                    for pull in pulls], progress=progress,
-                              expected_count=20 if chosen.method == "gauss-newton" else 200)
-        return fit_pulls(objective, branch.start, chosen, progress, cache=cache, near=near,
-                         far=far, quick=quick)
-
-    def fitted(branch: Subject) -> Estimate:
-        try:
-            return once(branch, settings, log)
-        except _ForceLeadsNowhereError as error:
-            progress.warn(f"{error.seen} {error.why} The gripper's recorded path is prescribed "
-                          "instead.")
-            # Force-driven evaluations do not apply here.
-            path_driven = settings.model_copy(update={"drive": "pose"})
-            try:
-                return once(branch, path_driven, EvaluationLog(None, ""))
-            except WorkError as second:
-                raise error from second
-
-    hangs = subject.hangs and any(under_its_weight(subject.model, pull.entry).prestress is not None
-                                  for pull in pulls)
-    return _as_it_hangs(subject, fitted, progress) if hangs else fitted(subject)
-
-
-def _in_free_frame(pulls: list[Pull], fitted: Callable[[list[Pull]], Estimate]) -> Estimate:
-    """Return the fit after the observer's frame has been put right; its turn may be large."""
-    seen, found = pulls, fitted(pulls)
-    for _ in range(ROUNDS - 1):
-        shift, turn = fitted_frame(found.cell_errors)
-        if found.stopped or np.linalg.norm(turn) < SMALL_RAD:
-            break
-        seen = [put_right(pull, shift, turn) for pull in seen]
-        found = fitted(seen)
-    return found
-
-
-def _as_it_hangs(subject: Subject, fitted: Callable[[Subject], Estimate],
-                 progress: Progress) -> Estimate:
-    """Return the estimate with the weight; without it if the weight cannot be carried."""
-    heavy: Estimate | None = None
-    failure: Exception | None = None
-    try:
-        heavy = fitted(subject)
-        sound = heavy.uncertainty.variance_factor < MISFIT_FACTOR
-        # A much softer branch would carry the weight too: then it is no cause of a misfit.
-        margin = 1.0 if sound else FAR_FROM_FOLDING
-        if heavy.stopped or subject.carries_itself(
-                replace(heavy.values, young=margin * heavy.values.young)):
-            return heavy
-    except (WorkError, NotPositiveDefiniteError) as error:
-        failure = error
-    try:
-        found = fitted(subject.without_weight())
-    except (WorkError, InputError):
-        if heavy is None:
-            raise
-        return heavy
-    if subject.carries_itself(found.values):
-        # The weight was not the cause.
-        if failure is not None:
-            raise failure
-        return present(heavy, "estimate with the weight")
-    found.is_weightless = True
-    if found.scale_deviation <= SCALE_DEVIATION:
-        # Otherwise nothing is known of how soft it is, and the estimate is refused.
-        progress.warn(
-            "The branch is too soft to carry its own weight in the scanned shape. The estimate "
-            "ignores its weight. Check the density, gravity and the unit of the force.")
-    return found
+    def _with(self, **changes: Any) -> "_Strategy":
+        return replace(self, settings=self.settings.model_copy(update=changes))
 
 
 def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
-              progress: Progress = SILENT, *, cache: Path | None = None, digest: str = "",
-              near: Values | None = None, far: FarPoints | None = None, quick: bool = False,
-              ) -> Estimate:
+              progress: Progress = SILENT, *, near: Values | None = None,
+              scaled: Values | None = None, quick: bool = False) -> Estimate:
     """Check what the data determine, fit, and compute intervals; ``quick`` keeps Gauss' and judges
-    nothing (:func:`complete`). It starts from ``near`` if that has an equilibrium; ``far`` ends it
-    if points are far off. ``cache`` and ``digest`` belong to reduced bases."""
+    nothing (:func:`complete`). It starts from ``near`` if that has an equilibrium, otherwise from
+    ``scaled``, moduli of the right size (None: found here)."""
     require_scale_in_principle(objective.forwards)
-    reduction = (Reduction(objective.forwards, cache, digest) if settings.forward == "reduced"
-                 else None)
     first = None if near is None else objective.evaluate(objective.space.pack(near),
                                                          jacobian=True)
-    if near is not None and first is not None:
-        start = near
-    else:
-        if far is not None and reduction is None and settings.method == "gauss-newton":
-            set_rough_keys(objective)
-        start, first = _standing(objective, start, settings, progress, reduction)
-        _require_stable(objective, start)
+    is_near = near is not None and first is not None
+    if first is None:
+        near, first = _standing(objective, start, scaled, progress)
+    start = present(near, "initial values")
     judged = identifiability(first, objective.space)
     if not force_is_measured(objective):
         require_scale(judged, objective, first)
@@ -229,13 +256,10 @@ def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
     if space.links:
         objective = objective.with_space(space)
     try:
-        fit, objective = _fitted(objective, space.pack(start), settings, progress, reduction,
-                                 far, is_near=near is not None and start is near)
+        fit = _fitted(objective, space.pack(start), settings, progress, is_near=is_near)
     except Stopped:
         fit = best_so_far(objective)
     stopped = fit.status is FitStatus.stopped
-    if far is not None and not stopped:
-        far.look(fit.evaluation, objective)
     if settings.method == "gauss-newton" and not stopped:
         fit, objective = _linked_at_the_end(fit, objective, settings, progress)
         fit, objective = with_creep(fit, objective)
@@ -262,26 +286,19 @@ def complete(found: Estimate, settings: FitSpec, progress: Progress = SILENT) ->
         hold_out(found, progress)
 
 
-def _standing(objective: Objective, start: Values, settings: FitSpec, progress: Progress,
-              reduction: Reduction | None) -> tuple[Values, Evaluation]:
+def _standing(objective: Objective, start: Values, scaled: Values | None, progress: Progress,
+              ) -> tuple[Values, Evaluation]:
     """Return initial values that have equilibria, and their evaluation."""
-    judged_on = objective
-    if reduction is not None and reduction.is_built:
-        start = reduction.around(start)
-        judged_on = reduction.objective(objective, start)
-    else:
-        start = scaled_start(objective, start)
-        if any(forward.uses_force for forward in objective.forwards):
-            suspicion = force_unit_suspicion(float(np.mean(start.young)))
-            if suspicion:
-                progress.warn(suspicion)
-    uniform, explains = start, True
-    if settings.method == "gauss-newton" and reduction is None:
-        start, explains = prescribed_start(judged_on, uniform)
-    standing = standing_start(judged_on, start, uniform, explains=explains)
-    if standing is None:
-        raise _without_equilibrium(judged_on)
-    return standing
+    start = scaled_start(objective, start) if scaled is None else standing(objective, scaled)
+    if any(forward.uses_force for forward in objective.forwards):
+        suspicion = force_unit_suspicion(float(np.exp(np.mean(np.log(start.young)))))
+        if suspicion:
+            progress.warn(suspicion)
+    found = standing_start(objective, start)
+    if found is None:
+        raise _without_equilibrium(objective)
+    _require_stable(objective, found[0])
+    return found
 
 
 def _require_stable(objective: Objective, values: Values) -> None:
@@ -315,30 +332,14 @@ def _without_equilibrium(objective: Objective) -> WorkError:
 
 
 def _fitted(objective: Objective, start: np.ndarray, settings: FitSpec,
-            progress: Progress, reduction: Reduction | None, far: FarPoints | None, *,
-            is_near: bool) -> tuple[Fit, Objective]:
-    def optimise(chosen: Objective, free: np.ndarray, is_near: bool = False) -> Fit:
-        if settings.method == "nelder-mead":
-            return nelder_mead(chosen, free, evaluation_limit=EVALUATION_LIMIT,
-                               delta_m2=settings.delta_m2)
-        return gauss_newton(chosen, free, is_near=is_near, evaluation_limit=EVALUATION_LIMIT)
-
-    if settings.method == "gauss-newton":
-        start = _resumed(objective, start)
-        if far is not None and reduction is None and not is_near:
-            # A rough fit tells whether points are far off. The full one then begins from there.
-            rough = gauss_newton(objective, start, robust=False, tolerance=ROUGH_ENDING,
-                                 force_rounds=0, evaluation_limit=EVALUATION_LIMIT).evaluation
-            start, is_near = rough.free, True
-            far.look(rough, objective)
-            set_all_keys(objective, settings.key_frames)
-    if reduction is not None:
-        return fit_reduced(objective, start, optimise, _rough, reduction, progress)
-    return _refined(optimise(objective, start, is_near), objective, settings, progress), objective
-
-
-def _rough(objective: Objective, free: np.ndarray) -> Fit:
-    return gauss_newton(objective, free, evaluation_limit=8, tolerance=1e-2)
+            progress: Progress, *, is_near: bool) -> Fit:
+    if settings.method == "nelder-mead":
+        fit = nelder_mead(objective, start, evaluation_limit=EVALUATION_LIMIT,
+                          delta_m2=settings.delta_m2)
+    else:
+        fit = gauss_newton(objective, _resumed(objective, start), is_near=is_near,
+                           evaluation_limit=EVALUATION_LIMIT)
+    return _refined(fit, objective, settings, progress)
 
 
 def _resumed(objective: Objective, start: np.ndarray) -> np.ndarray:
@@ -429,9 +430,9 @@ class Support:
 
 def is_open(settings: FitSpec) -> bool:
     """Whether the number of control points is to be chosen: it is not given, and can be.
-    Nelder-Mead has no derivatives; the paper's field and a reduced model have no bumps."""
+    Nelder-Mead has no derivatives; the paper's field has no bumps."""
     return (not settings.fractions and settings.method == "gauss-newton"
-            and settings.forward == "full" and settings.field == "open")
+            and settings.field == "open")
 
 
 def equal_fractions(count: int) -> tuple[float, ...]:
@@ -466,7 +467,7 @@ class _Problem:
     @classmethod
     def of(cls, found: Estimate) -> "_Problem":
         evaluation, space = found.fit.evaluation, found.objective.space
-        field = getattr(found.objective.forwards[0].full, "field", None)
+        field = getattr(found.objective.forwards[0], "field", None)
         if evaluation.jacobian is None or field is None or field.straight is None:
             raise InputError("The evidence of control points needs derivatives and an open field.",
                              "Only a Gauss-Newton fit with the full model has both.",

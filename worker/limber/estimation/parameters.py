@@ -202,6 +202,12 @@ class YoungField:
     names: tuple[str, ...] = ()
     log_factor: np.ndarray | float = 0.0
 
+    def on(self, tets: np.ndarray) -> "YoungField":
+        """Return the field on some of its tetrahedra."""
+        own = {name: value[tets] if name in ("weights", "straight", "bumps", "log_factor")
+               and np.ndim(value) else value for name, value in vars(self).items()}
+        return YoungField(**own)
+
     def young(self, values: Values) -> np.ndarray:
         """Young's modulus of all tetrahedra [Pa], shape [tet_count]."""
         plain = self.weights @ values.young

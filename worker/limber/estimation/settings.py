@@ -31,7 +31,7 @@ class EstimateSettings(Settings):
     groups: ClassVar[Groups] = {
         "input": ("pull", "drive", "motion", "fractions"),
         "material": ("also", "field", "pith_radius", "bark"),
-        "solver": ("method", "delta_m2", "forward", "quick"),
+        "solver": ("method", "delta_m2", "quick"),
     }
     common = ("pull", "fractions", "method", "also", "quick")
 
@@ -41,10 +41,6 @@ class EstimateSettings(Settings):
     delta_m2: float | None = Field(
         None, gt=0, description="Mean squared distance of the points [m^2] below which "
         "nelder-mead ends: the paper's delta. Default: where it no longer falls.")
-    forward: Literal["full", "reduced"] = Field(
-        "full", description="reduced: a reduced model of slow pose-driven pulls, corrected by "
-        "the full model. Its basis is kept in the branch folder, so further estimates take "
-        "seconds.")
     quick: bool = Field(
         False, description="A first look: few simulated frames, no fit without each pull, no "
         "finer mesh and no other shapes of the branch. Its intervals are too narrow.",

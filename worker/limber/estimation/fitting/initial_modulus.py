@@ -1,135 +1,345 @@
-"""Around a fit: its initial modulus, errors too large for their squares, pulls it leaves out."""
+"""Around a fit: its initial moduli, errors too large for their squares, pulls it leaves out."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from limber.core.errors import WorkError
 from limber.core.not_none import present
+from limber.core.numerics.compiled import compiled, for_kernels
 from limber.core.numerics.rigid import rotated
-from limber.estimation.fitting.nuisances import nuisance_records
+from limber.core.numerics.rigid_kernels import crossed, frame_of
 from limber.estimation.fitting.objective import Evaluation, Objective, seen_in
-from limber.estimation.fitting.optimise import gauss_newton
-from limber.estimation.forward.forward_model import Forward
-from limber.estimation.forward.observed_path import ObservedPathForward, is_path_observed
+from limber.estimation.fitting.optimise import LONGEST_STEP, gauss_newton
+from limber.estimation.forward.forward_model import Forward, key_frames, smoothed, travel
+from limber.estimation.forward.observed_path import AT_REST_M
 from limber.estimation.forward.solved_pull import QuasiStaticForward
-from limber.estimation.parameters import YOUNG_BOUNDS_PA, ParameterSpace, Values
-from limber.recordings.recording import Pull
+from limber.estimation.parameters import LINK_DEVIATION, YOUNG_BOUNDS_PA, Values
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.recordings.recording import Pull, calibration_of
 
-# Initial values of a fit: the uniform modulus that explains the measured force best.
+# Initial values of a fit: the moduli for which a beam answers the recorded force as recorded.
+#
+# The run from base to grasp is a rod of round sections. Force and place of the gripper are
+# recorded, so the moment in each section is known as soon as its place is, and the deformed rod
+# follows from the base outwards, section by section, for any modulus: no equations are solved, and
+# no modulus is without a state. What grows on the run is rigid and weighs on it.
 
+SECTIONS, KEYS = 48, 12
+"""Sections of the rod, and frames of a pull that are compared."""
+WEIGHT_PASSES = 3
+"""Times that the rod is bent by the weight of its last shape; the first has none."""
+BEAM_M, BEAM_SHARE = 3e-3, 0.03
+"""Deviation of the beam's points: constant [m], and a fraction of the longest motion. Chosen."""
+DECADES = np.arange(3.0, 12.01, 0.25)
+"""Uniform moduli that are tried first, in decades of pascals."""
+BEAM_ROUNDS, BEAM_ENDING = 15, 1e-3
+"""Most steps of the beam's fit, and the relative fall of its cost at which it ends."""
 PARTS = (0.25, 0.45, 0.7)
 """Fractions of a fast pull's frames that are fitted first: over a quarter the simulation cannot be
 a whole period off. The fractions between are chosen, not measured.
 """
-ROUGH_KEYS = 5
-"""Simulated frames of a first fit by force alone. Chosen: it only has to come near."""
-ROUGH_STEP = 0.3
-"""Standard deviations from its solution at which such a fit ends."""
 FEWEST_FRAMES = 6
 """Fewest frames that describe a motion."""
-FALL = 0.9
-"""Decrease of log E between neighbouring control points of a start, as in the paper's branches."""
-RAN_OFF = 4.0
-"""Mean squared residual of a first fit by force alone above which it has failed. Of drawn branches,
-fits that led to the solution ended at 0.9 to 1.8, diverged ones at 11 to 16, with moduli up to
-fiftyfold wrong, under which a branch folds up and each simulation takes long.
-"""
 STIFFER = 2.0
 """Factor by which a branch that does not carry its own weight is stiffened at a time."""
+MOST_STIFFENED = 6
+"""Times that a start without equilibrium is stiffened, threefold each."""
 MOST_DECADES = 6.0
 """Farthest search for the scale of the moduli where no force gives it."""
-WORSE = 2.0
-"""Increase of the objective by which following the force counts as misled by its linearisation: 20
-times in the one fit seen, where a branch folded up; otherwise it decreases.
-"""
+
+
+class Beam:
+    """The run from base to grasp of one pull as a rod: ``axis`` [S + 1, 3] as scanned; frames [k]
+    with force and torque [k, 3] at ``place`` [k, 3]; ``seen`` [k, m + 1, 3] and ``rest`` are the
+    observed points and, last, the grasp."""
+
+    def __init__(self, forward: QuasiStaticForward, *, weighs: bool = True):
+        self._forward, mesh = forward, forward.mesh
+        self._gravity = forward.model.gravity if weighs else np.zeros(3)
+        skeleton = present(forward.skeleton, "skeleton of a pulled branch")
+        grasp = np.array(forward.entry.grasp.point_m)
+        run = _run_to(skeleton, grasp)
+        arc = skeleton.arc_length[run] - skeleton.arc_length[run[0]]
+        along = np.linspace(0.0, arc[-1], SECTIONS + 1)
+        self.axis = np.column_stack([np.interp(along, arc, each) for each in skeleton.nodes[run].T])
+        radius = np.interp(0.5 * (along[1:] + along[:-1]), arc, skeleton.radius[run])
+        self._second = np.pi / 4 * radius**4
+        self._step = np.diff(self.axis, axis=0)
+        # What grows on the run moves with the section that carries it.
+        section = np.full(skeleton.node_count, -1)
+        section[run] = np.rint(arc / along[1]).astype(int)
+        for node in np.flatnonzero(section < 0):
+            section[node] = section[skeleton.parent[node]]
+        tree = cKDTree(skeleton.nodes)
+        self._field = forward.field.on(
+            cKDTree(mesh.centroids).query(self.axis[:-1] + 0.5 * self._step)[1])
+        self.rest = np.vstack([forward.rest_points, grasp])
+        self._at = np.r_[section[tree.query(forward.rest_points)[1]], SECTIONS].astype(int)
+        added = forward.model.point_masses
+        places = np.vstack([mesh.centroids, *(np.reshape(each.position, (1, 3)) for each in added)])
+        at = section[tree.query(places)[1]]
+        self._carried = np.zeros((2, SECTIONS + 1, 4))
+        for part, mass in enumerate((np.abs(mesh.volumes), np.array([e.mass for e in added]))):
+            chosen = slice(0, mesh.tet_count) if part == 0 else slice(mesh.tet_count, None)
+            np.add.at(self._carried[part], at[chosen], mass[:, None] * np.column_stack(
+                [np.ones(len(mass)), (places - self.axis[at])[chosen]]))
+        self._record(forward, grasp)
+
+    def _record(self, forward: QuasiStaticForward, grasp: np.ndarray) -> None:
+        """Smooth what was recorded at few frames."""
+        frames, entry = forward.frames, forward.entry
+        self.is_loaded = entry.drive == "force"
+        known = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
+        along = np.arange(len(frames)) if self.is_loaded else travel(frames.poses)
+        keys = np.flatnonzero(known)[key_frames(along[known], KEYS)[0]]
+        self.times = frames.times[keys]
+
+        def at_keys(values: np.ndarray) -> np.ndarray:
+            enough = np.isfinite(values).sum() > 3
+            return smoothed(frames.times, values[:, None], self.times)[:, 0] if enough else (
+                values[keys])
+
+        wrench = np.column_stack([at_keys(each) for each in frames.wrenches.T[
+            :6 if forward.uses_torque else 3]])
+        self.place = frames.poses[keys, :3]
+        off = grasp - self.place[0]
+        if not self.is_loaded and np.linalg.norm(off) < AT_REST_M:
+            # The sensor's reading at rest is its zero.
+            wrench, self.place = wrench - wrench[0], self.place + off
+        self.force = wrench[:, :3]
+        self.torque = wrench[:, 3:] if wrench.shape[1] == 6 else np.zeros_like(self.force)
+        points = frames.positions.reshape(len(frames), -1)
+        self.seen = np.concatenate([np.reshape([at_keys(each) for each in points.T], (
+            -1, len(keys))).T.reshape(len(keys), -1, 3), self.place[:, None]], axis=1)
+        if self.is_loaded:
+            self.seen[:, -1] = np.nan
+
+    def bent(self, values: Sequence[Values]) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``rest`` moved under each of b values, [b, k, m + 1, 3], and sections' rotations
+        there [b, k, m + 1, 3, 3]."""
+        young = np.array([self._field.young(each) for each in values])
+        stiffness = young * self._second, young * self._second / (1 + values[0].poisson)
+        gravity = self._gravity
+        carried = values[0].density * self._carried[0] + self._carried[1]
+        places, turns = self.axis[None, None], np.broadcast_to(
+            np.eye(3), (1, 1, SECTIONS + 1, 3, 3))
+        hung = self._hung(carried, places, turns, gravity)
+        held = hung[0, 0] if self._forward.model.prestress is not None else 0 * hung[0, 0]
+        weight = _from_end(carried[:, :1] * gravity)
+        for _ in range(WEIGHT_PASSES if gravity.any() or self.is_loaded else 1):
+            hung = self._hung(carried, places, turns, gravity)
+            grasp = places[:, :, -1] + self.rest[-1] - self.axis[-1] if self.is_loaded else (
+                self.place)
+            shape = (len(values), len(self.force))
+            places, turns = np.empty((*shape, SECTIONS + 1, 3)), np.empty(
+                (*shape, SECTIONS + 1, 3, 3))
+            bend_rods(*(for_kernels(each) for each in (
+                self.axis, *stiffness, self.force, self.torque, np.broadcast_to(grasp, (*shape, 3)),
+                weight, np.broadcast_to(hung, (*shape, SECTIONS + 1, 3)), held)), places, turns)
+        found = turns[:, :, self._at]
+        return places[:, :, self._at] + np.einsum(
+            "bkmij,mj->bkmi", found, self.rest - self.axis[self._at]), found
+
+    @staticmethod
+    def _hung(carried: np.ndarray, places: np.ndarray, turns: np.ndarray, gravity: np.ndarray,
+              ) -> np.ndarray:
+        """Moment of the weight from each section on about the origin, [b, k, S + 1, 3]."""
+        return _from_end(np.cross(carried[:, :1] * places + np.einsum(
+            "bksij,sj->bksi", turns, carried[:, 1:]), gravity))
+
+    def residuals(self, values: Sequence[Values]) -> np.ndarray:
+        """Difference of simulated and recorded motions over their deviation, [b, r]: from the
+        first frame on, as places at rest may be wrong; under a stated load, from rest."""
+        moved, _ = self.bent(values)
+        seen = self.seen - (self.rest if self.is_loaded else self.seen[0])
+        off = moved - (self.rest if self.is_loaded else moved[:, :1]) - seen
+        size = float(np.nanmax(np.linalg.norm(seen, axis=-1), initial=0.0))
+        return np.nan_to_num(off / (BEAM_M + BEAM_SHARE * size)).reshape(len(values), -1)
+
+    @property
+    def name(self) -> str:
+        return self._forward.name
+
+    @property
+    def may_be_off(self) -> bool:
+        """Whether observed points may be elsewhere along the branch than stated."""
+        return self._forward.may_be_off_along and not self.is_loaded
+
+    def shifts(self, values: Values) -> np.ndarray:
+        """Distances of the observed points along the branch from where they are stated [m], [m]."""
+        sigma = calibration_of(self._forward.entry).point_sigma_m
+        moved, turns = self.bent([values])
+        axis = np.gradient(self.axis, axis=0)[self._at[:-1]]
+        axis = np.einsum("kmij,mj->kmi", turns[0, :, :-1],
+                         axis / np.linalg.norm(axis, axis=1, keepdims=True))
+        off = np.nanmean(np.sum((self.seen - moved[0])[:, :-1] * axis, axis=2), axis=0)
+        return np.nan_to_num(off) * sigma**2 / (sigma**2 + BEAM_M**2)
+
+
+def _run_to(skeleton: Skeleton, point: np.ndarray) -> np.ndarray:
+    """Nodes from the base to the one nearest to a point."""
+    run = [int(np.linalg.norm(skeleton.nodes - point, axis=1).argmin())]
+    while skeleton.parent[run[-1]] >= 0:
+        run.append(int(skeleton.parent[run[-1]]))
+    return np.array(run[::-1])
+
+
+def _from_end(values: np.ndarray) -> np.ndarray:
+    """Sum from each section outwards; the section is the last axis but one."""
+    return np.flip(np.cumsum(np.flip(values, axis=-2), axis=-2), axis=-2)
+
+
+@compiled
+def bend_rods(axis: np.ndarray, bending: np.ndarray, twist: np.ndarray, force: np.ndarray,
+              torque: np.ndarray, grasp: np.ndarray, weight: np.ndarray, hung: np.ndarray,
+              held: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
+    """Fill places [b, k, S + 1, 3] and rotations of the sections, from the base on. Each turns by
+    the moment at its middle: of the gripper and of the ``weight`` from there on, with moment
+    ``hung`` about the origin, less that as scanned, ``held``. Stiffnesses are [b, S] [N m^2]."""
+    inside, tangent, turn, at, middle = (np.empty(3), np.empty(3), np.empty(3), np.empty(3),
+                                         np.empty(3))
+    step, rotation, half, unit = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.eye(3)
+    for b in range(places.shape[0]):
+        for k in range(places.shape[1]):
+            places[b, k, 0], turns[b, k, 0] = axis[0], unit
+            for s in range(axis.shape[0] - 1):
+                length = 1e-18
+                for i in range(3):
+                    step[i] = axis[s + 1, i] - axis[s, i]
+                    length += step[i]**2
+                length = math.sqrt(length)
+                half[:] = turns[b, k, s]
+                at[:] = places[b, k, s]
+                for part in range(2):
+                    # The moment at the begin leads to the middle, and that there to the end.
+                    for i in range(3):
+                        middle[i] = axis[s, i] + 0.5 * part * step[i]
+                    pulled = crossed(grasp[b, k] - at, force[k])
+                    hanging, stood = crossed(at, weight[s + 1]), crossed(middle, weight[s + 1])
+                    for i in range(3):
+                        inside[i] = pulled[i] + torque[k, i] + hung[b, k, s + 1, i] - hanging[i]
+                        tangent[i] = 0.0
+                        for j in range(3):
+                            inside[i] -= half[i, j] * (held[s + 1, j] - stood[j])
+                            tangent[i] += half[i, j] * step[j] / length
+                    axial, size = 0.0, 0.0
+                    for i in range(3):
+                        axial += inside[i] * tangent[i]
+                    for i in range(3):
+                        along = axial * tangent[i]
+                        turn[i] = length * ((inside[i] - along) / bending[b, s]
+                                            + along / twist[b, s])
+                        size += turn[i]**2
+                    # A far too soft one curls up, by a radian in each section at most.
+                    shrink = 0.5 / max(math.sqrt(size), 1.0)
+                    for i in range(3):
+                        turn[i] *= shrink
+                    _turn_by(turn, turns[b, k, s], half)
+                    for i in range(3):
+                        at[i] = places[b, k, s, i]
+                        for j in range(3):
+                            at[i] += 0.5 * half[i, j] * step[j]
+                for i in range(3):
+                    turn[i] *= 2.0
+                    places[b, k, s + 1, i] = 2 * at[i] - places[b, k, s, i]
+                _turn_by(turn, turns[b, k, s], rotation)
+                turns[b, k, s + 1] = rotation
+
+
+@compiled
+def _turn_by(vector: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
+    """Fill a rotation [3, 3] turned by a vector [rad]."""
+    pose = np.zeros(6)
+    for i in range(3):
+        pose[3 + i] = vector[i]
+    frame = frame_of(pose)
+    for i in range(3):
+        for j in range(3):
+            after[i, j] = (frame[i, 0] * before[0, j] + frame[i, 1] * before[1, j]
+                           + frame[i, 2] * before[2, j])
+
+
+@dataclass(frozen=True)
+class BeamStart:
+    """Moduli by beam theory, and which part of the recorded motion they explain (0 to 1)."""
+
+    values: Values
+    explained: float
+
+
+EXPLAINED = 0.5
+"""Part of the recorded motion that some modulus has to explain. Chosen: sound pulls reach 0.9."""
+
+
+def unexplained(begun: BeamStart) -> str:
+    """A sentence for a start that explains little."""
+    return (f"Before the fit: no Young's modulus explains more than {100 * begun.explained:.0f} % "
+            "of the motion by the recorded force. Check in which frame the force was recorded and "
+            "its sign, the clocks, the grasp point, and the order of the markers.")
+
+
+def beams_of(forwards: Sequence[Forward], *, weighs: bool = True) -> list[Beam]:
+    """The slow pulls with a measured force as rods, with their weight or without."""
+    return [Beam(forward, weighs=weighs) for forward in forwards if forward.uses_force
+            and isinstance(forward, QuasiStaticForward) and forward.skeleton is not None]
+
+
+def far_from_stated(beams: Sequence[Beam], values: Values) -> dict[str, np.ndarray]:
+    """Distances of pulls' points along the branch [m], by name, where one is far."""
+    found = {beam.name: beam.shifts(values) for beam in beams if beam.may_be_off}
+    return {name: each for name, each in found.items() if np.abs(each).max(initial=0) > FAR_M}
+
+
+def beam_start(beams: Sequence[Beam], base: Values) -> BeamStart:
+    """Fit rods to their pulls: uniform moduli of all decades first, then one at each control point.
+    It does not depend on the moduli of ``base``."""
+    count, lower, upper = len(base.young), *np.log(YOUNG_BOUNDS_PA)
+
+    def residuals(logs: np.ndarray) -> np.ndarray:
+        values = [replace(base, young=np.exp(each)) for each in logs]
+        return np.hstack([*(beam.residuals(values) for beam in beams),
+                          np.diff(logs, axis=1) / LINK_DEVIATION])
+
+    def costs(logs: np.ndarray) -> np.ndarray:
+        return np.sum(residuals(logs)**2, axis=1)
+
+    tried = np.repeat(np.log(10) * DECADES[:, None], count, axis=1)
+    found = costs(tried)
+    stiff, cost, log_young = found[-1], found.min(), tried[found.argmin()]
+    damping, step = 1e-2, 1e-3
+    for _ in range(BEAM_ROUNDS):
+        rows = residuals(np.vstack([log_young, log_young + step * np.eye(count)]))
+        slopes = (rows[1:] - rows[0]).T / step
+        square, before = slopes.T @ slopes, cost
+        for _ in range(4):
+            change = -np.linalg.solve(square + damping * np.diag(np.diag(square) + 1e-9),
+                                      slopes.T @ rows[0])
+            change *= min(1.0, LONGEST_STEP / max(float(np.abs(change).max()), 1e-12))
+            other = np.clip(log_young + change, lower, upper)
+            if (left := costs(other[None])[0]) < cost:
+                log_young, cost, damping = other, left, damping / 5
+                break
+            damping *= 8
+        if before - cost < BEAM_ENDING * before:
+            break
+    young = np.clip(np.exp(log_young), *YOUNG_BOUNDS_PA)
+    return BeamStart(replace(base, young=young), 1 - float(cost / max(stiff, 1e-300)))
 
 
 def scaled_start(objective: Objective, values: Values) -> Values:
-    """Scale all moduli to the measurements, so that the branch stands: by the linear response at
-    rest, as displacement depends on force over modulus. Without a force some decades are tried."""
+    """Return moduli under which the branch stands and answers the measured force as recorded. A
+    fast pull is fitted step by step; without a force some decades are tried."""
     if any(forward.is_dynamic for forward in objective.forwards):
         return _step_by_step(objective, values)
-    return _scaled(objective, values)
-
-
-def set_rough_keys(objective: Objective) -> None:
-    """Simulate few frames of pulls with an observed path, until a fit is near its solution."""
-    for forward in objective.forwards:
-        if is_path_observed(forward):
-            forward.set_key_count(min(ROUGH_KEYS, forward.key_count))
-
-
-def set_all_keys(objective: Objective, count: int) -> None:
-    """Simulate at most ``count`` frames of these pulls, from the states found so far."""
-    for forward in objective.forwards:
-        if is_path_observed(forward):
-            forward.set_key_count(count)
-    objective.forget()
-
-
-def prescribed_start(objective: Objective, values: Values) -> tuple[Values, bool]:
-    """Fit pulls with an observed path by force alone first, and say whether it explains them. Far
-    from the solution no force explains path and points; near it both are fitted together."""
-    observed = [forward for forward in objective.forwards if is_path_observed(forward)]
-    if not observed:
-        return values, True
-    space = objective.space
-    likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
-    counts = [forward.key_count for forward in observed]
-    for forward, count in zip(observed, counts, strict=True):
-        forward.is_watching = False
-        forward.set_key_count(min(ROUGH_KEYS, count))
-    try:
-        rough = objective.with_forwards(objective.forwards).with_space(likely)
-        found = gauss_newton(rough, likely.pack(values), evaluation_limit=12, tolerance=3e-2,
-                             force_rounds=0, shortest=ROUGH_STEP).evaluation
-        explains = found.mean_square < RAN_OFF and not _is_unbounded(found, likely)
-        for forward in observed:
-            forward.keep()
-        if explains:
-            found = _followed(rough, found, observed)
-    except WorkError:
-        return values, True
-    finally:
-        for forward, count in zip(observed, counts, strict=True):
-            forward.is_watching = True
-            forward.set_key_count(count)
-    objective.forward_count = rough.forward_count
-    return likely.unpack(found.free), explains
-
-
-def _is_unbounded(found: Evaluation, space: ParameterSpace) -> bool:
-    """Whether no modulus is too stiff, or too soft, for the pulls: their force may be all zero."""
-    return bool(set(space.on_bound(found.free)) - {name for name, _, _ in space.priors})
-
-
-def _followed(
-    rough: Objective, found: Evaluation, observed: list[ObservedPathForward]
-) -> Evaluation:
-    """Continue the fit at the forces from a first fit, unless that is worse."""
-    rough.follow_forces(found)
-    at_end = rough.evaluate(found.free, jacobian=True)
-    if at_end is None or at_end.objective > WORSE * found.objective:
-        for forward in observed:
-            forward.step_back()
-        return found
-    fit = gauss_newton(rough, found.free, evaluation_limit=12, tolerance=3e-2, is_near=True,
-                       force_rounds=0, shortest=ROUGH_STEP)
-    for forward in observed:
-        forward.keep()
-    return fit.evaluation
-
-
-def _scaled(objective: Objective, values: Values) -> Values:
-    factors = [factor for forward in objective.forwards if forward.uses_force
-               and (factor := forward.force_ratio(values)) is not None]
-    if factors:
-        young = values.young * float(np.exp(np.mean(np.log(factors))))
-        return standing(objective, replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA)))
-    return _scanned(objective, standing(objective, values))
+    beams = beams_of(objective.forwards)
+    if not beams:
+        return _scanned(objective, standing(objective, values))
+    return standing(objective, beam_start(beams, values).values)
 
 
 def standing(objective: Objective, values: Values) -> Values:
@@ -139,6 +349,18 @@ def standing(objective: Objective, values: Values) -> Values:
             break
         values = replace(values, young=np.clip(STIFFER * values.young, *YOUNG_BOUNDS_PA))
     return values
+
+
+def standing_start(objective: Objective, start: Values) -> tuple[Values, Evaluation] | None:
+    """Return the start, or the first of stiffer ones that has an equilibrium, and its evaluation.
+    None if none has."""
+    for number in range(MOST_STIFFENED + 1):
+        values = replace(start, young=np.clip(
+            start.young * np.exp(number * LONGEST_STEP), *YOUNG_BOUNDS_PA))
+        found = objective.evaluate(objective.space.pack(values), jacobian=True)
+        if found is not None:
+            return values, found
+    return None
 
 
 def _step_by_step(objective: Objective, values: Values) -> Values:
@@ -152,7 +374,7 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
                     for forward in objective.forwards]
         short = objective.with_forwards(forwards).with_space(likely)
         if number == 0:
-            values = _scaled(short, values)
+            values = _scanned(short, standing(short, values))
         fit = gauss_newton(short, likely.pack(values), evaluation_limit=12, tolerance=1e-2,
                            force_rounds=1)
         values = likely.unpack(fit.evaluation.free)
@@ -184,51 +406,6 @@ def _scanned(objective: Objective, values: Values) -> Values:
                    if (known := cost(shift)) is not None)[1]
         step, centre = step / 2 if best == centre else step, best
     return scaled(centre)
-
-
-def standing_start(objective: Objective, start: Values, uniform: Values, *, explains: bool = True,
-                   ) -> tuple[Values, Evaluation] | None:
-    """Return values near the start that have an equilibrium, and their evaluation, or None. If the
-    start does not explain the pulls, it and the uniform modulus are led along the path, and the
-    better is taken. At last uniform and outward softer moduli are tried under the force."""
-    if explains:
-        found = objective.evaluate(objective.space.pack(start), jacobian=True)
-        if found is not None:
-            return start, found
-    found_along = [each for values in (uniform, start)
-                   if (each := _along_recorded_path(objective, values)) is not None]
-    if found_along:
-        best = min(found_along, key=lambda each: each[1].objective)
-        # Simulations continue from their last state.
-        return best if best is found_along[-1] else _along_recorded_path(objective, best[0])
-    index = np.arange(len(uniform.young))
-    falling = np.exp(FALL * (index.mean() - index))
-    return _first_standing(objective, [
-        replace(uniform, young=uniform.young * factor * course)
-        for factor in (1.0, 3.0, 0.3, 10.0, 0.1) for course in (falling, 1.0)])
-
-
-def _along_recorded_path(objective: Objective, values: Values) -> tuple[Values, Evaluation] | None:
-    """Evaluate with pulls led along their recorded paths; None: no path or no equilibrium."""
-    observed = [forward for forward in objective.forwards if is_path_observed(forward)]
-    if not observed or not all(forward.lead_along_path(values) for forward in observed):
-        return None
-    objective.forget()
-    found = objective.evaluate(objective.space.pack(values), jacobian=True)
-    return None if found is None else (values, found)
-
-
-def _first_standing(objective: Objective, trials: list[Values],
-                    ) -> tuple[Values, Evaluation] | None:
-    """Return the first that has an equilibrium; the force is the measured one."""
-    for trial in trials:
-        for forward in objective.forwards:
-            if is_path_observed(forward):
-                forward.forget()
-        found = objective.evaluate(objective.space.pack(trial), jacobian=True)
-        if found is not None:
-            return trial, found
-    return None
 
 
 # Errors so large that their squares matter: put right by what was fitted, then fitted again.
@@ -276,39 +453,6 @@ def put_right(pull: Pull, shift: np.ndarray, turn: np.ndarray) -> Pull:
     middle = np.nanmean(points, axis=(0, 1))
     back = rotated(-turn, (points - middle).reshape(-1, 3)).reshape(points.shape)
     return replace(pull, observations=replace(seen, positions=middle + back))
-
-
-class FarPointsError(Exception):
-    """Points are far from where they were simulated: the pulls are fitted again there."""
-
-    def __init__(self, shifts: dict[str, np.ndarray], values: Values, forwards: list[Forward]):
-        super().__init__()
-        self.shifts, self.values, self.forwards = shifts, values, forwards
-
-    def begin(self, forwards: list[Forward]) -> None:
-        """Let simulations of the same pulls start from the states found so far."""
-        for forward, known in zip(forwards, self.forwards, strict=True):
-            if isinstance(forward, QuasiStaticForward) and isinstance(known, QuasiStaticForward):
-                forward.begin_at(known)
-
-
-@dataclass(frozen=True)
-class FarPoints:
-    """Looks whether a fit has moved points far along the branch from ``shifts`` [m]."""
-
-    shifts: dict[str, np.ndarray]
-
-    def look(self, evaluation: Evaluation, objective: Objective) -> None:
-        """Raise FarPointsError if it has."""
-        if evaluation.errors is None:
-            return
-        size = objective.space.size
-        listed = nuisance_records(objective.cell_errors.nuisances, evaluation.errors,
-                                  np.zeros((size, size)))
-        far = far_points(listed, self.shifts)
-        if far is not None:
-            raise FarPointsError(far, objective.space.unpack(evaluation.free),
-                                 objective.forwards)
 
 
 # Pulls that a fit leaves out, and how well it predicts them.

@@ -12,8 +12,8 @@ from limber.estimation.fitting.objective import Evaluation, Objective
 
 EVALUATION_LIMIT = 400
 """Forward simulations of all pulls, after which a fit that still moves is given up."""
-FIRST_STEP = 1.5
-"""Longest first step of Gauss-Newton in log E: a factor of 4.5. Chosen, not measured."""
+FIRST_DAMPING, MOST_DAMPING = 0.02, 1e3
+"""Damping, over the squares of the slopes, of a step tried again; above the last, none descends."""
 LONGEST_STEP = 1.1
 """Longest step of Gauss-Newton in a log E, a factor of three: beyond it no linearisation holds."""
 OUTLYING = 3.0
@@ -30,8 +30,6 @@ WANDERING_STEP = 0.1
 position, whose repeatability is no better; a stricter end does not converge. The remainder adds
 half a percent to the deviation.
 """
-SHORTEST_STEP = 3e-4
-"""Step relative to the free vector's length at which it ends if no step descends."""
 FIRST_SIMPLEX = 0.5
 """Step of Nelder-Mead's first simplex in log E: a factor of 1.6. With 1 it finds the paper's young
 branch as fast.
@@ -50,14 +48,12 @@ class FitStatus(StrEnum):
     converged: by the optimiser's own criterion.
     out_of_evaluations: no more simulations were allowed.
     misfit: it settled, but farther from the measurements than requested.
-    unconfirmed: a reduced model's fit that the full model could not confirm.
     stopped: by the user.
     """
 
     converged = "converged"
     out_of_evaluations = "out of evaluations"
     misfit = "misfit"
-    unconfirmed = "unconfirmed"
     stopped = "stopped"
 
 
@@ -78,109 +74,101 @@ class Fit:
 def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True,
                  evaluation_limit: int = 40, tolerance: float = 3e-5, is_near: bool = False,
                  force_rounds: int = FORCE_ROUNDS, shortest: float = SETTLED_STEP) -> Fit:
-    """Levenberg-Marquardt in a trust region (``least_squares``). ``robust``: residuals beyond
-    ``OUTLYING`` count linearly (``soft_l1``). It ends at a relative change ``tolerance`` of the
-    cost or a step ``shortest`` in deviations. WorkError if the start has no equilibrium."""
+    """Levenberg-Marquardt within bounds, at most threefold in a modulus a step. ``robust``:
+    residuals beyond ``OUTLYING`` count linearly (soft l1). It ends at a relative change
+    ``tolerance`` of the cost or a step ``shortest`` in deviations. WorkError if the start has no
+    equilibrium."""
     # Far from the solution all residuals are large, and a robust loss would only slow convergence.
-    phases = [("linear", ROUGH_ENDING), ("soft_l1", tolerance)]
+    phases = [(False, ROUGH_ENDING), (True, tolerance)]
     if not robust:
-        phases = [("linear", tolerance)]
+        phases = [(False, tolerance)]
     elif is_near:
         phases = phases[1:]
-    search = _Search(objective, start, evaluation_limit, shortest)
-    moved = search.begin
+    search = _Search(objective, evaluation_limit, shortest)
+    at = _required(objective, search.inside(start))
     for phase in phases:
-        found = search.minimised(moved, *phase)
-        moved = found.x
+        end = search.minimised(at, *phase)
+        at = end.evaluation
     for _ in range(force_rounds):
         # Measured input forces are now known better, and so is their effect on the points.
-        if not objective.follow_forces(search.at(moved)):
+        if not objective.follow_forces(at):
             break
-        before = search.at(moved)
-        found = search.minimised(moved, *phases[-1])
-        away = before.jacobian @ (found.x - moved)
-        moved = found.x
-        if np.linalg.norm(away) < FORCE_SETTLED:
+        before = _required(objective, at.free)
+        end = search.minimised(before, *phases[-1])
+        at = end.evaluation
+        if np.linalg.norm(before.slopes @ (at.free - before.free)) < FORCE_SETTLED:
             break
-    status = FitStatus.converged if found.status > 0 else FitStatus.out_of_evaluations
-    return Fit(search.at(found.x), status, str(found.message))
+    return Fit(_required(objective, at.free), end.status, end.reason)
 
 
 class _Search:
-    """Scipy's searches use shifted vectors, as it limits the first step by the vector's length: to
-    about a factor of e in all moduli, while log E itself would allow any."""
+    """Damped steps from evaluation to evaluation; one that has no equilibrium, or does not descend,
+    is tried again with more damping."""
 
-    def __init__(self, objective: Objective, start: np.ndarray, evaluation_limit: int,
-                 shortest: float):
+    def __init__(self, objective: Objective, evaluation_limit: int, shortest: float):
         self._objective, self._limit = objective, evaluation_limit
         self._lower, self._upper = objective.space.bounds()
-        start = np.clip(start, self._lower + 1e-6, self._upper - 1e-6)
-        self._size = len(_required(objective, start).residual)
-        self._shift = start - FIRST_STEP / np.sqrt(len(start))
-        self.begin = self._accepted = start - self._shift
         settles = any(forward.watches_pose for forward in objective.forwards)
         self._shortest = max(WANDERING_STEP if settles else 0.0, shortest)
 
-    def at(self, moved: np.ndarray) -> Evaluation:
-        """Evaluate with derivatives."""
-        return _required(self._objective, moved + self._shift)
+    def inside(self, free: np.ndarray) -> np.ndarray:
+        """The vector within the bounds."""
+        return np.clip(free, self._lower + 1e-6, self._upper - 1e-6)
 
-    def minimised(self, moved: np.ndarray, loss: str,
-                  ending: float) -> "scipy.optimize.OptimizeResult":
-        """Return scipy's result from ``moved`` with a loss, to a relative change of cost."""
-        self._accepted = moved
+    def minimised(self, at: Evaluation, robust: bool, ending: float) -> Fit:
+        """Descend from an evaluation to a relative change of cost."""
+        damping = 0.0
+        for _ in range(self._limit):
+            weight = (1 + (at.residual / OUTLYING)**2)**-0.25 if robust else np.ones(
+                len(at.residual))
+            slopes, residual = weight[:, None] * at.slopes, weight * at.residual
+            step = self._step(at.free, slopes, residual, damping)
+            length = float(np.linalg.norm(slopes @ step))
+            if length < self._shortest:
+                return Fit(at, FitStatus.converged, "The next step is shorter than "
+                           f"{self._shortest:g} standard deviations.")
+            longest = float(np.abs(step[:self._objective.space.group_count]).max())
+            step *= min(1.0, LONGEST_STEP / max(longest, 1e-12))
+            tried = self._objective.evaluate(at.free + step, jacobian=True)
+            fall = -np.inf if tried is None else _cost(at, robust) - _cost(tried, robust)
+            if tried is None or fall <= 0:
+                if damping > MOST_DAMPING:
+                    return Fit(at, FitStatus.converged, "No step descends.")
+                damping = max(FIRST_DAMPING, 8 * damping)
+                continue
+            linear = residual + slopes @ step
+            foreseen = 0.5 * float(residual @ residual - linear @ linear)
+            damping = 0.0 if damping < FIRST_DAMPING else (
+                damping / 8 if fall > 0.25 * foreseen else 2 * damping)
+            was, at = _cost(at, robust), tried
+            if fall < ending * was:
+                return Fit(at, FitStatus.converged, f"The last step changed the cost by less than "
+                           f"{ending:g} of it.")
+        return Fit(at, FitStatus.out_of_evaluations, f"{self._limit} simulations were not enough.")
 
-        def jacobian(moved: np.ndarray) -> np.ndarray:
-            # Asked at each accepted vector.
-            self._accepted = moved.copy()
-            found = self.at(moved)
-            step, length = _wanted_step(found, loss)
-            aim = moved + self._shift + step
-            if length < self._shortest and np.all((self._lower < aim) & (aim < self._upper)):
-                raise _SettledError(moved)
-            return found.slopes
-
-        try:
-            return scipy.optimize.least_squares(
-                self._residual, moved, jacobian,
-                bounds=(self._lower - self._shift, self._upper - self._shift), method="trf",
-                loss=loss, f_scale=OUTLYING, ftol=ending, xtol=SHORTEST_STEP, gtol=1e-12,
-                max_nfev=self._limit)
-        except _SettledError as end:
-            return scipy.optimize.OptimizeResult(
-                x=end.moved, status=1, message=f"The next step is shorter than {self._shortest:g} "
-                "standard deviations.")
-
-    def _residual(self, moved: np.ndarray) -> np.ndarray:
-        # Nearly every step is accepted, and its derivative is cheapest right after the solve.
-        found = None if self._is_far(moved) else self._objective.evaluate(
-            moved + self._shift, jacobian=True)
-        # What is not finite has no value for scipy: the trust region shrinks.
-        return np.full(self._size, np.nan) if found is None else found.residual
-
-    def _is_far(self, moved: np.ndarray) -> bool:
-        """Whether a step from the last accepted vector changes a modulus too much to be tried."""
-        count = self._objective.space.group_count
-        return bool(np.abs(moved - self._accepted)[:count].max() > LONGEST_STEP)
+    def _step(self, free: np.ndarray, slopes: np.ndarray, residual: np.ndarray, damping: float,
+              ) -> np.ndarray:
+        """The damped Gauss-Newton step; what would leave the bounds ends there, and the others
+        follow."""
+        scale = np.sqrt(damping) * np.linalg.norm(slopes, axis=0)
+        rows = np.vstack([slopes, np.diag(scale)]) if damping else slopes
+        right = np.r_[-residual, np.zeros(len(free))] if damping else -residual
+        step, moves = np.zeros(len(free)), np.ones(len(free), bool)
+        while moves.any():
+            step[moves] = np.linalg.lstsq(rows[:, moves], right - rows[:, ~moves] @ step[~moves],
+                                          rcond=None)[0]
+            inside = self.inside(free + step) - free
+            out = moves & (np.abs(inside - step) > 1e-12)
+            if not out.any():
+                break
+            step[out], moves[out] = inside[out], False
+        return step
 
 
-class _SettledError(Exception):
-    """Ends scipy's iteration at ``moved``."""
-
-    def __init__(self, moved: np.ndarray):
-        super().__init__()
-        self.moved = moved
-
-
-def _wanted_step(found: Evaluation, loss: str) -> tuple[np.ndarray, float]:
-    """Return the Gauss-Newton step from an evaluation, shape [p], and its length in standard
-    deviations."""
-    weight = np.ones(len(found.residual))
-    if loss == "soft_l1":
-        weight = (1 + (found.residual / OUTLYING)**2)**-0.25
-    slopes = weight[:, None] * found.slopes
-    step = -np.linalg.lstsq(slopes, weight * found.residual, rcond=None)[0]
-    return step, float(np.linalg.norm(slopes @ step))
+def _cost(found: Evaluation, robust: bool) -> float:
+    if not robust:
+        return found.objective
+    return float(OUTLYING**2 * np.sum(np.sqrt(1 + (found.residual / OUTLYING)**2) - 1))
 
 
 def nelder_mead(objective: Objective, start: np.ndarray, *,

@@ -9,6 +9,7 @@ from scipy import sparse
 
 from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.parameters import Values
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.dynamics.motion import NewmarkSettings, subspace_round
 from limber.mechanics.grasp import Grasp
@@ -401,6 +402,9 @@ class Forward(ABC):
     shape [m].
     """
 
+    skeleton: Skeleton | None = None
+    """Axes of the branch, if known: a fit starts from a beam along them."""
+
     creep_time: float | None = None
     """Time constant of the branch's creep [s], if its share is an unknown of the fit."""
 
@@ -454,20 +458,9 @@ class Forward(ABC):
         return False
 
     @property
-    def full(self) -> "Forward":
-        """The corresponding forward simulation with the full model."""
-        return self
-
-    @property
     def has_force_unknowns(self) -> bool:
         """Whether a measured force with errors is prescribed."""
         return False
-
-    @property
-    def reduction_error(self) -> tuple[float, float] | None:
-        """Largest error of the reduced model relative to the full one, in position [m] and in force
-        over the largest force; None if the full model itself is simulated, or could not be."""
-        return None
 
     def shift_force(self, change: np.ndarray) -> None:
         """Change the force's unknowns [L], in the order of the response's columns, and linearise
@@ -477,11 +470,6 @@ class Forward(ABC):
     def under_readings(self, simulated: Simulated) -> Simulated:
         """Predict a pull from its force readings alone, without its observed points."""
         return simulated
-
-    def force_ratio(self, values: Values) -> float | None:
-        """Measured force over the force that moves a branch of these ``values`` equally far, by its
-        linear response at rest; None if the pull does not determine it."""
-        return None
 
     def stands(self, values: Values) -> bool:
         """Whether the branch carries its own weight under these values."""

@@ -19,7 +19,6 @@ import scipy
 from limber.core.errors import WorkError
 from limber.core.not_none import present
 from limber.core.numerics.rigid import any_normal, principal_axes, rotation_matrix
-from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.forward_model import Forward, Response, Simulated, compliance
 from limber.estimation.forward.solved_pull import FEW_KEYS, QuasiStaticForward
@@ -261,21 +260,7 @@ AT_REST_M = 5e-3
 """Distance of a first pose from the grasp point below which the branch is at rest; the sensor's
 reading is then its zero.
 """
-ROUGH_POSE_M = 5e-3
-"""Standard deviation of the recorded path in a first fit, where force and gripper frame are taken
-as recorded. Without the path, the branch beyond the last point would be undetermined.
-"""
 TANGENT_RADII = 4.0
-LED_STEP = 0.03
-"""Longest step along a recorded path over the branch's size: its response is then nearly linear."""
-LED_ROUNDS = 40
-"""Most steps to a key frame."""
-LED_END_M = 1e-3
-"""Step at which a key frame is reached."""
-LED_PART = 0.02
-"""Compliance over the largest one below which a path tells no force: along a slender branch, it
-would take hundreds of newtons to follow an error of a millimetre.
-"""
 SAME_RESPONSE = 0.02
 """Change over the branch's size below which the response to its force is unchanged."""
 
@@ -283,8 +268,6 @@ SAME_RESPONSE = 0.02
 class ObservedPathForward(QuasiStaticForward):
     """Simulates one pose-recorded pull by its force; arguments as for its base class."""
 
-    is_watching = True
-    """False for a first fit by force alone."""
     _drives_for: Values | None = None
     """Values for which the force was last found."""
     _good: tuple | None = None
@@ -296,15 +279,7 @@ class ObservedPathForward(QuasiStaticForward):
 
     @property
     def watches_pose(self) -> bool:
-        return self.is_watching
-
-    @property
-    def compares_grasp(self) -> bool:
         return True
-
-    @property
-    def pose_sigma(self) -> float:
-        return super().pose_sigma if self.is_watching else ROUGH_POSE_M
 
     def __init__(self, *arguments: Any, **options: Any):
         self._grasp_slopes: dict[int, np.ndarray] = {}
@@ -325,7 +300,7 @@ class ObservedPathForward(QuasiStaticForward):
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
         known = self._drives_for
-        if self.is_watching and known is not None and not equal_values(known, values):
+        if known is not None and not equal_values(known, values):
             # At the same positions the force is proportional to the stiffness.
             factor = np.exp(np.mean(np.log(values.young) - np.log(known.young)))
             self._drives = [drive * factor for drive in self._drives]
@@ -363,56 +338,6 @@ class ObservedPathForward(QuasiStaticForward):
             drives, self._drives_for, memory, self._values, self.response = self._good
             self._drives, self._memory, self._hints = list(drives), list(memory), None
 
-    def forget(self) -> None:
-        """Return to the measured force, without a state."""
-        self._good = self._drives_for = None
-        self._memory = [None] * len(self.keys)
-        self.set_key_count(self.key_count)
-
-    def lead_along_path(self, values: Values) -> bool:
-        """Find the force that leads the branch along the recorded path, by its compliance in short
-        steps from rest: least squares decide along the branch, where the path cannot. It folds no
-        branch, unlike readings with a large zero. False if no equilibria; state as before."""
-        model, place = self.model_with(values), self.frames.poses[:, :3]
-        offset = self.entry.grasp.point_m - place[0]
-        if np.linalg.norm(offset) < AT_REST_M:
-            place = place + offset
-        drive, state, found = np.zeros(self._measured.shape[1]), np.zeros_like(self.mesh.nodes), []
-        for loads, target in zip(self._loads, place[self.keys], strict=True):
-            try:
-                led = self._moved_to(model, loads, drive, state, target)
-            except NotPositiveDefiniteError:
-                led = None
-            if led is None:
-                return False
-            drive, state = led
-            found.append(led)
-        self._drives = [drive for drive, _ in found]
-        self._drives_for, self._values, self.response = values, None, None
-        self._memory = [None] * len(self.keys)
-        self.hint([state for _, state in found])
-        return True
-
-    def _moved_to(self, model: BranchModel, loads: np.ndarray, drive: np.ndarray, state: np.ndarray,
-                  target: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Force and state with the gripper as near to a position [m] as a force tells."""
-        longest = LED_STEP * float(np.linalg.norm(np.ptp(self.mesh.nodes, axis=0)))
-        for _ in range(LED_ROUNDS):
-            moved = compliance(model, state, loads)
-            slopes = self.grasp.position_slopes(self.mesh.nodes, state, np.moveaxis(moved, 0, -1))
-            step = np.linalg.lstsq(slopes, target - self.grasp_position(state), rcond=LED_PART)[0]
-            size = float(np.linalg.norm(slopes @ step))
-            if size < LED_END_M:
-                return drive, state
-            step *= min(1.0, longest / size)
-            drive = drive + step
-            result = self._solve(model, np.tensordot(drive, loads, axes=1),
-                                 state + np.tensordot(step, moved, axes=1))
-            if result is None:
-                return None
-            state = result.displacement
-        return None
-
     def moved_by(self, change: np.ndarray) -> float:
         """Largest motion of the gripper position by a change of the force unknowns [m]."""
         response = present(self.response, "response of the pull to its force")
@@ -420,9 +345,6 @@ class ObservedPathForward(QuasiStaticForward):
         return float(np.linalg.norm(moved, axis=1).max())
 
     def shift_force(self, change: np.ndarray) -> None:
-        if not self.is_watching:
-            super().shift_force(change)
-            return
         response = self.response
         size = float(np.linalg.norm(np.ptp(self.mesh.nodes, axis=0)))
         is_small = self.moved_by(change) < SAME_RESPONSE * size

@@ -188,7 +188,7 @@ LONGEST_STEP = 0.5
 def averaged(fit: Fit, objective: Objective) -> Fit:
     """Return the fit moved to the mode of the moduli's marginal density; unchanged if the form of
     the field is not an unknown."""
-    full = objective.forwards[0].full
+    full = objective.forwards[0]
     if not isinstance(full, QuasiStaticForward | DynamicForward):
         return fit
     field = full.field

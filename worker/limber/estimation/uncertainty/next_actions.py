@@ -146,7 +146,7 @@ class Prospects:
         values = self._objective.space.unpack(self._evaluation.free)
         forwards, is_new = [], False
         for forward in self._objective.forwards:
-            full = forward.full
+            full = forward
             if (isinstance(full, QuasiStaticForward) and full.drive == "pose"
                     and full.entry.grasp.mode == "rigid" and not full.uses_torque):
                 if full.simulate(values, (), False) is None:

@@ -237,8 +237,8 @@ class SectionMean:
 def strain_energy(objective: Objective, values: Values) -> np.ndarray | None:
     """Strain energy [tet_count] [J] summed over the frames simulated for ``values``; None if a pull
     is dynamic."""
-    forwards = [forward.full for forward in objective.forwards
-                if isinstance(forward.full, QuasiStaticForward)]
+    forwards = [forward for forward in objective.forwards
+                if isinstance(forward, QuasiStaticForward)]
     if len(forwards) < len(objective.forwards):
         return None
     energies = [forward.model_with(values).internal(state).tet_energy for forward in forwards
@@ -288,8 +288,8 @@ def _towards(skeleton: Skeleton, shape: Skeleton) -> Skeleton:
 def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np.ndarray | None:
     """Return the relative deviation of E [K] from that of twigs and leaves outside the mesh,
     ``sigma``. None if nothing hangs or there is no gravity, or as :func:`compensation`."""
-    models = [forward.full.model for forward in objective.forwards
-              if isinstance(forward.full, QuasiStaticForward)]
+    models = [forward.model for forward in objective.forwards
+              if isinstance(forward, QuasiStaticForward)]
     # Stated masses are known; those of twigs and leaves come from their volume.
     if not sigma or not any(
             model.gravity.any() and any(isinstance(one, HungTwig) for one in model.point_masses)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 
 from limber.core.errors import Cancelled, LimberError, Option, WorkError
-from limber.core.files.atomic import file_digest
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.estimation.settings import EstimateSettings, FitSpec
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
 
 EVALUATIONS = ".estimate-evaluations.jsonl"
 """File in the branch folder that grows while an estimate runs, and lets a stopped one resume."""
-_BASES = ".reduced-*.npz"
-"""Bases of reduced models in the same folder, from which the next estimate starts."""
 
 
 class Estimate(Result):
@@ -195,7 +192,7 @@ class EstimateYoung(EstimateSettings, Repeatable, BranchStage):
 
 def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[str, Any]:
     from limber.estimation.estimate_file import details, summary
-    from limber.estimation.estimated_branch import tell_doubts
+    from limber.estimation.estimated_branch import lumped, tell_doubts
     from limber.estimation.fit import fit_branch, is_open
     from limber.estimation.fit_assessment import judge_model, require_result
     from limber.estimation.fitting.objective import EvaluationLog
@@ -228,15 +225,16 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
     log_path = branch.folder / EVALUATIONS
     if asked.force or not asked.resume:
         log_path.unlink(missing_ok=True)
-    bases = _finished_bases(branch)
     log = EvaluationLog(log_path, json.dumps([plain(asked), digests], sort_keys=True))
     initial, evidence = subject, None
     if is_open(settings):
         pulls = _placed(pulls, initial)
+    subject = lumped(subject, pulls, settings)
+    if is_open(settings):
         found, settings, subject, evidence = _with_supported_points(
             branch, pulls, subject, settings, log, heard.part(0.2, 0.9))
     else:
-        found = fit_branch(pulls, subject, settings, log=log, cache=branch.folder,
+        found = fit_branch(pulls, subject, settings, log=log,
                            progress=heard.part(0.2, 0.9))
     found.warnings = warnings
     if not found.stopped:
@@ -259,12 +257,13 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
         full = result | details(found, subject, pulls)
         stage.write("estimate.json", full)
         if not found.stopped:
-            subject.mesh.with_data(cell_data={
-                "young": subject.young(found.values),
-                "poisson": np.full(subject.mesh.tet_count, found.values.poisson),
-                "density": np.full(subject.mesh.tet_count, found.values.density),
+            whole = load_subject(branch, settings)
+            whole.mesh.with_data(cell_data={
+                "young": whole.young(found.values),
+                "poisson": np.full(whole.mesh.tet_count, found.values.poisson),
+                "density": np.full(whole.mesh.tet_count, found.values.density),
             }).write(stage.path("mesh.vtu"))
-        stage.result.update(result | {"bases": bases | _bases(branch.folder)})
+        stage.result.update(result)
     if found.stopped:
         raise Cancelled("The estimate was stopped.",
                         f"Its best so far (loss {found.fit.evaluation.loss:.3g} m2) is in "
@@ -280,6 +279,7 @@ def _with_supported_points(
         ) -> tuple[fit_assessment.Estimate, FitSpec, Subject, dict[int, float] | None]:
     """Fit with as many control points as the pulls support, from a fit with four on; return the
     fit, its settings and branch, and the log evidence by number of control points."""
+    from limber.estimation.estimated_branch import lumped
     from limber.estimation.fit import complete, fit_branch, supported
     from limber.estimation.fitting.objective import EvaluationLog
     from limber.store.loading import load_subject
@@ -293,7 +293,7 @@ def _with_supported_points(
         evidence = support.evidence
         if support.fractions != settings.initial_fractions:
             chosen = settings.model_copy(update={"fractions": support.fractions})
-            model = load_subject(branch, chosen)
+            model = lumped(load_subject(branch, chosen), pulls, chosen)
             heard: list[str] = []
             try:
                 found = fit_branch(pulls, model, chosen, log=EvaluationLog(None, ""), quick=True,
@@ -315,24 +315,6 @@ def _placed(pulls: list[Pull], subject: Subject) -> list[Pull]:
     rest = tuple(map(tuple, subject.control_points.tolist()))
     return [pull if pull.entry.rest_points_m is not None else replace(
         pull, entry=pull.entry.model_copy(update={"rest_points_m": rest})) for pull in pulls]
-
-
-def _bases(folder: Path) -> dict[str, str]:
-    """Bases of reduced models in a folder: file name to checksum."""
-    return {path.name: file_digest(path) for path in sorted(folder.glob(_BASES))}
-
-
-def _finished_bases(branch: Branch) -> dict[str, str]:
-    """Bases of finished estimates; others are removed, as they come from a killed run."""
-    entry = branch.manifest.stages.get("estimate")
-    known = entry.result.get("bases", {}) if entry else {}
-    kept = {}
-    for name, digest in _bases(branch.folder).items():
-        if known.get(name) == digest:
-            kept[name] = digest
-        else:
-            (branch.folder / name).unlink()
-    return kept
 
 
 def follow(asked: EstimateYoung, progress: Progress, training_count: int = 60,
