@@ -17,6 +17,7 @@ from limber.robot.driver.link import RobotLink
 from limber.robot.motion.joint_path import joint_space_path, to_joints
 from limber.robot.motion.trajectory import along_bounded
 from limber.store import Branch
+from limber.store.loading import load_skeleton
 
 GRASP = (0, 0, 0.15, 0, 0, 0)
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
@@ -146,18 +147,26 @@ def test_release_opens_the_gripper_and_goes_away_from_the_branch(stepped, tmp_pa
 
 
 @pytest.mark.slow
-def test_goto_start_ends_where_execute_begins(stepped, planned_folder, tmp_path, capfd):
-    """Slow: two dry runs of the plan."""
+@pytest.mark.parametrize("command", ["goto-start", "goto-grasp"])
+def test_the_arm_goes_to_where_it_is_asked(command, stepped, planned_folder, tmp_path, capfd):
+    """Slow: two dry runs of the plan. At the grasp the gripper is on the branch, across it."""
     cell = standing_at(Branch.open(planned_folder), stepped.address, grip_seconds=0.1)
     path = str(cell_file(cell, tmp_path))
-    code, told = robot_answer(capfd, "goto-start", path, str(planned_folder))
+    code, told = robot_answer(capfd, command, path, str(planned_folder))
     assert code == 0 and not told["armed"], told
     goal = np.array(told["end_joints_rad"])
-    stepped.ask("stand", joints=list(goal + [0.03, 0, 0, 0, 0, 0.05]))
-    code, told = robot_answer(capfd, "goto-start", path, str(planned_folder), "--arm", "--confirm",
-                      "goto-start")
+    stepped.ask("stand", joints=list((goal if command == "goto-start" else np.array(
+        told["start_joints_rad"])) + [0.03, 0, 0, 0, 0, 0.05]))
+    code, told = robot_answer(capfd, command, path, str(planned_folder), "--arm", "--confirm",
+                              command)
     assert code == 0 and told["reached"], told
     assert stepped.state["joints"] == pytest.approx(goal, abs=1e-4)
+    if command == "goto-grasp":
+        skeleton = load_skeleton(Branch.open(planned_folder))
+        held = cell.grasp_frames(cell.arm.forward(goal))
+        assert held[:3, 3] == pytest.approx(skeleton.point_at(2 / 3), abs=1e-3)
+        axis = skeleton.point_at(2 / 3) - skeleton.point_at(0.62)
+        assert abs(held[:3, 1] @ axis) > 0.99 * np.linalg.norm(axis)
 
 
 def test_the_gripper_opens_while_the_robot_is_stopped(stepped, tmp_path, capfd):

@@ -1,5 +1,6 @@
 """Positions in the loop's cell: the robot, its gripper at the branch, touched marks."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,6 +28,9 @@ _AROUND_M = 0.06  # the gripper must reach this far around the grasp
 _RIM_M = 0.12  # radius of the pot's rim, which has marks to touch
 _MARKS = 6
 _SINGULARITY = 0.08
+
+IsMet = Callable[[np.ndarray, np.ndarray], bool]
+"""Whether flange frames [n, 4, 4] at joints [n, 6] meet something."""
 
 
 def bending_modulus(skeleton: Skeleton, fraction: float, force: float, travel: float) -> float:
@@ -61,18 +65,20 @@ def base_beside(arm: Arm, tool: np.ndarray, point: np.ndarray, axis: np.ndarray)
     return best[1]
 
 
-def gripper_at(cell: Cell, point: np.ndarray, axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def gripper_at(cell: Cell, point: np.ndarray, axis: np.ndarray, is_met: IsMet | None = None,
+               ) -> tuple[np.ndarray, np.ndarray]:
     """Return joints [rad, 6] and the gripper's rotation [rad, 3] with the gripper on the branch;
-    NoPathError if it does not reach the surroundings of that point."""
+    NoPathError if it does not reach the surroundings of that point, or ``is_met`` there."""
     found = _held(cell.arm, np.array(cell.base.pose), matrices(np.array(cell.tool.grasp_pose)),
-                  point, axis)
+                  point, axis, is_met)
     if found is None:
-        raise NoPathError("The arm cannot reach around the grasp.", "", "Move its base.")
+        raise NoPathError("The arm cannot reach around the grasp.", "", "Move its base, or grasp "
+                          "the branch elsewhere.")
     return found[0].joints[0], found[1]
 
 
 def _held(arm: Arm, base: np.ndarray, tool: np.ndarray, point: np.ndarray, axis: np.ndarray,
-          ) -> tuple[JointPath, np.ndarray] | None:
+          is_met: IsMet | None = None) -> tuple[JointPath, np.ndarray] | None:
     """The arm motion slightly around a grasp that stays farthest from singularities."""
     best: tuple[JointPath, np.ndarray] | None = None
     for rotation in across(axis):
@@ -87,7 +93,8 @@ def _held(arm: Arm, base: np.ndarray, tool: np.ndarray, point: np.ndarray, axis:
         frames = inverted(matrices(base)) @ np.array([*around, back])
         steps = matrices(densely(pose_vectors(frames), spacing=0.015)) @ inverted(tool)
         paths, _refusals = follow(arm, steps, singularity_margin=_SINGULARITY)
-        if paths and (best is None or paths[0].singularity > best[0].singularity):
+        if paths and (best is None or paths[0].singularity > best[0].singularity) and not (
+                is_met and is_met(steps, paths[0].joints)):
             best = paths[0], rotation
     return best
 

@@ -1,4 +1,5 @@
-"""Motions of the arm alone: `limber robot home`, `goto-start`, `retreat`, `release`, `open`.
+"""Motions of the arm alone: `limber robot home`, `goto-start`, `goto-grasp`, `retreat`, `release`,
+`open`.
 
 Each is planned from the arm's current position, and moves nothing without --arm.
 """
@@ -19,7 +20,9 @@ from pydantic import Field
 from limber.cli.cell_tool import ArmedTool, confirmed_by
 from limber.core.errors import Command, InputError, Option, SafetyStop
 from limber.core.json_values import plain
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
+from limber.geometry.settings import GRASP_FRACTION
 from limber.stages.stage import About, argument, given
 
 if TYPE_CHECKING:
@@ -69,6 +72,43 @@ class GotoStart(ArmedTool):
                               cell=self.cell_file, speed=self.speed, unwatched=True).run(progress)
         return _to(self, cell, self.branch_folder, np.array(dry_run["start_joints_rad"], float),
                    progress)
+
+
+class GotoGrasp(ArmedTool):
+    """Move the empty arm and its open gripper onto the branch, to where `limber record` begins.
+
+    The arm goes to a place before the branch, past obstacles, then straight along the cell's
+    approach; a force ends it. Of all directions across the branch it takes the one from which it
+    reaches 6 cm around the grasp, farthest from singularities.
+    """
+
+    about = About("robot goto-grasp", where="", moves_robot="when armed",
+                  then="limber record {branch_folder} --cell {cell_file}")
+
+    branch_folder: Path = argument("The branch folder.")
+    fraction: float = Field(GRASP_FRACTION, gt=0, le=1, description=(
+        "Where the gripper comes to, as a fraction of the main path."))
+    confirm: str | None = confirmed_by("goto-grasp")
+
+    def run(self, progress: Progress = SILENT) -> dict[str, Any]:
+        from limber.cell.obstacles import cell_obstacles
+        from limber.cell.reach_and_collision import ArmSurroundings, blocked_by
+        from limber.cli.closed_loop.cell_layout import grasp_of, gripper_at
+        from limber.core.numerics.rigid import matrices, pose_vectors
+        from limber.robot.motion.joint_path import away_from_branch
+        from limber.store import Branch
+        from limber.store.loading import load_skeleton
+
+        cell, skeleton = self.cell(), load_skeleton(Branch.read(self.branch_folder))
+        obstacles = cell_obstacles(cell, self.cell_file.parent)
+        met, around = blocked_by(cell, obstacles), ArmSurroundings(cell, obstacles, skeleton)
+        # The last joints are of the place before the branch.
+        joints, _ = gripper_at(
+            cell, *grasp_of(skeleton, self.fraction), lambda flange, joints: not around.free(
+                joints[-1:]).all() or (met is not None and met(flange, joints) is not None))
+        here = cell.arm.forward(joints) @ matrices(np.array(cell.tool.grasp_pose))
+        way = away_from_branch(cell, joints, pose_vectors(here)).backwards()
+        return _to(self, cell, self.branch_folder, present(way.joints, "joints")[0], progress, way)
 
 
 class Retreat(ArmedTool):
@@ -126,7 +166,7 @@ class Release(ArmedTool):
         cell = self.cell()
         sample, pose = stands(cell)
         motion = away_from_branch(cell, sample.joints, pose)
-        return _followed(self, cell, motion, _motion_summary(motion), progress, opens=True)
+        return _followed(self, cell, [motion], {}, progress, opens=True)
 
 
 class Open(ArmedTool):
@@ -164,9 +204,10 @@ class Open(ArmedTool):
         return result
 
 
-def _to(move: Home | GotoStart, cell: Cell, folder: Path | None, goal: np.ndarray,
-        progress: Progress) -> dict[str, Any]:
-    """Plan the path of the empty arm to joint angles ``goal`` [n], and follow it if armed."""
+def _to(move: Home | GotoStart | GotoGrasp, cell: Cell, folder: Path | None, goal: np.ndarray,
+        progress: Progress, *then: Trajectory) -> dict[str, Any]:
+    """Plan the path of the empty arm to joint angles ``goal`` [n], and follow it if armed, and what
+    comes ``then``."""
     from limber.cell.obstacles import cell_obstacles
     from limber.cell.reach_and_collision import ArmSurroundings
     from limber.robot.motion.joint_path import is_at, to_joints
@@ -180,21 +221,23 @@ def _to(move: Home | GotoStart, cell: Cell, folder: Path | None, goal: np.ndarra
                       "alone (", Option("branch"), ").")
     around = ArmSurroundings(cell, cell_obstacles(cell, move.cell_file.parent), skeleton)
     sample, _ = stands(cell)
-    if is_at(sample.joints, goal):
+    motions, clearance = list(then), {}
+    if not is_at(sample.joints, goal):
+        motion = to_joints(cell, sample.joints, goal, around)
+        motions.insert(0, motion)
+        clearance["clearance_m"] = float(around.clearance(present(motion.joints, "joints")).min())
+    if not motions:
         return {"armed": move.arm, "duration_s": 0.0}
-    motion = to_joints(cell, sample.joints, goal, around)
-    assert motion.joints is not None
-    return _followed(move, cell, motion, _motion_summary(motion) | {"clearance_m": float(
-        around.clearance(motion.joints).min())}, progress)
+    return _followed(move, cell, motions, clearance, progress)
 
 
-def _followed(move: Home | GotoStart | Release, cell: Cell, motion: Trajectory,
+def _followed(move: Home | GotoStart | GotoGrasp | Release, cell: Cell, motions: list[Trajectory],
               result: dict[str, Any], progress: Progress, *, opens: bool = False) -> dict[str, Any]:
-    """Follow a motion of the empty gripper if armed, and log it; ``opens`` the gripper before."""
+    """Follow motions of the empty gripper if armed, and log them; ``opens`` the gripper before."""
     from limber.robot.driver.link import RobotLink
     from limber.robot.operator_decisions import grip, require_confirmation
 
-    result |= {"armed": move.arm}
+    result |= _motion_summary(motions) | {"armed": move.arm}
     if not move.arm:
         return result
     require_confirmation(move.about.name.rpartition(" ")[2], move.confirm, cell, progress)
@@ -203,12 +246,15 @@ def _followed(move: Home | GotoStart | Release, cell: Cell, motion: Trajectory,
         if opens:
             grip(cell, link, close=False, progress=progress)
         link.tare(_TARE_SECONDS)
-        try:
-            event = link.follow(motion)
-        except KeyboardInterrupt:
-            # Ctrl-C stops the arm before anything else.
-            link.stop()
-            raise
+        for motion in motions:
+            try:
+                event = link.follow(motion)
+            except KeyboardInterrupt:
+                # Ctrl-C stops the arm before anything else.
+                link.stop()
+                raise
+            if event["event"] != "reached":
+                break
     result |= {"reached": event["event"] == "reached", "stop_reason": event.get("reason")}
     log_move(move, result)
     if not result["reached"]:
@@ -240,11 +286,11 @@ def require_empty(cell: Cell, progress: Progress) -> None:
         progress.warn("The gripper is opened by hand: check that it is open.")
 
 
-def _motion_summary(motion: Trajectory) -> dict[str, Any]:
-    assert motion.joints is not None
-    return {"duration_s": motion.duration, "start_joints_rad": motion.joints[0],
-            "end_joints_rad": motion.joints[-1], "pose_count": len(motion.times),
-            "greatest_speed_m_s": float(motion.greatest_speeds[0])}
+def _motion_summary(motions: list[Trajectory]) -> dict[str, Any]:
+    first, last = (present(motions[k].joints, "joints") for k in (0, -1))
+    return {"duration_s": sum(motion.duration for motion in motions), "start_joints_rad": first[0],
+            "end_joints_rad": last[-1], "pose_count": sum(len(one.times) for one in motions),
+            "greatest_speed_m_s": max(float(one.greatest_speeds[0]) for one in motions)}
 
 
 def log_move(move: ArmedTool, result: dict[str, Any]) -> None:
