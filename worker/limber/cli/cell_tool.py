@@ -46,3 +46,11 @@ def confirmed_by(word: str) -> Any:
     """Return the field of the confirmation by a word, else asked for at the terminal."""
     return option(f"The word {word}, to confirm that the robot may move. Default: ask at the "
                   "terminal.", panel=False)
+
+
+def require_word(word: str, given: str | None, why: str = "", what: str = "robot") -> None:
+    """InputError if the confirmation that something may move is not the ``word``."""
+    if given != word:
+        raise InputError(f"Nobody confirmed that the {what} may move.", why, "Give ",
+                         Option("confirm", word), ", with the workspace free and a hand at the "
+                         "emergency stop.")

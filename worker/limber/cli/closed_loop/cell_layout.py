@@ -82,15 +82,11 @@ def _held(arm: Arm, base: np.ndarray, tool: np.ndarray, point: np.ndarray, axis:
     """The arm motion slightly around a grasp that stays farthest from singularities."""
     best: tuple[JointPath, np.ndarray] | None = None
     for rotation in across(axis):
-        grasp = matrices(np.r_[point, rotation])
-        around = [grasp]
-        for offset in _AROUND_M * np.vstack([np.eye(3), -np.eye(3)]):
-            away = grasp.copy()
-            away[:3, 3] += offset
-            around += [away, grasp]
-        back = grasp.copy()
-        back[:3, 3] -= 0.08 * grasp[:3, 2]
-        frames = inverted(matrices(base)) @ np.array([*around, back])
+        # To each side and back, then to a place before the branch.
+        way = np.tile(matrices(np.r_[point, rotation]), (14, 1, 1))
+        way[1:12:2, :3, 3] += _AROUND_M * np.vstack([np.eye(3), -np.eye(3)])
+        way[13, :3, 3] -= 0.08 * way[13, :3, 2]
+        frames = inverted(matrices(base)) @ way
         steps = matrices(densely(pose_vectors(frames), spacing=0.015)) @ inverted(tool)
         paths, _refusals = follow(arm, steps, singularity_margin=_SINGULARITY)
         if paths and (best is None or paths[0].singularity > best[0].singularity) and not (

@@ -7,15 +7,15 @@ own network alone.
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from limber.cli.cell_tool import ArmedTool, CellTool, views_in_turn
-from limber.core.errors import InputError, LimberError, Option, SafetyStop
+from limber.cli.cell_tool import ArmedTool, CellTool, require_word, views_in_turn
+from limber.core.errors import InputError, LimberError, SafetyStop
 from limber.core.progress import SILENT, Progress
 from limber.stages.stage import About, argument, given, option, required
 
@@ -49,12 +49,9 @@ class RosCheck(_RosTool):
 
         cell = self.cell()
         felt = wrench_topic(cell)
-        bridge = Bridge(self.url)
-        try:
+        with closing(Bridge(self.url)) as bridge:
             robot = RosRobot(cell, bridge, Topics())
             ages, forces = robot.watched(_SECONDS)
-        finally:
-            bridge.close()
         assert robot.last is not None
         modes = {name: value for name, value in (
             ("safety_mode", robot.last.safety_mode), ("robot_mode", robot.last.robot_mode),
@@ -111,12 +108,9 @@ class RosScan(_RosTool):
         from limber.robot.ros.messages import CloudTopic, Topics
 
         cell, views = self.cell(), views_in_turn(self.views)
-        bridge = Bridge(self.url)
-        try:
+        with closing(Bridge(self.url)) as bridge:
             camera = CloudTopic(cell, bridge, self.topic, Topics().joint_states)
             points = np.concatenate([camera.next_cloud() for _ in views])
-        finally:
-            bridge.close()
         if not len(points):
             raise InputError(f"The clouds on {self.topic} have no point within camera.range_m.",
                              "", "Check the camera and [camera] in the cell file.")
@@ -164,10 +158,7 @@ class RosFollow(_RosTool, ArmedTool):
         result |= {"leg": leg, "leg_seconds": trajectory.duration, "armed": self.arm}
         if not self.arm:
             return result
-        if self.confirm != self.name:
-            raise InputError("Nobody confirmed that the robot may move.", "",
-                             "Give ", Option("confirm", self.name), ", with the workspace free "
-                             "and a hand at the emergency stop.")
+        require_word(self.name, self.confirm)
         began = time.monotonic()
         event = _followed(planned.cell, trajectory, self.url, progress,
                           is_held=leg in ("path", "return"), goes_on=leg == "return",
@@ -204,9 +195,7 @@ class RosRetreat(_RosTool, ArmedTool):
                                   "places": len(followed.poses)}
         if not self.arm:
             return result
-        if self.confirm != "retreat":
-            raise InputError("Nobody confirmed that the robot may move.", "", "Give ",
-                             Option("confirm", "retreat"), ", with a hand at the emergency stop.")
+        require_word("retreat", self.confirm)
         event = _followed(cell, None, self.url, progress, is_held=True)
         result |= {"retreated": event["event"] == "reached", "stop_reason": event.get("reason"),
                    "force_n": event["force_n"]}
@@ -237,14 +226,12 @@ class RosServe(_RosTool):
 
         cell, service = self.cell(), self.service
         wrench_topic(cell)
-        if self.arm and self.confirm != "retreat":
-            raise InputError("Nobody confirmed that the robot may move.", "Whoever calls the "
-                             "service moves it.", "Give ", Option("confirm", "retreat"), ", with "
-                             "a hand at the emergency stop.")
-        bridge, count = Bridge(self.url), 0
+        if self.arm:
+            require_word("retreat", self.confirm, "Whoever calls the service moves it.")
+        count = 0
         try:
-            with TriggerService(bridge, service, lambda: _answered(self, cell, progress),
-                                ) as offered:
+            with closing(Bridge(self.url)) as bridge, TriggerService(
+                    bridge, service, lambda: _answered(self, cell, progress)) as offered:
                 progress(0.0, f"offering {service}")
                 while True:
                     if (values := offered.answer()) is not None:
@@ -253,8 +240,6 @@ class RosServe(_RosTool):
         except ConnectionError as error:
             raise SafetyStop(f"{error}.", f"{service} is no longer offered.", "Start it again.",
                              result={"calls": count}) from error
-        finally:
-            bridge.close()
 
 
 def _answered(asked: RosServe, cell: Cell, progress: Progress) -> tuple[bool, str]:
@@ -295,20 +280,15 @@ class RosGripper(_RosTool):
                                   "wanted": self.position}
         if not self.arm:
             return result
-        if self.confirm != "gripper":
-            raise InputError("Nobody confirmed that the gripper may move.", "A bent branch "
-                             "springs back where it opens.", "Give ",
-                             Option("confirm", "gripper"), ".")
-        bridge = Bridge(self.url)
-        try:
-            result |= drive(bridge, self.action, self.position, self.effort,
-                            cell.tool.grip_seconds + SECONDS)
-        except ConnectionError as error:
-            raise SafetyStop(f"{error}.", "Whether the gripper moved is not known.",
-                             "Check the gripper.") from error
-        finally:
-            bridge.close()
-        return result
+        require_word("gripper", self.confirm, "A bent branch springs back where it opens.",
+                     what="gripper")
+        with closing(Bridge(self.url)) as bridge:
+            try:
+                return result | drive(bridge, self.action, self.position, self.effort,
+                                      cell.tool.grip_seconds + SECONDS)
+            except ConnectionError as error:
+                raise SafetyStop(f"{error}.", "Whether the gripper moved is not known.",
+                                 "Check the gripper.") from error
 
 
 def _followed(cell: Cell, trajectory: Trajectory | None, url: str, progress: Progress, *,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -226,8 +227,8 @@ def _points(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
 
     try:
         rows = csv_rows(path, "a table of points")
-        if rows and not _is_number(rows[0][1]):
-            rows = rows[1:]
+        if rows and not re.match(r"\s*([-+.\d]|nan|inf)", rows[0][1], re.IGNORECASE):
+            rows = rows[1:]  # a header
         names = [row[0] for row in rows]
         numbers = np.array([[float(part) for part in row[1:]] for row in rows])
     except (ValueError, IndexError) as error:
@@ -241,14 +242,6 @@ def _points(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
                          "Three, or nine with the robot's pose, were expected.",
                          "Correct the file.")
     return names, numbers[:, :3], numbers[:, 3:6] if numbers.shape[1] == 9 else None
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _touch(cell: Cell, names: list[str]) -> tuple[np.ndarray, str]:

@@ -78,9 +78,8 @@ def _from_files(check: Check, cell: Cell, progress: Progress) -> dict[str, Any]:
     for text in _not_stated(cell):
         progress.warn(text)
     result: dict[str, Any] = {
-        "arm": cell.arm.name, "obstacles": len(obstacles),
-        "base_position_sigma_m": cell.base.position_sigma_m,
-        "base_rotation_sigma_rad": cell.base.rotation_sigma_rad,
+        "arm": cell.arm.name, "obstacles": len(obstacles), "base_position_sigma_m":
+        cell.base.position_sigma_m, "base_rotation_sigma_rad": cell.base.rotation_sigma_rad,
         "calibration_residual_m": cell.base.residual_m}
     if plan is None and folder is not None and (
             warning := check_branch(cell, Branch.read(folder).uuid, folder)):
@@ -95,24 +94,21 @@ def _from_files(check: Check, cell: Cell, progress: Progress) -> dict[str, Any]:
 
 def _not_stated(cell: Cell) -> list[str]:
     """What a cell file leaves open, and what that means."""
-    found = []
-    if cell.base.residual_m is None:
-        found.append("base.pose was not calibrated by Limber. It is believed within "
-                     f"{1000 * cell.base.position_sigma_m:.1f} mm (limber robot calibrate).")
-    if cell.branch is None:
-        found.append("The cell names no branch, so it is taken for each one.")
-    if cell.tool.mass_kg is None:
-        found.append("tool.mass_kg is not stated. No motion starts without it.")
-    if not any(cell.tool.grasp_pose[:3]) and cell.tool.gripper != "none":
-        found.append("tool.grasp_pose is not stated: the flange itself would go to the branch.")
-    if cell.tool.mass_kg and not any(cell.tool.centre_of_mass_m):
-        found.append("tool.centre_of_mass_m is not stated, so the gripper's weight counts as if it "
-                     "were in the flange; its torque is then taken for one of the branch.")
-    if not cell.tool.parts:
-        found.append("tool.parts is empty, so the gripper itself is not checked against obstacles.")
-    if not cell.obstacles:
-        found.append("No obstacle is stated: nothing but the branch is avoided.")
-    return found
+    tool = cell.tool
+    return [text for is_so, text in (
+        (cell.base.residual_m is None, "base.pose was not calibrated by Limber. It is believed "
+         f"within {1000 * cell.base.position_sigma_m:.1f} mm (limber robot calibrate)."),
+        (cell.branch is None, "The cell names no branch, so it is taken for each one."),
+        (tool.mass_kg is None, "tool.mass_kg is not stated. No motion starts without it."),
+        (not any(tool.grasp_pose[:3]) and tool.gripper != "none",
+         "tool.grasp_pose is not stated: the flange itself would go to the branch."),
+        (tool.mass_kg and not any(tool.centre_of_mass_m),
+         "tool.centre_of_mass_m is not stated, so the gripper's weight counts as if it were in the "
+         "flange; its torque is then taken for one of the branch."),
+        (not tool.parts,
+         "tool.parts is empty, so the gripper itself is not checked against obstacles."),
+        (not cell.obstacles, "No obstacle is stated: nothing but the branch is avoided."),
+    ) if is_so]
 
 
 def _camera(cell: Cell, progress: Progress) -> dict[str, Any]:
@@ -175,14 +171,12 @@ def _computer(progress: Progress) -> dict[str, bool]:
 
     summary = {"real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
                "kept_awake": keep_awake()}
-    if not summary["real_time"]:
-        progress.warn("The loop has no real-time priority. Other programs can delay it, which "
-                      "stops the robot.")
-    if not summary["kept_in_memory"]:
-        progress.warn("The driver's memory is not locked (on Linux `ulimit -l`). Memory that "
-                      "was swapped out can delay it, which stops the robot.")
-    if not summary["kept_awake"]:
-        progress.warn("The computer's processors may sleep while idle (on Linux, write access "
-                      "to /dev/cpu_dma_latency prevents this). Those of a virtual machine "
-                      "wake late, which stops the robot.")
+    for name, text in (
+            ("real_time", "The loop has no real-time priority. Other programs can delay it"),
+            ("kept_in_memory", "The driver's memory is not locked (on Linux `ulimit -l`). Memory "
+             "that was swapped out can delay it"),
+            ("kept_awake", "The computer's processors may sleep while idle (on Linux, write access "
+             "to /dev/cpu_dma_latency prevents this). Those of a virtual machine wake late")):
+        if not summary[name]:
+            progress.warn(f"{text}, which stops the robot.")
     return summary

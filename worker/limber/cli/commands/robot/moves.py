@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import Field
 
-from limber.cli.cell_tool import ArmedTool, confirmed_by
+from limber.cli.cell_tool import ArmedTool, confirmed_by, require_word
 from limber.core.errors import Command, InputError, Option, SafetyStop
 from limber.core.json_values import plain
 from limber.core.not_none import present
@@ -191,10 +191,7 @@ class Open(ArmedTool):
         result = {"armed": self.arm, "gripper": cell.tool.gripper, "output": output}
         if not self.arm:
             return result
-        if self.confirm != "open":
-            raise InputError("Nobody confirmed that the gripper may open.",
-                             "A bent branch springs back.", "Give ", Option("confirm", "open"),
-                             ".")
+        require_word("open", self.confirm, "A bent branch springs back.", what="gripper")
         drive_gripper(cell, False)
         time.sleep(cell.tool.grip_seconds)
         kept = FollowedPathFile(cell)
