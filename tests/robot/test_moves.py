@@ -10,6 +10,7 @@ from benchmarks.robot_faults import cell_for, set_off, straight
 from limber.cell.cell_file import Cell, WorkspaceEntry
 from limber.cell.obstacles import Box
 from limber.cell.reach_and_collision import ArmSurroundings
+from limber.cli.closed_loop.cell_layout import grasp_of
 from limber.core.errors import NoPathError
 from limber.core.numerics.rigid import matrices
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -152,21 +153,19 @@ def test_the_arm_goes_to_where_it_is_asked(command, stepped, planned_folder, tmp
     """Slow: two dry runs of the plan. At the grasp the gripper is on the branch, across it."""
     cell = standing_at(Branch.open(planned_folder), stepped.address, grip_seconds=0.1)
     path = str(cell_file(cell, tmp_path))
-    code, told = robot_answer(capfd, command, path, str(planned_folder))
+    words = (capfd, command, path, str(planned_folder))
+    code, told = robot_answer(*words)
     assert code == 0 and not told["armed"], told
     goal = np.array(told["end_joints_rad"])
-    stepped.ask("stand", joints=list((goal if command == "goto-start" else np.array(
-        told["start_joints_rad"])) + [0.03, 0, 0, 0, 0, 0.05]))
-    code, told = robot_answer(capfd, command, path, str(planned_folder), "--arm", "--confirm",
-                              command)
+    start = goal if command == "goto-start" else np.array(told["start_joints_rad"])
+    stepped.ask("stand", joints=list(start + [0.03, 0, 0, 0, 0, 0.05]))
+    code, told = robot_answer(*words, "--arm", "--confirm", command)
     assert code == 0 and told["reached"], told
     assert stepped.state["joints"] == pytest.approx(goal, abs=1e-4)
     if command == "goto-grasp":
-        skeleton = load_skeleton(Branch.open(planned_folder))
+        point, axis = grasp_of(load_skeleton(Branch.open(planned_folder)), 2 / 3)
         held = cell.grasp_frames(cell.arm.forward(goal))
-        assert held[:3, 3] == pytest.approx(skeleton.point_at(2 / 3), abs=1e-3)
-        axis = skeleton.point_at(2 / 3) - skeleton.point_at(0.62)
-        assert abs(held[:3, 1] @ axis) > 0.99 * np.linalg.norm(axis)
+        assert held[:3, 3] == pytest.approx(point, abs=1e-3) and abs(held[:3, 1] @ axis) > 0.99
 
 
 def test_the_gripper_opens_while_the_robot_is_stopped(stepped, tmp_path, capfd):
