@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from limber.cell.arm import MOST_SPEED, MOST_TURN_SPEED, Arm, greatest_force, greatest_torque
 from limber.cell.known_arms import arm_named
 from limber.cell.ur_arms import NAMES
-from limber.cell.urdf_arm import ENDING
+from limber.cell.urdf_arm import is_file
 from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.atomic import write_atomically
 from limber.core.files.reading import read_toml
@@ -343,7 +343,7 @@ def read_cell(path: str | Path) -> Cell:
                                    Command("robot calibrate"), " makes one)"), finite=False)
     for entry in (content.get("robot"), content.get("second_arm")):
         # An arm's file is relative to the cell file, as those of obstacles are.
-        if isinstance(entry, dict) and str(entry.get("model", "")).lower().endswith(ENDING):
+        if isinstance(entry, dict) and is_file(str(entry.get("model", ""))):
             entry["model"] = str(path.absolute().parent / entry["model"])
     try:
         return validated(Cell, content)

@@ -5,7 +5,7 @@ from importlib.metadata import entry_points
 
 from limber.cell.arm import Arm
 from limber.cell.ur_arms import ARMS
-from limber.cell.urdf_arm import ENDING, arm_of_file
+from limber.cell.urdf_arm import arm_of_file, is_file
 from limber.core.errors import InputError
 
 _ARMS: dict[str, Arm] = dict(ARMS)
@@ -28,7 +28,7 @@ def register_arm(arm: Arm) -> None:
 def arm_named(name: str) -> Arm:
     """Return the arm called ``name``, in any case and with or without a hyphen, or a URDF file's;
     InputError if unknown, no arm, or if an installed package of arms is incomplete."""
-    if name.lower().endswith(ENDING):
+    if is_file(name):
         return arm_of_file(name)
     if _plain(name) not in _ARMS:
         _import_packages()

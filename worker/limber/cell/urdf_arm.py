@@ -68,15 +68,15 @@ class _WithoutDoctype(ElementTree.TreeBuilder):
                                      "it can define entities")
 
 
-def read_chain(path: Path) -> Chain:
-    """Read the arm of a URDF file, from the link ``base`` (else the root) to ``tool0``, ``flange``,
-    or the end of the only chain with six or more joints. InputError if it cannot be read, or is no
-    arm of six or more revolute joints."""
+def read_chain(path: Path, tip: str = "") -> Chain:
+    """Read the arm of a URDF file, from the link ``base`` (else the root) to ``tip``, or else to
+    ``tool0``, ``flange``, or the first end of its one chain of six or more joints; a gripper's
+    fingers are no part of it. InputError if it cannot be read, or is no such arm."""
     try:
         # Entities need a document type, which is refused.
         root = ElementTree.XML(read_text(path, "the description of an arm (URDF)"),
                                ElementTree.XMLParser(target=_WithoutDoctype()))  # noqa: S314
-        return _Robot(root).chain()
+        return _Robot(root).chain(tip)
     except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f"Robot {str(path)!r} does not describe a supported arm: {error}.",
                          "Limber supports serial arms with six or more revolute joints.",
@@ -90,22 +90,26 @@ class _Robot:
     def __init__(self, root: Element):
         if root.tag != "robot":
             raise ValueError(f"its root is <{root.tag}>, not <robot>")
+        if any("wiki/xacro" in str(element.tag) for element in root):
+            raise ValueError("it is a xacro file")
         self._links = {_said(link, "name"): link for link in root.findall("link")}
         self._above = {_said(_part(joint, "child"), "link"): joint
                        for joint in root.findall("joint")}
 
-    def chain(self) -> Chain:
+        # Fingers slide, follow another joint, or are the joint that others follow.
+        followed = {mimic.get("joint") for mimic in root.iterfind("joint/mimic")}
+        self._fingers = {joint for joint in self._above.values() if joint.get("type") == "prismatic"
+                         or joint.find("mimic") is not None or joint.get("name") in followed}
+
+    def chain(self, tip: str) -> Chain:
         """The joints from the base to the flange."""
         base = self._joints_to(_BASE) if _BASE in self._links else []
         if any(_turns(joint) for joint in base):
             raise ValueError(f"its link {_BASE!r} is not fixed to the root")
-        frame = np.eye(4)
-        for joint in base:
-            frame = frame @ _origin(joint)
-        frame = inverse_of(frame)
+        frame = inverse_of(functools.reduce(np.matmul, map(_origin, base), np.eye(4)))
         joints: list[Joint] = []
         rods: list[Rod] = []
-        for element in self._joints_to(self._flange()):
+        for element in self._joints_to(tip or self._flange()):
             frame = frame @ _origin(element)
             if _turns(element):
                 joints.append(_joint(element, frame))
@@ -121,13 +125,18 @@ class _Robot:
         for name in _FLANGES:
             if name in self._links:
                 return name
-        parents = {_said(_part(joint, "parent"), "link") for joint in self._above.values()}
-        ends = [name for name in self._links if name not in parents
-                and sum(map(_turns, self._joints_to(name))) >= _FEWEST]
+        parents = {_said(_part(joint, "parent"), "link") for joint in self._above.values()
+                   if joint not in self._fingers}
+        paths = {name: self._joints_to(name) for name in self._links if name not in parents}
+        # Of several ends of one chain, the first.
+        ends = {turning[-1]: name for name, path in reversed(paths.items())
+                if self._fingers.isdisjoint(path) and len(
+                    turning := [joint for joint in path if _turns(joint)]) >= _FEWEST}
         if len(ends) != 1:
+            ways = "".join(f"; one to arm.urdf#{name}" for name in ends.values())
             raise ValueError(f"it has no link {' or '.join(map(repr, _FLANGES))}, and {len(ends)} "
-                             f"chains of {_FEWEST} or more revolute joints")
-        return ends[0]
+                             f"chains of {_FEWEST} or more revolute joints{ways}")
+        return next(iter(ends.values()))
 
     def _joints_to(self, link: str) -> list[Element]:
         """The joints from the root to a link."""
@@ -148,7 +157,7 @@ def _turns(joint: Element) -> bool:
         return False
     if kind not in ("revolute", "continuous") or joint.find("mimic") is not None:
         raise ValueError(f"its joint {joint.get('name')!r} has type {kind!r} or mimics another "
-                         "joint; only revolute, continuous and fixed joints are supported")
+                         "joint; an arm's own are revolute, continuous or fixed")
     return True
 
 
@@ -341,7 +350,6 @@ def solved(origins: np.ndarray, axes: np.ndarray, frames: np.ndarray, starts: np
     return found
 
 
-ENDING = ".urdf"
 _STARTS = 96
 _MOST = 8  # stored configurations
 _APART = 0.2  # rad between two configurations
@@ -518,21 +526,19 @@ class UrdfArm:
         return np.array(kept)
 
 
+def is_file(name: str) -> bool:
+    """Return whether a robot's name is that of a file: ``arm.urdf``, or ``arm.urdf#LINK``."""
+    return name.partition("#")[0].lower().endswith((".urdf", ".xacro"))
+
+
 def arm_of_file(name: str) -> UrdfArm:
-    """Return the arm of a URDF file, named as the file; InputError if it cannot be read, or is no
-    supported arm."""
-    path = Path(name)
-    try:
-        stamp = path.stat()
-    except OSError as error:
-        raise InputError(f"Robot {name!r} cannot be read from its file ({error.strerror}).",
-                         "It must describe the arm's links and "
-                         "joints.", "Give the path of its URDF.",
-                         ) from error
-    return _read(name, stamp.st_mtime_ns, stamp.st_size)
+    """Return the arm of a URDF file up to its flange, which may be named behind its path (``#``),
+    named as the file; InputError if it cannot be read, or is no supported arm."""
+    path = Path(name.partition("#")[0])
+    return _read(name, path, path.stat().st_mtime_ns if path.is_file() else 0)
 
 
 @functools.lru_cache(maxsize=16)
-def _read(name: str, _changed: int, _size: int) -> UrdfArm:
+def _read(name: str, path: Path, _changed: int) -> UrdfArm:
     """The arm of a file in its present state: a cell asks for its arm many times a second."""
-    return UrdfArm(name, read_chain(Path(name)))
+    return UrdfArm(name, read_chain(path, name.partition("#")[2]))

@@ -9,16 +9,14 @@ import scipy
 
 from limber.core.constants import FORCE_UNITS_N
 from limber.core.errors import InputError, Option
-from limber.recordings.tables import (
-    FORCE_NAMES_N,
-    LENGTH_UNITS_M,
-    Table,
-    read_table,
-    scale_of,
-    split_title,
-)
+from limber.recordings import tables
 from limber.recordings.time_series import saturated
 
+MOVED = (r"displacement|travel|stroke|deflection|extension|crosshead|position|weg|durchbiegung"
+         r"|verformung|deplacement|fleche|allongement|course|desplazamiento|deformacion|flecha"
+         r"|carrera|recorrido")
+FORCE = r"force|load|kraft|^last|pruflast|charge|effort|fuerza|carga"
+"""Titles of testing machines in English, German, French and Spanish, in :func:`.plain` letters."""
 NOISE_FLOOR_N = 20 * FORCE_UNITS_N["gf"]
 """Force above the unloaded reading that counts as contact [N]; a drop of twice as much is a slip.
 """
@@ -75,10 +73,9 @@ def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: 
     ``Load Cell Reading (gf)``, ``Displacement (mm)``, ``distance from base (cm)``. Incomplete rows
     are dropped with a warning. InputError for a missing column or unit, fewer than 3 rows, or
     several distances."""
-    table = read_table(path)
-    force_at, force_scale = _column(table, r"force|load", FORCE_NAMES_N, force_unit)
-    moved_at, moved_scale = _column(table, r"displacement|travel|position|stroke|deflection",
-                                    LENGTH_UNITS_M, unit)
+    table = tables.read_table(path)
+    force_at, force_scale = _column(table, FORCE, tables.FORCE_NAMES_N, force_unit)
+    moved_at, moved_scale = _column(table, MOVED, tables.LENGTH_UNITS_M, unit)
     pairs = table.values[:, [moved_at, force_at]]
     kept = pairs[np.isfinite(pairs).all(axis=1)]
     warnings = list(table.warnings)
@@ -91,11 +88,11 @@ def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: 
                       _distance(table, path), tuple(warnings))
 
 
-def _distance(table: Table, path: Path) -> float | None:
+def _distance(table: tables.Table, path: Path) -> float | None:
     """Distance of the load from the base [m], if the table has such a column."""
-    if not any(re.search(_DISTANCE, split_title(title).name.lower()) for title in table.titles):
+    if not any(re.search(_DISTANCE, title.lower()) for title in table.titles):
         return None
-    at, scale = _column(table, _DISTANCE, LENGTH_UNITS_M, None)
+    at, scale = _column(table, _DISTANCE, tables.LENGTH_UNITS_M, None)
     column = table.values[:, at]
     found = np.unique(column[np.isfinite(column)]) * scale
     if len(found) > 1:
@@ -172,11 +169,11 @@ def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[
         warnings=tuple(messages))
 
 
-def _column(table: Table, name: str, units: dict[str, float], requested: str | None,
+def _column(table: tables.Table, name: str, units: dict[str, float], requested: str | None,
             ) -> tuple[int, float]:
     for index, text in enumerate(table.titles):
-        title = split_title(text)
-        if not re.search(name, title.name, re.IGNORECASE):
+        title = tables.split_title(text)
+        if not re.search(name, title.plain if name in (FORCE, MOVED) else title.name.lower()):
             continue
         if requested is not None:
             return index, units[requested]
@@ -185,9 +182,10 @@ def _column(table: Table, name: str, units: dict[str, float], requested: str | N
                              f"units: {', '.join(units)}.", "A number without a unit cannot be "
                              "used.", "Add the unit to the title, for example 'Force (N)', or "
                              "give ", Option("unit"), " and ", Option("force_unit"), ".")
-        return index, scale_of(title, units, "", table.path)
+        return index, tables.scale_of(title, units, "", table.path)
     raise InputError(f"{table.path} has the columns {', '.join(table.titles)}.",
-                     f"No column name contains {name.replace('|', ' or ')}.", "Rename the column.")
+                     f"No column name contains one of {name.replace('|', ', ')}.",
+                     "Rename the column.")
 
 
 def _in_range(moved: np.ndarray, force: np.ndarray, messages: list[str],

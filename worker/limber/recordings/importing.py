@@ -22,6 +22,8 @@ from limber.core.not_none import present
 from limber.recordings.bag_pull import pull_of_bag
 from limber.recordings.bag_reader import LIMBER, read_bag
 from limber.recordings.force_slope import (
+    FORCE,
+    MOVED,
     WHY_NO_MODULUS,
     ForceTable,
     force_slope,
@@ -98,9 +100,10 @@ def read_clouds(path: Path, request: ImportRequest) -> list[str]:
 
 def is_force_table(path: Path) -> bool:
     """Whether it is a table of displacement and force."""
-    names = [title.name.lower() for title in _titles(path)]
-    moved = any(re.search(r"displacement|travel|stroke|deflection", name) for name in names)
-    return moved and any(re.search(r"force|load", name) for name in names)
+    names = [title.plain for title in _titles(path)]
+    # A robot's log has positions and forces too.
+    return all(any(re.search(words, name) for name in names)
+               for words in (MOVED.replace("|position", ""), FORCE))
 
 
 def read_force_table(path: Path, request: ImportRequest) -> ForceTable:
@@ -283,7 +286,7 @@ def _of_robot(found: Recorded, asked: ImportRequest) -> Pull:
         entry = _with_written(entry, written, request)
     pull = _pull(request, entry, robot, markers.seen,
                  (*found.warnings, *markers.warnings, *robot.warnings), is_table=found.is_table)
-    return pull if found.robot is None else _of_known_robot(pull, asked)
+    return _of_known_robot(pull, asked)
 
 
 def _gripper(request: ImportRequest) -> Stream:
@@ -333,6 +336,11 @@ def _of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
         return pull
     if robot is None:
         taken = CalibrationEntry()
+        peak = float(np.nan_to_num(np.linalg.norm(pull.wrenches[:, :3], axis=1)).max())
+        errors = pull.entry.sensor.force_sigma_n + taken.force_bias_sigma_n
+        small = Text(f" The largest force, {peak:.3g} N, is small against them, so the modulus "
+                     "will be uncertain: state them, a gauge's noise with ", Option("force_sigma"),
+                     ", its zero as force_bias_sigma_n.") if 0 < peak < 3 * errors else ""
         return pull.warned(Text(
             f"{pull.name}: the calibration errors of gripper and force sensor are not stated. "
             f"Assumed standard deviations: gripper frame {1e3 * taken.pose_sigma_m:g} mm and "
@@ -340,7 +348,7 @@ def _of_known_robot(pull: Pull, request: ImportRequest) -> Pull:
             f"{100 * taken.force_gain_sigma:g} %, force zero {taken.force_bias_sigma_n:g} N, force "
             f"drift {taken.force_drift_sigma_n:g} N. They widen the interval of an estimate. Give "
             "the robot's cell file with ", Option("cell"), ", or [calibration] in ",
-            Option("pull_toml"), "."))
+            Option("pull_toml"), ".", small))
     sensor = pull.entry.sensor.model_copy(update={
         "force_range_n": robot.noise.force_range_n,
         **({} if "force_sigma" in request.stated else {

@@ -3,7 +3,9 @@
 Each check returns the pull with the fault removed and a sentence about it in ``warnings``.
 """
 
+import tomllib
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -159,7 +161,8 @@ def _tared(pull: Pull) -> Pull:
         return pull
     at_rest = np.cumprod(travel <= 0.01 * travel.max()).astype(bool)
     quiet = pull.wrenches[at_rest]
-    quiet = quiet[np.isfinite(quiet).all(axis=1)] if np.isfinite(pull.wrenches).any() else quiet[:0]
+    # A gauge measures no torque.
+    quiet = quiet[np.isfinite(quiet[:, :3]).all(axis=1)]
     starts_at_rest = np.linalg.norm(pull.poses[0, :3] - pull.entry.grasp.point_m) <= 2e-3
     if not len(quiet) or not starts_at_rest:
         return pull
@@ -180,8 +183,10 @@ def _with_right_sign(pull: Pull) -> Pull:
         # Without a zero, the work is unknown.
         return pull
     # By the change of the force: its zero may not be that of a recording that begins bent.
-    first = pull.wrenches[np.isfinite(pull.wrenches).all(axis=1)][:1]
-    work = work_done(replace(pull, wrenches=pull.wrenches - first))
+    first = pull.wrenches[np.isfinite(pull.wrenches[:, :3]).all(axis=1)]
+    if not len(first):
+        return pull
+    work = work_done(replace(pull, wrenches=pull.wrenches - np.nan_to_num(first[:1])))
     most, least = work.max(), work.min()
     noise = pull.entry.sensor.force_sigma_n * np.sqrt(
         np.sum(np.diff(pull.poses[:, :3], axis=0)**2))
@@ -210,12 +215,6 @@ def _with_gaps_named(pull: Pull) -> Pull:
 
 
 # Sensor presets: how the files of a scanner or camera are read, and the noise of a force sensor.
-#
-# Axes of most cameras: x right, y down, z forward, so that up is -y. Some files have y up. The
-# camera is the origin of both.
-
-_Y_DOWN = {"up": [0.0, -1.0, 0.0], "camera_at": [0.0, 0.0, 0.0]}
-_Y_UP = {"up": [0.0, 1.0, 0.0], "camera_at": [0.0, 0.0, 0.0]}
 
 
 @dataclass(frozen=True)
@@ -229,50 +228,5 @@ class SensorPreset:
     settings: dict[str, Any] = field(default_factory=dict)
 
 
-def _data_sheet(force: float, torque: float) -> dict[str, float]:
-    """Return the noise of a sensor whose data sheet states a precision [N], [N m]: taken as two
-    standard deviations."""
-    return {"force_sigma": force / 2, "torque_sigma": torque / 2}
-
-
-SENSORS = {
-    "laser_scanner": SensorPreset(
-        "Laser scanner on a level tripod", "reconstruct",
-        "ASTM E2807 (E57): metres. The scanner's level makes z vertical",
-        {"unit": "m", "up": [0.0, 0.0, 1.0]}),
-    "depth_camera": SensorPreset(
-        "Depth camera, ROS optical frame", "reconstruct",
-        "REP 103: metres; x right, y down, z forward", {"unit": "m", **_Y_DOWN}),
-    "realsense_ply": SensorPreset(
-        "RealSense, PLY of its Viewer", "reconstruct",
-        "librealsense, issues 3589 and 5833, from 2.19: metres; x right, y up, z backward",
-        {"unit": "m", **_Y_UP}),
-    "azure_kinect": SensorPreset(
-        "Azure Kinect", "reconstruct",
-        "Azure Kinect DK, Coordinate systems: millimetres; x right, y down, z forward",
-        {"unit": "mm", **_Y_DOWN}),
-    "kinect_v2": SensorPreset(
-        "Kinect for Windows, version 2", "reconstruct",
-        "Kinect for Windows SDK 2.0, CameraSpacePoint: metres; x left, y up, z forward",
-        {"unit": "m", **_Y_UP}),
-    "zivid": SensorPreset(
-        "Zivid", "reconstruct",
-        "Zivid, Camera Coordinate System: millimetres; x right, y down, z outward",
-        {"unit": "mm", **_Y_DOWN}),
-    "ur5e": SensorPreset(
-        "UR5e, own sensor", "import-pull",
-        "UR5e data sheet: precision 3.5 N and 0.2 Nm, taken as two standard deviations",
-        _data_sheet(3.5, 0.2)),
-    "ur10e": SensorPreset(
-        "UR10e, own sensor", "import-pull",
-        "UR10e data sheet: precision 5 N and 0.2 Nm, taken as two standard deviations",
-        _data_sheet(5.0, 0.2)),
-    "ur5": SensorPreset(
-        "UR5 (CB3), from motor currents", "import-pull",
-        "Standard deviation of ten weighings, Universal Robots forum, topic 229",
-        {"force_sigma": 3.6}),
-    "ft300": SensorPreset(
-        "Robotiq FT300", "import-pull",
-        "Standard deviation of ten weighings on a UR5, Universal Robots forum, topic 229",
-        {"force_sigma": 0.6}),
-}
+SENSORS = {name: SensorPreset(**known) for name, known in tomllib.loads(
+    Path(__file__).with_name("sensors.toml").read_text(encoding="utf-8")).items()}

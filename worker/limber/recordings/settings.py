@@ -55,8 +55,9 @@ class ImportSettings(Settings):
         "motion capture system: [m] and rotation vector [rad]. Without it and without --nominal "
         "they are in the branch's frame.")
     coordinates: Literal["branch", "scan"] = Field(
-        "branch", description="Coordinates of --nominal, --grasp-point, --load, --marker-frame and "
-        "--frame-pose: the branch folder's, or those of the scan's file in metres.")
+        "branch", description="Coordinates of the tables of markers and gripper, of --nominal, "
+        "--grasp-point, --load, --marker-frame and --frame-pose: the branch folder's, or those of "
+        "the scan's file in metres.")
     grasp_point: tuple[float, float, float] | None = Field(
         None, description="Position of the grasp or the load at rest [m]. Default: the robot's "
         "first pose.")

@@ -101,9 +101,7 @@ def likely_slip(points: np.ndarray, nodes: np.ndarray, alignment: Alignment, nea
     away = {name: off(points @ turn.T) for name, turn in AXES.items() if name != "x,y,z"}
     name = min(away, key=lambda each: away[each])
     if off(alignment.apply_metres(points)) <= min(near, away[name]):
-        return Text("They fit in the frame of the scan: state it with ",
-                    Option("coordinates", "scan"), " and ", Option("frame_pose", (0,) * 6),
-                    " for the gripper, ", Option("marker_frame", (0,) * 6), " for markers.")
+        return Text("They fit in the frame of the scan: state ", Option("coordinates", "scan"), ".")
     if away[name] <= near:
         if "-" in name:
             return f"They fit with other axes: x, y, z of the branch are {name} of the table."

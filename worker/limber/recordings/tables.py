@@ -17,16 +17,6 @@ from scipy.spatial.transform import Rotation
 from limber.core.constants import FORCE_UNITS_N, UNIT_METRES
 from limber.core.errors import InputError, Option, Text
 from limber.core.files import text_columns
-from limber.core.files.text_columns import (
-    DECIMAL_COMMA,
-    LENGTHS,
-    MISSING,
-    coding_of,
-    fields_of,
-    plain,
-    separator_of,
-    with_units,
-)
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS
 from limber.recordings.time_series import (
     TIME_UNITS_S,
@@ -66,7 +56,7 @@ def is_clock(part: str) -> bool:
 def text_of(path: Path) -> str:
     """Return the text of a file; InputError if it cannot be read, or is not text."""
     try:
-        text = path.read_text(encoding=coding_of(path), errors="replace")
+        text = path.read_text(encoding=text_columns.coding_of(path), errors="replace")
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
                          "Check the path and the file.") from error
@@ -86,22 +76,35 @@ def number_of(text: str, comma: bool) -> float | None:
 
 
 def first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:
-    """Return the index of the first row of numbers, and the number of its fields; InputError if
-    there is none."""
-    for index, row in enumerate(rows):
-        words = words_in(row)
-        known = [part for part in row if part.lower() not in MISSING]
-        follows = rows[index + 1] if index + 1 < len(rows) else row
-        # A preamble (NO_OF_FRAMES 600) also has numbers, but never two consecutive rows of several
-        # numbers, nor words at the same positions twice.
-        if (len(row) > 1 or _is_column(rows[index:index + _COLUMN])) and (
-                len(known) - len(words) > len(row) // 2) and (
-                not words or (words == words_in(follows) and len(words) <= len(row) // 3)) and (
-                len(follows) == len(row) or index + 2 >= len(rows)):
-            return index, len(row)
+    """Return the index of the first row of the longest table of numbers, and the number of its
+    fields; InputError if there is none. A testing machine writes a table of results above."""
+    best = longest = index = 0
+    while index < len(rows):
+        length = _length(rows, index)
+        if length > longest:
+            best, longest = index, length
+        index += max(length, 1)
+    if longest:
+        return best, len(rows[best])
     raise InputError(f"{path} has no row of numbers." if rows else f"{path} is empty.",
                      "A header and rows of numbers were expected.",
                      "Check the file, or export it again.")
+
+
+def _length(rows: list[list[str]], index: int) -> int:
+    """Rows of a table of numbers that begins here; 0 if none does."""
+    row, words = rows[index], words_in(rows[index])
+    known = [part for part in row if part.lower() not in text_columns.MISSING]
+    follows = rows[index + 1] if index + 1 < len(rows) else row
+    # A preamble (NO_OF_FRAMES 600) also has numbers, but never two consecutive rows of several
+    # numbers, nor words at the same positions twice.
+    if not ((len(row) > 1 or _is_column(rows[index:index + _COLUMN])) and (
+            len(known) - len(words) > len(row) // 2) and (
+            not words or (words == words_in(follows) and len(words) <= len(row) // 3)) and (
+            len(follows) == len(row) or index + 2 >= len(rows))):
+        return 0
+    return next((k - index for k in range(index + 1, len(rows))
+                 if len(rows[k]) > 1 and len(words_in(rows[k])) == len(rows[k])), len(rows) - index)
 
 
 def _is_column(rows: list[list[str]]) -> bool:
@@ -264,8 +267,8 @@ def without_arrows(lines: list[str]) -> list[str]:
     if 2 * sum(one is not None for one in found) <= len(lines):
         return lines
     stamped = [(one[1], re.sub(r"\s*([:=])\s*", r"\1", one[2])) for one in found if one is not None]
-    separator = separator_of([rest for _, rest in stamped[-_SAMPLE:]])
-    rows = [(stamp, fields_of(rest, separator)) for stamp, rest in stamped]
+    separator = text_columns.separator_of([rest for _, rest in stamped[-_SAMPLE:]])
+    rows = [(stamp, text_columns.fields_of(rest, separator)) for stamp, rest in stamped]
     pairs = [[_PAIR.fullmatch(part) for part in row] for _, row in rows]
     titles = next(([pair[1] for pair in row if pair] for row in pairs if row and all(row)), [])
     if titles:
@@ -292,7 +295,7 @@ def _is_reading(part: str) -> bool:
     return part != "" and number_of(part, True) is not None
 
 
-LENGTH_UNITS_M = {spelt: UNIT_METRES[unit] for spelt, unit in LENGTHS.items()}
+LENGTH_UNITS_M = {spelt: UNIT_METRES[unit] for spelt, unit in text_columns.LENGTHS.items()}
 FORCE_NAMES_N = FORCE_UNITS_N | {
     "newton": 1.0, "newtons": 1.0, "lb": FORCE_UNITS_N["lbf"], "kg": FORCE_UNITS_N["kgf"],
     **dict.fromkeys(("g", "gram", "grams"), FORCE_UNITS_N["gf"])}
@@ -332,7 +335,7 @@ class Title:
     @property
     def plain(self) -> str:
         """Lower-case letters and digits alone."""
-        return plain(self.name)
+        return text_columns.plain(self.name)
 
 
 def read_table(path: str | Path) -> Table:
@@ -346,8 +349,8 @@ def read_table(path: str | Path) -> Table:
     lines = without_arrows(section_of(text.splitlines()))
     bare = [line for line in lines if not line.lstrip().startswith(("#", "%"))]
     comments = [line.lstrip()[1:].strip() for line in lines if line not in bare]
-    separator = separator_of(bare[-_SAMPLE:])
-    rows = [fields_of(line, separator) for line in bare]
+    separator = text_columns.separator_of(bare[-_SAMPLE:])
+    rows = [text_columns.fields_of(line, separator) for line in bare]
     first, width = first_numbers(path, rows)
     capture = capture_preamble(rows[:first], width, comments)
     titles = capture.titles or _titles(rows[:first], comments, width, separator)
@@ -359,7 +362,9 @@ def read_table(path: str | Path) -> Table:
                   unit=capture.unit or text_columns.stated_unit("\n".join(comments)))
     words = words_in(rows[first])
     table.clocks = tuple(k for k, part in enumerate(rows[first]) if is_clock(part))
-    table.values = _numbers(table, bare[first:], rows[first:], text.endswith(("\n", "\r")), words)
+    end = first + _length(rows, first)
+    table.values = _numbers(table, bare[first:end], rows[first:end],
+                            end < len(rows) or text.endswith(("\n", "\r")), words)
     return _without_words(table, words)
 
 
@@ -546,8 +551,8 @@ def _titles(above: list[list[str]], comments: list[str], width: int, separator: 
     """The lowest title line with as many names; units in the next line are appended."""
     fitting = [row for row in above if len(row) == width and _is_named(row)]
     if not fitting:
-        fitting = [row for comment in comments
-                   if len(row := fields_of(comment, separator)) == width and _is_named(row)]
+        fitting = [row for row in (text_columns.fields_of(each, separator) for each in comments)
+                   if len(row) == width and _is_named(row)]
     if not fitting:
         # LabVIEW's comment column is mostly empty.
         fitting = [row[:width] for row in above[-1:] if len(row) > width and _is_named(row[:width])]
@@ -556,7 +561,7 @@ def _titles(above: list[list[str]], comments: list[str], width: int, separator: 
     units = _units(fitting[-1]) if len(fitting) > 1 else None
     if units is None:
         return fitting[-1]
-    return with_units(fitting[-2], units)
+    return text_columns.with_units(fitting[-2], units)
 
 
 def _is_named(row: list[str]) -> bool:
@@ -572,7 +577,7 @@ def _units(row: list[str]) -> list[str] | None:
 def _numbers(table: Table, lines: list[str], rows: list[list[str]], complete: bool,
              words: list[int]) -> np.ndarray:
     name, width = table.path.name, len(table.titles)
-    comma = any(DECIMAL_COMMA.fullmatch(part) for row in rows[:50] for part in row)
+    comma = any(text_columns.DECIMAL_COMMA.fullmatch(part) for row in rows[:50] for part in row)
     kept, bad = [], []
     for index, row in enumerate(rows):
         numbers = [np.nan if k in words else number_of(part, comma) for k, part in enumerate(row)]

@@ -203,7 +203,7 @@ TIME_UNITS_S = {
 """Units of time in seconds, by their names in files."""
 
 _WORDS = (r"t|times?|timestamps?|stamp|elapsed|elapsedtime|elapsedsince\w*|clock|clocktime|zeit"
-          r"|zeitstempel|uhrzeit|xvalue|datetime|date|datum|rostime|systime|systemtime|unixtime|epoch"
+          r"|zeitstempel|uhrzeit|xvalue|temps|tiempo|tempo|pruf?zeit|datetime|date|datum|rostime|systime|systemtime|unixtime|epoch"
           r"|(?:\w*header)?stamp")
 _NAME = re.compile(rf"(?:{_WORDS})?(?P<unit>{'|'.join(sorted(TIME_UNITS_S, key=len)[::-1])})?"
                    rf"|(?:{_WORDS})")

@@ -201,14 +201,12 @@ class Skeleton:
                        radius_sigma=self.radius_sigma / alignment.scale)
 
     def write_swc(self, path: Path, *, unit: str = "m") -> None:
-        """Write an SWC file in the unit that its header states; type 5 is a fork, 6 a tip, 0 else.
-        """
-        counts = self.child_counts()
-        kind = np.select([self.parent < 0, counts > 1, counts == 0], [1, 5, 6], 0)
+        """Write an SWC file in the unit that its header states. All nodes have one type, 3: viewers
+        of neurons refuse one that changes between forks, and take 1 for a cell's body."""
         lines = ["# Limber skeleton, SWC", f"# unit: {unit}", "# id type x y z radius parent"]
         for i, (p, r) in enumerate(zip(self.nodes, self.radius, strict=True)):
             up = self.parent[i] + 1 if self.parent[i] >= 0 else -1
-            lines.append(f"{i + 1} {kind[i]} {p[0]:.15g} {p[1]:.15g} {p[2]:.15g} {r:.9g} {up}")
+            lines.append(f"{i + 1} 3 {p[0]:.15g} {p[1]:.15g} {p[2]:.15g} {r:.9g} {up}")
         Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

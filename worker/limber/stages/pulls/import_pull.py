@@ -150,18 +150,22 @@ def _imported(asked: ImportPull, progress: Progress) -> dict[str, Any]:
         folder = stage.path(prefix + "pull.toml").parent
         is_bare = is_force and not branch.has("mesh.vtu")
         frame = BranchFrame() if is_bare else _frame(branch, settings)
-        in_branch = ImportSpec.of(settings.model_copy(update=_poses_in_branch(asked, branch)))
+        in_branch = ImportSpec.of(settings.model_copy(
+            update=_poses_in_branch(asked, branch, kind in ("markers", "c3d", "robot"))))
         stage.result.update(import_recording(kind, ImportRequest(
             source, folder, name, in_branch, frame, robot, progress)))
         stage.result |= {"pull": name, "kind": kind}
     return stage.result
 
 
-def _poses_in_branch(asked: ImportPull, branch: Branch) -> dict[str, tuple[float, ...]]:
-    """The poses of frames that the user gave, in the branch's frame."""
-    poses = {name: np.array(pose) for name in ("frame_pose", "marker_frame")
-             if (pose := getattr(asked, name)) is not None}
-    if asked.coordinates == "branch" or not poses:
+def _poses_in_branch(asked: ImportPull, branch: Branch, is_table: bool,
+                     ) -> dict[str, tuple[float, ...]]:
+    """The poses of frames in the branch's frame: those that the user gave; those of a table that
+    has its own in no other frame."""
+    own = {"frame_pose": asked.cell, "marker_frame": asked.nominal}
+    poses = {name: np.array(pose or (0.0,) * 6) for name, other in own.items()
+             if (pose := getattr(asked, name)) or (is_table and other is None)}
+    if asked.coordinates == "branch":
         return {}
     from limber.core.numerics.rigid import composed, rotation_vector
 

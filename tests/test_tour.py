@@ -1,0 +1,58 @@
+"""A tour of files as other programs write them: each is read through its door, by its content."""
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.cell.known_arms import arm_named
+from limber.core.errors import InputError
+from limber.recordings.force_slope import force_slope, read_force_displacement
+from limber.recordings.recording_formats import RECORDINGS
+from limber.recordings.tables import read_table, robot_stream, time_stream
+
+TOUR = Path(__file__).parent / "data" / "tour"
+STOPS = tomllib.loads((TOUR / "tour.toml").read_text(encoding="utf-8"))
+
+
+def test_each_file_has_its_stop():
+    known = {name.partition("#")[0] for stops in STOPS.values() for name in stops}
+    assert known == {path.name for path in TOUR.iterdir()} - {"tour.toml", "README.md"}
+
+
+@pytest.mark.parametrize(("name", "slope"), STOPS["force"].items())
+def test_bending_tests_of_testing_machines(name, slope):
+    assert RECORDINGS.of(TOUR / name).name == "force-displacement"
+    table = read_force_displacement(TOUR / name)
+    assert len(table.force) == 25 and np.ptp(table.displacement) == pytest.approx(0.024)
+    assert force_slope(table.displacement, table.force).slope == pytest.approx(slope, rel=0.02)
+
+
+@pytest.mark.parametrize(("name", "step"), STOPS["clock"].items())
+def test_time_stamps_of_any_clock(name, step):
+    """Counts, clocks since 1970 and dates become seconds in even steps."""
+    stream = time_stream(read_table(TOUR / name))
+    np.testing.assert_allclose(np.diff(stream.times), step, atol=2e-6)
+    assert len(stream) == 30
+    if "micros.csv" in name:
+        assert "read as us (533.3 samples per second)" in stream.warnings[0]
+
+
+@pytest.mark.parametrize(("name", "height"), STOPS["arm"].items())
+def test_a_grippers_fingers_are_no_part_of_the_arm(name, height):
+    """Sliding, following, and the one that others follow; the end is the hand, or its TCP."""
+    if isinstance(height, str):
+        with pytest.raises(InputError, match=height):
+            arm_named(str(TOUR / name))
+        return
+    arm = arm_named(str(TOUR / name))
+    assert len(arm.joint_names) == 6
+    assert arm.forward(np.zeros(6))[2, 3] == pytest.approx(height)
+
+
+@pytest.mark.parametrize(("name", "turn"), STOPS["pose"].items())
+def test_poses_of_tum_and_ros(name, turn):
+    """A translation and a quaternion, whatever topic they come from."""
+    poses = robot_stream(TOUR / name).values[:, :6]
+    np.testing.assert_allclose(poses[0], [0.1, 0.2, 0.3, 0, 0, turn], atol=1e-6)
