@@ -26,8 +26,7 @@ FRACTIONS = (0.2, 0.4, 0.6, 0.8)
 
 @pytest.fixture(scope="module")
 def field(small_bench):
-    return open_field(small_bench.mesh, small_bench.branch.skeleton, small_bench.weights,
-                      FRACTIONS)
+    return open_field(small_bench.mesh, small_bench.branch.skeleton, small_bench.weights, FRACTIONS)
 
 
 def test_shares_are_the_derivatives_of_the_field(field):
@@ -190,11 +189,9 @@ def test_the_step_leads_to_the_mode_of_the_integral():
         return halves.min() - np.log(np.sum(np.exp(halves.min() - halves)))
 
     mode = least_squares(residual, np.r_[np.log(space.base.young), 0.0, 0.0], xtol=1e-12).x
-    true = minimize(left, mode[:2], method="Nelder-Mead",
-                    options={"xatol": 1e-5, "fatol": 1e-9}).x
+    true = minimize(left, mode[:2], method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-9}).x
     values = space.unpack(mode)
-    slopes = np.vstack([readings @ field.shares(values, space.extra).T,
-                        np.eye(4)[2:]])
+    slopes = np.vstack([readings @ field.shares(values, space.extra).T, np.eye(4)[2:]])
     step = marginal_step(Evaluation(mode, residual(mode), slopes, 0.0, ()), space, field)
     off, still_off = true - mode[:2], true - mode[:2] - step[:2]
     assert np.linalg.norm(off) > 5e-3

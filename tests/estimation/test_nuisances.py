@@ -12,11 +12,7 @@ from limber.core.errors import WorkError
 from limber.core.numerics.rigid import rotated
 from limber.estimation.estimated_branch import Subject, forwards_of, observes_path
 from limber.estimation.fit import fit_branch, fit_pulls
-from limber.estimation.fitting.initial_modulus import (
-    far_points,
-    fitted_frame,
-    put_right,
-)
+from limber.estimation.fitting.initial_modulus import far_points, fitted_frame, put_right
 from limber.estimation.fitting.nuisances import (
     _across,
     _Pull,
@@ -222,8 +218,7 @@ def test_a_point_that_is_off_along_the_branch_is_told_as_that(small, small_bench
         "calibration": CalibrationEntry(force_bias_sigma_n=0.0, force_drift_sigma_n=0.0),
         "rest_points_m": tuple(map(tuple, (2 * places - off).tolist()))})
     objective = objective_of(small_bench, replace(pull, entry=entry))
-    evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)),
-                                    jacobian=True)
+    evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)), jacobian=True)
     listed = {each["name"]: each for each in nuisance_records(
         objective.cell_errors.nuisances, evaluation.errors, np.zeros((4, 4)))}
     point = listed["position of point 3 along the branch"]
@@ -432,8 +427,7 @@ def test_a_point_aside_of_the_axis_turns_with_the_branch():
         assert np.einsum("fik,fi->fk", own, directions[:, point]) == pytest.approx(0, abs=1e-12)
         assert np.einsum("fik,fil->fkl", own, own) == pytest.approx(np.stack(5 * [np.eye(2)]))
         about = np.cross(directions[0, point], directions[-1, point])
-        assert own.swapaxes(1, 2) @ about == pytest.approx(np.stack(
-            5 * [own[0].T @ about]))
+        assert own.swapaxes(1, 2) @ about == pytest.approx(np.stack(5 * [own[0].T @ about]))
 
 
 @pytest.mark.slow

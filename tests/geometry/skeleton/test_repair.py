@@ -14,11 +14,7 @@ from limber.geometry.skeleton.confidence import KINK, DoubtfulKind, doubtful_par
 from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.visible_sides import seen_sides
 from limber.geometry.skeleton.repair import PASSES, Pass, Repaired, without_kinks
-from limber.geometry.skeleton.run_ends import (
-    point_counts,
-    steadied,
-    tapered,
-)
+from limber.geometry.skeleton.run_ends import point_counts, steadied, tapered
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 

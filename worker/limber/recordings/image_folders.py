@@ -80,8 +80,7 @@ def write_frame(path: Path, points: np.ndarray) -> None:
     PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
 
 
-def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SILENT,
-              ) -> list[str]:
+def copy_rgbd(source: Path, folder: Path, settings: Any, progress: Progress = SILENT,) -> list[str]:
     """Import an RGB-D folder into ``depth/``, ``mask/`` and ``camera.toml``; return warnings.
     ``depth.txt``, ``rgb.txt``, ``mask.txt`` (``timestamp file``) and ``groundtruth.txt``
     (``timestamp tx ty tz qx qy qz qw``) are as in TUM's data; without the lists, file names are
@@ -259,8 +258,7 @@ def _masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
     return [_nearest(listed, stamp, stamps) for stamp in stamps]
 
 
-def _nearest(listed: list[tuple[float, Path]], target: float, stamps: list[float],
-             ) -> Path | None:
+def _nearest(listed: list[tuple[float, Path]], target: float, stamps: list[float],) -> Path | None:
     """The file nearest in time, if it is nearer than half a frame."""
     stamp, file = min(listed, key=lambda entry: abs(entry[0] - target))
     reach = 0.5 * float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
@@ -339,8 +337,7 @@ class YoloSegmenter:
     prompt is that of an open-vocabulary model (YOLO-World, YOLOE), such as the paper's "potted
     plant", or one of the classes of another."""
 
-    def __init__(self, weights: Path, *, prompt: str | None = None,
-                 confidence: float = 0.25):
+    def __init__(self, weights: Path, *, prompt: str | None = None, confidence: float = 0.25):
         weights = Path(weights)
         if not weights.is_file():
             raise InputError(f"The weights file {weights} does not exist.",

@@ -188,8 +188,7 @@ def _with_right_sign(pull: Pull) -> Pull:
         return pull
     work = work_done(replace(pull, wrenches=pull.wrenches - np.nan_to_num(first[:1])))
     most, least = work.max(), work.min()
-    noise = pull.entry.sensor.force_sigma_n * np.sqrt(
-        np.sum(np.diff(pull.poses[:, :3], axis=0)**2))
+    noise = pull.entry.sensor.force_sigma_n * np.sqrt(np.sum(np.diff(pull.poses[:, :3], axis=0)**2))
     if -least <= 3 * most or -least <= 3 * noise:
         return pull
     seen = (f"{pull.name}: according to the measured force, the branch did {-least:.3g} J of work "

@@ -660,8 +660,7 @@ def robot_stream(path: str | Path, force_unit: str | None = None,
 def is_robot_table(titles: list[Title]) -> bool:
     """Return whether the columns hold a gripper's position and force, as a robot's log does."""
     plain = {title.plain for title in _known(titles)}
-    return all(plain & set(_ALIASES[name]) for name in (*POSE_COLUMNS[:3],
-                                                        *WRENCH_COLUMNS[:3]))
+    return all(plain & set(_ALIASES[name]) for name in (*POSE_COLUMNS[:3], *WRENCH_COLUMNS[:3]))
 
 
 def _known(titles: list[Title]) -> list[Title]:

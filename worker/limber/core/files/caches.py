@@ -29,11 +29,9 @@ def cache_folder() -> Path:
 
 def known_caches() -> list[Cache]:
     """Return the existing caches by name."""
-    found = []
-    for path in sorted(path for path in cache_folder().glob("*") if path.is_dir()):
-        sizes = [size for _, size, _ in _files(path)]
-        found.append(Cache(path.name, path, len(sizes), sum(sizes), sizes.count(0)))
-    return found
+    return [Cache(path.name, path, len(sizes), sum(sizes), sizes.count(0))
+            for path in sorted(cache_folder().glob("*")) if path.is_dir()
+            for sizes in [[size for _, size, _ in _files(path)]]]
 
 
 def trim(folder: Path, most_bytes: float) -> int:

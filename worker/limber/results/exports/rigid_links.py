@@ -199,8 +199,7 @@ def _laid_out(skeleton: Skeleton, spacing: float, wood: cKDTree,
                                   for at in (low, (low + high) / 2, high))
             tangent = (end - start) / np.linalg.norm(end - start)
             link = len(segments) + 1
-            segments.append(_Segment(start, middle, end, tangent, float(high - low), current,
-                                     link))
+            segments.append(_Segment(start, middle, end, tangent, float(high - low), current, link))
             half = len(points) // 2
             samples.append(points)
             owner += [len(segments) - 1] * len(points)
