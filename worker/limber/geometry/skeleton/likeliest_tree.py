@@ -61,7 +61,7 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
     if rays := scan.sight is not None:
         # One sensor's rays show widths, which the noise along its sight leaves as they are.
         skeleton, _ = by_projected_widths(skeleton, points, view)
-    found = assessed(skeleton, points, noise, rays=rays, view=view if rays else None)
+    found = assessed(skeleton.on_grid(), points, noise, rays=rays, view=view if rays else None)
     even, kinks = without_kinks(found)
     return doubted(even, points, noise) if kinks else found, noise, count
 
@@ -125,7 +125,7 @@ def _step(skeleton: Skeleton, scan: PointLikelihood, prior: "_Prior") -> Skeleto
     move = step[:, :3] / np.maximum(far, 1.0)[:, None]
     log_radius = np.log(skeleton.radius) + np.clip(step[:, 3], -_CHANGE, _CHANGE)
     return replace(skeleton.moved(skeleton.nodes + move), radius=np.exp(
-        _falling(log_radius, own.diagonal()[3::4] + 1.0, skeleton.parent)))
+        _falling(log_radius, own.diagonal()[3::4] + 1.0, skeleton.parent))).on_grid()
 
 
 def _falling(value: np.ndarray, weight: np.ndarray, parent: np.ndarray) -> np.ndarray:
@@ -195,9 +195,9 @@ class _Prior:
 
 def _padded(matrix: sparse.csr_matrix, more: int) -> sparse.csr_matrix:
     """A matrix with so many more rows and columns of zeros."""
-    size = matrix.shape[0] + more
-    return sparse.csr_matrix((matrix.data, matrix.indices, np.append(
-        matrix.indptr, np.full(more, matrix.indptr[-1]))), (size, size))
+    matrix = matrix.copy()
+    matrix.resize(matrix.shape[0] + more, matrix.shape[0] + more)
+    return matrix
 
 
 def _places(axes: np.ndarray, normal: np.ndarray, sharpness: np.ndarray, scan: PointLikelihood,

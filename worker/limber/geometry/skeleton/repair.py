@@ -484,5 +484,6 @@ def repaired(skeleton: Skeleton, points: np.ndarray, radius_limits: tuple[float,
     for each in PASSES:
         until = done if each.until is None else each.until
         now = each.run(replace(now, progress=progress.part(done, until)))
+        now = now.of(now.skeleton.on_grid())
         done = until
     return now

@@ -184,7 +184,8 @@ class FoundSkeleton:
             skeleton, contraction, arrays["node_of_point"], arrays["residual"], stored.noise,
             [bridge.found() for bridge in stored.bridges],
             [piece.found() for piece in stored.split_off], stored.loops, stored.pruned,
-            _position_array(stored.second_base), [end.found() for end in stored.root_ends],
+            None if (base := stored.second_base) is None else np.array(base),
+            [end.found() for end in stored.root_ends],
             stored.leafy, [twig.found() for twig in stored.unlikely]),
                    _leaves(path, arrays, stored))
 
@@ -308,10 +309,6 @@ def _is_possible(skeleton: Skeleton) -> bool:
 
 def _are_below(index: np.ndarray, count: int) -> bool:
     return index.dtype.kind == "i" and bool(((index >= 0) & (index < count)).all())
-
-
-def _position_array(position: _Place | None) -> np.ndarray | None:
-    return None if position is None else np.array(position)
 
 
 def _damaged(path: Path, why: str) -> InputError:

@@ -18,6 +18,7 @@ thin for the scan's points and noise, or in a gap."""
 STATES = {"measured": MEASURED, "limited": LIMITED, "interpolated": INTERPOLATED,
           "unresolved": UNRESOLVED, "bridged": BRIDGED}
 """Names of these values."""
+_GRID, _EVEN = 1e-5, 2.0**-20  # of the median radius: step of places; step of probabilities
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,15 @@ class Skeleton:
     def moved(self, nodes: np.ndarray) -> "Skeleton":
         """Return the skeleton with other node positions [m], shape [n, 3]."""
         return replace(self, nodes=np.asarray(nodes, float))
+
+    def on_grid(self) -> "Skeleton":
+        """Return the skeleton on a grid far finer than anything is known: how a processor or a
+        library rounds does not outlast a step that ends with it."""
+        step = 2.0**np.floor(np.log2(_GRID * float(np.median(self.radius))))
+        nodes, radius, sigma = (np.round(values / step) * step for values in (
+            self.nodes, self.radius, self.radius_sigma))
+        return replace(self, nodes=nodes, radius=np.maximum(radius, step), radius_sigma=sigma,
+                       probability=np.round(self.probability / _EVEN) * _EVEN)
 
     def axes(self) -> np.ndarray:
         """Unit vector along the axis at each node, shape [n, 3]."""

@@ -72,8 +72,8 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                             None if show_apart is None else (
                                 lambda apart: show_apart(apart[original_order])),
                             twig_probability, progress)
-    contraction = found.contraction
-    return replace(found.moved(own.outside), contraction=replace(
+    contraction, moved = found.contraction, found.moved(own.outside)
+    return replace(moved, skeleton=moved.skeleton.on_grid(), contraction=replace(
         contraction, points=own.outside(contraction.points)),
         node_of_point=found.node_of_point[original_order], residual=found.residual[original_order])
 

@@ -330,9 +330,6 @@ def _anchor(skeleton: Skeleton, nodes: np.ndarray, per_node: np.ndarray) -> spar
     return sparse.bsr_matrix((block, np.arange(len(nodes)), np.arange(len(nodes) + 1))).tocsc()
 
 
-# Grid from which each round starts, as a fraction of the median radius. It is a fifth of the step
-# that ends a fit, and far coarser than rounding differences between libraries.
-_GRID = 1e-5
 _MOVED = 0.2  # fraction of the radius; nodes that moved less keep their points' cylinders
 _REACH = 2.0  # largest distance of an axis from its contracted position, in radii
 _HELD = 2  # trusted rounds in which the limit keeps that of most sensors
@@ -373,10 +370,8 @@ class _Rounds:
         # Leaves, which lie on no axis, mislead a fit. A difference in the last digit then grows
         # from round to round until other cylinders are chosen. On a grid it does not outlast its
         # round.
-        self._grid = 2.0**np.floor(np.log2(_GRID * float(np.median(skeleton.radius))))
-        nodes, radius = self._on_grid(skeleton.nodes, skeleton.radius)
-        self._start = replace(skeleton, nodes=nodes, radius=radius)
-        self._nodes, self._radius, self._points = nodes, radius, points
+        self._start = skeleton.on_grid()
+        self._nodes, self._radius = nodes, radius = self._start.nodes, self._start.radius
         self._rounds, self._settled, self._along_sight = rounds, settled, along_sight
         self._spread = 0.35 * float(np.median(radius))
         self._floor = 0.05 * float(np.median(radius))
@@ -384,11 +379,10 @@ class _Rounds:
         # is used.
         self._known = SCATTERED_ALONG_SIGHT if along_sight else seen
         self._near: np.ndarray | None = None
-        self._found_at = nodes
+        self._points, self._found_at = points, nodes
         self._even: np.ndarray | None = None
         self._fitted_side: SeenSides | None = None
-        self._side_fit_count = 0
-        self.noise = 0.0
+        self._side_fit_count, self.noise = 0, 0.0
 
     def step(self, number: int) -> float:
         """Move axes and radii by one round; returns the longest step of a node [m]."""
@@ -433,11 +427,6 @@ class _Rounds:
         fitted = replace(start, nodes=nodes, radius=np.maximum(radius, 0.1 * self._floor),
                          radius_sigma=sigma, radius_state=state)
         return AxisFit(fitted, match.segment, match.residual, noise, seen)
-
-    def _on_grid(self, nodes: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and radii [m] rounded to the grid, no radius to zero."""
-        nodes, radius = (np.round(values / self._grid) * self._grid for values in (nodes, radius))
-        return nodes, np.maximum(radius, self._grid)
 
     def _match(self) -> Match:
         """The cylinder of each point; candidates are searched again once axes have moved."""
@@ -494,16 +483,16 @@ class _Rounds:
         shrink = np.minimum(1.0, 0.5 * self._radius / np.maximum(size, 1e-300))
         nodes = self._nodes + step[:, :3] * shrink[:, None]
         radius = self._radius + np.clip(step[:, 3], -0.4 * self._radius, 0.8 * self._radius)
-        self._nodes, self._radius = self._on_grid(*_near_start(self._start, nodes, radius))
+        after = _near_start(self._start, nodes, radius).on_grid()
+        self._nodes, self._radius = after.nodes, after.radius
 
 
-def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
-                ) -> tuple[np.ndarray, np.ndarray]:
+def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray) -> Skeleton:
     """Keep axes within reach of the contracted ones, which are inside the branch or on its skin: a
     run with few points may drift off and take other runs' points with it."""
     moved = nodes - skeleton.nodes
     size = np.linalg.norm(moved, axis=1)
     reach = _REACH * skeleton.radius
     moved *= np.minimum(1.0, reach / np.maximum(size, 1e-300))[:, None]
-    return skeleton.nodes + moved, np.clip(
-        radius, skeleton.radius / (2 * _REACH), 2 * _REACH * skeleton.radius)
+    return replace(skeleton.moved(skeleton.nodes + moved), radius=np.clip(
+        radius, skeleton.radius / (2 * _REACH), 2 * _REACH * skeleton.radius))
