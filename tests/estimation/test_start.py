@@ -280,6 +280,15 @@ def test_twigs_that_no_pull_reaches_are_rigid(twiggy):
     assert light == pytest.approx(heavy, rel=1e-3, abs=1e-3)
 
 
+def test_another_shape_of_a_lumped_branch_carries_its_twigs_too(twiggy):
+    """Or the shape's error would be that of their weight, over a step of 1e-4."""
+    _, part, pull, settings = twiggy
+    forward = forwards_of([pull], part, settings)[0]
+    beside = forward.with_prescribed_poses(forward.frames.poses).aside(part.mesh.nodes)
+    known, again = (each.model.prestress.total.stiffness for each in (forward, beside))
+    assert abs(again - known).max() < 1e-9 * abs(known).max()
+
+
 def test_a_reached_twig_stays_meshed(twiggy):
     """One on which a point is observed."""
     whole, part, pull, settings = twiggy

@@ -60,6 +60,7 @@ class Beam:
 
     def __init__(self, forward: QuasiStaticForward, *, weighs: bool = True):
         self._forward, mesh = forward, forward.mesh
+        self.name = forward.name
         self._gravity = forward.model.gravity if weighs else np.zeros(3)
         skeleton = present(forward.skeleton, "skeleton of a pulled branch")
         grasp = np.array(forward.entry.grasp.point_m)
@@ -160,10 +161,6 @@ class Beam:
         off = moved - (self.rest if self.is_loaded else moved[:, :1]) - seen
         size = float(np.nanmax(np.linalg.norm(seen, axis=-1), initial=0.0))
         return np.nan_to_num(off / (BEAM_M + BEAM_SHARE * size)).reshape(len(values), -1)
-
-    @property
-    def name(self) -> str:
-        return self._forward.name
 
     @property
     def may_be_off(self) -> bool:

@@ -335,6 +335,7 @@ class QuasiStaticForward(Forward):
         made = type(self)(self.name, self._model, self.weights, self.entry,
                           replace(self.frames, poses=poses), self.rest_points,
                           key_count=FEW_KEYS, field=self.field)
+        made.lumped_weight = self.lumped_weight
         made.begin_at(self)
         return made
 
