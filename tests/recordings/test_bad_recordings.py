@@ -454,6 +454,5 @@ def test_a_small_force_names_the_errors_to_state(bare_folder, tables, capsys):
 def test_points_beside_a_branch_are_not_said_to_be_millimetres():
     """Whatever is a metre away fits near the base once divided by a thousand."""
     nodes = np.column_stack([np.zeros(50), np.zeros(50), np.linspace(0, 0.4, 50)])
-    beside = np.array([[0.3, 0.0, 0.2]])
-    assert "millimetres" not in likely_slip(beside, nodes, Alignment(), 0.1)
+    assert "millimetres" not in likely_slip(np.array([[0.3, 0.0, 0.2]]), nodes, Alignment(), 0.1)
     assert "millimetres" in likely_slip(np.array([[10.0, 0.0, 300.0]]), nodes, Alignment(), 0.1)

@@ -150,23 +150,20 @@ def _imported(asked: ImportPull, progress: Progress) -> dict[str, Any]:
         folder = stage.path(prefix + "pull.toml").parent
         is_bare = is_force and not branch.has("mesh.vtu")
         frame = BranchFrame() if is_bare else _frame(branch, settings)
-        in_branch = ImportSpec.of(settings.model_copy(
-            update=_poses_in_branch(asked, branch, kind in ("markers", "c3d", "robot"))))
+        in_branch = ImportSpec.of(settings.model_copy(update=_poses_in_branch(asked, branch, kind)))
         stage.result.update(import_recording(kind, ImportRequest(
             source, folder, name, in_branch, frame, robot, progress)))
         stage.result |= {"pull": name, "kind": kind}
     return stage.result
 
 
-def _poses_in_branch(asked: ImportPull, branch: Branch, is_table: bool,
-                     ) -> dict[str, tuple[float, ...]]:
+def _poses_in_branch(asked: ImportPull, branch: Branch, kind: str) -> dict[str, Any]:
     """The poses of frames in the branch's frame: those that the user gave; those of a table that
     has its own in no other frame."""
-    own = {"frame_pose": asked.cell, "marker_frame": asked.nominal}
-    poses = {name: np.array(pose or (0.0,) * 6) for name, other in own.items()
-             if (pose := getattr(asked, name)) or (is_table and other is None)}
-    if asked.coordinates == "branch":
-        return {}
+    is_table = kind in ("markers", "c3d", "robot")
+    poses = {name: np.array(getattr(asked, name) or (0.0,) * 6) for name, other in (
+        ("frame_pose", asked.cell), ("marker_frame", asked.nominal))
+             if asked.coordinates == "scan" and (getattr(asked, name) or (is_table and not other))}
     from limber.core.numerics.rigid import composed, rotation_vector
 
     alignment = branch.manifest.alignment
