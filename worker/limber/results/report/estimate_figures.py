@@ -67,14 +67,12 @@ def young_along_branch(estimate: dict[str, Any]) -> Any:
                       label="95 %, including radii and mesh")
     axes.errorbar(fractions, young, np.abs(sensor.T / 1e6 - young), fmt="o-", color=SIMULATED,
                   capsize=4, label="estimated, 95 % from the sensors alone")
-    truth = estimate.get("truth")
-    if truth:
+    if truth := estimate.get("truth"):
         axes.plot(truth["fractions"], np.array(truth["young_pa"]) / 1e6, "D", ms=7, mfc="none",
                   color=TRUE, label="assumed" if truth.get("assumed") else "true")
-    if young.max() > 5 * young.min() or interval[:, 1].max() > 20 * young.max():
-        axes.set_yscale("log")
-    else:
-        axes.set_ylim(bottom=0)
+    is_wide = young.max() > 5 * young.min() or interval[:, 1].max() > 20 * young.max()
+    axes.set_yscale("log" if is_wide else "linear")
+    axes.set_ylim(bottom=None if is_wide else 0)
     axes.set_xlim(0, 1)
     figure.legend(frameon=False, ncols=2, fontsize=8, loc="outside upper left")
     return figure
@@ -146,7 +144,7 @@ def held_out_scores(estimate: dict[str, Any]) -> Any:
     for shift, key, colour, label in (
             (0.2, "relative_distance", SIMULATED, "points, relative to travel"),
             (-0.2, "relative_force", FORCE, "force, relative to its peak")):
-        values = 100 * np.array([_number(score.get(key)) for score in scores.values()])
+        values = 100 * _numbers([score.get(key) for score in scores.values()])
         axes.barh(rows + shift, np.nan_to_num(values), 0.36, color=colour, label=label)
     axes.set_yticks(rows, [name if score.get("in_fit", True) else f"{name} (not in the fit)"
                            for name, score in scores.items()])
@@ -157,8 +155,7 @@ def held_out_scores(estimate: dict[str, Any]) -> Any:
 def loss_over_evaluations(estimate: dict[str, Any]) -> Any:
     """The paper's loss J [m^2] of every forward simulation."""
     figure, axes = chart(5.2, 3.2, "forward simulations", "loss J [m²]")
-    loss = np.array([np.nan if entry["loss_m2"] is None else entry["loss_m2"]
-                     for entry in estimate["history"]], float)
+    loss = _numbers([entry["loss_m2"] for entry in estimate["history"]])
     count = np.arange(1, len(loss) + 1)
     axes.semilogy(count, loss, ".", color="#999999")
     axes.semilogy(count, np.fmin.accumulate(loss), color=SIMULATED, label=estimate["method"])
@@ -212,19 +209,12 @@ def _interval_caption(estimate: dict[str, Any]) -> str:
     shares = [f"{name} {100 * max(np.atleast_1d(parts[key])):.1f} %" for key, name in
               (("sensor", "sensors"), ("geometry", "shape from the scan"), ("mesh", "mesh"))
               if parts.get(key) is not None]
-    missing = ""
-    if parts and parts.get("geometry") is None:
-        missing = (" The radii have no stated deviation, so the interval does not include their "
-                   "error.")
-    elif parts.get("axis_is_exact", True) and parts:
-        missing = " The position of the scan's axis is assumed exact."
-    return ("Young's modulus along the branch with its 95 % interval"
-            + (f"; largest standard deviations from: {', '.join(shares)}" if shares else "")
-            + "." + missing)
-
-
-def _number(value: float | None) -> float:
-    return np.nan if value is None else float(value)
+    missing = "" if not parts else (
+        " The radii have no stated deviation, so the interval does not include their error."
+        if parts.get("geometry") is None else " The position of the scan's axis is assumed exact."
+        if parts.get("axis_is_exact", True) else "")
+    named = f"; largest standard deviations from: {', '.join(shares)}" if shares else ""
+    return f"Young's modulus along the branch with its 95 % interval{named}.{missing}"
 
 
 def _numbers(values: Any) -> np.ndarray:

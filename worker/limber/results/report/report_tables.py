@@ -91,13 +91,11 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
         if name in ("geometry", "mesh") or parts.get(name)}, "total": "together"}
     if not any(parts.get(name) for name in known):
         return []
-    rows = [["control point", "position (0 base, 1 tip)", *known.values()]]
-    for number, fraction in enumerate(estimate["fractions"]):
-        shares = ["not examined" if not parts.get(name) else "not known"
-                  if parts[name][number] is None else f"{100 * parts[name][number]:.1f} %"
-                  for name in known]
-        rows.append([str(number + 1), f"{fraction:.2f}", *shares])
-    return rows
+    return [["control point", "position (0 base, 1 tip)", *known.values()], *(
+        [str(number + 1), f"{fraction:.2f}", *(
+            "not examined" if not parts.get(name) else "not known"
+            if parts[name][number] is None else f"{100 * parts[name][number]:.1f} %"
+            for name in known)] for number, fraction in enumerate(estimate["fractions"]))]
 
 
 def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:

@@ -52,8 +52,7 @@ def add_cloud(data: SceneData, branch: Branch) -> None:
     if len(cloud) > CLOUD_LIMIT:
         cloud = cloud.subset(np.linspace(0, len(cloud) - 1, CLOUD_LIMIT).astype(int))
     data.arrays["cloud"] = cloud.points.astype(np.float32)
-    colour = cloud.attributes.get("color")
-    if colour is not None:
+    if (colour := cloud.attributes.get("color")) is not None:
         linear = linear_of(np.asarray(colour, float) / 255)
         data.arrays["cloud_color"] = np.column_stack([linear, np.ones(len(linear))]
                                                      ).astype(np.float32)
@@ -68,13 +67,11 @@ def add_skeleton(data: SceneData, branch: Branch) -> None:
     data.arrays |= {
         "skeleton": skeleton.nodes, "skeleton_parent": skeleton.parent,
         "skeleton_radius": skeleton.radius, "skeleton_radius_sigma": skeleton.radius_sigma,
-        "skeleton_probability": skeleton.probability,
-        "skeleton_order": skeleton.order,
+        "skeleton_probability": skeleton.probability, "skeleton_order": skeleton.order,
         "skeleton_flags": (ROOT * (skeleton.parent < 0) + FORK * (children > 1)
                            + TIP * (children == 0) + RADIUS_LIMITED * (state == LIMITED)
                            + RADIUS_INTERPOLATED * (state == INTERPOLATED)
-                           + RADIUS_UNRESOLVED * (state == UNRESOLVED)
-                           + BRIDGE * (state == BRIDGED)
+                           + RADIUS_UNRESOLVED * (state == UNRESOLVED) + BRIDGE * (state == BRIDGED)
                            + EDITED * _edited(branch, skeleton)).astype(np.int32)}
 
 
