@@ -1,5 +1,6 @@
 """A tour of files as other programs write them: each is read through its door, by its content."""
 
+import re
 import tomllib
 from contextlib import nullcontext
 from pathlib import Path
@@ -9,6 +10,9 @@ import pytest
 
 from limber.cell.known_arms import arm_named
 from limber.core.errors import InputError
+from limber.geometry.io.clouds import read_points
+from limber.geometry.io.skeletons import read_skeleton
+from limber.recordings.bag_reader import bag_arrays
 from limber.recordings.force_slope import force_slope, read_force_displacement
 from limber.recordings.recording_formats import RECORDINGS
 from limber.recordings.tables import read_table, robot_stream, time_stream
@@ -53,3 +57,30 @@ def test_poses_of_tum_and_ros(name, turn):
     """A translation and a quaternion, whatever topic they come from."""
     poses = robot_stream(TOUR / name).values[:, :6]
     np.testing.assert_allclose(poses[0], [0.1, 0.2, 0.3, 0, 0, turn], atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "stop"), STOPS["skeleton"].items())
+def test_an_axis_in_the_models_of_other_programs(name, stop):
+    """Titles by their meaning; loose parts are left out with their share; of several trees one is
+    asked for; a model is no cloud."""
+    if "refused" in stop:
+        with pytest.raises(InputError, match=stop["refused"]):
+            read_skeleton(TOUR / name)
+    if "refused" not in stop or "near" in stop:
+        found = read_skeleton(TOUR / name, near=stop.get("near"))
+        assert found.node_count == 8 and found.length == pytest.approx(0.707107, rel=1e-5)
+        assert re.search(stop.get("note", "^$"), " ".join(found.notes))
+    if name.endswith(("csv", "txt")) and name != "treeqsm_text.txt":
+        with pytest.raises(InputError, match=r"model.*limber mesh"):
+            read_points(TOUR / name)
+
+
+@pytest.mark.parametrize(("name", "count"), STOPS["bag"].items())
+def test_a_killed_recorders_bag_is_read_to_its_last_message(name, count):
+    """A force of 50 N/m, in the order of its messages; chunks that cannot be unpacked are lost."""
+    found = bag_arrays(TOUR / name)
+    assert int(found["read"]) == count
+    assert re.search(f"has no end.*Its {count} whole messages were read, \\d+ bytes behind",
+                     str(found["notes"][0]))
+    force, pose = found["0_values"][:, 0], found["1_values"][:, 0]
+    np.testing.assert_allclose(force[:len(pose)], 50 * pose, atol=1e-9)

@@ -165,7 +165,7 @@ def test_what_is_a_model_and_what_is_refused(tmp_path):
     (tmp_path / "thin.swc").write_text("1 0 0 0 0 0 -1\n2 0 0 0 1 0.1 1\n")
     for path, settings, told in (
             ("thin.swc", MeshSurfaceSettings(), "radius 0"),
-            ("rtwig.csv", MeshSurfaceSettings(root=(0.0, 0.0, 0.0)), "defines its own root")):
+            ("rtwig.csv", MeshSurfaceSettings(root=(0.0, 0.0, 9.0)), "defines its own root")):
         with pytest.raises(InputError, match=told):
             Mesh.of(settings, surface=tmp_path / path, output=tmp_path / "b.branch").run()
     assert not (tmp_path / "b.branch").exists()

@@ -13,7 +13,7 @@ from limber.geometry.io.depth_images import depth_metres
 from limber.perception.observe import write_depth
 from limber.recordings import bag_reader
 from limber.recordings.bag_pull import _Messages, pull_of_bag, write_mcap
-from limber.recordings.bag_reader import Bag, Topic, read_bag, stamped
+from limber.recordings.bag_reader import Bag, Topic, bag_arrays, read_bag, stamped
 from limber.recordings.import_request import ImportRequest
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.settings import ImportSpec
@@ -46,11 +46,11 @@ def mcap(tmp_path, plain_pull):
 class Written:
     """Messages into an MCAP file, one by one."""
 
-    def __init__(self, path):
+    def __init__(self, path, **options):
         from mcap.writer import Writer
 
         self._stream = open(path, "wb")
-        self._writer, self._channels = Writer(self._stream), {}
+        self._writer, self._channels = Writer(self._stream, **options), {}
         self._writer.start(profile="ros2", library="test")
         self.made = _Messages()
 
@@ -285,6 +285,33 @@ def test_damaged_bags_are_refused_or_read_never_crash(mcap, tmp_path, bare_folde
             assert len(str(error)) < 1500
             answers.append("refused")
     assert "refused" in answers
+
+
+def test_a_killed_recorders_folder_has_no_index(tmp_path, bare_folder):
+    """Two files without metadata.yaml, the second without an end."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for number, shift in enumerate((0.0, 2.02)):
+        with Written(folder / f"run_{number}.mcap", use_chunking=False) as bag:
+            for time in np.linspace(1.0, 3.0, 101) + shift:
+                bag.wrench("/wrench", time, [2.5 * (time - 1.0), 0.0, 0.0])
+                bag.pose("/pose", time, [0.05 * (time - 1.0), 0.0, 0.5])
+    last = folder / "run_1.mcap"
+    last.write_bytes(last.read_bytes()[:-6000])
+    result = ImportPull(branch_folder=bare_folder, source=folder, name="cut").run()
+    assert result["kind"] == "bag"
+    pull = read_pull(bare_folder / "pulls" / "cut")
+    assert 101 < len(pull.times) <= 202
+    assert np.allclose(pull.wrenches[:, 0], 50 * pull.poses[:, 0], atol=1e-6)
+
+
+def test_a_bag_of_no_whole_message_names_the_tool(tmp_path):
+    with Written(tmp_path / "a.mcap", use_chunking=False) as bag:
+        bag.wrench("/wrench", 1.0, [1.0, 0.0, 0.0])
+    content = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "a.mcap").write_bytes(content[:content.index(b"test") + 400])
+    with pytest.raises(ValueError, match="no whole message; `mcap recover`"):
+        bag_arrays(tmp_path / "a.mcap")
 
 
 def test_a_robots_log_alone_is_a_pull(tmp_path, bare_folder):

@@ -38,7 +38,7 @@ def test_ptx_in_pieces(tmp_path, monkeypatch):
     """Pieces end within scans; a part of the points is kept; a row may not change its width."""
     ptx(tmp_path / "a.ptx", colour=True, silent=7)
     whole = read_points(tmp_path / "a.ptx")
-    monkeypatch.setattr(clouds_module, "LINES_AT_ONCE", 8)
+    monkeypatch.setattr(clouds_module.text_columns, "LINES_AT_ONCE", 8)
     pieces = read_points(tmp_path / "a.ptx")
     np.testing.assert_array_equal(pieces.points, whole.points)
     np.testing.assert_array_equal(pieces.attributes["color"], whole.attributes["color"])

@@ -98,7 +98,7 @@ def test_an_axis_goes_on_where_the_parts_of_the_one_before_end(tmp_path):
     ("/P1/A1/U1\t\t\t0\tinf\t\t0\t1\n", HEAD, "finite"),
     ("/P1/A1/U1\t\t\t0\t0\t\t0\n", HEAD, "no radius"),
     ("/P1\n", HEAD, "0 vertices"),
-    (FLAT + "/P2/A1/U1\t\t\t0\t0\t\t0\t8\n", HEAD, "2 vertices"),
+    (FLAT + FLAT.replace("/P1", "/P2").replace("\t0\t8", "\t1\t8"), HEAD, "2 trees"),
     (FLAT, HEAD.replace("diam", "mass"), "no column Radius"),
     (FLAT, HEAD.replace("\tZZ\t", "\tH\t"), "XX, YY and ZZ"),
     ("", "CODE:\n", "no section"),
@@ -178,16 +178,32 @@ def test_it_is_read_as_one_of_version_7(tmp_path):
     write_treeqsm(AXIS, tmp_path / "old.mat")
     old, new = read_treeqsm(tmp_path / "old.mat"), read_treeqsm(written(tmp_path / "new.mat"))
     assert old.keys() == new.keys()
-    for name in old:
+    for name in old.keys() - {"notes"}:
         np.testing.assert_allclose(new[name], old[name], atol=1e-8)
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_of_several_models_the_first_counts(tmp_path, count):
+def test_without_distances_the_first_model_counts_and_all_are_listed(tmp_path, count):
     found = mat_v73_fields(written(tmp_path / "a.mat", count=count, creator="SmartQSM"))
-    assert set(found) == {*TREEQSM_FIELDS, "UnmodRadius", "creator"}
+    assert set(found) == {*TREEQSM_FIELDS, "UnmodRadius", "creator", "models", "taken"}
     np.testing.assert_allclose(found["start"], fields()["start"])
     assert str(found["creator"]) == "SmartQSM" and found["UnmodRadius"].shape == (7, 1)
+    assert len(found["models"]) == count and found["taken"] == 1
+
+
+def test_loose_vertices_of_a_graph_are_left_out(tmp_path):
+    graph = read(tmp_path, FLAT + "/P2/A1/U1\t\t\t0\t0\t\t999\t8\n")
+    assert graph.node_count == 6 and "1 of 7 parts" in graph.notes[0]
+
+
+def test_a_section_of_an_swc_has_one_type(tmp_path):
+    """MorphIO refuses others: "section type changed without a bifurcation"."""
+    nodes = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 2], [0, -1, 2], [0, 2, 3.0]])
+    forked = Skeleton.from_edges(nodes, np.array([-1, 0, 1, 1, 2]), np.full(5, 0.01))
+    forked.write_swc(tmp_path / "a.swc")
+    rows = [line.split() for line in (tmp_path / "a.swc").read_text().splitlines()
+            if not line.startswith("#")]
+    assert {row[1] for row in rows} == {"3"}
 
 
 def test_nothing_outside_the_file_is_read(tmp_path):

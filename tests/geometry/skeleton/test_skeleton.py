@@ -45,7 +45,7 @@ def test_cylinder_csv_round_trip(y_skeleton, tmp_path):
 
 @pytest.mark.parametrize(("lines", "complaint"), [
     ("1 0 0 0 0 1 2\n2 0 0 0 1 1 3\n3 0 0 0 2 1 2\n4 0 0 0 3 1 -1", "cycle"),
-    ("1 0 0 0 0 1 -1\n2 0 0 0 1 1 -1", "2 roots"),
+    ("1 0 0 0 0 1 -1\n2 0 0 0 1 1 -1", "2 trees"),
     ("1 0 0 0 0 1 -1\n2 0 0 0 1 -0.5 1", "negative"),
     ("1 0 0 0 0 1 -1\n2 0 0 0 x 1 1", "is not a node"),
     ("1 0 0 0 0 1 -1\n2 0 0 0 1 1 7", "not exist in the file"),

@@ -311,12 +311,16 @@ def body_format(path: Path) -> Format:
 def mesh_model(path: Path, settings: MeshSurfaceSettings, progress: Progress = SILENT,
                ) -> tuple[MeshedBody, list[dict[str, Any]]]:
     """Return the branch of a cylinder model, and the masses of the pruned twigs. InputError for an
-    unusable model or a given root: the model has its own. MeshingError if it cannot be meshed."""
-    if settings.root is not None:
-        raise InputError(Text("A root (", Option("root"), ") was given for a cylinder model."),
-                         "The model defines its own root.", "Omit ", Option("root"), ".")
+    unusable model, or a given root at another end than its own. MeshingError if it cannot be
+    meshed."""
     scale = UNIT_METRES[settings.unit]
-    read = read_skeleton(path, scale=scale)
+    read = read_skeleton(path, scale=scale, near=settings.root, progress=progress)
+    ends = read.nodes[np.r_[0, np.flatnonzero(read.child_counts() == 0)]]
+    if settings.root is not None and np.linalg.norm(
+            ends - scale * np.array(settings.root), axis=1).argmin() > 0:
+        raise InputError(Text("A tip of the cylinder model is nearer to the root (",
+                              Option("root"), ") than its own root."),
+                         "The model defines its own root.", "Omit ", Option("root"), ".")
     if (read.radius <= 0).any():
         raise InputError(f"{int((read.radius <= 0).sum())} of {read.node_count} nodes of {path} "
                          "have radius 0.", "A branch has a thickness.",

@@ -42,7 +42,7 @@ class _BagReading:
     def __init__(self, bag: Bag, request: ImportRequest):
         self.request, self.settings = request, request.settings
         self.clock = "stamps" if self.settings.bag_clock == "header" else "logged"
-        self.warnings: list[str] = []
+        self.warnings = list(bag.notes)
         self.bag = stamped(bag, self.clock, self.warnings)
         self.frames = Frames(self.bag.of("transform"), self.clock)
 

@@ -5,7 +5,9 @@ since bags may be untrusted. Messages that cannot be decoded are skipped and cou
 many of them is refused.
 """
 
-from collections.abc import Callable
+import struct
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -46,13 +48,15 @@ class Topic:
 class Bag:
     """Content of a bag: topics by kind (``wrench``, ``pose``, ``transform``, ``joints``,
     ``points``, ``image``, ``camera``), ``others`` as ``topic (type)``, the number of ``broken``
-    messages, and Limber's description of the pull if Limber wrote the bag."""
+    messages, Limber's description of the pull if Limber wrote the bag, and what a user should know
+    about the file."""
 
     path: Path
     kinds: dict[str, tuple[Topic, ...]]
     others: tuple[str, ...]
     broken: int
     pull_toml: str = ""
+    notes: tuple[str, ...] = ()
 
     def of(self, kind: str) -> tuple[Topic, ...]:
         """Return the topics of a kind."""
@@ -79,7 +83,7 @@ def read_bag(path: Path) -> Bag:
                          "Too few remain for a recording.", "Record or export it again.")
     others = tuple(str(entry) for entry in arrays["others"])
     return Bag(path, {kind: tuple(topics) for kind, topics in kinds.items()}, others, broken,
-               str(arrays["pull_toml"]))
+               str(arrays["pull_toml"]), tuple(map(str, arrays["notes"])))
 
 
 @dataclass
@@ -105,15 +109,104 @@ class _Growing:
                         "values": np.concatenate(self.values)}
 
 
+_MAGIC = b"\x89MCAP0\r\n"
+_FOOTER, _MESSAGE, _CHUNK, _DATA_END = 2, 5, 6, 15
+_KEPT = (1, 3, 4, _MESSAGE, 12)
+"""Kinds of MCAP's records: header, schema, channel, message, metadata."""
+
+
+def recovered(path: Path, target: Path) -> tuple[int, int]:
+    """Write the whole messages of an MCAP file without an end, as a killed recorder leaves it, into
+    ``target``: their number, and the bytes behind the last one. ValueError without any."""
+    count, cut = 0, [0]
+    with open(target, "wb") as stream:
+        stream.write(_MAGIC)
+        for kind, record in _whole_records(path.read_bytes(), len(_MAGIC), cut):
+            if kind in _KEPT:
+                stream.write(struct.pack("<BQ", kind, len(record)) + record)
+                count += kind == _MESSAGE
+        for kind, length in ((_DATA_END, 4), (_FOOTER, 20)):
+            stream.write(struct.pack("<BQ", kind, length) + bytes(length))
+        stream.write(_MAGIC)
+    if not count:
+        raise ValueError("it has no whole message; `mcap recover` may find some")
+    return count, cut[0]
+
+
+def _whole_records(content: bytes, at: int, cut: list[int]) -> Iterator[tuple[int, bytes]]:
+    """The kind and content of each whole record, also those in chunks; ``cut`` counts bytes of one
+    that was not finished. The last chunk may be cut: what can be unpacked of it counts."""
+    while at + 9 <= len(content):
+        kind, length = struct.unpack_from("<BQ", content, at)
+        record = content[at + 9:at + 9 + length]
+        at += 9 + length
+        if kind == _DATA_END:
+            return
+        if kind == _CHUNK and len(record) > 40:
+            size, = struct.unpack_from("<I", record, 28)
+            method = record[32:32 + size].decode("ascii", "replace")
+            inner = _unpacked(method, record[40 + size:])
+            cut[0] += 0 if inner or len(record) == length else len(record)
+            yield from _whole_records(inner, 0, cut)
+        elif len(record) == length:
+            yield kind, record
+        else:
+            cut[0] += len(record)
+    cut[0] += max(len(content) - at, 0)
+
+
+def _unpacked(method: str, packed: bytes) -> bytes:
+    """The content of a chunk, or of its beginning."""
+    if method == "zstd":
+        import zstandard
+
+        return zstandard.ZstdDecompressor().decompressobj().decompress(packed)
+    if method == "lz4":
+        import lz4.frame
+
+        return lz4.frame.LZ4FrameDecompressor().decompress(packed)
+    return packed
+
+
+def _files_of(path: Path) -> list[Path]:
+    """The bag itself; of a folder without an index, which a killed recorder does not write, its
+    files."""
+    if not path.is_dir() or (path / "metadata.yaml").is_file():
+        return [path]
+    return sorted(each for each in path.iterdir() if each.suffix in (".mcap", ".db3"))
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a folder is a bag, also one without its index."""
+    return path.is_dir() and bool(_files_of(path))
+
+
 def bag_arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the content of a bag as flat arrays, for :func:`read_bag` in the parent process."""
+    files = _files_of(path)
+    notes = [] if files == [path] else [
+        f"{path.name} has no metadata.yaml: its recorder was stopped. Its {len(files)} file(s) "
+        "were read."]
+    with tempfile.TemporaryDirectory(prefix="limber-bag-") as folder:
+        for number, file in enumerate(files):
+            if file.suffix.lower() == ".mcap" and not file.read_bytes().endswith(_MAGIC):
+                files[number] = Path(folder, f"{number}.mcap")
+                count, cut = recovered(file, files[number])
+                notes.append(f"{file.name} has no end: its recorder was stopped. Its {count} whole "
+                             "messages were read" + (f", {cut} bytes behind them were not."
+                                                     if cut else "."))
+        return _content(files, notes)
+
+
+def _content(files: Sequence[Path], notes: Sequence[str]) -> dict[str, np.ndarray]:
+    """The content of files of one bag."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     found: dict[str, _Growing] = {}
     others: list[str] = []
     read = broken = 0
-    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+    with AnyReader(files, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         connections = []
         for connection in reader.connections:
             if connection.msgtype in _READERS:
@@ -137,7 +230,7 @@ def bag_arrays(path: Path) -> dict[str, np.ndarray]:
     arrays: dict[str, np.ndarray] = {
         "topic_count": np.array(len(found)), "read": np.array(read), "broken": np.array(broken),
         "others": np.array(others, "U200"), "points": np.zeros((0, 3)),
-        "pull_toml": np.array(_pull_toml(path))}
+        "pull_toml": np.array(_pull_toml(files[0])), "notes": np.array(notes, "U400")}
     for number, (name, topic) in enumerate(found.items()):
         arrays |= {f"{number}_{key}": array for key, array in topic.arrays(name).items()}
     return arrays

@@ -27,7 +27,7 @@ class RecordingFormat(Format):
 
 RECORDINGS = Registry("recording", "limber.recordings", [
     RecordingFormat("bag", (".mcap", ".db3", ".bag"), f"{_READERS}:read_bag_pull",
-                    recognises=lambda path: (path / "metadata.yaml").is_file(), holds="pull",
+                    recognises="limber.recordings.bag_reader:is_bag", holds="pull",
                     about="ROS bag, file or folder"),
     RecordingFormat("pull", (), f"{_READERS}:read_folder", holds="pull", about="Limber pull",
                     recognises=lambda path: (path / "pull.toml").exists()),

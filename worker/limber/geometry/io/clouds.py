@@ -18,27 +18,12 @@ import numpy as np
 
 from limber.core.constants import UNIT_METRES
 from limber.core.errors import Command, InputError, Option, Text
-from limber.core.files.reading import (
-    check_las,
-    check_pcd,
-    check_ply,
-    header_bytes,
-    read_arrays,
-    require_size,
-)
-from limber.core.files.text_columns import (
-    LINES_AT_ONCE,
-    ColumnsError,
-    Table,
-    coding_of,
-    lines_of,
-    stated_unit,
-    three_of,
-)
+from limber.core.files import reading, text_columns
 from limber.geometry.cloud.cloud import LEFT_OUT, POINTS, Cloud, property_names
 from limber.geometry.cloud.preparation import PIECE_POINTS, gathered
 from limber.geometry.io.e57 import read_e57
 from limber.geometry.io.formats import Format, Registry, head_of, starts_with
+from limber.geometry.io.skeletons import is_cylinders, is_tree_file
 
 # A mesh given as a cloud: its vertices may be a scan, or far too few.
 
@@ -87,7 +72,7 @@ def read_ply(path: Path) -> Cloud:
     # Faces count the file's vertices.
     notes = () if cloud.left_out else tuple(mesh_notes(path, cloud.points, _triangles(content)))
     comments = "\n".join([*content.comments, *content.obj_info])
-    return replace(cloud, unit=stated_unit(comments), notes=notes)
+    return replace(cloud, unit=text_columns.stated_unit(comments), notes=notes)
 
 
 def _triangles(content: Any) -> np.ndarray:
@@ -105,7 +90,7 @@ def _ply_content(path: Path) -> tuple[Any, dict[str, str]]:
     standard; programs write comments and names in other letters too."""
     from plyfile import PlyData
 
-    raw, body = header_bytes(path, b"end_header")
+    raw, body = reading.header_bytes(path, b"end_header")
     if raw.isascii():
         return PlyData.read(str(path)), {}
     try:
@@ -133,12 +118,12 @@ _PADDING = "#$%&~~"  # prefix by which pypcd4 names fields that are called _
 
 def read_pcd(path: Path) -> Cloud:
     """Return the points of a PCD file, with the file's own names of renamed columns."""
-    raw, body = header_bytes(path, b"\nDATA")
+    raw, body = reading.header_bytes(path, b"\nDATA")
     header, titles = _completed(path, raw.decode("utf-8", "replace"))
     cloud = gathered(_cloud(table, titles) for table in _tables(path, header, body))
     comments = [line for line in raw.decode("utf-8", "replace").splitlines()
                 if line.startswith("#")]
-    return replace(cloud, unit=stated_unit("\n".join(comments)))
+    return replace(cloud, unit=text_columns.stated_unit("\n".join(comments)))
 
 
 def _cloud(table: np.ndarray, titles: dict[str, str]) -> Cloud:
@@ -330,7 +315,7 @@ def read_points3d(path: Path) -> Cloud:
     the file is cut short."""
     raw = path.read_bytes()
     count, = struct.unpack_from("<Q", raw)
-    require_size(path, float(count) * _POINT.size + 8, len(raw), f"{count} points")
+    reading.require_size(path, float(count) * _POINT.size + 8, len(raw), f"{count} points")
     cut = InputError(f"{path} is cut short.", f"It announces {count} points.", "Export it again.")
     rows, at = np.empty((count, 7)), 8
     for row in rows:
@@ -363,7 +348,7 @@ class _Scan(NamedTuple):
 def read_ptx(path: Path) -> Cloud:
     """Return the points of all scans [m] in their common frame, with intensity and colour, thinned
     by :func:`gathered`. InputError if a scan is cut short, or one of its lines is invalid."""
-    coding = coding_of(path)
+    coding = text_columns.coding_of(path)
     scans = _scans(path, coding)
     width = min((scan.width for scan in scans), default=0)
     if width < 3:
@@ -373,7 +358,7 @@ def read_ptx(path: Path) -> Cloud:
 
 
 def _lines(path: Path, coding: str) -> Iterator[str]:
-    return filter(str.strip, lines_of(path, coding))
+    return filter(str.strip, text_columns.lines_of(path, coding))
 
 
 def _scans(path: Path, coding: str) -> list[_Scan]:
@@ -397,7 +382,7 @@ def _scan_pieces(path: Path, coding: str, scans: list[_Scan], width: int) -> Ite
     lines = _lines(path, coding)
     for scan in scans:
         rows = itertools.islice(lines, _HEAD, _HEAD + scan.size)
-        while some := list(itertools.islice(rows, LINES_AT_ONCE)):
+        while some := list(itertools.islice(rows, text_columns.LINES_AT_ONCE)):
             table = _table(path, some, scan)
             # A direction without an echo is a point at the scanner itself.
             seen = np.isfinite(table[:, 0])
@@ -498,13 +483,17 @@ def unit_of(cloud: Cloud, requested: str | None) -> tuple[str, list[str]]:
 
 
 def _read_text(path: Path) -> Cloud:
-    """XYZ, TXT, CSV; see :mod:`limber.core.files.text_columns`."""
+    """XYZ, TXT, CSV; see :mod:`limber.core.files.text_columns`. InputError also for a model."""
+    if is_cylinders(path) or is_tree_file(path):
+        raise InputError(f"{path} holds the cylinders or segments of a tree's model.",
+                         "A point cloud was expected.", "Mesh the model with ", Command("mesh"),
+                         ", or give it beside its cloud with ", Option("skeleton", path.name), ".")
     try:
-        table = Table(path)
+        table = text_columns.Table(path)
         held = gathered(Cloud(piece[:, table.axes], {"others": np.delete(piece, table.axes, 1)})
                         for piece in table.pieces())
         read = table.columns(_joined(held, table.axes))
-    except ColumnsError as error:
+    except text_columns.ColumnsError as error:
         raise InputError(error.seen, error.why, error.fix) from error
     # A column with the name of an earlier one would replace it.
     names = property_names(read.names)
@@ -545,17 +534,17 @@ def _commented_unit(path: Path) -> str | None:
     if path.suffix.lower() != ".obj":
         return None
     lines = head_of(path, 10_000).decode("utf-8", "replace").splitlines()
-    return stated_unit("\n".join(line for line in lines if line.startswith("#")))
+    return text_columns.stated_unit("\n".join(line for line in lines if line.startswith("#")))
 
 
 def _read_arrays(path: Path) -> Cloud:
-    arrays = read_arrays(path, "a point cloud")
+    arrays = reading.read_arrays(path, "a point cloud")
     names = ("points", "xyz", "positions", "vertices", "arr_0")
     key = next((name for name in names if name in arrays), None)
     if key is not None and arrays[key].dtype.names:
         arrays, key = {name: arrays[key][name] for name in arrays[key].dtype.names}, None
     if key is None:
-        if three_of("position", list(arrays)) is None:
+        if text_columns.three_of("position", list(arrays)) is None:
             raise InputError(f"{path} has the arrays {', '.join(arrays)[:200]}.",
                              f"A cloud has one of {', '.join(names[:-1])}, or x, y and z.",
                              "Save the coordinates under one of these names.")
@@ -577,14 +566,14 @@ def _of_columns(path: Path, columns: dict[str, np.ndarray]) -> Cloud:
 
 
 CLOUDS = Registry("point cloud", "limber.clouds", [
-    Format("PLY", (".ply",), read_ply, check=check_ply, recognises=starts_with(b"ply")),
-    Format("PCD", (".pcd",), read_pcd, check=check_pcd,
+    Format("PLY", (".ply",), read_ply, check=reading.check_ply, recognises=starts_with(b"ply")),
+    Format("PCD", (".pcd",), read_pcd, check=reading.check_pcd,
            recognises=starts_with(b"# .PCD", b"VERSION")),
     Format("text", (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzrgb", ".tsv"), _read_text),
     Format("PTX", (".ptx",), read_ptx),
     Format("E57", (".e57",), read_e57, recognises=starts_with(b"ASTM-E57")),
     Format("COLMAP", (".bin",), read_points3d),
-    Format("LAS", (".las", ".laz"), las_columns, check=check_las, isolated=is_packed,
+    Format("LAS", (".las", ".laz"), las_columns, check=reading.check_las, isolated=is_packed,
            recognises=starts_with(b"LASF")),
     Format("vertices of a mesh", (".obj", ".stl", ".off"), _read_vertices),
     Format("NumPy", (".npz", ".npy"), _read_arrays)], of_arrays=_of_columns)

@@ -11,6 +11,7 @@
 ======================  ===========================================================================
 """
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,9 @@ from limber.geometry.skeleton.skeleton import Skeleton
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _STARTS = (0, 512)
 """Offset at which HDF5 begins: Matlab writes its own header before it."""
-_MOST_TEXT = 200
+_MOST_TEXT, _MOST_MODELS = 200, 1000
+Model = tuple[dict[str, Any], str, float]
+"""Fields of its cylinders, its creator, mean distance of the cloud's points from it (or NaN)."""
 
 
 def is_hdf5(path: Path) -> bool:
@@ -42,24 +45,26 @@ def is_hdf5(path: Path) -> bool:
     return any(head[at:at + len(_SIGNATURE)] == _SIGNATURE for at in _STARTS)
 
 
-def struct_arrays(path: Path, needed: tuple[str, ...], further: tuple[str, ...],
-                  ) -> dict[str, np.ndarray]:
-    """Return the fields [rows, columns] of the first struct, or its ``cylinder``, with all needed
-    ones, and ``creator``, the text of ``rundata.creator``; empty if none has them. A damaged file
-    raises OSError, ValueError, KeyError or RuntimeError."""
+def mat_v73_models(path: Path) -> Iterator[Model]:
+    """Yield the models of a MAT file of version 7.3. A damaged file raises OSError, ValueError,
+    KeyError or RuntimeError."""
     import h5py
 
     most = max(LARGEST_EXPANSION * path.stat().st_size, HARMLESS_BYTES)
     with h5py.File(path, "r") as file:
         for name in file:
-            first = _struct(file, _own(file, name))
-            for found in (first, _struct(file, _own(first, "cylinder"))):
-                if found is not None and all(name in found for name in needed):
-                    arrays = {name: _numbers(_own(found, name), most)
-                              for name in (*needed, *further) if name in found}
-                    creator = _own(_struct(file, _own(first, "rundata")), "creator")
-                    return arrays | {"creator": np.array(_text(creator))}
-    return {}
+            for outer in _structs(file, _own(file, name)):
+                texts = _structs(file, _own(outer, "rundata"))
+                for k, found in enumerate([outer, *_structs(file, _own(outer, "cylinder"))]):
+                    if not all(field in found for field in TREEQSM_FIELDS):
+                        continue
+                    creator = _text(_own(texts[min(k, len(texts)) - 1], "creator")
+                                    ) if texts else ""
+                    near = _structs(file, _own(outer, "pmdistance"))
+                    off = _own(near[min(k, len(near)) - 1], "mean") if near else None
+                    yield {field: _numbers(_own(found, field), most)
+                           for field in (*TREEQSM_FIELDS, _THICK) if field in found}, creator, (
+                        float("nan") if off is None else float(_numbers(off, most).ravel()[0]))
 
 
 def _own(group: Any, name: str) -> Any:
@@ -72,16 +77,15 @@ def _own(group: Any, name: str) -> Any:
     return group[name]
 
 
-def _struct(file: Any, found: Any) -> Any:
-    """A struct; for an array of structs or a cell array, the first one."""
+def _structs(file: Any, found: Any) -> list[Any]:
+    """A struct, or all those of an array of structs or a cell array."""
     import h5py
 
     if isinstance(found, h5py.Dataset) and h5py.check_ref_dtype(found.dtype) is h5py.Reference:
-        if not found.size:
-            return None
-        first = found[(0,) * found.ndim]
-        found = file[first] if first else None
-    return found if isinstance(found, h5py.Group) else None
+        several = [file[each] for each in np.ravel(found[()])[:_MOST_MODELS] if each]
+    else:
+        several = [found]
+    return [each for each in several if isinstance(each, h5py.Group)]
 
 
 def _numbers(found: Any, most_bytes: float) -> np.ndarray:
@@ -115,12 +119,15 @@ _THICK = "UnmodRadius"
 
 def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
     """Return ``id``, ``parent`` (-1: none), ``start``, ``end``, ``radius`` and ``start_radius`` of
-    a ``.mat`` file's first model. Cylinders without a parent are attached if they start where the
-    first does. MissingDependencyError for version 7.3 without h5py."""
+    a ``.mat`` file's model, of several the one nearest to its points (else the first), and
+    ``notes`` that list them. MissingDependencyError for version 7.3 without h5py."""
     found = _fields(Path(path))
     if not found:
         raise InputError(f"{path} has no struct with the fields {', '.join(TREEQSM_FIELDS)}.",
                          "A TreeQSM model was expected.", "Save the QSM itself from TreeQSM.")
+    notes = [f"{Path(path).name} has {len(found['models'])} models: "
+             f"{'; '.join(found['models'])}. Number {found['taken']} was taken. For another, "
+             "save it alone in Matlab."] if len(found["models"]) > 1 else []
     try:
         radius, length, parent = (np.asarray(found[name], float).ravel()
                                   for name in ("radius", "length", "parent"))
@@ -135,7 +142,7 @@ def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
                          "Each field needs one value for each cylinder.", "Save it again.")
     return {"id": np.arange(1.0, count + 1), "parent": np.where(parent > 0, parent, -1.0),
             "start": start, "end": start + axis * length[:, None], "radius": radius,
-            "start_radius": _thick_ends(found, radius)}
+            "start_radius": _thick_ends(found, radius), "notes": np.array(notes)}
 
 
 def _fields(path: Path) -> dict[str, Any]:
@@ -154,26 +161,52 @@ def _fields(path: Path) -> dict[str, Any]:
 
 
 def mat_v73_fields(path: Path) -> dict[str, np.ndarray]:
-    """Return the fields of the cylinders of a MAT file of version 7.3."""
-    return struct_arrays(path, TREEQSM_FIELDS, (_THICK,))
+    """Return what :func:`mat_fields` does of a MAT file of version 7.3."""
+    return _best_of(mat_v73_models(path))
 
 
 def mat_fields(path: Path) -> dict[str, np.ndarray]:
-    """Return the fields of the cylinders and ``creator`` of a MAT file of an older version; empty
-    without cylinders. scipy's compiled reader can crash on a damaged file."""
+    """Return the fields of the cylinders, ``creator``, ``models`` (texts on all of the file) and
+    ``taken``, the number of the one, of a MAT file of an older version; empty without cylinders.
+    scipy's compiled reader can crash on a damaged file."""
     from scipy.io import loadmat
 
     content = loadmat(path, squeeze_me=True, struct_as_record=False)
-    cylinder = _cylinder_struct(content)
-    if cylinder is None:
+    return _best_of(_models_of(content))
+
+
+def _models_of(content: dict[str, Any]) -> Iterator[Model]:
+    for value in content.values():
+        several = value.ravel() if isinstance(value, np.ndarray) and value.dtype == object else [
+            value]
+        for each in several[:_MOST_MODELS]:
+            for found in (each, getattr(each, "cylinder", None)):
+                if found is not None and all(hasattr(found, name) for name in TREEQSM_FIELDS):
+                    off = getattr(getattr(each, "pmdistance", None), "mean", np.nan)
+                    yield {name: np.asarray(getattr(found, name))
+                           for name in (*TREEQSM_FIELDS, _THICK) if hasattr(found, name)}, str(
+                        getattr(getattr(each, "rundata", None), "creator", "")), (
+                        float(off) if np.size(off) == 1 else np.nan)
+                    break
+
+
+def _best_of(models: Iterable[Model]) -> dict[str, np.ndarray]:
+    """The model nearest to its points, and what there is of others."""
+    known = list(models)
+    for fields, _, _ in known:
+        for name, values in fields.items():
+            if values.dtype.kind == "O":
+                raise ValueError(f"{name} has values that are no numbers")
+    if not known:
         return {}
-    creator = getattr(getattr(content.get("QSM"), "rundata", None), "creator", "")
-    fields = {name: np.asarray(getattr(cylinder, name)) for name in (*TREEQSM_FIELDS, _THICK)
-              if hasattr(cylinder, name)}
-    for name, values in fields.items():
-        if values.dtype.kind == "O":
-            raise ValueError(f"{name} has values that are no numbers")
-    return fields | {"creator": np.asarray(str(creator))}
+    off = [distance if np.isfinite(distance) else np.inf for *_, distance in known]
+    best = int(np.argmin(off))
+    fields, creator, _ = known[best]
+    about = [f"{k}: {np.size(each['radius'])} cylinders"
+             + (f", {1e3 * distance:.3g} mm from its points" if np.isfinite(distance) else "")
+             for k, (each, _, distance) in enumerate(known, 1)]
+    return fields | {"creator": np.asarray(creator), "models": np.array(about),
+                     "taken": np.array(best + 1)}
 
 
 def _thick_ends(found: dict[str, Any], radius: np.ndarray) -> np.ndarray:
@@ -186,59 +219,64 @@ def _thick_ends(found: dict[str, Any], radius: np.ndarray) -> np.ndarray:
     return thick if fits and (np.isfinite(thick) & (thick > 0)).all() else radius
 
 
-def _cylinder_struct(content: dict[str, Any]) -> Any:
-    for value in content.values():
-        first = value.ravel()[0] if isinstance(value, np.ndarray) and value.size and (
-            value.dtype == object) else value
-        for found in (first, getattr(first, "cylinder", None)):
-            if found is not None and all(hasattr(found, name) for name in TREEQSM_FIELDS):
-                return found
-    return None
+def _columns_of(skeleton: Skeleton) -> dict[str, np.ndarray]:
+    """The cylinder below each node but the root: its place, length, axis, radius and branch."""
+    up, node = skeleton.parent[1:], np.arange(1, skeleton.node_count)
+    start, end = skeleton.nodes[up], skeleton.nodes[1:]
+    length = np.linalg.norm(end - start, axis=1)
+    return {"node": node, "up": up, "start": start, "end": end, "length": length,
+            "axis": (end - start) / np.maximum(length, 1e-300)[:, None],
+            "radius": skeleton.radius[1:], "branch": skeleton.branch[1:],
+            "order": skeleton.order[1:]}
+
+
+def _write(path: Path, titles: str, *columns: np.ndarray, **options: Any) -> None:
+    """Write a table with these columns, each [n] or [n, 3]."""
+    parts = (list(part) for column in columns for part in np.atleast_2d(column.T))
+    write_table(path, titles.split(), zip(*parts, strict=True), **options)
 
 
 def write_treeqsm(skeleton: Skeleton, path: Path) -> None:
     """Write a TreeQSM ``.mat`` file in metres: a struct ``QSM`` with ``cylinder``."""
     from scipy.io import savemat
 
-    start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
-    length = np.linalg.norm(end - start, axis=1)
-    count = len(end)
-    extension = np.zeros(count)
-    position = np.ones(count)
-    for node in range(2, count + 1):
-        up = int(skeleton.parent[node])
+    found = _columns_of(skeleton)
+    extension, position = np.zeros(len(found["up"])), np.ones(len(found["up"]))
+    for node, up in zip(found["node"][1:], found["up"][1:], strict=True):
         if up > 0 and skeleton.branch[up] == skeleton.branch[node]:
-            extension[up - 1] = node
-            position[node - 1] = position[up - 1] + 1
+            extension[up - 1], position[node - 1] = node, position[up - 1] + 1
     column = {name: np.asarray(values, float)[:, None] for name, values in {
-        "radius": skeleton.radius[1:], "length": length, "parent": skeleton.parent[1:],
-        "extension": extension, "branch": skeleton.branch[1:] + 1,
-        "BranchOrder": skeleton.order[1:], "PositionInBranch": position,
-        "added": np.zeros(count)}.items()}
-    axis = (end - start) / np.maximum(length, 1e-300)[:, None]
-    savemat(path, {"QSM": {"cylinder": {**column, "start": start, "axis": axis}}},
+        "radius": found["radius"], "length": found["length"], "parent": found["up"],
+        "extension": extension, "branch": found["branch"] + 1, "BranchOrder": found["order"],
+        "PositionInBranch": position, "added": np.zeros(len(position))}.items()}
+    savemat(path, {"QSM": {"cylinder": column | {key: found[key] for key in ("start", "axis")}}},
             do_compression=True)
+
+
+def write_cylinders(skeleton: Skeleton, path: Path) -> None:
+    """Write one cylinder for each node but the root, as CSV in the skeleton's unit. The state of a
+    radius is 0 measured, 1 limited, 2 interpolated, 3 unresolved or 4 bridged."""
+    c, later = _columns_of(skeleton), slice(1, None)
+    _write(path, "id parent sx sy sz ex ey ez radius length ax ay az branch order radius_sigma "
+           "radius_state probability start_radius", c["node"] - 1, c["up"] - 1, c["start"],
+           c["end"], c["radius"], c["length"], c["axis"], c["branch"], c["order"],
+           *(np.array([f"{value:{form}}" for value in values]) for values, form in (
+               (skeleton.radius_sigma[later], ".3g"), (skeleton.radius_state[later], "d"),
+               (skeleton.probability[later], ".3f"), (skeleton.radius[c["up"]], ".12g"))),
+           digits=15, line_end="\r\n")
 
 
 def write_rtwig(skeleton: Skeleton, path: Path) -> None:
     """Write rTwig's minimal table [m]: what its ``reconstruct_qsm`` needs, with branch and order.
     """
-    titles = ("id parent start_x start_y start_z end_x end_y end_z radius branch "
-              "branch_order").split()
-    write_table(path, titles, (
-        (node, up, *skeleton.nodes[up], *skeleton.nodes[node], skeleton.radius[node],
-         skeleton.branch[node] + 1, skeleton.order[node])
-        for node, up in enumerate(skeleton.parent[1:], start=1)))
+    c = _columns_of(skeleton)
+    _write(path, "id parent start_x start_y start_z end_x end_y end_z radius branch branch_order",
+           c["node"], c["up"], c["start"], c["end"], c["radius"], c["branch"] + 1, c["order"])
 
 
 def write_simpleforest(skeleton: Skeleton, path: Path) -> None:
     """Write a table with SimpleForest's names [m]."""
-    titles = ("ID parentID startX startY startZ endX endY endZ axisX axisY axisZ radius length "
-              "branchID branchOrder").split()
-    rows = []
-    for node, up in enumerate(skeleton.parent[1:], start=1):
-        start, end = skeleton.nodes[up], skeleton.nodes[node]
-        length = float(np.linalg.norm(end - start))
-        rows.append((node - 1, up - 1, *start, *end, *((end - start) / max(length, 1e-300)),
-                     skeleton.radius[node], length, skeleton.branch[node], skeleton.order[node]))
-    write_table(path, titles, rows)
+    c = _columns_of(skeleton)
+    _write(path, "ID parentID startX startY startZ endX endY endZ axisX axisY axisZ radius length "
+           "branchID branchOrder", c["node"] - 1, c["up"] - 1, c["start"], c["end"], c["axis"],
+           c["radius"], c["length"], c["branch"], c["order"])

@@ -1,23 +1,24 @@
 """Skeletons of other programs and the registry of their formats; SWC, cylinder models as CSV."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from limber.core.constants import UNIT_METRES
-from limber.core.errors import InputError
+from limber.core.errors import InputError, Option
 from limber.core.files.atomic import write_lines
 from limber.core.files.reading import read_text, require_finite
-from limber.core.files.tables import csv_records, write_table
-from limber.geometry.io.cylinder_models import (
-    read_treeqsm,
-    write_rtwig,
-    write_simpleforest,
-    write_treeqsm,
-)
+from limber.core.files.text_columns import fields_of, plain, separator_of
+from limber.core.not_none import present
+from limber.core.progress import SILENT, Progress
+from limber.geometry.io import cylinder_models
+from limber.geometry.io.cylinder_models import write_cylinders
 from limber.geometry.io.formats import Format, Registry, head_of
 from limber.geometry.skeleton.skeleton import STATES, Skeleton
 
@@ -31,6 +32,7 @@ from limber.geometry.skeleton.skeleton import STATES, Skeleton
 #
 # Source: C. Pradal, C. Godin, *MTG user guide* (OpenAlea), and its example files.
 
+Place = Sequence[float] | None
 _SECTIONS = ("CODE", "CLASSES", "DESCRIPTION", "FEATURES", "MTG")
 _TOKEN = re.compile(r"(/|<<|\+\+|<|\+)?([A-Za-z$]+)(\d*)")
 _PLACE = (("XX", "YY", "ZZ"), ("X", "Y", "Z"))
@@ -48,7 +50,7 @@ class _Vertex:
     tail: int = field(default=-1)
 
 
-def read_mtg(path: Path, *, scale: float | None = None) -> Skeleton:
+def read_mtg(path: Path, *, scale: float | None = None, near: Place = None) -> Skeleton:
     """Read an MTG; nodes without radius or diameter have that of the node before. ``scale`` is
     metres per unit (None: 1). InputError if it is not one tree with positions and radii."""
     lines = read_text(path, _WHAT).splitlines()
@@ -56,7 +58,7 @@ def read_mtg(path: Path, *, scale: float | None = None) -> Skeleton:
     reader = _Reader(path, scales, *_header(path, body))
     for number, line in body[1:]:
         reader.take(number, line)
-    return reader.skeleton(1.0 if scale is None else scale)
+    return reader.skeleton(1.0 if scale is None else scale, near)
 
 
 def _sections(path: Path, lines: list[str]) -> tuple[dict[str, int], list[tuple[int, str]]]:
@@ -196,15 +198,14 @@ class _Reader:
         require_finite(self.path, {f"position in line {number}": np.array(position)}, _WHAT)
         return *position, value(self.radius_column) * _RADII[self.radius_column]
 
-    def skeleton(self, scale: float) -> Skeleton:
-        roots = self.parent.count(-1)
-        if roots != 1:
-            raise InputError(f"{self.path} has {roots} vertices with a position that grow from no "
-                             "other vertex.", "A branch has exactly one root.",
-                             "Keep only one plant in the file.")
-        nodes, radius = np.array(self.nodes), np.array(self.radius)
+    def skeleton(self, scale: float, near: Place) -> Skeleton:
+        nodes, parent = np.array(self.nodes).reshape(-1, 3), np.array(self.parent, np.int64)
+        if not len(nodes):
+            raise InputError(f"{self.path} has 0 vertices with a position.",
+                             "A branch has a root and a tip.", "Check the columns of positions.")
+        radius = np.array(self.radius)
         require_finite(self.path, {"radii": radius}, _WHAT)
-        return Skeleton.from_edges(nodes * scale, np.array(self.parent), radius * scale)
+        return _of_nodes(self.path, nodes, parent, radius, scale, near)
 
     def wrong(self, number: int, code: str, why: str) -> InputError:
         return InputError(f"{self.path}, line {number}: {code[:60]!r} cannot be read.", why,
@@ -242,19 +243,35 @@ def write_mtg(skeleton: Skeleton, path: Path) -> None:
     write_lines(path, lines)
 
 
-_ALIASES = {"id": "id", "parentid": "parent", "radius": "radius", **{
-    f"{end}{axis}": f"{end[0]}{axis}" for end in ("start", "end") for axis in "xyz"}}
-"""Names of columns in rTwig and SimpleForest, in lower case and without underscores."""
+_MEANINGS = {
+    spelt: name for name, several in {
+        "id": ("id", "cylid", "cylinderid"), "parent": ("parent", "parentid", "parentcylid"),
+        "radius": ("radius", "radiuscyl", "cylradius"), "length": ("length", "len"),
+        "diameter": ("diameter", "diametercyl", "diam"),
+        **{f"{end[0]}{axis}": (f"{end[0]}{axis}", f"{end}{axis}", f"{end}{k}", f"{axis}{end}")
+           for end in ("start", "end", "axis") for k, axis in enumerate("xyz", 1)}}.items()
+    for spelt in several}
+"""Columns of Limber, TreeQSM, rTwig, SimpleForest and aRchi, in :func:`.text_columns.plain`."""
+_MISSING = {"NA": "nan", "NULL": "nan"}
+_LOOSE = 0.1
+"""Fraction of the length of a file's trees that may be loose from the longest, and is left out."""
 _HEAD = 4096  # bytes searched for the format
 
 
-def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read a skeleton of any format of :data:`SKELETONS`. ``scale`` is metres per unit; None uses
-    the file's own, or metres. InputError if its format is not known, or it is not a tree."""
-    return SKELETONS.read(Path(path), scale=scale)
+def read_skeleton(path: Path, *, scale: float | None = None, near: Place | str = None,
+                  progress: Progress = SILENT) -> Skeleton:
+    """Read a skeleton of any format of :data:`SKELETONS`, and tell its notes. ``scale`` is metres
+    per unit; None uses the file's own, or metres; of several trees that with its root ``near`` a
+    place [3] in the file's coordinates (no word) is taken. InputError if its format is not known,
+    or it is not a tree."""
+    options = {} if near is None or isinstance(near, str) else {"near": near}
+    found = SKELETONS.read(Path(path), scale=scale, **options)
+    for text in found.notes:
+        progress.warn(text)
+    return found
 
 
-def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
+def read_swc(path: Path, *, scale: float | None = None, near: Place = None) -> Skeleton:
     """Read an SWC file. ``scale`` is metres per unit; None uses the header's ``# unit:``, or
     metres. InputError if it is not a tree; see :meth:`Skeleton.from_edges`."""
     rows, header_scale = [], 1.0
@@ -277,7 +294,7 @@ def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
     _require_whole(path, table[:, [0, 5]])
     parent = _parents(path, table[:, 0].astype(np.int64), table[:, 5].astype(np.int64))
     factor = header_scale if scale is None else scale
-    return Skeleton.from_edges(table[:, 1:4] * factor, parent, table[:, 4] * factor)
+    return _of_nodes(path, table[:, 1:4], parent, table[:, 4], factor, near)
 
 
 def _swc_node(line: str) -> list[float]:
@@ -298,79 +315,180 @@ def _is_swc(path: Path) -> bool:
         return False
 
 
-def _is_cylinders(path: Path) -> bool:
-    return "radius" in [title.strip().lower() for title in _first_line(path).split(",")]
+def _of_nodes(path: Path, nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray,
+              factor: float, near: Place) -> Skeleton:
+    """The skeleton of a file's nodes [n, 3]."""
+    keep, notes = _one_tree(path, parent, nodes, np.where(
+        parent < 0, 0.0, np.linalg.norm(nodes - nodes[parent], axis=1)), near)
+    return replace(Skeleton.from_edges(nodes[keep] * factor, _moved(parent, keep),
+                                       radius[keep] * factor), notes=notes)
 
 
-def read_cylinders(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read columns id, parent, sx, sy, sz, ex, ey, ez, radius (any order; also by the names of
-    rTwig and SimpleForest), and what :func:`write_cylinders` adds. An end becomes a node attached
-    to its parent's end; the root's start is the root. InputError if it is not one tree."""
-    rows = [{_ALIASES.get(name.strip().lower().replace("_", ""), name.strip()): value
-             for name, value in row.items() if name is not None}
-            for row in csv_records(path, "a cylinder model")]
+def _one_tree(path: Path, parent: np.ndarray, start: np.ndarray, length: np.ndarray,
+              near: Place) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Which parts of a file [n] are its tree, by their parents (-1: none), start [n, 3] and length,
+    and notes on those left out: the tree ``near`` a place, else the longest. InputError if there
+    are several."""
+    below, roots = np.flatnonzero(parent >= 0), np.flatnonzero(parent < 0)
+    # Several may grow from the ground of one root.
+    _, first, group = np.unique(np.round(start[roots], 9), axis=0, return_index=True,
+                                return_inverse=True)
+    links = (np.r_[below, roots], np.r_[parent[below], roots[first[group.ravel()]]])
+    count, label = connected_components(
+        coo_array((np.ones(len(parent)), links), (len(parent),) * 2), directed=False)
+    if count == 1 or len(np.unique(label[roots])) < count or not np.isfinite(length).all():
+        # A cycle, or no numbers: refused by the skeleton.
+        return np.ones(len(parent), bool), ()
+    share = np.bincount(label, length) / max(length.sum(), 1e-300)
+    if near is not None:
+        nearest = roots[np.linalg.norm(start[roots] - near, axis=1).argmin()]
+        return label == label[nearest], (
+            f"{path.name} has {count} trees. The one with its root at {_place(start[nearest])} was "
+            f"taken: {100 * share[label[nearest]]:.3g} % of their length.",)
+    longest = np.argsort(-share, kind="stable")
+    loose = 1.0 - share[longest[0]]
+    if loose > _LOOSE:
+        places = "; ".join(f"{_place(start[roots[label[roots] == k][0]])} ({100 * share[k]:.2g} %)"
+                           for k in longest[:4] if (label[roots] == k).any())
+        raise InputError(f"{path} has {count} trees. Roots, with shares of the length: {places}.",
+                         "A branch has exactly one root.", "Choose one with ", Option("root"),
+                         " and a place near its root, or keep only one tree in the file.")
+    return label == longest[0], (
+        f"{path.name}: {int((label != longest[0]).sum())} of {len(parent)} parts, "
+        f"{100 * loose:.2g} % of the length, are loose from the tree and were left out.",)
+
+
+def _place(point: np.ndarray) -> str:
+    return f"({', '.join(f'{value:.6g}' for value in point)})"
+
+
+def _moved(parent: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    """Parents of the kept parts, counted among them."""
+    return np.where(parent < 0, -1, (np.cumsum(keep) - 1)[parent])[keep]
+
+
+def is_cylinders(path: Path) -> bool:
+    """Return whether a file begins with the titles of a table of cylinders."""
+    found = _columns([_first_line(path)])
+    return {"parent", "sx"} <= set(found) and bool({"radius", "diameter"} & set(found))
+
+
+def _columns(lines: Sequence[str]) -> dict[str, Sequence[Any]]:
+    """The fields below each title, by its meaning if that is known."""
+    mark = separator_of(lines[:1])
+    titles, *rows = [fields_of(line, mark) for line in lines]
+    found: dict[str, Sequence[Any]] = {}
+    for k, title in enumerate(titles):
+        found.setdefault(_MEANINGS.get(plain(title), title), [
+            row[k].replace(",", ".") if k < len(row) else "" for row in rows])
+    return found
+
+
+def read_cylinders(path: Path, *, scale: float | None = None, near: Place = None) -> Skeleton:
+    """Read columns parent, sx, sy, sz, radius and ex, ey, ez, or ax, ay, az and length (any order,
+    separator and names of :data:`_MEANINGS`; without id they are counted from 1), and what
+    :func:`write_cylinders` adds. An end becomes a node attached to its parent's end; the root's
+    start is the root. InputError if it is not one tree."""
+    lines = [line for line in read_text(path, "a cylinder model").splitlines()
+             if line.strip() and not line.startswith("#")]
+    columns = _columns(lines) if lines else {}
+    columns.setdefault("id", range(1, len(lines)))
+    if "radius" not in columns and "diameter" in columns:
+        columns["radius"] = (_numbers(path, columns, ["diameter"])[:, 0] / 2).tolist()
+    if "ex" not in columns and {"ax", "ay", "az", "length"} <= set(columns):
+        read = _numbers(path, columns, ("sx", "sy", "sz", "ax", "ay", "az", "length"))
+        columns |= zip(("ex", "ey", "ez"), (
+            read[:, :3] + read[:, 3:6] * read[:, 6:]).T.tolist(), strict=True)
     names = ("id", "parent", "sx", "sy", "sz", "ex", "ey", "ez", "radius")
-    missing = [name for name in names if not rows or name not in rows[0]]
-    if missing:
-        raise InputError(f"{path} lacks the columns {', '.join(missing)}.",
+    missing = [name for name in names if name not in columns]
+    if missing or len(lines) < 2:
+        raise InputError(f"{path} lacks the columns {', '.join(missing)}." if missing else
+                         f"{path} has no cylinders.",
                          f"A cylinder model has the columns {', '.join(names)}.",
                          "Rename the columns of your export.")
-    return _tree_of(path, _numbers(path, rows, names), scale, rows)
+    return _tree_of(path, _numbers(path, columns, names), scale, near, columns)
 
 
-def _of_arrays(path: Path, read: dict[str, np.ndarray], *, scale: float | None = None) -> Skeleton:
+_SEGMENT = re.compile(r"x,y,z,radius,parent_id[\w,]*")
+
+
+def is_tree_file(path: Path) -> bool:
+    """Return whether a file begins with the titles of a tree file of raycloudtools."""
+    return _SEGMENT.search(head_of(path, _HEAD).decode("utf-8", "replace")) is not None
+
+
+def read_tree_file(path: Path, *, scale: float | None = None, near: Place = None) -> Skeleton:
+    """Read a tree file of raycloudtools: a line for each tree with its attributes and segments,
+    these with the place of their end, radius and the number of their parent (-1: the root).
+    InputError if a line is not of this kind, or without one tree."""
+    text = read_text(path, "a tree file")
+    titles = present(_SEGMENT.search(text), "titles of a tree file").group().strip(",").split(",")
+    rows: list[list[float]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not re.match(r"\s*[-\d.]", line):
+            continue
+        before = len(rows)
+        try:
+            for part in re.split(r",\s+", line.strip().rstrip(",")):
+                fields = [float(field) for field in part.split(",")]
+                if len(fields) == len(titles):
+                    up = fields[4]
+                    rows.append([len(rows), up + before if up >= 0 else -1, *fields[:4]])
+                elif len(rows) > before:
+                    raise ValueError(f"{len(fields)} values instead of {len(titles)}")
+            if len(rows) == before:
+                raise ValueError(f"no segment of {len(titles)} values")
+        except ValueError as error:
+            raise InputError(f"{path}, line {number} is not a tree ({error}).",
+                             f"A segment has {', '.join(titles)}.", "Export it again.") from error
+    if not rows:
+        raise InputError(f"{path} has no trees.", "Each line is a tree.", "Export it again.")
+    table = np.array(rows)
+    parent = _parents(path, table[:, 0].astype(np.int64), table[:, 1].astype(np.int64))
+    return _of_nodes(path, table[:, 2:5], parent, table[:, 5], 1.0 if scale is None else scale,
+                     near)
+
+
+def _of_arrays(path: Path, read: dict[str, np.ndarray], *, scale: float | None = None,
+               near: Place = None) -> Skeleton:
     table = np.column_stack([read[name] for name in ("id", "parent", "start", "end", "radius")])
-    return _tree_of(path, table, scale, start_radius=read.get("start_radius"))
+    found = _tree_of(path, table, scale, near, start_radius=read.get("start_radius"))
+    return replace(found, notes=(*found.notes, *map(str, read.get("notes", ()))))
 
 
-def _read_mat(path: Path, *, scale: float | None = None) -> Skeleton:
-    return _of_arrays(path, read_treeqsm(path), scale=scale)
+def _read_mat(path: Path, **options: Any) -> Skeleton:
+    return _of_arrays(path, cylinder_models.read_treeqsm(path), **options)
 
 
-def _tree_of(path: Path, table: np.ndarray, scale: float | None,
-             rows: Sequence[dict[str, str]] = (), *,
+def _tree_of(path: Path, table: np.ndarray, scale: float | None, near: Place,
+             columns: Mapping[str, Sequence[Any]] | None = None, *,
              start_radius: np.ndarray | None = None) -> Skeleton:
     """The skeleton of cylinders: id, parent, start, end and radius, shape [n, 9]."""
     scale = 1.0 if scale is None else scale
+    table[:, 1] = np.where(np.isnan(table[:, 1]), -1, table[:, 1])
     _require_whole(path, table[:, :2])
     ids, up = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
     # Some programs count from 1 and give the root the parent 0.
     parent = _parents(path, ids, np.where((up == 0) & ~(ids == 0).any(), -1, up))
-    roots = np.flatnonzero(parent < 0)
-    # Several may grow from the ground of the first one.
-    first_start = table[roots[:1], 2:5]
-    if not len(roots) or not (np.abs(table[roots, 2:5] - first_start) < 1e-9).all():
-        raise InputError(f"{path} has {len(roots)} cylinders without a parent.",
-                         "A branch has exactly one root.", "Keep only one tree in the file.")
-    root = roots[0]
+    if not (parent < 0).any():
+        raise InputError(f"{path} has 0 cylinders without a parent.",
+                         "A branch has exactly one root.", "Correct the file.")
+    whole, notes = _one_tree(path, parent, table[:, 2:5], np.linalg.norm(
+        table[:, 5:8] - table[:, 2:5], axis=1), near)
+    fitted = _fitted_columns(path, columns, scale) if columns else {}
+    first = np.array(table[:, 8] if start_radius is None else start_radius)
+    if columns and "start_radius" in columns:
+        first = _numbers(path, columns, ["start_radius"])[:, 0]
+    parent, table, first = _moved(parent, whole), table[whole], first[whole]
+    fitted = {name: values[whole] for name, values in fitted.items()}
+    root = np.flatnonzero(parent < 0)[0]
     nodes = np.vstack([table[root, 2:5], table[:, 5:8]]) * scale
-    if rows and rows[root].get("start_radius"):
-        first = _numbers(path, rows[root:root + 1], ["start_radius"])[0, 0]
-    else:
-        first = (table[:, 8] if start_radius is None else start_radius)[root]
-    radius = np.concatenate([[first], table[:, 8]]) * scale
+    radius = np.concatenate([[first[root]], table[:, 8]]) * scale
     hang = np.concatenate([[-1], np.where(parent < 0, 0, parent + 1)])
-    fitted = _fitted_columns(path, rows, scale) if rows else {}
     hang, keep = _without_repeats(nodes, hang)
-    return Skeleton.from_edges(nodes[keep], hang, radius[keep], **{
+    return replace(Skeleton.from_edges(nodes[keep], hang, radius[keep], **{
         name: np.concatenate([values[root:root + 1], values])[keep]
-        for name, values in fitted.items()})
-
-
-def write_cylinders(skeleton: Skeleton, path: Path) -> None:
-    """Write one cylinder for each node but the root, as CSV in the skeleton's unit. The state of a
-    radius is 0 measured, 1 limited, 2 interpolated, 3 unresolved or 4 bridged."""
-    start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
-    length = np.linalg.norm(end - start, axis=1)
-    axis = (end - start) / np.maximum(length, 1e-300)[:, None]
-    titles = ("id parent sx sy sz ex ey ez radius length ax ay az branch order radius_sigma "
-              "radius_state probability start_radius").split()
-    rows = ((node - 1, up - 1, *start[node - 1], *end[node - 1], skeleton.radius[node],
-             length[node - 1], *axis[node - 1], skeleton.branch[node], skeleton.order[node],
-             f"{skeleton.radius_sigma[node]:.3g}", skeleton.radius_state[node],
-             f"{skeleton.probability[node]:.3f}", f"{skeleton.radius[up]:.12g}")
-            for node, up in enumerate(skeleton.parent[1:], start=1))
-    write_table(path, titles, rows, digits=15, line_end="\r\n")
+        for name, values in fitted.items()}), notes=notes)
 
 
 def _require_whole(path: Path, numbers: np.ndarray) -> None:
@@ -379,21 +497,22 @@ def _require_whole(path: Path, numbers: np.ndarray) -> None:
                          "The ids of nodes are whole numbers.", "Correct the file.")
 
 
-def _numbers(path: Path, rows: Sequence[dict[str, str]], names: Sequence[str]) -> np.ndarray:
-    """Columns of a table, shape [n, names]."""
+def _numbers(path: Path, columns: Mapping[str, Sequence[Any]], names: Sequence[str]) -> np.ndarray:
+    """Columns of a table, shape [n, names]; NaN for a word that means missing."""
     try:
-        return np.array([[float(row[name]) for name in names] for row in rows])
-    except (TypeError, ValueError) as error:
+        return np.column_stack([[float(_MISSING.get(part, part)) for part in columns[name]]
+                                for name in names])
+    except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} has a field that is not a number ({error}).",
                          f"{', '.join(names)} are numbers.", "Correct the file.") from error
 
 
-def _fitted_columns(path: Path, rows: Sequence[dict[str, str]], scale: float,
+def _fitted_columns(path: Path, columns: Mapping[str, Sequence[Any]], scale: float,
                     ) -> dict[str, np.ndarray]:
     names = ("radius_sigma", "radius_state", "probability")
-    if any(name not in rows[0] for name in names):
+    if any(name not in columns for name in names):
         return {}
-    sigma, state, probability = np.ascontiguousarray(_numbers(path, rows, names).T)
+    sigma, state, probability = np.ascontiguousarray(_numbers(path, columns, names).T)
     if not (((sigma >= 0) & np.isfinite(sigma)).all()
             and np.isin(state, list(STATES.values())).all()
             and ((probability >= 0) & (probability <= 1)).all()):
@@ -445,14 +564,17 @@ def _without_repeats(nodes: np.ndarray, parent: np.ndarray) -> tuple[np.ndarray,
 SKELETONS = Registry("skeleton", "limber.skeletons", [
     Format("SWC", (".swc",), read_swc, Skeleton.write_swc, recognises=_is_swc,
            about="axes with radii"),
-    Format("cylinders", (".csv",), read_cylinders, write_cylinders, recognises=_is_cylinders,
-           about="cylinders of Limber, rTwig or SimpleForest"),
-    Format("rtwig", (".csv",), write=write_rtwig),
-    Format("simpleforest", (".csv",), write=write_simpleforest),
-    Format("TreeQSM", (".mat",), _read_mat, write_treeqsm,
+    Format("cylinders", (".csv", ".txt"), read_cylinders, write_cylinders,
+           recognises=is_cylinders, about="cylinders of Limber, rTwig, SimpleForest or aRchi"),
+    Format("tree file", (".txt",), read_tree_file, recognises=is_tree_file,
+           about="trees of raycloudtools"),
+    Format("rtwig", (".csv",), write=cylinder_models.write_rtwig),
+    Format("simpleforest", (".csv",), write=cylinder_models.write_simpleforest),
+    Format("TreeQSM", (".mat",), _read_mat, cylinder_models.write_treeqsm,
            about="cylinders of TreeQSM or SmartQSM"),
     Format("MTG", (".mtg",), read_mtg, write_mtg, about="multiscale tree graph of the axes"),
 ], of_arrays=_of_arrays)
-"""Readers take ``scale``, the metres per unit or None; their results are in metres. Arrays that a
-format reads are cylinders: ``id``, ``parent`` (-1: none), ``start``, ``end`` and ``radius``.
+"""Readers take ``scale``, the metres per unit or None, and ``near``, the place of a root, where it
+is given; their results are in metres. Arrays that a format reads are cylinders: ``id``, ``parent``
+(-1: none), ``start``, ``end`` and ``radius``.
 """

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -158,7 +158,8 @@ class FoundSkeleton:
             "leafy", "unlikely")} | {
             "iterations": result.contraction.iterations, "status": result.contraction.status,
             "leaves": [{"count": len(leaf.points), "area": leaf.area} for leaf in self.leaves]}
-        np.savez(path, told=np.array(json.dumps(plain(values))), **asdict(result.skeleton),
+        np.savez(path, told=np.array(json.dumps(plain(values))),
+                 **{name: getattr(result.skeleton, name) for name in _SKELETON},
                  node_of_point=result.node_of_point, residual=result.residual,
                  contracted=result.contraction.points, linearity=result.contraction.linearity,
                  leaf_points=np.concatenate([np.zeros(0, np.int64), *(
@@ -169,7 +170,7 @@ class FoundSkeleton:
         """Read a file that :meth:`write` has written; InputError if it is damaged."""
         arrays = read_arrays(path, _WHAT)
         require_shapes(path, arrays, _SKELETON | _POINTS, _WHAT)
-        skeleton = Skeleton(**{name: arrays[name] for name in _SKELETON})
+        skeleton = Skeleton(**dict[str, Any]({name: arrays[name] for name in _SKELETON}))
         stored = _stored(path, arrays)
         if not _is_tree(skeleton.parent) or not _are_below(
                 arrays["node_of_point"], skeleton.node_count):

@@ -45,6 +45,7 @@ class Skeleton:
     order: np.ndarray = field(default=cast(np.ndarray, None))
     radius_state: np.ndarray = field(default=cast(np.ndarray, None))
     probability: np.ndarray = field(default=cast(np.ndarray, None))
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.nodes)

@@ -170,7 +170,8 @@ def _of_scan(asked: Reconstruct, progress: Progress) -> dict[str, Any]:
                       "and wires blue, another plant violet.")
     with branch.dropped_if_empty(), branch.stage("reconstruct", asked, digests=digests) as stage:
         own = None if asked.skeleton is None else read_skeleton(
-            asked.skeleton, scale=UNIT_METRES[asked.unit])
+            asked.skeleton, scale=UNIT_METRES[asked.unit], near=asked.root,
+            progress=progress.keeping(warnings))
         try:
             made = reconstruct_cloud(raw, asked, own=own, edits=edits, eye=_eye(asked.camera),
                                      known=known, keep=keep, show=show,
