@@ -49,10 +49,18 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
     its spurs, or from the ``known``, the noise [m] and the number of twigs left out, if it scores
     more than the known with axes and radii fitted alike; ``points`` [m, 3] [m] are the scan's."""
     apart = PointSpacing.of(points)
-    scan = PointLikelihood.of(points).where_seen(known)
-    tried = [likeliest_tree(start, scan, apart, progress.part(part, part + 0.5))
-             for part, start in ((0.0, first), (0.5, known))]
-    skeleton, count = max(tried, key=lambda one: scan.score(one[0]))
+    # Whether one sensor saw them is asked of whole searches: twigs that hang to one side of a
+    # thick axis look so too, and a thin axis beside a branch's middle hides it.
+    scan = PointLikelihood.of(points)
+    around = [likeliest_tree(start, scan, apart, progress.part(part, part + 0.25))
+              for part, start in ((0.0, first), (0.25, known))]
+    skeleton, count = max(around, key=lambda one: scan.score(one[0]))
+    seen = scan.where_seen(known)
+    if seen.sight is not None:
+        other = likeliest_tree(known, seen, apart, progress.part(0.5, 0.75))
+        if seen.score(other[0]) > scan.score(skeleton):
+            scan, more = seen, likeliest_tree(first, seen, apart, progress.part(0.75, 1.0))
+            skeleton, count = max(other, more, key=lambda one: seen.score(one[0]))
     alike = fitted(_spaced(known, apart), scan, _LAST_STEPS)
     if scan.score(skeleton) <= scan.score(alike):
         return None

@@ -33,6 +33,7 @@ _OPEN = 0.2  # sine of the angle between axis and sight under which an axis has 
 # A twig's fork, direction (2), length, radius and bend: each costs half the logarithm of the points
 # (Schwarz 1978, Bayes' information criterion).
 _TWIG_NUMBERS = 6.0
+_SIGHT_NUMBERS = 3.0  # direction (2) and distance of a sensor, likewise
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ class PointLikelihood:
 
         around = replace(self, sight=None)
         score, direction, near = max(map(scored, _DIRECTIONS), key=itemgetter(0))
-        if score <= around.score(skeleton):
+        if score <= around.score(skeleton) + _SIGHT_NUMBERS / 2 * np.log(len(self.points)):
             return around
         step, halvings = _TURN, 0
         while halvings < _HALVINGS:
