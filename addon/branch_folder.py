@@ -12,7 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from .stages import Stage
+from .stages import Stage, stages
 
 MANIFEST = "branch.json"
 
@@ -44,8 +44,11 @@ class BranchRecord:
         """Return the record of a stage if it were run with these values."""
         key = stage.key.format_map({"name": values.get("name", "")}) if stage.key else ""
         record = self.stages.get(key)
-        # Two stages may make the same file (a pull): the settings show which one did.
-        return record if record and set(record.settings) <= stage.fields.keys() else None
+        # Two stages may make the same file (a pull): the settings show which one did. An older
+        # version may have had others.
+        known = {other.name: len(other.fields.keys() & set(record.settings)) for other in
+                 stages().values() if other.key == stage.key} if record else {}
+        return record if known and known[stage.name] == max(known.values()) else None
 
     def has(self, patterns: Iterable[str]) -> bool:
         """Whether the folder has a file for each of these: its name, or the start of one."""

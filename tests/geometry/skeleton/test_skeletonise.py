@@ -210,7 +210,9 @@ def test_the_order_of_the_points_changes_nothing() -> None:
 
 @pytest.mark.slow
 def test_a_scan_moved_and_turned_gives_the_same_skeleton() -> None:
-    """Of thin branches in as much noise, where each choice leads to others, down to rounding."""
+    """Of thin branches in as much noise, where each choice leads to others, to a step of the grid
+    on which a search ends.
+    """
     rng = np.random.default_rng(5)
     points = generate_branch(12, length=0.4, fork_count=2, point_spacing=0.003).cloud.points
     points = points + rng.normal(0, 0.004, points.shape)
@@ -220,8 +222,9 @@ def test_a_scan_moved_and_turned_gives_the_same_skeleton() -> None:
     first = skeletonise(points).skeleton
     again = skeletonise(points @ turn.T + away, up=turn @ up).skeleton
     assert again.node_count == first.node_count
-    np.testing.assert_allclose((again.nodes - away) @ turn, first.nodes, atol=1e-9)
-    np.testing.assert_allclose(again.radius, first.radius, atol=1e-9)
+    step = 1e-5 * np.median(first.radius)
+    np.testing.assert_allclose((again.nodes - away) @ turn, first.nodes, rtol=0, atol=step)
+    np.testing.assert_allclose(again.radius, first.radius, rtol=0, atol=step)
 
 
 def _root_of_stem(foot: np.ndarray, thick: list[float], support: list[int]) -> int:

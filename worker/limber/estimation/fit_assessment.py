@@ -55,6 +55,7 @@ from limber.mechanics.materials.materials import LayeredSection
 from limber.recordings.recording import GraspEntry, Pull, calibration_of, grasp_on
 from limber.recordings.sensor_checks import PLAUSIBLE_YOUNG_PA
 
+_PARTS = ("geometry", "mesh", "path", "hung", "grip", "graph")  # None where not examined
 MISFIT_FACTOR = 4.0
 """Mean squared residual over the expected one above which model and pull do not belong together:
 twice the stated noise. Of 10 branches reconstructed from scans, all correct ones stayed under 1.3;
@@ -125,8 +126,8 @@ class Estimate:
         groups = list(self.objective.space.groups)
         sensor = np.minimum(np.sqrt(np.diag(self.uncertainty.covariance))[groups], 35.0)
         error = self.model_error
-        return {"sensor": sensor, **error.parts, "axis_is_exact": error.axis_is_exact,
-                "total": error.total(sensor)}
+        return {"sensor": sensor, **dict.fromkeys(_PARTS), **error.parts,
+                "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
 
     @property
     def young(self) -> np.ndarray:

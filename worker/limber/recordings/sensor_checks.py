@@ -3,7 +3,6 @@
 Each check returns the pull with the fault removed and a sentence about it in ``warnings``.
 """
 
-import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import scipy
 
 from limber.core.constants import FORCE_UNITS_N
 from limber.core.errors import InputError, Option, Text
+from limber.core.files.reading import read_toml
 from limber.recordings.recording import Observations, Pull
 from limber.recordings.time_series import gaps, saturated, spikes
 
@@ -227,5 +227,5 @@ class SensorPreset:
     settings: dict[str, Any] = field(default_factory=dict)
 
 
-SENSORS = {name: SensorPreset(**known) for name, known in tomllib.loads(
-    Path(__file__).with_name("sensors.toml").read_text(encoding="utf-8")).items()}
+SENSORS = {name: SensorPreset(**known) for name, known in read_toml(
+    Path(__file__).with_name("sensors.toml"), "the sensors' presets").items()}

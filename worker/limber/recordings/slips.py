@@ -33,6 +33,8 @@ _FRAMES_COUNT = 12
 """Frames that count as independent: the beam's error is the same in neighbours."""
 _MUCH_BETTER, _AS_WELL = 12.0, 6.0
 """Differences of chi-squared from which a frame is named, and up to which another fits as well."""
+_FOLLOWS = 0.5
+"""Fraction of its misfit that points have left with another offset of the clocks that is named."""
 _NOISES = 5.0
 """Noises of the force that its change must exceed to have a direction."""
 AS_POSES = "poses"
@@ -337,7 +339,8 @@ def require_followed(pull: Pull, skeleton: Skeleton, known: Frames, *, is_placed
     others = better_frames(frames)
     if others and frames[others[0]].chi_squared < least + _AS_WELL:
         _refuse_frame(pull.name, frames, others, known)
-    if costs[40] > least + _MUCH_BETTER:
+    if costs[40] > least + _MUCH_BETTER and (
+            lags[int(costs.argmin())].misfit < _FOLLOWS * lags[40].misfit):
         fit = at[costs < least + _AS_WELL] + pull.entry.time_offset_s
         raise InputError(
             f"{pull.name}: the points do not follow the gripper with the clocks as they are "
