@@ -46,14 +46,14 @@ class BranchRecord:
         record = self.stages.get(key)
         # Two stages may make the same file (a pull): the settings show which one did. An older
         # version may have had others.
-        known = {other.name: len(other.fields.keys() & set(record.settings)) for other in
-                 stages().values() if other.key == stage.key} if record else {}
-        return record if known and known[stage.name] == max(known.values()) else None
+        return record if record and len(stage.fields.keys() & record.settings.keys()) == max(
+            len(other.fields.keys() & record.settings.keys()) for other in stages().values()
+            if other.key == stage.key) else None
 
     def has(self, patterns: Iterable[str]) -> bool:
         """Whether the folder has a file for each of these: its name, or the start of one."""
-        starts = [pattern.split("{name}")[0] for pattern in patterns]
-        return all(any(name.startswith(start) for name in self.files) for start in starts)
+        return all(any(name.startswith(pattern.split("{name}")[0]) for name in self.files)
+                   for pattern in patterns)
 
     def names(self, pattern: str) -> list[str]:
         """Return the names of the folder's entries, sorted.

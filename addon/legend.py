@@ -136,8 +136,7 @@ def _shown_scalar(surface: bpy.types.Object) -> str:
 def _add_color_bar(sheet: _Sheet, name: str, scale: dict) -> None:
     sheet.text(scale["title"] + (", log scale" if scale["log"] else ""))
     sheet.y += 1.3 * _LINE
-    mesh = meshes.new_rectangle("Legend colours", _BAR_WIDTH * sheet.unit,
-                                _BAR_HEIGHT * sheet.unit)
+    mesh = meshes.new_rectangle("Legend colours", _BAR_WIDTH * sheet.unit, _BAR_HEIGHT * sheet.unit)
     material = materials.scalar_material(f"Legend {name}", "height", low=0.0, high=1.0,
                                          log=False, stops=scale["stops"], flat=True)
     sheet.put("Legend colours", mesh, material, sheet.x, sheet.y + _BAR_HEIGHT)

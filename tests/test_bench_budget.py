@@ -106,8 +106,7 @@ def test_a_run_goes_on_with_kept_trials(clock, tmp_path, monkeypatch):
             clock.now += 3
             return {"error": float("nan"), "list": np.arange(2)}
         tasks = [(seed, "a") for seed in range(4, 9)]
-        found = go_on(part, tasks, work, ("core",), kept, Budget(seconds, clock),
-                      at_least=at_least)
+        found = go_on(part, tasks, work, ("core",), kept, Budget(seconds, clock), at_least=at_least)
         assert all(each["error"] == np.inf and each["list"] == [0, 1] for each in found)
         return [each.task for each in found]
     assert trials(7) == [(4, "a"), (5, "a")] == made

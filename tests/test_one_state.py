@@ -95,8 +95,7 @@ def test_estimate_and_predict(folder, expected):
     """The forward of an estimate at the same pose; its state, under its own force, again."""
     grasp, pose, state, _ = expected
     subject = load_subject(Branch.open(folder), FitSpec())
-    entry = PullEntry(grasp=GraspEntry(point_m=tuple(grasp.centre), radius_m=0.012,
-                                       mode="point"))
+    entry = PullEntry(grasp=GraspEntry(point_m=tuple(grasp.centre), radius_m=0.012, mode="point"))
     pull = _recorded(pose, state.reaction_force, entry)
     patch = replace(grasp)
     forward = QuasiStaticForward("one", subject.model, subject.weights, entry, frames_of(pull),

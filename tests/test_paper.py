@@ -70,7 +70,6 @@ def test_it_has_an_option_and_a_row_in_the_guide(what, stage, values):
         row = next((line for line in page.splitlines() if f"`{stage}`" in line and flag in line),
                    None)
         assert row is not None, f"{what}: no row of {stage} {flag}"
-    needed = {name: "some" for name, field in described.model_fields.items()
-              if field.is_required()}
+    needed = {name: "some" for name, field in described.model_fields.items() if field.is_required()}
     made = described.checked(needed | values)
     assert {name: getattr(made, name) for name in values} == values

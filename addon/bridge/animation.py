@@ -252,8 +252,7 @@ def retime(things: Iterable[bpy.types.Object], moved: bpy.types.Object, frame_st
     modifier.frame_scale, modifier.frame_start = speed, speed * frame_start
     for thing in things:
         for curve in _ours_in(compat.fcurves_of(thing)):
-            _change_keys(curve, 0, lambda frames: frame_start + (frames - start) * (
-                before / speed))
+            _change_keys(curve, 0, lambda frames: frame_start + (frames - start) * (before / speed))
 
 
 def cache_frame(target: bpy.types.Object, frame: float) -> float:

@@ -203,8 +203,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
     def _show_limits(self, context, frame: HeldFrame) -> None:
         """The branch is red while it is held beyond a limit of the plan."""
         self._reached = limits.reached(context.scene, frame)
-        self._tint.show(self._hold is not None and any(
-            one.share > 1.0 for one in self._reached))
+        self._tint.show(self._hold is not None and any(one.share > 1.0 for one in self._reached))
 
     def _send(self) -> None:
         """Send the grasp's target, if it was not sent yet."""

@@ -141,8 +141,7 @@ def is_kept():
     seen["kept"] = [group.use_move, list(group.move), list(group.grasp_point), group.grasp_mode]
     seen["restored"] = max((now - then).length for now, then in zip(
         tip()[1], state["before"], strict=True))
-    seen["marks_after"] = max((now - state["marks"][name]).length
-                              for name, now in marks().items())
+    seen["marks_after"] = max((now - state["marks"][name]).length for name, now in marks().items())
     seen["colour_after"] = colour()
     seen["motion_shown"] = surface().modifiers["Limber motion"].show_viewport
     return True

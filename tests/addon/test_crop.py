@@ -32,8 +32,7 @@ def test_a_box_around_a_part_is_kept_in_the_files_numbers(bpy, scan):
     bpy.ops.mesh.primitive_cube_add(size=1.0, location=(low + high) / 2, scale=(0.2, 0.1, 0.5))
     bpy.context.view_layer.update()
     assert bpy.ops.limber.crop_scan() == {"FINISHED"}
-    assert _cropped(bpy) == pytest.approx(
-        [499950, 1950, 50, 500150, 2050, 550], abs=0.1)
+    assert _cropped(bpy) == pytest.approx([499950, 1950, 50, 500150, 2050, 550], abs=0.1)
 
 
 def test_selected_points_give_the_box(bpy, scan):

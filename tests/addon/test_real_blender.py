@@ -79,8 +79,7 @@ def test_the_worker_comes_along(blender, tmp_path):
         next(tmp_path.glob("*.zip")))
     generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud.write_ply(
         tmp_path / "scan.ply")
-    run("--command", "limber", "reconstruct", tmp_path / "scan.ply", "-o",
-        tmp_path / "scan.branch")
+    run("--command", "limber", "reconstruct", tmp_path / "scan.ply", "-o", tmp_path / "scan.branch")
     assert (tmp_path / "scan.branch" / "mesh.vtu").is_file()
 
 

@@ -391,8 +391,7 @@ def test_a_cell_is_shown_where_its_file_says(bpy, addon, beam, tmp_path):
     scenes = importlib.import_module("limber_addon.scene")
     reader = importlib.import_module("limber_addon.scene_data")
     for _ in range(2):
-        shown = scenes.show_branch(bpy.context.scene,
-                                   reader.read_scene_data(tmp_path / "data.npz"))
+        shown = scenes.show_branch(bpy.context.scene, reader.read_scene_data(tmp_path / "data.npz"))
     kinds = {kind for kind in shown.objects if kind.startswith("cell:")}
     assert kinds == {"cell:arm", "cell:tool", "cell:obstacle1"}
     [thing] = shown.objects["cell:obstacle1"]

@@ -106,8 +106,7 @@ def test_in_a_checkout_the_advice_names_the_checkout(monkeypatch, prefix, advice
     monkeypatch.setattr(sys, "prefix", str(CHECKOUT / prefix))
     with pytest.raises(MissingDependencyError) as caught:
         optional.require_extra("report", ("no_such_package",), "The report")
-    assert str(caught.value) == (
-        f"no_such_package is not installed. The report needs it. {advice}")
+    assert str(caught.value) == (f"no_such_package is not installed. The report needs it. {advice}")
 
 
 @pytest.mark.parametrize("extra", ["planning", "robot", "blender"])

@@ -24,8 +24,7 @@ DAYS = ("2026-05-01", "2026-05-03T12:00", "2026-05-06")
 def test_a_branch_that_dries_stiffens_by_what_it_did():
     """Two percent a day over five days, each pull known to half a percent."""
     days = np.array([0.0, 2.5, 5.0])
-    steps = [ScaleStep(k, float(np.log(1.02) * day) - 0.05, 0.005**2)
-             for k, day in enumerate(days)]
+    steps = [ScaleStep(k, float(np.log(1.02) * day) - 0.05, 0.005**2) for k, day in enumerate(days)]
     found = drift(steps, DAYS, 0.0)
     assert found["per_day"] == pytest.approx(0.02, abs=1e-6)
     low, high = found["interval"]

@@ -22,8 +22,7 @@ def test_rows_are_taken_as_they_are_written(tmp_path, plain_pull, monkeypatch):
     live = tmp_path / "live"
     live.mkdir()
     (live / "pull.toml").write_text((tmp_path / "whole" / "pull.toml").read_text())
-    texts = {name: (tmp_path / "whole" / name).read_text() for name in ("robot.csv",
-                                                                        "markers.csv")}
+    texts = {name: (tmp_path / "whole" / name).read_text() for name in ("robot.csv", "markers.csv")}
 
     def record() -> None:
         for before, share in ((0.25, 0.4), (0.4, 0.7), (0.7, 1.0)):

@@ -107,8 +107,7 @@ def test_a_clamped_gripper_needs_its_torque(small, small_bench):
     pull = driven(pull)
     found = small_bench.objective([pull], SETTINGS).evaluate(np.log(TRUTH))
     off = np.linalg.norm(found.pulls[0].positions - pull.observations.positions, axis=2)
-    moved = np.linalg.norm(pull.observations.positions[-1] - pull.observations.positions[0],
-                           axis=1)
+    moved = np.linalg.norm(pull.observations.positions[-1] - pull.observations.positions[0], axis=1)
     # The mesh is another one (half as coarse: 0.001 of the motion).
     assert np.all(off[-1] < 0.02 * moved.max())
     deaf = driven(pull, sensor=sensor.model_copy(update={"torque_sigma_nm": None}))

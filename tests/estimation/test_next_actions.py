@@ -183,8 +183,7 @@ def test_a_new_source_of_error_is_one_entry(small_bench, noisy, monkeypatch):
     plain = prospects(small_bench, [noisy])
     monkeypatch.setattr(nuisances, "UNKNOWNS", [*nuisances.UNKNOWNS, backlash])
     objective = objective_of(small_bench, noisy)
-    evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)),
-                                    jacobian=True)
+    evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)), jacobian=True)
     assert len(evaluation.errors.values) == len(objective.cell_errors.nuisances)
     parts = variance_parts(evaluation, objective)
     assert np.all(parts["backlash"] > 1e-8)

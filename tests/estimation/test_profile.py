@@ -58,8 +58,7 @@ def test_a_soft_piece_is_missed_as_often_to_one_side_as_to_the_other():
     """Of 1,500 draws 2.5 % each; by the curvature twice as often, all of them too soft."""
     rng, plain, found = np.random.default_rng(1), [], []
     for _ in range(1500):
-        drawn = TwoPieces(TwoPieces.bends @ [1.0, 1.0]
-                          + TwoPieces.noise * rng.standard_normal(2))
+        drawn = TwoPieces(TwoPieces.bends @ [1.0, 1.0] + TwoPieces.noise * rng.standard_normal(2))
         if np.linalg.solve(TwoPieces.bends, drawn.readings)[1] < 0.05:
             continue
         best = drawn.best()

@@ -190,8 +190,7 @@ def test_the_mass_of_twigs_enters_the_interval(small, small_bench, small_pull):
 
 # Another likely skeleton of the scan enters the intervals of an estimate.
 
-QUICK = ("--progress", "none", "--quick", "--fractions",
-         "0.2,0.4,0.6,0.8", "--json", "--force")
+QUICK = ("--progress", "none", "--quick", "--fractions", "0.2,0.4,0.6,0.8", "--json", "--force")
 
 
 def estimated(folder, capsys):
@@ -222,8 +221,7 @@ def test_the_moduli_of_another_skeleton_widen_the_intervals(branch_folder, capsy
     told = [text for text in both["warnings"] if "alternative 2" in text]
     assert len(told) == 1 and "0.5 times" in told[0]
     likely, values = re.search(r"it is (\S+) times as likely, and gives (.*) MPa", told[0]).groups()
-    change = np.log(1e-6 * np.array(alone["young_pa"])
-                    / np.array(values.split(", "), float))
+    change = np.log(1e-6 * np.array(alone["young_pa"]) / np.array(values.split(", "), float))
     assert change == pytest.approx(4 * np.log(edit.radius / control), rel=0.4)
     share = float(likely) / (1 + float(likely))
     assert both["young_deviation"]["graph"] == pytest.approx(share**0.5 * change, rel=0.05)

@@ -187,8 +187,7 @@ def test_following_a_pull(branch_folder):
                     pace=0)
     assert result["frame_count"] == 24 and result["method"] == "online"
     stored = json.loads((branch_folder / "estimate-online.json").read_text())
-    widths = [np.log(np.array(state["young_interval_pa"])) @ [-1, 1]
-              for state in stored["history"]]
+    widths = [np.log(np.array(state["young_interval_pa"])) @ [-1, 1] for state in stored["history"]]
     assert np.all(widths[-1] < 0.3 * widths[5])
     half = np.log(np.array(result["young_interval_pa"])) @ [-0.5, 0.5]
     batch = np.array(Fit.of(settings, branch_folder=branch_folder).run()["young_pa"])

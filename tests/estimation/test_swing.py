@@ -143,8 +143,7 @@ def test_markers_that_are_jostled_before_are_no_release():
     moved = 1e-6 * np.random.default_rng(1).standard_normal((300, 3, 3))
     moved[:, 0, 0] -= 0.01 * swings * (1 + 0.05 * since)
     moved[8:, 2, 1] += 4e-4
-    released, period = first_guess(SwingSeen(times, moved, MARKERS, "held", np.zeros(3), 0.0,
-                                             1e-5))
+    released, period = first_guess(SwingSeen(times, moved, MARKERS, "held", np.zeros(3), 0.0, 1e-5))
     assert released == pytest.approx(0.4, abs=0.02)
     assert period == pytest.approx(0.25, rel=0.03)
 

@@ -88,8 +88,7 @@ def test_a_clamped_grasp_twists_and_its_torque_tells_the_outer_moduli(truth, ben
     for chosen in (sensor, deaf):
         entry = pull.entry.model_copy(update={"sensor": chosen})
         objective = bench.objective([replace(pull, entry=entry)], settings)
-        judged = identifiability(objective.evaluate(np.log(TRUTH), jacobian=True),
-                                 objective.space)
+        judged = identifiability(objective.evaluate(np.log(TRUTH), jacobian=True), objective.space)
         deviations.append(judged.deviations)
         if chosen is deaf:
             continue

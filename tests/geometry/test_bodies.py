@@ -76,8 +76,7 @@ def test_own_sag_gives_the_modulus(tmp_path):
     branch = tmp_path / "beam.branch"
     Mesh.of(SETTINGS, surface=path, output=branch).run()
     assert sum(mass.mass for mass in load_point_masses(Branch.open(branch))) == HUNG
-    fine, masses = mesh_sections(read_sections(path, "m"),
-                                 SETTINGS, elements_across=4.5)
+    fine, masses = mesh_sections(read_sections(path, "m"), SETTINGS, elements_across=4.5)
     model = BranchModel(fine.mesh, young=YOUNG, poisson=0.35, density=DENSITY,
                         gravity=fine.numbers["gravity_m_s2"], point_masses=[
                             PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in masses])

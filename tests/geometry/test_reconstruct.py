@@ -72,8 +72,7 @@ def test_the_unit_of_a_scan_is_asked_for(tmp_path, capsys):
     for scale, text in ((3.0, "No plant"), (1.0, "unit")):
         cloud = Cloud(np.loadtxt(scan) * scale)
         with pytest.raises(InputError, match=text):
-            reconstruct_cloud(cloud, ReconstructSettings(
-                **{"unit": "m"} if scale > 1 else {}))
+            reconstruct_cloud(cloud, ReconstructSettings(**{"unit": "m"} if scale > 1 else {}))
 
 
 @pytest.mark.slow
@@ -90,8 +89,7 @@ def test_an_open_root_is_asked_for_and_leaves_an_earlier_result_whole(tmp_path, 
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert call(given) == 2
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    ends = sorted(one["value"][0] for one in told["remedies"]
-                  if isinstance(one["value"], list))
+    ends = sorted(one["value"][0] for one in told["remedies"] if isinstance(one["value"], list))
     assert ends == pytest.approx([0, 400], abs=40)
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 

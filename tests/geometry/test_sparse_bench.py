@@ -30,8 +30,7 @@ def test_changes_are_as_small_as_they_say() -> None:
     less, moved = (PERTURBED[name](Cloud(points), {}, np.random.default_rng(4))[0].points
                    for name in ("two less", "noise"))
     assert len(less) == 398
-    assert np.linalg.norm(moved - points, axis=1).mean() == pytest.approx(
-        0.5 * spacing, rel=0.15)
+    assert np.linalg.norm(moved - points, axis=1).mean() == pytest.approx(0.5 * spacing, rel=0.15)
 
 
 def _rows(monkeypatch, tmp_path, change: str, **other: object) -> str:

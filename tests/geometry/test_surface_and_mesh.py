@@ -180,8 +180,7 @@ def test_sweep_joins_twigs_all_around():
         parent.append(np.concatenate([[at], count + np.arange(11)]))
         radius.append(np.full(12, 0.003 + 0.001 * k))
         count += 12
-    skeleton = Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent),
-                                   np.concatenate(radius))
+    skeleton = Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent), np.concatenate(radius))
     meshed = mesh_branch(skeleton, MeshSettings(mesher="sweep"))
     assert not meshed.left_out
     assert dihedral_angles(meshed.mesh).min() > 2
@@ -200,8 +199,7 @@ def test_sweep_joins_the_whorls_of_a_conifer():
             parent.append(np.concatenate([[at], count + np.arange(7)]))
             radius.append(np.linspace(0.0022, 0.0008, 8))
             count += 8
-    skeleton = Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent),
-                                   np.concatenate(radius))
+    skeleton = Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent), np.concatenate(radius))
     meshed = mesh_branch(skeleton, MeshSettings(mesher="sweep"))
     assert skeleton.branch_count == 71 and not meshed.left_out
     assert dihedral_angles(meshed.mesh).min() > 2

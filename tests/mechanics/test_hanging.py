@@ -126,8 +126,7 @@ def test_sensitivities(mesh):
         size = np.abs(slope).max()
         assert np.abs(found.displacement[..., column] - slope).max() < 2e-3 * size + 1e-9
         slope = (ahead.reaction_force - behind.reaction_force) / (2 * step)
-        np.testing.assert_allclose(found.reaction_force[..., column], slope, rtol=2e-3,
-                                   atol=1e-6)
+        np.testing.assert_allclose(found.reaction_force[..., column], slope, rtol=2e-3, atol=1e-6)
 
 
 def test_density_field_and_factor_agree(mesh):

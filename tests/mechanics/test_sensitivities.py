@@ -75,10 +75,8 @@ def test_static_derivatives(mesh, weights, mode, material):
         return solve_static(candidate, grasp=grasp, settings=PRECISE, **pull).require()
 
     result = solve(model)
-    found = static_sensitivities(model, result, grasp, weights, NAMES[:3],
-                                 is_held=mode != "force")
-    assert found.labels == ["log_young_0", "log_young_1", "log_young_2", "poisson",
-                            "log_density"]
+    found = static_sensitivities(model, result, grasp, weights, NAMES[:3], is_held=mode != "force")
+    assert found.labels == ["log_young_0", "log_young_1", "log_young_2", "poisson", "log_density"]
     for column in range(5):
         ahead, behind = (solve(varied(model, weights, column, s)) for s in (STEP, -STEP))
         moved = (ahead.displacement - behind.displacement) / (2 * STEP)

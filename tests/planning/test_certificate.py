@@ -99,8 +99,7 @@ def test_gradient_of_the_subsolution_stays_below_the_cost_by_brute_force(across,
     generator = np.random.default_rng(2)
     checked = 0
     for grid in grids:
-        rates, u, inside = next(item for item in seen
-                                 if item[1].shape == grid.open_cells.shape)
+        rates, u, inside = next(item for item in seen if item[1].shape == grid.open_cells.shape)
         cells = np.argwhere(rates.open_cells & ~inside)
         cells = cells[generator.integers(len(cells), size=3000)]
         place = generator.uniform(size=(len(cells), 3))

@@ -110,8 +110,7 @@ def test_a_probability_of_damage_limits_the_strain(tmp_path):
 def test_a_plan_keeps_under_a_strength_that_is_known_or_assumed():
     """By half, unless the user limits the strain. Of stems softer than wood nothing is assumed."""
     settings, tests = PlanSpec(), Strength.of_tests(np.linspace(0.04, 0.06, 9), "tests")
-    assert with_damage(Limits(), settings, tests, 1e8).strain == pytest.approx(
-        0.5 * tests.median)
+    assert with_damage(Limits(), settings, tests, 1e8).strain == pytest.approx(0.5 * tests.median)
     assert with_damage(Limits(), settings, None, 8e9).strain == pytest.approx(0.003)
     assert with_damage(Limits(), settings, None, 1e8).strain == np.inf
     own = PlanSpec(max_strain=0.02)
@@ -119,8 +118,7 @@ def test_a_plan_keeps_under_a_strength_that_is_known_or_assumed():
     ash = PlanSpec(wood="ash")
     of_ash = with_damage(Limits.of(ash), ash, Strength.of_species("ash"), 8e9)
     assert of_ash.strain == Limits.of(ash).strain
-    assert "0.3 %, half of that at which" in default_limit(
-        Limits(strain=0.003), settings, None)
+    assert "0.3 %, half of that at which" in default_limit(Limits(strain=0.003), settings, None)
     assert not default_limit(Limits(strain=0.02), own, None)
     assert not default_limit(Limits.of(ash), ash, None)
 

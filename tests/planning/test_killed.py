@@ -18,8 +18,7 @@ from limber.core.files.atomic import is_owned_name
 from limber.store import Branch
 
 ROOT = Path(__file__).parents[2]
-pytestmark = [pytest.mark.skipif(os.name == "nt", reason="POSIX signals"),
-              pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.skipif(os.name == "nt", reason="POSIX signals"), pytest.mark.timeout(400)]
 
 
 @pytest.fixture

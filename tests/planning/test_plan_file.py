@@ -156,8 +156,7 @@ def test_a_bound_is_kept_and_read_between_its_cells(tmp_path):
     costs[2, 1, 1] = np.nan
     file = tmp_path / "bound.npz"
     corner = np.array([1.0, 2.0, 3.0])
-    CostToGo(axes, (BoundGrid(corner, np.full(3, 0.5), costs, np.isfinite(costs)),)).write(
-        file)
+    CostToGo(axes, (BoundGrid(corner, np.full(3, 0.5), costs, np.isfinite(costs)),)).write(file)
     found = CostToGo.read(file)
     np.testing.assert_array_equal(found.grids[0].costs, costs)
     points = corner + 0.5 * np.array([[1.5, 0.5, 0.5], [1.25, 0.5, 1.0], [2.5, 1.5, 1.5],

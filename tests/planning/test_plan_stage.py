@@ -141,8 +141,7 @@ def test_folder_can_be_read_again_and_is_not_done_twice(copied):
 def test_same_seed_same_plan(copied):
     """Run again by force, the planner's path is the same to the bit."""
     before = read_plan(copied)
-    Planned(branch_folder=copied, iterations=800, start_seed=3, name="there",
-              force=True).run()
+    Planned(branch_folder=copied, iterations=800, start_seed=3, name="there", force=True).run()
     after = read_plan(copied)
     for key in ("baseline", "plan"):
         assert np.array_equal(before[key]["field_energies_j"], after[key]["field_energies_j"])

@@ -38,8 +38,7 @@ def make_problem(field, *, deformation, distance=0.3, goal=GOAL, **limits):
 
 
 def measured(field, points):
-    return measure_path(points, field.energy(points),
-                        np.linalg.norm(field.force(points), axis=1))
+    return measure_path(points, field.energy(points), np.linalg.norm(field.force(points), axis=1))
 
 
 @pytest.mark.slow

@@ -316,8 +316,7 @@ class Bow:
 @pytest.fixture
 def bow(monkeypatch):
     model = Bow(0.02)
-    monkeypatch.setattr(sampling, "taken",
-                        lambda branch, result: branch.solved(result))
+    monkeypatch.setattr(sampling, "taken", lambda branch, result: branch.solved(result))
     return model
 
 

@@ -226,8 +226,7 @@ def test_an_arm_that_was_moved_after_its_stop_does_not_go_back(stepped):
         set_off(stepped, link, straight(stepped, (0.0, 0.1, 0.0)))
         link.stop()
         link.wait("stopped", seconds=5)
-        stepped.ask("stand", joints=list(np.add(stepped.state["joints"],
-                                                 [0.2, 0, 0, 0, 0, 0])))
+        stepped.ask("stand", joints=list(np.add(stepped.state["joints"], [0.2, 0, 0, 0, 0, 0])))
         stepped.rest(0.1)
         with pytest.raises(SafetyStop, match=r"mm and .* degrees away from its path"):
             link.retreat()

@@ -95,8 +95,7 @@ def test_stiffness_is_the_slope_of_the_wrench(beam):
             else:
                 turn = Rotation.from_rotvec(sign * step * np.eye(3)[k - 3])
                 moved[3:] = (turn * Rotation.from_rotvec(pose[3:])).as_rotvec()
-            result = solve_static(model, grasp=grasp, pose=moved,
-                                  start=bent.displacement).require()
+            result = solve_static(model, grasp=grasp, pose=moved, start=bent.displacement).require()
             wrenches.append(np.r_[result.reaction_force, result.reaction_torque])
         slope = (wrenches[1] - wrenches[0]) / (2 * step)
         assert stiffness[:, k] == pytest.approx(slope, abs=2e-3 * np.abs(stiffness[:, k]).max())

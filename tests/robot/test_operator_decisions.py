@@ -94,8 +94,7 @@ def test_where_the_driver_is_gone_another_takes_its_place(monkeypatch):
     assert not found["retreated"] and found["gripper_opened"] and found["force_n"] is None
     assert switched == [("127.0.0.1", 0, False)]
     assert "none could take its place (No robot answers)" in found["outcome"]
-    assert "by hand" in retreat_if_chosen(cell_with("by_hand"), gone, "retreat",
-                                          SILENT)["outcome"]
+    assert "by hand" in retreat_if_chosen(cell_with("by_hand"), gone, "retreat", SILENT)["outcome"]
 
 
 @pytest.mark.parametrize("choice", ["hold", "ask"])

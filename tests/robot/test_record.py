@@ -541,8 +541,7 @@ def test_a_realsense_records_what_the_tracker_follows(branch_folder, tmp_path, r
 def test_a_camera_on_the_flange_cannot_watch_a_pull(branch_folder, tmp_path, robot, monkeypatch):
     cell = cell_at(branch_folder, robot.address).model_copy(update={
         "camera": CameraEntry(pose=(0, 0, 0.1, 0, 0, 0), mount="flange")})
-    monkeypatch.setitem(sys.modules, "pyrealsense2", VirtualRealSense(
-        robot.address, np.zeros(6)))
+    monkeypatch.setitem(sys.modules, "pyrealsense2", VirtualRealSense(robot.address, np.zeros(6)))
     with pytest.raises(InputError, match="mount = \"branch\""):
         RecordPull(branch_folder=branch_folder, cell=cell_file(cell, tmp_path), name="seen",
                    **sideways_pull(branch_folder), confirm="seen", realsense=True).run()

@@ -62,8 +62,7 @@ def test_every_sensor_gives_the_wrench_of_the_gripper_on_the_branch(kind):
         raw = np.r_[force, torque + np.cross(lever, force)]
         frame = matrices(np.array(cell.sensor.pose))
         at_flange = turned_wrench(frame[:3, :3], raw, frame[:3, 3])
-        reading = reading_of(at_flange + weight_wrench(0.9, np.array([0, 0, 0.06]),
-                                                       flange[:3, :3]))
+        reading = reading_of(at_flange + weight_wrench(0.9, np.array([0, 0, 0.06]), flange[:3, :3]))
     now, smooth = chain.wrench(sample_at(pose), reading)
     assert now == pytest.approx(on_branch, abs=1e-12)
     assert smooth == pytest.approx(now)

@@ -25,8 +25,7 @@ def sample_of(true=GRASP, **changes) -> Sample:
 
 
 def test_a_controller_that_is_set_as_the_cell_states_differs_in_nothing():
-    assert differences(CELL, sample_of(payload=1.2, payload_centre=np.array([0, 0, 0.05]),
-                                       )) == []
+    assert differences(CELL, sample_of(payload=1.2, payload_centre=np.array([0, 0, 0.05]), )) == []
     assert differences(CELL, sample_of()) == []
 
 

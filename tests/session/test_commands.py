@@ -320,8 +320,7 @@ def test_named_targets_are_followed(branch_folder, tmp_path):
     shutil.copytree(branch_folder, folder)
     targets = [{"name": "flower", "position_m": [0.0, 0.0, 0.18], "mass_kg": 0.002}]
     with Branch.open(folder).stage("target") as stage:
-        stage.path("targets.json").write_text(json.dumps(
-            {"format_version": 1, "targets": targets}))
+        stage.path("targets.json").write_text(json.dumps({"format_version": 1, "targets": targets}))
     with InteractiveSession(folder, reduced=False, mode="point") as session:
         assert session.hello["targets"] == ["flower"]
         rest = session.latest()

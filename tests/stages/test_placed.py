@@ -50,8 +50,7 @@ def test_all_positions_are_moved_and_boxes_refused(tmp_path, name):
     folder = _aligned(shutil.copytree(EXAMPLE, tmp_path / "a.branch"))
     stage = stage_class(name)
     fields = {field: stage.model_fields[field] for field in stage.parts()["settings"]}
-    kinds = {field: (about.json_schema_extra or {}).get("frame")
-             for field, about in fields.items()}
+    kinds = {field: (about.json_schema_extra or {}).get("frame") for field, about in fields.items()}
     listed = {field for field, about in fields.items()
               if "position" in (about.description or "").lower()
               and "tuple" in str(about.annotation)}

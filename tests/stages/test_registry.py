@@ -88,8 +88,7 @@ def test_description_is_whole(name):
     assert schema_of(stage)["summary"].endswith(".")
     for base in stage.__mro__:
         named = {field for names in vars(base).get("groups", {}).values() for field in names}
-        assert named | set(vars(base).get("common", ())) <= set(
-            getattr(base, "model_fields", {}))
+        assert named | set(vars(base).get("common", ())) <= set(getattr(base, "model_fields", {}))
     for field, about in stage.model_json_schema()["properties"].items():
         assert about["description"], field
         assert about["group"] != "options" or issubclass(stage, Tool), field

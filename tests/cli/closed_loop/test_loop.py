@@ -164,8 +164,7 @@ def test_an_estimate_at_other_control_points_is_compared_with_the_truth_there():
     estimated = {"young_pa": [4.1e9, 2e9], "young_interval_pa": [[3.5e9, 4.5e9], [2e9, 3e9]],
                  "fractions": [0.2, 0.8]}
     watch = SimpleNamespace(at_the_end=lambda: None, extrapolation_error=0.0, overloaded=None)
-    planned = Planned(estimated, np.zeros(3),
-                      SimpleNamespace(holding_force=1.0, max_force=2.0), {})
+    planned = Planned(estimated, np.zeros(3), SimpleNamespace(holding_force=1.0, max_force=2.0), {})
     found = compared(truth, np.zeros(3), planned, defaultdict(float), watch, ("", watch), 10.0)
     assert found["young_true_pa"] == pytest.approx([4e9, 1e9], rel=1e-6)
     assert found["covered"] == [True, False]

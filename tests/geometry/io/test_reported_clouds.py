@@ -128,8 +128,7 @@ def test_a_column_of_words_is_named(tmp_path):
                                     "color_r;color_g;color_b"])
 def test_names_of_colours(tmp_path, titles):
     (tmp_path / "a.csv").write_text(table(f"x;y;z;{titles}", ";", more=("9", "8", "7")))
-    np.testing.assert_array_equal(read_points(tmp_path / "a.csv").attributes["color"][0],
-                                  [9, 8, 7])
+    np.testing.assert_array_equal(read_points(tmp_path / "a.csv").attributes["color"][0], [9, 8, 7])
 
 
 @pytest.mark.parametrize("cut", [0, 1, 30])

@@ -85,8 +85,7 @@ def test_chains_side_axes_and_series(tmp_path):
 
 
 def test_an_axis_goes_on_where_the_parts_of_the_one_before_end(tmp_path):
-    assert parents_of(read(tmp_path, PARTS)) == {(0, 0, 100): (0, 0, 0),
-                                                 (0, 0, 200): (0, 0, 100)}
+    assert parents_of(read(tmp_path, PARTS)) == {(0, 0, 100): (0, 0, 0), (0, 0, 200): (0, 0, 100)}
 
 
 @pytest.mark.parametrize(("body", "head", "told"), [

@@ -39,8 +39,7 @@ def test_blocks_are_the_sums_of_outer_products() -> None:
         size=count)
     normal, across, gradient = (rng.normal(size=(count, width)) for width in (3, 3, 8))
     low, high = rng.uniform(size=count), rng.uniform(size=count)
-    block, right = normal_blocks(segment, share, low, high, normal, across, gradient,
-                                 weight, 3)
+    block, right = normal_blocks(segment, share, low, high, normal, across, gradient, weight, 3)
     row = np.column_stack([-(1 - share)[:, None] * normal, -low, -share[:, None] * normal, -high])
     none = np.zeros(count)
     side = np.column_stack([-(1 - share)[:, None] * across, none, -share[:, None] * across, none])
@@ -78,7 +77,6 @@ def test_reach_is_a_side_blurred_as_von_mises_has_it() -> None:
     inside = (vonmises.cdf(limit - angle, sharpness) - vonmises.cdf(-limit - angle, sharpness))
     np.testing.assert_allclose(np.exp(log), least + (1 - least) * inside, atol=2e-5)
     # From sharpness 30 the density is von Mises' own, and the share that of its normal shape.
-    np.testing.assert_allclose(
-        by_angle, (reach(step)[0] - reach(-step)[0]) / (2 * step), atol=5e-3)
+    np.testing.assert_allclose(by_angle, (reach(step)[0] - reach(-step)[0]) / (2 * step), atol=5e-3)
     np.testing.assert_allclose(
         by_limit, (reach(0, step)[0] - reach(0, -step)[0]) / (2 * step), atol=5e-3)

@@ -271,8 +271,7 @@ def test_places_are_told_in_the_coordinates_of_the_file(second):
     assert 0.3 < apart.mean() < 0.7
     for plant in (nearest < len(first), nearest >= len(first)):
         assert apart[plant].mean() < 0.01 or apart[plant].mean() > 0.99
-    place = [float(part) for part in
-             re.search(r"at \(([^)]*)\)", str(refusal.value))[1].split(",")]
+    place = [float(part) for part in re.search(r"at \(([^)]*)\)", str(refusal.value))[1].split(",")]
     assert (cloud.min(axis=0) <= place).all() and (place <= cloud.max(axis=0)).all()
 
 

@@ -217,8 +217,7 @@ def test_fronts_hold_all_that_fills_in():
         own = equations_module.SupernodalFactor(make_fronts(lower.indptr, lower.indices))
         own.factorise(values.data)
         right = rng.standard_normal(part.shape[0])
-        assert own.solve(right) == pytest.approx(np.linalg.solve(whole.toarray(), right),
-                                                 rel=1e-10)
+        assert own.solve(right) == pytest.approx(np.linalg.solve(whole.toarray(), right), rel=1e-10)
 
 
 def test_bulky_meshes_go_to_a_general_library(short_box, monkeypatch):

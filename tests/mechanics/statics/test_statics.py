@@ -57,8 +57,7 @@ def test_elastica_tip_load(beam, tip, alpha):
 @pytest.mark.parametrize("beta", [1.0, 5.0, 10.0])
 def test_elastica_own_weight(slender_beam, beta):
     """A horizontal beam sags under its own weight as the elastica does, within 0.7 %."""
-    row = next(r for r in reference("elastica_self_weight.csv")
-               if r["beta_qL3_over_EI"] == beta)
+    row = next(r for r in reference("elastica_self_weight.csv") if r["beta_qL3_over_EI"] == beta)
     gravity = beta * YOUNG * SIDE**4 / 12 / LENGTH**3 / (900 * SIDE**2)
     model = BranchModel(slender_beam, young=YOUNG, poisson=0.35, density=900,
                         gravity=(gravity, 0, 0))
@@ -380,8 +379,7 @@ def test_a_bow_that_turned_over_is_said_to_have_another_state(column):
     aside = solve_static(model, grasp=end, pose=pressed, nodal_forces=0.3 * push).require()
     bow = solve_static(model, grasp=end, pose=pressed, start=aside).require()
     assert bow.displacement[middle, 0].mean() > 0.02 and not bow.uncertainty
-    over = solve_static(model, grasp=end, pose=pressed, nodal_forces=-2 * push,
-                        start=bow).require()
+    over = solve_static(model, grasp=end, pose=pressed, nodal_forces=-2 * push, start=bow).require()
     assert over.displacement[middle, 0].mean() < -0.02
     assert "another stable state" in over.uncertainty and over.uncertainty[1:] in "".join(
         over.warnings

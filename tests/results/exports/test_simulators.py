@@ -98,8 +98,7 @@ def test_usd_holds_a_deformable_body_that_bends_as_we_do(small_bench, small, tmp
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.GetStageUpAxis(stage) == "Z"
     body, solid = stage.GetDefaultPrim(), UsdGeom.TetMesh.Get(stage, "/Branch/simulation")
     # Schemas that USD itself does not know stand in the metadata alone.
-    applied = [prim.GetMetadata("apiSchemas").GetAppliedItems()
-               for prim in (body, solid.GetPrim())]
+    applied = [prim.GetMetadata("apiSchemas").GetAppliedItems() for prim in (body, solid.GetPrim())]
     assert "OmniPhysicsDeformableBodyAPI" in applied[0]
     assert {"OmniPhysicsVolumeDeformableSimAPI", "PhysicsCollisionAPI"} <= set(applied[1])
     points, tets = np.array(solid.GetPointsAttr().Get()), np.array(

@@ -105,8 +105,7 @@ def test_a_goal_larger_than_the_branch_is_shown_as_it_is(tmp_path, mesh):
     plan = {"plans/p.json": json.dumps({"goal": goal} | end),
             "plans/p.csv": "x_m,y_m,z_m\n0,0,0.3\n0.1,0,0.3\n"}
     data = scene_data(_branch(tmp_path / "a.branch", mesh, plan__p=plan))
-    assert data.info["goal"] == {"kind": "tip", "centre_m": goal["position_m"],
-                                 "radius_m": 0.3}
+    assert data.info["goal"] == {"kind": "tip", "centre_m": goal["position_m"], "radius_m": 0.3}
 
 
 def test_goal_path_and_motion(tmp_path, mesh):
@@ -562,8 +561,7 @@ def test_each_frame_has_what_was_measured_then(branch):
     """On the frames' clock, not the robot's; between two looks on the line; unseen in between."""
     arrays = scene_data(branch).arrays
     np.testing.assert_allclose(arrays["observation_motion"][:, 0, 0], [0, 0.05, 0.1, 0.15, 0.2])
-    np.testing.assert_allclose(arrays["observation_motion"][:, 1, 0],
-                               [0, 0.01, 0.02, 0.03, 0.04])
+    np.testing.assert_allclose(arrays["observation_motion"][:, 1, 0], [0, 0.01, 0.02, 0.03, 0.04])
     assert not arrays["observation_seen"][2, 0] and arrays["observation_seen"][[0, 4], 0].all()
     assert arrays["observation_seen"][:, 1].all()
 
