@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
-from scipy.special import ive
+from scipy.special import i0e, i1e
 
 from limber.core.numerics.compiled import compiled_exactly
 from limber.core.progress import SILENT, Progress
@@ -215,7 +215,7 @@ def _places(axes: np.ndarray, normal: np.ndarray, sharpness: np.ndarray, scan: P
     [m, 3] is the direction around the axis."""
     facing, aside = (scan.facing(axes, ways) for ways in (normal, across))
     if facing is None or aside is None:
-        return (ive(1, sharpness) / ive(0, sharpness))[:, None] * normal
+        return (i1e(sharpness) / i0e(sharpness))[:, None] * normal
     turn = np.minimum(_WIDE / np.sqrt(np.maximum(sharpness, 1e-300)), np.pi)[:, None] * _POSITIONS
     density = scan.seen(facing[:, None] * np.cos(turn) + aside[:, None] * np.sin(turn)) * np.exp(
         sharpness[:, None] * (np.cos(turn) - 1))

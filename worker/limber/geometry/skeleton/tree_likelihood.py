@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 
 import numpy as np
-from scipy.special import ive
+from scipy.special import i0e
 
 from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.radii.fit_kernels import Match, match_cylinders
@@ -85,7 +85,7 @@ class PointLikelihood:
         ``facing`` is the cosine of the angle to the sensor, [m]; None: from all around."""
         sharpness = distance[:, None] * radius[:, None] / self.noises**2
         off = (distance - radius)[:, None] / self.noises
-        density = ive(0, sharpness) * np.exp(-0.5 * off**2) / (2 * np.pi * self.noises**2)
+        density = i0e(sharpness) * np.exp(-0.5 * off**2) / (2 * np.pi * self.noises**2)
         if facing is None:
             return density
         # Fourier's series of the half-wave rectified cosine. Around the circle the noise is von
