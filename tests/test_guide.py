@@ -68,10 +68,10 @@ def test_every_option_of_help_is_explained(written_pages):
     assert sum(found) > 150
 
 
-def test_the_page_of_accuracy_is_that_of_its_data(written_pages):
-    """`scripts/docs` writes it; a new table in worker/docs/data needs it again."""
-    assert (GUIDE / "explanation" / "accuracy.md").read_text(encoding="utf-8") == (
-        written_pages["explanation/accuracy.md"])
+@pytest.mark.parametrize("page", ["explanation/accuracy.md", "explanation/decide.md"])
+def test_pages_of_accuracy_are_those_of_their_data(page, written_pages):
+    """`scripts/docs` writes them; a new table in worker/docs/data needs them again."""
+    assert (GUIDE / page).read_text(encoding="utf-8") == written_pages[page]
 
 
 @pytest.mark.parametrize("path", sorted((GUIDE / "data").glob("*.json")), ids=lambda p: p.stem)

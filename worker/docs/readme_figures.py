@@ -40,10 +40,19 @@ def _share(counts: list[tuple[str, ...]]) -> str:
     return f"{100 * found / there:.0f} %"
 
 
-def _range(values: list[tuple[str, ...]]) -> str:
-    """The least and the largest of all rows."""
+def _range(values: list[tuple[str, ...]], sign: str = "+") -> str:
+    """The least and the largest of all rows; an error has a sign, a share has none."""
     numbers = [float(value) for value, in values]
-    return f"{min(numbers):+g} to {max(numbers):+g} %"
+    return f"{min(numbers):{sign}g} to {max(numbers):{sign}g} %"
+
+
+def _shares(values: list[tuple[str, ...]]) -> str:
+    return _range(values, "")
+
+
+def _percent(values: list[tuple[str, ...]]) -> str:
+    """The figure of the first row."""
+    return f"{values[0][0]} %"
 
 
 _ONE_SIDE, _ROUND = (rf"worlds, \S+ \(left out\), {view}:" for view in ("one-sided", "round"))
@@ -53,16 +62,25 @@ FIGURES = {
     "other forks, around": Figure("worlds", _ROUND, _FORKS, _share),
     "other bias, one side": Figure("worlds", _ONE_SIDE, _BIAS, _range),
     "other bias, around": Figure("worlds", _ROUND, _BIAS, _range),
-    "real length": Figure("worlds", "worlds, real scans", r"^\d of \d; (\S+)%", lambda rows:
-                          f"{rows[0][0]} %"),
+    "real length": Figure("worlds", "worlds, real scans", r"^\d of \d; (\S+)%", _percent),
     "real held": Figure("worlds", "worlds, real scans", r"^(\d of \d);"),
+    "other twigs, one side": Figure("worlds", _ONE_SIDE, r"; (\d+)% / ", _shares),
+    "other twigs, around": Figure("worlds", _ROUND, r"; (\d+)% / ", _shares),
+    "other volume, one side": Figure("worlds", _ONE_SIDE, r"%\); (\S+)%; ", _shares),
+    "other volume, around": Figure("worlds", _ROUND, r"%\); (\S+)%; ", _shares),
+    "in leaf": Figure("worlds", "worlds, leafy", r"^(\d+)%", _percent),
+    "right in leaf": Figure("worlds", "worlds, leafy", r"/ (\d+)% \(worst \d+%\);", _percent),
+    "one image": Figure("scans", "single-view: forks", r"^(\d+)%", _percent),
+    "one image, radius": Figure("scans", "single-view: radius", r"bias (\S+)%", _percent),
+    "one image, volume": Figure("scans", "single-view: mesh volume", r"^worst (\S+)%", _percent),
+    "sparse length": Figure("sparse", r"sparse, drooping \([^)]*\): axes found",
+                            r"; (\d+)% \(ratio", _percent),
+    "sparse volume": Figure("sparse", r"sparse, drooping \([^)]*\): stated",
+                            r"(\d+ of \d+) state no volume"),
     "sparse": Figure("sparse", r"sparse, drooping \([^)]*\): axes found", r"^(\d+ / \d+ %)"),
-    "sparse held": Figure("sparse", r"sparse, drooping \([^)]*\): stated", r"^(\d+)%", lambda rows:
-                          f"{rows[0][0]} %"),
-    "forks": Figure("scans", "one-sided, noise 1 mm: forks", r"^(\S+)% ", lambda rows:
-                    f"{rows[0][0]} %"),
-    "radius": Figure("scans", "one-sided, noise 1 mm: radius", r"median (\S+)%", lambda rows:
-                     f"{rows[0][0]} %"),
+    "sparse held": Figure("sparse", r"sparse, drooping \([^)]*\): stated", r"^(\d+)%", _percent),
+    "forks": Figure("scans", "one-sided, noise 1 mm: forks", r"^(\S+)% ", _percent),
+    "radius": Figure("scans", "one-sided, noise 1 mm: radius", r"median (\S+)%", _percent),
     "elastica": Figure("mechanics", "cantilever against the elastica: own weight", r"^(\S+ %)"),
     "frequency": Figure("mechanics", "undamped free vibration", r"^(\S+ %)"),
     "held": Figure("truth", "scan to moduli", r"^(\S+ %) of"),
@@ -71,6 +89,13 @@ FIGURES = {
     "stiffness": Figure("truth", "the same of bending stiffness E I", r"median error (\S+ %)"),
     "drop": Figure("estimation", "silicone_beam: E from", r"\(-?(\S+ %)\)$"),
     "exact": Figure("estimation", "three branches, one pull, exact", r"^(.*)$"),
+    "other loads": Figure("estimation", "the same with simulated recordings", r"^(\S+ %)"),
+    "depth frames": Figure("estimation", "depth frames of a simulated D455", r"(\S+ %) \("),
+    "goals": Figure("planning", "goals of the tip", r"^(\d+ of \d+)"),
+    "hopeless": Figure("planning", "unreachable: refused", r"^(\d+ of \d+)"),
+    "gap": Figure("planning", "there: certified gap of the energy", r"^(\S+) /", _percent),
+    "false proofs": Figure("planning", "limits within 5 %", r"^(\d+ of \d+)"),
+    "faults": Figure("robot", "40 faults while moving: standstill", r"^(\d+ of \d+)"),
     "saved": Figure("planning", r"paper's arcs, --max-detour 8\.1: saved against RRT\*, not",
                     r"^(\S+ %), \+"),
     "longer": Figure("planning", r"paper's arcs, --max-detour 8\.1: saved against RRT\*, not",
@@ -125,13 +150,13 @@ def figure(name: str) -> tuple[str, int]:
 
 def table() -> str:
     """Return the README's table."""
-    rows = [f"| {what} | {_filled(how)} | {shown} |" for what, how, shown in ROWS]
+    rows = [f"| {what} | {filled(how)} | {shown} |" for what, how, shown in ROWS]
     return "\n".join(["| what | how well (trials of each figure) | shown by |", "|---|---|---|",
                       *rows])
 
 
-def _filled(how: str) -> str:
-    """Put the figures in, each with the number of its trials."""
+def filled(how: str) -> str:
+    """Put the figures into a text, each with the number of its trials."""
     names = [name for _, name, _, _ in Formatter().parse(how) if name]
     return how.format(**{name: "{} ({})".format(*figure(name)) for name in names})
 

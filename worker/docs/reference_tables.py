@@ -1,8 +1,8 @@
 """A Sphinx extension: reference pages written from the code, so that they cannot go stale.
 
 `commands.md` comes from the stages' schemas and the other commands' options; `pull_toml.md` and
-`cell_toml.md` from the models that read those files; ``explanation/accuracy.md`` from the tables of
-the benches.
+`cell_toml.md` from the models that read those files; ``explanation/accuracy.md`` and
+``explanation/decide.md`` from the tables of the benches.
 """
 
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any, get_args, get_origin
 
 import click
 from accuracy_page import accuracy_page
+from decision_page import decision_page
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
@@ -37,6 +38,7 @@ def pages() -> dict[str, str]:
 
     return {
         "explanation/accuracy.md": accuracy_page(),
+        "explanation/decide.md": decision_page(),
         "reference/commands.md": commands_page(),
         "reference/pull_toml.md": _model_page("pull.toml", PullEntry, (
             "The settings of a recording, in `pulls/NAME/pull.toml`. `limber import-pull` and "
