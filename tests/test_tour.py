@@ -75,6 +75,23 @@ def test_an_axis_in_the_models_of_other_programs(name, stop):
             read_points(TOUR / name)
 
 
+@pytest.mark.parametrize(("name", "stop"), STOPS["cloud"].items())
+def test_clouds_of_phones_and_radiance_fields(name, stop):
+    """Positions, colours and normals by each program's layout; floaters are left out, and said."""
+    with pytest.raises(InputError, match=stop["refused"]) if "refused" in stop else nullcontext():
+        found = read_points(TOUR / name)
+        assert len(found) == stop["count"]
+        height = found.points[:, stop.get("up", 2)]
+        length = stop.get("length", 0.3 if stop["count"] != 40 else 0.249)
+        assert np.ptp(height) == pytest.approx(length, abs=3e-4)
+        assert np.ptp(found.points, axis=0).min() < 0.025, "a stem, without floaters"
+        assert re.search(stop.get("note", "^$|vertices were read"), " ".join(map(str, found.notes)))
+        if stop.get("colour", True):
+            np.testing.assert_allclose(found.attributes["color"][0], [90, 60, 30], atol=1)
+        if "normal" in stop:
+            np.testing.assert_allclose(found.attributes["normal"][0, 0], stop["normal"], atol=1e-6)
+
+
 @pytest.mark.parametrize(("name", "count"), STOPS["bag"].items())
 def test_a_killed_recorders_bag_is_read_to_its_last_message(name, count):
     """A force of 50 N/m, in the order of its messages; chunks that cannot be unpacked are lost."""

@@ -91,9 +91,9 @@ def test_an_axis_goes_on_where_the_parts_of_the_one_before_end(tmp_path):
 @pytest.mark.parametrize(("body", "head", "told"), [
     ("^/P1\n", HEAD, "refers to a vertex that does not exist"),
     ("/P1/X1\t\t\t0\t0\t\t0\t1\n", HEAD, "The file has no class X"),
-    ("/P1/A1)\t\t\t0\t0\t\t0\t1\n", HEAD, "a code consists of"),
+    ("/P1/A1)\t\t\t0\t0\t\t0\t1\n", HEAD, "does not consist of"),
     ("/P1/U1/A1\t\t\t0\t0\t\t0\t1\n", HEAD, "finer scale"),
-    ("/P1/A1/U1\t\t\t0\tx\t\t0\t1\n", HEAD, "must be numbers"),
+    ("/P1/A1/U1\t\t\t0\tx\t\t0\t1\n", HEAD, "could not convert"),
     ("/P1/A1/U1\t\t\t0\tinf\t\t0\t1\n", HEAD, "finite"),
     ("/P1/A1/U1\t\t\t0\t0\t\t0\n", HEAD, "no radius"),
     ("/P1\n", HEAD, "0 vertices"),

@@ -122,23 +122,19 @@ def _section(surface: Surface, axis: np.ndarray, at: float) -> tuple[float, np.n
     """Area [m^2] and centroid [m] of the cut by the plane ``axis . x = at``, by Green's theorem."""
     height = surface.vertices @ axis - at
     above = height[surface.faces] > 0
-    cut = np.flatnonzero(above.any(axis=1) & ~above.all(axis=1))
-    starts, ends = [], []
-    for k in range(3):
-        a, b = surface.faces[cut, k], surface.faces[cut, (k + 1) % 3]
-        share = height[a] / np.where(height[a] == height[b], 1.0, height[a] - height[b])
-        point = surface.vertices[a] + share[:, None] * (surface.vertices[b] - surface.vertices[a])
-        down, up = above[cut, k] & ~above[cut, (k + 1) % 3], ~above[cut, k] & above[
-            cut, (k + 1) % 3]
-        starts.append((point, down))
-        ends.append((point, up))
-    if len(cut) == 0:
+    cut = above.any(axis=1) & ~above.all(axis=1)
+    if not cut.any():
         return 0.0, np.zeros(3)
-    start = np.sum([np.where(used[:, None], point, 0.0) for point, used in starts], axis=0)
-    end = np.sum([np.where(used[:, None], point, 0.0) for point, used in ends], axis=0)
-    origin = start.mean(axis=0)
-    p, q = start - origin, end - origin
-    twice = np.cross(p, q) @ axis
+    # The corner that is alone on its side, and the two others in the order of the face.
+    is_top = above[cut].sum(axis=1) == 1
+    first = np.argmax(above[cut] == is_top[:, None], axis=1)
+    alone, *others = (np.take_along_axis(surface.faces[cut], (first[:, None] + k) % 3, 1)[:, 0]
+                      for k in range(3))
+    p, q = (surface.vertices[alone] + (height[alone] / (height[alone] - height[other]))[:, None]
+            * (surface.vertices[other] - surface.vertices[alone]) for other in others)
+    origin = (p + q).mean(axis=0) / 2
+    p, q = p - origin, q - origin
+    twice = np.where(is_top, 1.0, -1.0) * (np.cross(p, q) @ axis)
     area = twice.sum() / 2
     if abs(area) < 1e-300:
         return 0.0, origin

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from limber.core.errors import InputError
-from limber.core.files.reading import read_toml
-from limber.core.json_values import validated
+from limber.core.files.reading import checked_as, read_toml
 from limber.core.numerics.rigid import rotation_matrix, rotation_vector
 
 _MOST = 1e6
@@ -130,13 +129,8 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 def read_camera(path: Path) -> Camera:
     """Read ``camera.toml``. InputError if it is missing, or an entry is invalid, which it names."""
-    content = read_toml(path, "a file of camera intrinsics (depth images need it)")
-    try:
-        return validated(Camera, content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise InputError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}.",
-                         "The camera cannot be used.", "Correct the entry.") from error
+    what = "a file of camera intrinsics (depth images need it)"
+    return checked_as(path, Camera, read_toml(path, what), what)
 
 
 def write_camera(path: Path, camera: Camera) -> None:

@@ -312,9 +312,9 @@ _FINEST = 1e-5  # first grid step, as a fraction of the scan's size
 
 
 def gathered(pieces: Iterable[Cloud], most: int = MOST_POINTS) -> Cloud:
-    """Join pieces with the same attributes. Of over ``most`` points it keeps the first in each cell
-    of the finest grid that leaves no more. Its cells are within those of the next, twice as wide,
-    so the pieces do not matter. It needs memory for twice ``most`` points and a piece."""
+    """Join pieces, with the attributes that all have. Of over ``most`` points it keeps the first in
+    each cell of the finest grid that leaves no more. Its cells are within those of the next, twice
+    as wide, so the pieces do not matter. It needs memory for twice ``most`` points and a piece."""
     grid = _Grid(most)
     held: list[Cloud] = []
     for piece in pieces:
@@ -366,7 +366,8 @@ def _together(pieces: list[Cloud]) -> Cloud:
     return replace(
         first, points=np.concatenate([piece.points for piece in pieces]),
         attributes={name: np.concatenate([piece.attributes[name] for piece in pieces])
-                    for name in first.attributes},
+                    for name in first.attributes
+                    if all(name in piece.attributes for piece in pieces)},
         not_finite=sum(piece.not_finite for piece in pieces),
         left_out=sum(piece.left_out for piece in pieces))
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from limber.geometry.cloud.preparation import PIECE_POINTS, gathered
 from limber.geometry.io.e57 import read_e57
 from limber.geometry.io.formats import Format, Registry, head_of, starts_with
 from limber.geometry.io.skeletons import is_cylinders, is_tree_file
+from limber.geometry.io.splats import ply_splats
 
 # A mesh given as a cloud: its vertices may be a scan, or far too few.
 
@@ -61,8 +62,10 @@ def read_ply(path: Path) -> Cloud:
     """Return the vertices of a PLY file, with the file's own names of renamed columns."""
     content, titles = _ply_content(path)
     if "vertex" not in content:
-        raise InputError(f"{path} has no vertices.", "A PLY point cloud has an element `vertex`.",
-                         "Export it again.")
+        raise ValueError("it has no element `vertex`")
+    comments = "\n".join([*content.comments, *content.obj_info])
+    if (splats := ply_splats(content)) is not None:
+        return replace(splats, unit=text_columns.stated_unit(comments))
     table = content["vertex"].data
     names = [name for name in table.dtype.names if table.dtype[name].kind in "iuf"]
     # Binary tables stay in the file until a piece is asked for.
@@ -71,7 +74,6 @@ def read_ply(path: Path) -> Cloud:
                      for part in [table[start:start + PIECE_POINTS]])
     # Faces count the file's vertices.
     notes = () if cloud.left_out else tuple(mesh_notes(path, cloud.points, _triangles(content)))
-    comments = "\n".join([*content.comments, *content.obj_info])
     return replace(cloud, unit=text_columns.stated_unit(comments), notes=notes)
 
 
@@ -87,28 +89,35 @@ def _triangles(content: Any) -> np.ndarray:
 
 def _ply_content(path: Path) -> tuple[Any, dict[str, str]]:
     """Read a PLY file, and its names of the properties that are not ASCII. A header is ASCII by the
-    standard; programs write comments and names in other letters too."""
+    standard; programs write comments and names in other letters too. RealSense's Viewer writes
+    position, normal and colour of an ASCII vertex on a line each."""
     from plyfile import PlyData
 
-    raw, body = reading.header_bytes(path, b"end_header")
-    if raw.isascii():
+    raw, start = reading.header_bytes(path, b"end_header")
+    vertex = re.search(rb"element vertex (\d+)\s+((?:property \w+ \w+\s+)+)", raw)
+    in_parts = vertex and b"Realsense Viewer" in raw and b"format ascii" in raw
+    if raw.isascii() and not in_parts:
         return PlyData.read(str(path)), {}
     try:
         header = raw.decode("utf-8")
     except UnicodeDecodeError:
         header = raw.decode("latin-1")
-    lines = re.split(r"(\r\n|\r|\n)", header)
-    words = {k: line.split() for k, line in enumerate(lines) if line.startswith("property")}
-    other = [k for k, parts in words.items() if not parts[-1].isascii()]
-    taken = [parts[-1] for k, parts in words.items() if k not in other]
-    names = property_names((words[k][-1] for k in other), taken)
-    for k, name in zip(other, names, strict=True):
-        lines[k] = " ".join([*words[k][:-1], name])
-    plain = "".join(lines).encode("ascii", "replace")
-    with open(path, "rb") as stream:
-        stream.seek(body)
-        content = PlyData.read(io.BytesIO(plain + stream.read()))
-    return content, {name: words[k][-1] for k, name in zip(other, names, strict=True)}
+    titles: dict[str, str] = {}
+    taken = re.findall(r"(?<![^\r\n])property [^\r\n]* (\S+)", header)
+
+    def named(line: re.Match[str]) -> str:
+        name, = property_names([line[2]], [*taken, *titles])
+        titles[name] = line[2]
+        return line[1] + name
+
+    plain = re.sub(r"(?<![^\r\n])(property [^\r\n]* )(\S*[^\x00-\x7f]\S*)", named, header)
+    body = path.read_bytes()[start:]
+    if vertex and in_parts:
+        count, width = int(vertex[1]), vertex[2].count(b"property")
+        words = body.split(None, count * width)
+        body = b"\n".join([b" ".join(words[at:at + width])
+                           for at in range(0, count * width, width)] + words[count * width:])
+    return PlyData.read(io.BytesIO(plain.encode("ascii", "replace") + body)), titles
 
 
 # Clouds as PCD files, of all versions.
@@ -121,9 +130,7 @@ def read_pcd(path: Path) -> Cloud:
     raw, body = reading.header_bytes(path, b"\nDATA")
     header, titles = _completed(path, raw.decode("utf-8", "replace"))
     cloud = gathered(_cloud(table, titles) for table in _tables(path, header, body))
-    comments = [line for line in raw.decode("utf-8", "replace").splitlines()
-                if line.startswith("#")]
-    return replace(cloud, unit=text_columns.stated_unit("\n".join(comments)))
+    return replace(cloud, unit=_commented_unit(raw))
 
 
 def _cloud(table: np.ndarray, titles: dict[str, str]) -> Cloud:
@@ -154,8 +161,7 @@ def _tables(path: Path, header: str, body: int) -> Iterator[np.ndarray]:
                 listed += len(piece)
                 yield piece
             if listed < meta.points:
-                raise InputError(f"{path} announces {meta.points} points and lists {listed}.",
-                                 "It is cut short, or its header is damaged.", "Export it again.")
+                raise ValueError(f"it announces {meta.points} points and lists {listed}")
             return
         if meta.data.value == "binary" and meta.points:
             whole = np.memmap(path, dtype, "r", body, (meta.points,))
@@ -173,8 +179,7 @@ def _completed(path: Path, source: str) -> tuple[str, dict[str, str]]:
                if (words := line.split()) and not words[0].startswith("#")}
     for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA"):
         if not entries.get(key):
-            raise InputError(f"The header of {path} has no entry {key}.",
-                             "A PCD header needs this entry.", "Export it again.")
+            raise ValueError(f"its header has no entry {key}")
     fields = entries["FIELDS"]
     names = iter(property_names([title for title in fields if title != "_"]))
     renamed = [title if title == "_" else next(names) for title in fields]
@@ -274,9 +279,6 @@ def las_columns(path: Path) -> dict[str, np.ndarray]:
         metres = stated_metres([*reader.header.vlrs, *(reader.evlrs or ())])
     attributes = {name: values for name, values in cloud.attributes.items()
                   if name == "color" or values.any()}
-    if "color" in attributes and attributes["color"].max(initial=0) > 255:
-        # 16 bits per channel by the standard, though many programs write 8.
-        attributes["color"] = attributes["color"] // 257
     return {**attributes, POINTS: cloud.points, LEFT_OUT: np.array(cloud.left_out),
             METRES: metres}
 
@@ -316,15 +318,12 @@ def read_points3d(path: Path) -> Cloud:
     raw = path.read_bytes()
     count, = struct.unpack_from("<Q", raw)
     reading.require_size(path, float(count) * _POINT.size + 8, len(raw), f"{count} points")
-    cut = InputError(f"{path} is cut short.", f"It announces {count} points.", "Export it again.")
     rows, at = np.empty((count, 7)), 8
     for row in rows:
-        if at + _POINT.size > len(raw):
-            raise cut
         _, *row[:], seen = _POINT.unpack_from(raw, at)
         at += _POINT.size + _SEEN_BYTES * seen
     if at > len(raw):
-        raise cut
+        raise ValueError(f"it is cut short: it announces {count} points")
     return Cloud(rows[:, :3], {"color": rows[:, 3:6].astype(np.uint8), "error": rows[:, 6]})
 
 
@@ -336,63 +335,36 @@ _HEAD = 10
 """Lines above the points of a scan: columns, rows, position, three axes, a matrix of four rows."""
 
 
-class _Scan(NamedTuple):
-    """A scan: the number of its points, the matrix [4, 4] from points as rows to the common frame,
-    and the number of its columns."""
-
-    size: int
-    matrix: np.ndarray
-    width: int
-
-
 def read_ptx(path: Path) -> Cloud:
-    """Return the points of all scans [m] in their common frame, with intensity and colour, thinned
-    by :func:`gathered`. InputError if a scan is cut short, or one of its lines is invalid."""
-    coding = text_columns.coding_of(path)
-    scans = _scans(path, coding)
-    width = min((scan.width for scan in scans), default=0)
-    if width < 3:
-        raise InputError(f"{path} has no scan.", "A PTX file begins with the numbers of columns "
-                         "and rows of its first scan.", "Export it again.")
-    return replace(gathered(_scan_pieces(path, coding, scans, width)), unit="m")
+    """Return the points of all scans [m] in their common frame, with the intensity and colour that
+    all have, thinned by :func:`gathered`. InputError if a scan is cut short, or a line is invalid.
+    """
+    return replace(gathered(_scan_pieces(path)), unit="m")
 
 
-def _lines(path: Path, coding: str) -> Iterator[str]:
-    return filter(str.strip, text_columns.lines_of(path, coding))
-
-
-def _scans(path: Path, coding: str) -> list[_Scan]:
-    """The headers of all scans."""
-    lines, start, scans = _lines(path, coding), 0, []
+def _scan_pieces(path: Path) -> Iterator[Cloud]:
+    """The points of some lines after the other."""
+    lines = filter(str.strip, text_columns.lines_of(path, text_columns.coding_of(path)))
+    start = 0
     while head := list(itertools.islice(lines, _HEAD)):
-        count, matrix = _header(path, head, start)
-        first = next(lines, None)
-        found = 0 if first is None else 1 + sum(1 for _ in itertools.islice(lines, count - 1))
-        if first is None or found < count:
-            raise InputError(f"{path}: the scan at line {start + 1} announces {count} points, but "
-                             f"{found} lines follow.", "The file is cut short.",
-                             "Export it again.")
-        scans.append(_Scan(count, matrix, len(first.split())))
-        start += _HEAD + count
-    return scans
-
-
-def _scan_pieces(path: Path, coding: str, scans: list[_Scan], width: int) -> Iterator[Cloud]:
-    """The points of some lines after the other, with ``width`` of their columns."""
-    lines = _lines(path, coding)
-    for scan in scans:
-        rows = itertools.islice(lines, _HEAD, _HEAD + scan.size)
-        while some := list(itertools.islice(rows, text_columns.LINES_AT_ONCE)):
-            table = _table(path, some, scan)
+        count, matrix = _header(head, start)
+        left, width = count, 0
+        while some := list(itertools.islice(lines, min(left, text_columns.LINES_AT_ONCE))):
+            table = _table(some, matrix, width)
+            left, width = left - len(some), table.shape[1]
             # A direction without an echo is a point at the scanner itself.
             seen = np.isfinite(table[:, 0])
             attributes = {"intensity": table[seen, 3]} if width > 3 else {}
             if width >= 7:
                 attributes["color"] = table[seen, 4:7]
             yield Cloud(table[seen, :3], attributes, not_finite=int((~seen).sum()))
+        if left:
+            raise ValueError(f"it is cut short: the scan at line {start + 1} announces {count} "
+                             f"points, but {count - left} lines follow")
+        start += _HEAD + count
 
 
-def _header(path: Path, head: list[str], start: int) -> tuple[int, np.ndarray]:
+def _header(head: list[str], start: int) -> tuple[int, np.ndarray]:
     """Points of a scan and its matrix [4, 4] from points as rows to the common frame."""
     try:
         columns, rows = int(head[0]), int(head[1])
@@ -401,29 +373,37 @@ def _header(path: Path, head: list[str], start: int) -> tuple[int, np.ndarray]:
                 min(columns, rows) < 1 or max(columns, rows) > _MOST):
             raise ValueError
     except (ValueError, IndexError):
-        raise InputError(f"{path}, line {start + 1}: the header of a scan was expected.",
-                         "It has the numbers of columns and rows, the scanner's position and axes, "
-                         "and a matrix of four rows.", "Export it again.") from None
+        raise ValueError(f"line {start + 1}: the header of a scan was expected: numbers of columns "
+                         "and rows, the scanner's position and axes, a matrix of four rows"
+                         ) from None
     return columns * rows, matrix
 
 
-def _table(path: Path, rows: list[str], scan: _Scan) -> np.ndarray:
-    """Points in the common frame and the other values of a line; NaN where there was no echo."""
-    try:
-        table = np.loadtxt(rows, ndmin=2)
-        if table.shape[1] != scan.width:
-            raise ValueError(f"{table.shape[1]} columns instead of {scan.width}")
-    except ValueError as error:
-        raise InputError(f"{path}: a scan's points are not a table of numbers ({error}).",
-                         "The file is damaged.", "Export it again.") from error
+def _table(rows: list[str], matrix: np.ndarray, width: int) -> np.ndarray:
+    """Points in the common frame and the other values of a line; NaN where there was no echo. The
+    lines before have ``width`` values, 0 if there are none."""
+    table = np.loadtxt(rows, ndmin=2)
+    if table.shape[1] < 3 or width not in (0, table.shape[1]):
+        raise ValueError(f"a scan has {table.shape[1]} columns instead of {width or 4}")
     silent = ~table[:, :3].any(axis=1)
-    table[:, :3] = table[:, :3] @ scan.matrix[:3, :3] + scan.matrix[3, :3]
+    table[:, :3] = table[:, :3] @ matrix[:3, :3] + matrix[3, :3]
     table[silent, :3] = np.nan
     return table
 
 
 _FARTHEST = 1e15
 """Largest coordinate, whatever its unit."""
+_AGAIN = "Export a point cloud (PLY, LAS), or else a mesh (OBJ, GLB), from its program."
+_OTHERS = {
+    ".usdz .usd .usdc .usda .fbx .dae .gltf .blend": ("a scene for viewers", _AGAIN),
+    ".splat .ksplat .spz .sog": ("splats, packed", "Open it in SuperSplat and export PLY."),
+    ".psx .psz .rcp .rcs .zip": ("a project or an archive", _AGAIN),
+    ".jpg .jpeg .heic .mov .mp4": ("a photograph or a film", "Make a cloud of it first, with "
+                                   "COLMAP, Metashape or a phone's app."),
+    ".vis": ("COLMAP's list of the images that saw each point", "Give the .ply beside it."),
+    ".bag": ("a recording", Text("Play it in RealSense Viewer, stop, and export PLY. A pull's "
+                                 "recording goes to ", Command("import-pull"), "."))}
+"""What people have in place of a cloud: what it is, and what to do."""
 
 
 def read_points(path: Path) -> Cloud:
@@ -443,6 +423,9 @@ def read_points(path: Path) -> Cloud:
     if path.is_dir():
         raise InputError(f"{path} is a folder.", "A point cloud file was expected.", "Give one of "
                          "its files, or give the folder to ", Command("reconstruct"), ".")
+    for suffixes, (what, fix) in _OTHERS.items():
+        if path.suffix.lower() in suffixes.split():
+            raise InputError(f"{path.name} is {what}.", "A point cloud was expected.", fix)
     chosen = CLOUDS.of(path)
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty.", "A point cloud was expected.", "Export it again.")
@@ -516,25 +499,26 @@ def _read_vertices(path: Path) -> Cloud:
     import trimesh
 
     mesh: Any = trimesh.load(path, process=False)
-    parts = list(mesh.geometry.values()) if isinstance(mesh, trimesh.Scene) else [mesh]
+    # The parts of a scene stand where its nodes put them.
+    parts: list[Any] = mesh.dump() if isinstance(mesh, trimesh.Scene) else [mesh]
     points = np.vstack([np.asarray(part.vertices, np.float64) for part in parts]
                        or [np.empty((0, 3))])
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"{path} has vertices of {points.shape[-1]} coordinates.",
-                         "A vertex has three coordinates.", "Export it again.")
+        raise ValueError(f"its vertices have {points.shape[-1]} coordinates")
     notes = [note for part in parts if isinstance(part, trimesh.Trimesh)
-             for note in mesh_notes(path, part.vertices, part.faces)]
+             for note in mesh_notes(path, part.vertices, part.faces)][:1]
+    if is_gltf := path.suffix.lower() == ".glb":
+        notes.append(Text("glTF is in metres with y up: ", Option("up", (0, 1, 0)),
+                          ", unless its program turned it."))
     # STL repeats a vertex in each of its triangles.
-    return Cloud(np.unique(points, axis=0) if path.suffix.lower() == ".stl" else points,
-                 unit=_commented_unit(path), notes=tuple(notes[:1]))
+    return Cloud(np.unique(points, axis=0) if path.suffix.lower() == ".stl" else points, unit="m"
+                 if is_gltf else _commented_unit(head_of(path, 10_000)), notes=tuple(notes))
 
 
-def _commented_unit(path: Path) -> str | None:
-    """The unit that the comments above an OBJ file's vertices state."""
-    if path.suffix.lower() != ".obj":
-        return None
-    lines = head_of(path, 10_000).decode("utf-8", "replace").splitlines()
-    return text_columns.stated_unit("\n".join(line for line in lines if line.startswith("#")))
+def _commented_unit(head: bytes) -> str | None:
+    """The unit that the comments of a header state."""
+    comments = re.findall("^#.*", head.decode("utf-8", "replace"), re.MULTILINE)
+    return text_columns.stated_unit("\n".join(comments))
 
 
 def _read_arrays(path: Path) -> Cloud:
@@ -551,8 +535,7 @@ def _read_arrays(path: Path) -> Cloud:
         return Cloud.from_columns(arrays)
     points = np.asarray(arrays.pop(key), np.float64)
     if points.ndim != 2 or points.shape[1] < 3 or points.shape[0] == 3 < points.shape[1]:
-        raise InputError(f"{path}: {key} has shape {list(points.shape)}.",
-                         "Points must have shape [n, 3].", "Save them in this shape.")
+        raise ValueError(f"{key} has shape {list(points.shape)} instead of [n, 3]")
     renamed = {"normals": "normal", **dict.fromkeys(("colors", "colours", "colour", "rgb"),
                                                     "color")}
     return Cloud(points[:, :3], {renamed.get(k, k): v for k, v in arrays.items()})
@@ -575,7 +558,7 @@ CLOUDS = Registry("point cloud", "limber.clouds", [
     Format("COLMAP", (".bin",), read_points3d),
     Format("LAS", (".las", ".laz"), las_columns, check=reading.check_las, isolated=is_packed,
            recognises=starts_with(b"LASF")),
-    Format("vertices of a mesh", (".obj", ".stl", ".off"), _read_vertices),
+    Format("vertices of a mesh", (".obj", ".stl", ".off", ".glb"), _read_vertices),
     Format("NumPy", (".npz", ".npy"), _read_arrays)], of_arrays=_of_columns)
 """:func:`read_points` reads all of them. Arrays that a format reads are columns: x, y, z and any
 others, or the coordinates as :data:`~limber.geometry.cloud.cloud.POINTS`."""

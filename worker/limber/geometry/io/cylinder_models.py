@@ -128,18 +128,12 @@ def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
     notes = [f"{Path(path).name} has {len(found['models'])} models: "
              f"{'; '.join(found['models'])}. Number {found['taken']} was taken. For another, "
              "save it alone in Matlab."] if len(found["models"]) > 1 else []
-    try:
-        radius, length, parent = (np.asarray(found[name], float).ravel()
-                                  for name in ("radius", "length", "parent"))
-        start, axis = (np.atleast_2d(np.asarray(found[name], float))
-                       for name in ("start", "axis"))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: {error}.", "A cylinder's fields are numbers.",
-                         "Save it again.") from error
+    radius, length, parent = (np.asarray(found[name], float).ravel()
+                              for name in ("radius", "length", "parent"))
+    start, axis = (np.atleast_2d(np.asarray(found[name], float)) for name in ("start", "axis"))
     count = len(radius)
     if not (len(length) == len(parent) == count and start.shape == axis.shape == (count, 3)):
-        raise InputError(f"{path} has fields of different lengths.",
-                         "Each field needs one value for each cylinder.", "Save it again.")
+        raise ValueError("the fields of its cylinders have different lengths")
     return {"id": np.arange(1.0, count + 1), "parent": np.where(parent > 0, parent, -1.0),
             "start": start, "end": start + axis * length[:, None], "radius": radius,
             "start_radius": _thick_ends(found, radius), "notes": np.array(notes)}
@@ -147,12 +141,7 @@ def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
 
 def _fields(path: Path) -> dict[str, Any]:
     """The fields of the cylinders and ``creator``; empty if there are no cylinders."""
-    try:
-        is_new = is_hdf5(path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}).",
-                         "A TreeQSM model was expected.", "Check the path.") from error
-    if is_new:
+    if is_hdf5(path):
         require_extra("matlab", ("h5py",),
                       f"The MAT file {path} of version 7.3 (saving it in Matlab with -v7 avoids "
                       "this)")

@@ -48,25 +48,21 @@ def read_e57(path: Path) -> Cloud:
     start, length = struct.unpack("<QQ", pages.read(24, 16))
     text = pages.read(pages.logical(start), length)
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
-        raise _damaged(path, "its XML defines entities")
+        raise ValueError("its XML defines entities")
     try:
         # Without entities an XML text is no larger than its file.
         root = ElementTree.fromstring(text.decode("utf-8"))  # noqa: S314
     except (UnicodeDecodeError, ElementTree.ParseError) as error:
-        raise _damaged(path, f"its XML is invalid ({error})") from error
+        raise ValueError(f"its XML is invalid ({error})") from error
     for each in root.iter():
         each.tag = each.tag.rpartition("}")[2]
     scans = [_Scan(pages, each) for each in root.findall("./data3D/vectorChild")]
     scans = [scan for scan in scans if scan.count]
     if not scans:
-        raise InputError(f"{path} has no scan with points.", "A point cloud was expected.",
-                         "Export it again.")
-    shared = set.intersection(*(scan.attributes for scan in scans))
-    cloud = gathered(piece for scan in scans for piece in scan.pieces(shared))
+        raise ValueError("it has no scan with points")
+    cloud = gathered(piece for scan in scans for piece in scan.pieces())
     if not len(cloud):
-        raise InputError(f"None of the points in {path} has valid coordinates.",
-                         "All of them are marked as not seen, or are no numbers.",
-                         "Export it again.")
+        raise ValueError("no point has valid coordinates: all are marked as not seen")
     return replace(cloud, unit="m")
 
 
@@ -80,10 +76,10 @@ class _Pages:
         with open(path, "rb") as stream:
             head = stream.read(48)
         if len(head) < 48 or head[:8] != b"ASTM-E57":
-            raise _damaged(path, "it does not begin as E57 files do")
+            raise ValueError("it does not begin as E57 files do")
         _, _, _, _, self._page = struct.unpack_from("<QQQQQ", head, 8)
         if not 64 <= self._page <= 1 << 20 or self._page & (self._page - 1) or size % self._page:
-            raise _damaged(path, "its size is not a whole number of pages")
+            raise ValueError("its size is not a whole number of pages")
         self._count = size // self._page
         self.size = self._count * (self._page - 4)
 
@@ -95,8 +91,7 @@ class _Pages:
             wrong += int((checksums(pages[:, :-4]) != pages[:, -4:].copy().view(">u4").ravel()
                           ).sum())
         if wrong:
-            raise _damaged(self.path, f"{wrong} of its {self._count} pages do not match their "
-                           "checksums")
+            raise ValueError(f"{wrong} of its {self._count} pages do not match their checksums")
 
     def logical(self, physical: int) -> int:
         """Return the place without checksums of a place in the file."""
@@ -131,13 +126,12 @@ def checksums(pages: np.ndarray) -> np.ndarray:
 
 
 class _Scan:
-    """One scan of a file: the ``count`` of its points, and names of their colour and scalars."""
+    """One scan of a file: the ``count`` of its points."""
 
     def __init__(self, pages: _Pages, scan: ElementTree.Element):
         self._pages, self._scan = pages, scan
         points = scan.find("points")
         self.count = int(points.get("recordCount", 0)) if points is not None else 0
-        self.attributes: set[str] = set()
         if points is None or self.count == 0:
             return
         if len(points.findall("./codecs/vectorChild")):
@@ -148,14 +142,11 @@ class _Scan:
         self._offset = int(points.get("fileOffset", 0))
         bits = sum(field.bits for field in self._fields)
         if any(field.bits > _MOST_BITS for field in self._fields):
-            raise _damaged(pages.path, "it has integers of more than 64 bits")
+            raise ValueError("it has integers of more than 64 bits")
         require_size(pages.path, self.count * max(bits, 1) / 8, pages.size, f"{self.count} points")
-        names = {field.name for field in self._fields}
-        self.attributes = {_NAMES[name] for name in names if name in _NAMES} | (
-            {"color"} if set(_COLOURS) <= names else set())
 
-    def pieces(self, attributes: set[str]) -> Iterator[Cloud]:
-        """Yield some points after the other [m] in the common frame, with some attributes."""
+    def pieces(self) -> Iterator[Cloud]:
+        """Yield some points after the other [m] in the common frame."""
         held = [bytearray() for _ in self._fields]
         left = self.count
         for packet in _packets(self._pages, self._offset, len(held)):
@@ -166,17 +157,17 @@ class _Scan:
             if PIECE_POINTS <= ready < left:
                 # A multiple of eight values of any number of bits ends with a whole byte.
                 count = ready - ready % 8
-                yield self._taken(held, count, attributes)
+                yield self._taken(held, count)
                 left -= count
-        yield self._taken(held, left, attributes)
+        yield self._taken(held, left)
 
-    def _taken(self, held: list[bytearray], count: int, attributes: set[str]) -> Cloud:
+    def _taken(self, held: list[bytearray], count: int) -> Cloud:
         columns = {}
         for field, stream in zip(self._fields, held, strict=True):
             size = -(-count * field.bits // 8)
-            columns[field.name] = _values(self._pages.path, field, bytes(stream[:size]), count)
+            columns[field.name] = _values(field, bytes(stream[:size]), count)
             del stream[:size]
-        return _cloud(self._pages.path, columns, self._scan, attributes)
+        return _cloud(columns, self._scan)
 
 
 def _field(each: ElementTree.Element) -> _Field:
@@ -190,31 +181,31 @@ def _field(each: ElementTree.Element) -> _Field:
 
 def _packets(pages: _Pages, offset: int, count: int) -> Iterator[list[bytes]]:
     """Yield the bytes of each column in each packet of a section."""
-    path, section = pages.path, pages.logical(offset)
+    section = pages.logical(offset)
     kind, length, begin = struct.unpack("<BxxxxxxxQQ", pages.read(section, 24))
     at, end = pages.logical(begin), min(section + length, pages.size)
     if kind != 1 or not section < at <= end:
-        raise _damaged(path, "a section of points is none")
+        raise ValueError("a section of points is none")
     while at + 4 <= end:
         packet, _, size = struct.unpack("<BBH", pages.read(at, 4))
         if size < 3:
-            raise _damaged(path, "a packet of points is shorter than its header")
+            raise ValueError("a packet of points is shorter than its header")
         if packet == _DATA_PACKET:
             content = pages.read(at, size + 1)
             found, = struct.unpack_from("<H", content, 4)
             sizes = struct.unpack_from(f"<{found}H", content, 6)
             place = 6 + 2 * found
             if found != count or place + sum(sizes) > len(content):
-                raise _damaged(path, "a packet of points is longer than it says")
+                raise ValueError("a packet of points is longer than it says")
             ends = place + np.cumsum((0, *sizes))
             yield [content[a:b] for a, b in itertools.pairwise(ends)]
         at += size + 1
 
 
-def _values(path: Path, field: _Field, stream: bytes, count: int) -> np.ndarray:
+def _values(field: _Field, stream: bytes, count: int) -> np.ndarray:
     """The numbers of a column, shape [count]."""
     if len(stream) * 8 < count * field.bits:
-        raise _damaged(path, f"its column {field.name} ends early")
+        raise ValueError(f"its column {field.name} ends early")
     if field.kind == "Float":
         return np.frombuffer(stream, "<f4" if field.bits == 32 else "<f8", count)
     at = np.arange(count, dtype=np.int64) * field.bits
@@ -233,8 +224,7 @@ def _values(path: Path, field: _Field, stream: bytes, count: int) -> np.ndarray:
     return whole * field.scale + field.offset if field.kind == "ScaledInteger" else whole
 
 
-def _cloud(path: Path, columns: dict[str, np.ndarray], scan: ElementTree.Element,
-           fields: set[str]) -> Cloud:
+def _cloud(columns: dict[str, np.ndarray], scan: ElementTree.Element) -> Cloud:
     from scipy.spatial.transform import Rotation
 
     if set(_CARTESIAN) <= columns.keys():
@@ -247,20 +237,15 @@ def _cloud(path: Path, columns: dict[str, np.ndarray], scan: ElementTree.Element
                            distance * np.sin(elevation)], axis=1)
         state = columns.get("sphericalInvalidState")
     else:
-        raise InputError(f"{path} has a scan with the columns {', '.join(columns)}.",
-                         "Cartesian or spherical coordinates were expected.", "Export it again.")
+        raise ValueError(f"a scan has neither Cartesian nor spherical coordinates, but "
+                         f"{', '.join(columns)}")
     seen = np.isfinite(points).all(axis=1) if state is None else state == 0
     turn = [float(scan.findtext(f"./pose/rotation/{axis}") or axis == "w") for axis in "xyzw"]
     shift = [float(scan.findtext(f"./pose/translation/{axis}") or 0) for axis in "xyz"]
     attributes = {_NAMES[name]: values[seen] for name, values in columns.items()
-                  if _NAMES.get(name) in fields}
-    if "color" in fields:
+                  if name in _NAMES}
+    if set(_COLOURS) <= columns.keys():
         attributes["color"] = np.stack([columns[name] for name in _COLOURS], axis=1)[seen]
     return Cloud(Rotation.from_quat(turn).apply(points[seen]) + shift, attributes,
                  not_finite=int((~seen).sum()))
 
-
-def _damaged(path: Path, seen: str) -> InputError:
-    return InputError(f"{path} cannot be read: {seen}.",
-                      "The file is damaged, or is not an E57 file.",
-                      "Export it again, or as PLY or LAS with CloudCompare.")

@@ -118,8 +118,9 @@ class Registry(Generic[Kind]):
                                          f"Install it, or export the {self.what} in another "
                                          "format.") from error
         except Exception as error:  # each format's package raises its own
+            kind = "" if type(error) is ValueError else f"{type(error).__name__}: "
             raise machine_error(error, path) or InputError(
-                f"{path} cannot be read ({type(error).__name__}: {error}).",
+                f"{path} cannot be read ({kind}{error}).",
                 "The file is damaged, truncated, or does not have the format of its suffix.",
                 "Export it again.") from error
 

@@ -54,14 +54,17 @@ def read_mtg(path: Path, *, scale: float | None = None, near: Place = None) -> S
     """Read an MTG; nodes without radius or diameter have that of the node before. ``scale`` is
     metres per unit (None: 1). InputError if it is not one tree with positions and radii."""
     lines = read_text(path, _WHAT).splitlines()
-    scales, body = _sections(path, lines)
+    scales, body = _sections(lines)
     reader = _Reader(path, scales, *_header(path, body))
     for number, line in body[1:]:
-        reader.take(number, line)
+        try:
+            reader.take(line)
+        except ValueError as error:
+            raise ValueError(f"line {number}: {error}") from error
     return reader.skeleton(1.0 if scale is None else scale, near)
 
 
-def _sections(path: Path, lines: list[str]) -> tuple[dict[str, int], list[tuple[int, str]]]:
+def _sections(lines: list[str]) -> tuple[dict[str, int], list[tuple[int, str]]]:
     """The scale of each class, and the lines of the graph with their numbers."""
     found: dict[str, list[tuple[int, str]]] = {}
     current: list[tuple[int, str]] | None = None
@@ -73,15 +76,12 @@ def _sections(path: Path, lines: list[str]) -> tuple[dict[str, int], list[tuple[
             current.append((number, line))
     missing = [name for name in ("CLASSES", "MTG") if not found.get(name)]
     if missing:
-        raise InputError(f"{path} has no section {' and '.join(missing)}.",
-                         "An MTG has the sections CODE, CLASSES, DESCRIPTION, FEATURES and MTG.",
-                         "Choose an MTG file (FORM-A).")
+        raise ValueError(f"it has no section {' and '.join(missing)}")
     scales = {}
     for number, line in found["CLASSES"][1:]:
         words = line.split()
         if len(words) < 2 or not words[1].isdigit():
-            raise InputError(f"{path}, line {number}: {line.strip()[:60]!r} is not a class.",
-                             "A class has a symbol and a scale.", "Correct that line.")
+            raise ValueError(f"line {number} is no class with its scale: {line.strip()[:60]!r}")
         scales[words[0]] = int(words[1])
     return scales, found["MTG"]
 
@@ -116,44 +116,43 @@ class _Reader:
         self.parent: list[int] = []
         self.radius: list[float] = []
 
-    def take(self, number: int, line: str) -> None:
+    def take(self, line: str) -> None:
         cells = line.split("\t")
         codes = [(column, cell.strip()) for column, cell in enumerate(cells[:self.columns])
                  if cell.strip()]
         if not codes:
             return
-        values = self.values(number, cells)
+        values = self.values(cells)
         vertex: _Vertex | None = None
         for index, (column, code) in enumerate(codes):
             if vertex is None:
                 stays = code.startswith("^")
                 vertex = self.last.get(column if stays else column - 1)
                 if vertex is None and (stays or column > 0):
-                    raise self.wrong(number, code, "It refers to a vertex that does not exist.")
-            vertex = self.chain(number, code.removeprefix("^"), vertex,
+                    raise ValueError(f"{code!r} refers to a vertex that does not exist")
+            vertex = self.chain(code.removeprefix("^"), vertex,
                                 values if index == len(codes) - 1 else None)
             self.last = {at: one for at, one in self.last.items() if at < column}
             self.last[column] = vertex
 
-    def chain(self, number: int, code: str, vertex: _Vertex | None,
+    def chain(self, code: str, vertex: _Vertex | None,
               values: tuple[float, ...] | None) -> _Vertex:
         """Follow a code; its last vertex has the values of the line."""
         at = 0
         while at < len(code):
             token = _TOKEN.match(code, at)
             if token is None or (token.group(1) is None and vertex is not None):
-                raise self.wrong(number, code, "A code consists of /, < or + and labels.")
+                raise ValueError(f"{code!r} does not consist of /, < or + and labels")
             at = token.end()
             if token.group(2) not in self.scales:
-                raise self.wrong(number, code, f"The file has no class {token.group(2)}.")
-            vertex = self.vertex(number, code, (token.group(1) or "/")[0],
-                                 self.scales[token.group(2)], vertex,
+                raise ValueError(f"the file has no class {token.group(2)}")
+            vertex = self.vertex((token.group(1) or "/")[0], self.scales[token.group(2)], vertex,
                                  values if at == len(code) else None)
         if vertex is None:
-            raise self.wrong(number, code, "It does not name a vertex.")
+            raise ValueError(f"{code!r} does not name a vertex")
         return vertex
 
-    def vertex(self, number: int, code: str, sign: str, scale: int, before: _Vertex | None,
+    def vertex(self, sign: str, scale: int, before: _Vertex | None,
                values: tuple[float, ...] | None) -> _Vertex:
         anchor, whole = -1, None
         if before is not None:
@@ -164,52 +163,45 @@ class _Reader:
                 while whole is not None and whole.scale >= scale:
                     whole = whole.whole
             elif before.scale >= scale:
-                raise self.wrong(number, code, "A part must have a finer scale than its whole.")
+                raise ValueError("a part must have a finer scale than its whole")
         found = _Vertex(scale, whole, anchor)
         if values is not None:
-            found.anchor = self.node(number, code, anchor, values)
+            found.anchor = self.node(anchor, values)
             while whole is not None and sign != "+":
                 whole.tail, whole = found.anchor, whole.whole
         return found
 
-    def node(self, number: int, code: str, parent: int, values: tuple[float, ...]) -> int:
+    def node(self, parent: int, values: tuple[float, ...]) -> int:
         *position, radius = values
         if np.isnan(radius):
             if parent < 0:
-                raise self.wrong(number, code, "The first vertex with a position has no radius.")
+                raise ValueError("the first vertex with a position has no radius")
             radius = self.radius[parent]
         self.nodes.append(tuple(position))
         self.parent.append(parent)
         self.radius.append(radius)
         return len(self.nodes) - 1
 
-    def values(self, number: int, cells: list[str]) -> tuple[float, ...] | None:
+    def values(self, cells: list[str]) -> tuple[float, ...] | None:
         """Position and radius of a line (nan if it has no radius); None without a position."""
         def value(name: str) -> float:
             column = self.features[name]
             text = cells[column].strip() if column < len(cells) else ""
-            try:
-                return float(text) if text not in ("", "-", "NA") else np.nan
-            except ValueError as error:
-                raise self.wrong(number, text, "Positions and radii must be numbers.") from error
+            return float(text) if text not in ("", "-", "NA") else np.nan
+
         position = tuple(value(name) for name in "xyz")
         if np.isnan(position).all():
             return None
-        require_finite(self.path, {f"position in line {number}": np.array(position)}, _WHAT)
+        require_finite(self.path, {"a position": np.array(position)}, _WHAT)
         return *position, value(self.radius_column) * _RADII[self.radius_column]
 
     def skeleton(self, scale: float, near: Place) -> Skeleton:
         nodes, parent = np.array(self.nodes).reshape(-1, 3), np.array(self.parent, np.int64)
         if not len(nodes):
-            raise InputError(f"{self.path} has 0 vertices with a position.",
-                             "A branch has a root and a tip.", "Check the columns of positions.")
+            raise ValueError("it has 0 vertices with a position")
         radius = np.array(self.radius)
         require_finite(self.path, {"radii": radius}, _WHAT)
         return _of_nodes(self.path, nodes, parent, radius, scale, near)
-
-    def wrong(self, number: int, code: str, why: str) -> InputError:
-        return InputError(f"{self.path}, line {number}: {code[:60]!r} cannot be read.", why,
-                          "Correct that line.")
 
 
 def write_mtg(skeleton: Skeleton, path: Path) -> None:
@@ -439,10 +431,9 @@ def read_tree_file(path: Path, *, scale: float | None = None, near: Place = None
             if len(rows) == before:
                 raise ValueError(f"no segment of {len(titles)} values")
         except ValueError as error:
-            raise InputError(f"{path}, line {number} is not a tree ({error}).",
-                             f"A segment has {', '.join(titles)}.", "Export it again.") from error
+            raise ValueError(f"line {number} is not a tree ({error})") from error
     if not rows:
-        raise InputError(f"{path} has no trees.", "Each line is a tree.", "Export it again.")
+        raise ValueError("it has no trees")
     table = np.array(rows)
     parent = _parents(path, table[:, 0].astype(np.int64), table[:, 1].astype(np.int64))
     return _of_nodes(path, table[:, 2:5], parent, table[:, 5], 1.0 if scale is None else scale,
