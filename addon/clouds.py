@@ -18,9 +18,9 @@ _LINES = 20_000
 """Lines of text that are read at once: numpy holds the interpreter meanwhile."""
 
 
-def read_points(path: Path) -> tuple[np.ndarray, str | None]:
-    """Return the points of a PLY or text file in its own unit, shape [n, 3], and that unit if the
-    file states it.
+def read_points(path: Path) -> tuple[np.ndarray, str | None, np.ndarray | None]:
+    """Return the points of a PLY or text file in its own unit, shape [n, 3], that unit if the file
+    states it, and red, green and blue as bytes, shape [n, 3], if it has them.
 
     Points that are not finite are omitted, as in the worker.
 
@@ -28,36 +28,32 @@ def read_points(path: Path) -> tuple[np.ndarray, str | None]:
         ValueError: the file is not readable as points; states what to do.
     """
     try:
-        points, unit = _read_ply(path) if path.suffix.lower() == ".ply" else _read_text(path)
+        names, values, unit = (_read_ply if path.suffix.lower() == ".ply" else _read_text)(path)
+        axes, shades = (text_columns.three_of(role, names) for role in ("position", "color"))
+        if axes is None:
+            raise ValueError("x, y and z are missing")
+        points = np.column_stack([values[k].astype(float) for k in axes])
     except (OSError, ValueError, IndexError, KeyError, StopIteration) as error:
         raise ValueError(f"{path} cannot be shown as points ({error}). The worker reads more file "
                          "formats, so it may still reconstruct this file.") from error
-    points = points[(np.abs(points) < _FARTHEST).all(axis=1)]
-    if len(points) == 0:
+    is_there = (np.abs(points) < _FARTHEST).all(axis=1)
+    if not is_there.any():
         raise ValueError(f"{path} has no points, or none that are finite. Export the scan again.")
-    return points, unit
+    colours = None if shades is None else _bytes(np.column_stack([values[k] for k in shades]))
+    return points[is_there], unit, None if colours is None else colours[is_there]
 
 
-def read_colours(path: Path) -> np.ndarray | None:
-    """Return red, green, blue of a PLY file's points as bytes, shape [n, 3]; None without.
-
-    Colours of other kinds of files, and those of ASCII files, are left to the worker.
-    """
-    if path.suffix.lower() != ".ply":
-        return None
-    rows = _binary_rows(path)
-    names = ("red", "green", "blue")
-    if rows is None or any(rows.dtype.fields.get(name, (None,))[0] != np.uint8 for name in names):
-        return None
-    return np.column_stack([rows[name] for name in names])
+def _bytes(colours: np.ndarray) -> np.ndarray:
+    """Colours as bytes; files have bytes, 16 bits, or fractions of 1."""
+    top = colours.max(initial=0)
+    is_fraction = colours.dtype.kind == "f" and top < 1.01
+    scaled = colours * (255.0 if is_fraction else 1 / 257 if top > 255 else 1.0)
+    return np.clip(np.nan_to_num(np.round(scaled)), 0, 255).astype(np.uint8)
 
 
-def _read_text(path: Path) -> tuple[np.ndarray, str | None]:
+def _read_text(path: Path) -> tuple[list[str], list[np.ndarray], str | None]:
     read = text_columns.read_columns(path)
-    axes = text_columns.three_of("position", read.names)
-    if axes is None:
-        raise ValueError("x, y and z are missing")
-    return read.values[:, list(axes)], read.unit
+    return read.names, list(read.values.T), read.unit
 
 
 def _rows(lines, **how) -> np.ndarray:
@@ -70,38 +66,29 @@ def _rows(lines, **how) -> np.ndarray:
     return np.vstack(parts) if parts else np.empty((0, 3))
 
 
-def _read_ply(path: Path) -> tuple[np.ndarray, str | None]:
-    rows = _binary_rows(path)
-    with open(path, "rb") as stream:
-        _, count, columns = _read_ply_header(stream)
-        end = stream.tell()
-        stream.seek(0)
-        unit = text_columns.stated_unit(stream.read(end).decode("utf-8", "replace"))
-        names = [name for name, _ in columns]
-        axes = text_columns.three_of("position", names)
-        if axes is None:
-            raise ValueError("x, y and z are missing")
-        if rows is not None:
-            return np.column_stack([rows[names[k]].astype(float) for k in axes]), unit
-        values = _rows(itertools.islice(stream, count))
-    if len(values) < count:
-        raise ValueError("it is truncated")
-    return values[:, list(axes)], unit
-
-
-def _binary_rows(path: Path) -> np.ndarray | None:
-    """Return the vertices of a binary PLY file as a table; None for an ASCII file."""
+def _read_ply(path: Path) -> tuple[list[str], list[np.ndarray], str | None]:
     with open(path, "rb") as stream:
         order, count, columns = _read_ply_header(stream)
-        if order == "=":
-            return None
+        begin = stream.tell()
         kind = np.dtype([(name, order + code) for name, code in columns])
-        if count * kind.itemsize > path.stat().st_size:
+        if count > path.stat().st_size:
             raise ValueError("it is truncated")
-        content = stream.read(count * kind.itemsize)
-    if len(content) < count * kind.itemsize:
-        raise ValueError("it is truncated after its header")
-    return np.frombuffer(content, kind)
+        if order == "=":
+            # RealSense's Viewer writes position, normal and colour of a vertex on a line each.
+            parts = max(len(columns) // max(len(stream.readline().split()), 1), 1)
+            stream.seek(begin)
+            rows = _rows(itertools.islice(stream, count * parts))
+            values = [column.astype(code) for column, (_, code) in zip(
+                rows.reshape(-1, parts * rows.shape[1]).T, columns, strict=False)]
+        else:
+            content = stream.read(min(count * kind.itemsize, path.stat().st_size))
+            rows = np.frombuffer(content, kind, len(content) // kind.itemsize)
+            values, parts = [rows[name] for name, _ in columns], 1
+        if len(rows) < count * parts:
+            raise ValueError("it is truncated")
+        stream.seek(0)
+        unit = text_columns.stated_unit(stream.read(begin).decode("utf-8", "replace"))
+    return [name for name, _ in columns], values, unit
 
 
 def _read_ply_header(stream) -> tuple[str, int, list[tuple[str, str]]]:

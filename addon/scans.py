@@ -36,12 +36,11 @@ class Scan:
 
 def read_scan(path: Path) -> Scan:
     """Read the shown data of a scan; ValueError as :func:`.clouds.read_points`."""
-    points, unit = clouds.read_points(path)
+    points, unit, colours = clouds.read_points(path)
     low, high = points.min(axis=0), points.max(axis=0)
     middle = np.round((low + high) / 2)
     is_far = np.abs(middle).max() > 100 * max((high - low).max(), 1e-9)
     offset = middle if is_far else np.zeros(3)
-    colours = clouds.read_colours(path)
     if colours is not None:
         colours = np.column_stack([colours / np.float32(255), np.ones(len(colours), np.float32)])
     return Scan((points - offset).astype(np.float32), offset, float((high - low).max()),

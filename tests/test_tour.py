@@ -76,7 +76,7 @@ def test_an_axis_in_the_models_of_other_programs(name, stop):
 
 
 @pytest.mark.parametrize(("name", "stop"), STOPS["cloud"].items())
-def test_clouds_of_phones_and_radiance_fields(name, stop):
+def test_clouds_of_phones_and_radiance_fields(tmp_path, name, stop):
     """Positions, colours and normals by each program's layout; floaters are left out, and said."""
     with pytest.raises(InputError, match=stop["refused"]) if "refused" in stop else nullcontext():
         found = read_points(TOUR / name)
@@ -90,6 +90,8 @@ def test_clouds_of_phones_and_radiance_fields(name, stop):
             np.testing.assert_allclose(found.attributes["color"][0], [90, 60, 30], atol=1)
         if "normal" in stop:
             np.testing.assert_allclose(found.attributes["normal"][0, 0], stop["normal"], atol=1e-6)
+        found.write_ply(tmp_path / "again.ply")
+        assert read_points(tmp_path / "again.ply").attributes.keys() == found.attributes.keys()
 
 
 @pytest.mark.parametrize(("name", "count"), STOPS["bag"].items())

@@ -39,7 +39,10 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         return self.execute(context)
 
     def execute(self, context):
-        path = self._path(context)
+        if not self.filepath:
+            self.report({"ERROR"}, "No file was chosen. Choose a scan (PLY, XYZ, CSV ...).")
+            return {"CANCELLED"}
+        path = self._path()
         if not self._is_from_user:
             return self._show(context, lambda: scans.read_scan(path))
         # The interface stays usable while the points are read.
@@ -63,11 +66,11 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
             self._timer = None
             context.workspace.status_text_set(None)
 
-    def _path(self, context) -> Path:
-        return Path(bpy.path.abspath(self.filepath or context.scene.limber.reconstruct.cloud))
+    def _path(self) -> Path:
+        return Path(bpy.path.abspath(self.filepath))
 
     def _show(self, context, read: Callable[[], scans.Scan]):
-        settings, path = context.scene.limber, self._path(context)
+        settings, path = context.scene.limber, self._path()
         try:
             scan = read()
             mesh = meshes.new_mesh(path.stem, scan.points)

@@ -4,6 +4,7 @@ import importlib
 import shutil
 import struct
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,14 +19,11 @@ POINTS = np.random.default_rng(7).random((40, 3)) * 300
 
 
 def _ply(path, kind):
-    order = {"ascii": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[kind]
+    order = {"<": "binary_little_endian", ">": "binary_big_endian"}[kind]
     head = (f"ply\nformat {order} 1.0\ncomment made here\nelement vertex {len(POINTS)}\n"
             "property float x\nproperty float y\nproperty float z\nproperty uchar red\n"
             "end_header\n")
-    if kind == "ascii":
-        body = "".join(f"{x:.9g} {y:.9g} {z:.9g} 7\n" for x, y, z in POINTS).encode()
-    else:
-        body = b"".join(struct.pack(f"{kind}fffB", *point, 7) for point in POINTS)
+    body = b"".join(struct.pack(f"{kind}fffB", *point, 7) for point in POINTS)
     path.write_bytes(head.encode() + body)
 
 
@@ -36,7 +34,6 @@ def _text(path, delimiter, header):
 
 
 @pytest.mark.parametrize(("name", "write"), [
-    ("a.ply", lambda path: _ply(path, "ascii")),
     ("b.ply", lambda path: _ply(path, "<")),
     ("c.ply", lambda path: _ply(path, ">")),
     ("d.xyz", lambda path: _text(path, " ", "")),
@@ -70,7 +67,7 @@ def test_columns_are_read_as_the_worker_reads_them(bpy, registered, tmp_path, te
     """Coordinates by the header's names, in whatever order; no other column, no unit guessed."""
     path = tmp_path / "scan.csv"
     path.write_text(text, encoding="utf-8")
-    points, _ = importlib.import_module("limber_addon.clouds").read_points(path)
+    points, *_ = importlib.import_module("limber_addon.clouds").read_points(path)
     np.testing.assert_allclose(points, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
     np.testing.assert_allclose(points, read_cloud(path).points)
     bpy.ops.limber.import_cloud(filepath=str(path))
@@ -81,17 +78,28 @@ def test_columns_are_read_as_the_worker_reads_them(bpy, registered, tmp_path, te
     ("a.csv", "x_mm,y_mm,z_mm\n100,200,300\n400,500,600\n", "mm"),
     ("a.ply", "ply\nformat ascii 1.0\ncomment unit: mm\nelement vertex 2\nproperty float z\n"
               "property float x\nproperty float y\nend_header\n300 100 200\n600 400 500\n", "mm"),
-    ("points3D.txt", "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n7 .1 .2 .3 9 8 7 .4 1 5\n"
-                     "9 .4 .5 .6 9 8 7 .4\n", "m"),
     ("a.asc", "//X Y Z R G B\n2\n.1 .2 .3 9 8 7\n.4 .5 .6 9 8 7\n", "m")])
 def test_the_units_and_files_of_other_programs(bpy, registered, tmp_path, name, text, unit):
     """A unit that the file states is set, and the points are the worker's."""
     path = tmp_path / name
     path.write_text(text)
-    points, _ = importlib.import_module("limber_addon.clouds").read_points(path)
+    points, *_ = importlib.import_module("limber_addon.clouds").read_points(path)
     np.testing.assert_allclose(points * {"m": 1.0, "mm": 1e-3}[unit], read_cloud(path).points)
     bpy.ops.limber.import_cloud(filepath=str(path))
     assert bpy.context.scene.limber.reconstruct.unit == unit
+
+
+@pytest.mark.parametrize("name", ["realsense_ascii_normals.ply", "metashape.txt", "polycam.ply"])
+def test_a_scan_has_the_workers_colours(bpy, registered, name):
+    path = Path(__file__).parents[1] / "data" / "tour" / name
+    points, _, colours = importlib.import_module("limber_addon.clouds").read_points(path)
+    read = read_cloud(path)
+    np.testing.assert_allclose(points, read.points, atol=1e-9)
+    np.testing.assert_array_equal(colours, read.attributes["color"])
+    bpy.ops.limber.import_cloud(filepath=str(path))
+    assert bpy.data.objects[f"{path.stem} scan"].data.color_attributes
+    with pytest.raises(RuntimeError, match="No file was chosen"):
+        bpy.ops.limber.import_cloud(filepath="")
 
 
 def test_lines_of_different_length_are_refused(bpy, registered, tmp_path):

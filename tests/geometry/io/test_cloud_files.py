@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from benchmarks.foreign_files import CLOUD as POINTS
-from benchmarks.foreign_files import CLOUDS, write_ascii_ply
+from benchmarks.foreign_files import CLOUDS
 from limber.core.errors import InputError
 from limber.geometry.io import isolated_readers
 from limber.geometry.io.clouds import las_columns, read_cloud, read_points
@@ -22,17 +22,6 @@ def test_each_format_gives_the_points(tmp_path, name):
     path = tmp_path / name
     CLOUDS[name](path)
     np.testing.assert_allclose(read_points(path).points, POINTS, atol=2e-5)
-
-
-def test_attributes_are_kept(tmp_path):
-    """Normals, colours and scalars survive reading and writing."""
-    path = tmp_path / "a.ply"
-    write_ascii_ply(path)
-    cloud = read_points(path)
-    cloud.write_ply(tmp_path / "b.ply")
-    again = read_points(tmp_path / "b.ply")
-    assert set(again.attributes) == {"normal", "color"}
-    np.testing.assert_array_equal(again.attributes["color"][0], [200, 10, 20])
 
 
 def test_units_become_metres(tmp_path):
