@@ -195,16 +195,6 @@ def test_loose_vertices_of_a_graph_are_left_out(tmp_path):
     assert graph.node_count == 6 and "1 of 7 parts" in graph.notes[0]
 
 
-def test_a_section_of_an_swc_has_one_type(tmp_path):
-    """MorphIO refuses others: "section type changed without a bifurcation"."""
-    nodes = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 2], [0, -1, 2], [0, 2, 3.0]])
-    forked = Skeleton.from_edges(nodes, np.array([-1, 0, 1, 1, 2]), np.full(5, 0.01))
-    forked.write_swc(tmp_path / "a.swc")
-    rows = [line.split() for line in (tmp_path / "a.swc").read_text().splitlines()
-            if not line.startswith("#")]
-    assert {row[1] for row in rows} == {"3"}
-
-
 def test_nothing_outside_the_file_is_read(tmp_path):
     """Links and raw data in other files are not followed."""
     other = written(tmp_path / "other.mat")

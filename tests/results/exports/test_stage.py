@@ -46,6 +46,16 @@ def test_simulators_files_are_written(tmp_path):
     assert f"*NSET, NSET=TIP\n{told['tip_node']}\n" in text
 
 
+def test_an_swc_opens_in_morphio(tmp_path):
+    """It refuses others: "section type changed without a bifurcation"."""
+    Export(branch_folder=EXAMPLE, output=tmp_path / "a.swc").run()
+    assert set(np.loadtxt(tmp_path / "a.swc")[:, 1]) == {3}
+    morphio = pytest.importorskip("morphio", reason="MorphIO is not installed")
+    sections = morphio.Morphology(tmp_path / "a.swc").iter()
+    length = sum(np.linalg.norm(np.diff(each.points, axis=0), axis=1).sum() for each in sections)
+    assert length == pytest.approx(load_skeleton(Branch.open(EXAMPLE)).length, rel=1e-3)
+
+
 def test_an_mtg_has_a_line_for_each_node(tmp_path):
     """Axes follow with <, side axes with +; places and radii stand in their columns."""
     Export(branch_folder=EXAMPLE, output=tmp_path / "a.mtg").run()
