@@ -17,6 +17,8 @@ from tests.subjects.leafy import curved_leaves
 from benchmarks.worlds.sources import sparse_case
 from limber.core import optional
 from limber.core.errors import MissingDependencyError
+from limber.geometry.generated import generate_branch
+from limber.store import Branch
 
 _SKELETON = """
 import hashlib, sys
@@ -66,6 +68,24 @@ def test_a_scan_has_one_skeleton_whatever_was_loaded_before(tmp_path, points, be
     """
     np.save(scan := tmp_path / "scan.npy", points())
     assert _told(before + _SKELETON, 4, str(scan)) == _told(_SKELETON, 1, str(scan))
+
+
+@pytest.mark.slow
+def test_another_processor_writes_the_same_bytes(tmp_path):
+    """Sums in another order, without wide vectors and fused multiplication: of a branch folder only
+    times, memory and its own name differ."""
+    scan = tmp_path / "scan.ply"
+    generate_branch(3, fork_count=2, length=0.4, point_spacing=0.0025).cloud.write_ply(scan)
+    found = []
+    for kernel, without in (("Haswell", ""), ("Nehalem", "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX")):
+        folder = tmp_path / f"{kernel}.branch"
+        subprocess.run(
+            [sys.executable, "-m", "limber", "reconstruct", scan, "-o", folder], check=True,
+            env=os.environ | {"OPENBLAS_CORETYPE": kernel, "NPY_DISABLE_CPU_FEATURES": without})
+        kept = Branch.read(folder).manifest
+        del kept.stages["reconstruct"].result["peak_memory_mb"]
+        found.append((kept.files, kept.stages["reconstruct"].result))
+    assert found[0] == found[1] and {"cloud.ply", "skeleton.swc", "mesh.vtu"} < set(found[0][0])
 
 
 @pytest.mark.parametrize("before", ["", "import numpy, scipy.linalg\n", _LIBRARIES])

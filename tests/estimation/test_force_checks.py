@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.estimation.test_nuisances import TRUTH as TOLD
 from tests.estimation.test_nuisances import subject_of
-from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force, without_cell
+from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force
 
 from benchmarks.paper_branches import FRACTIONS, measured
 from limber.core.errors import InputError, LimberError, WorkError
@@ -26,16 +26,6 @@ from limber.estimation.uncertainty.identifiability import (
 )
 from limber.estimation.uncertainty.model_error import total_interval
 from limber.recordings.recording import CalibrationEntry
-
-
-@pytest.fixture(scope="module")
-def pull(small_pull):
-    return without_cell(small_pull)
-
-
-@pytest.fixture(scope="module")
-def objective(small_bench, pull):
-    return small_bench.objective([pull], SETTINGS)
 
 
 def test_a_small_force_is_named_with_its_assumed_errors(small_bench, pull):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force, without_cell
+from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force
 
 from limber.core.errors import WorkError
 from limber.core.progress import Progress
@@ -31,16 +31,6 @@ from limber.mechanics.grasp import Grasp
 from limber.mechanics.statics.solve import solve_static
 from limber.store import Branch
 from limber.store.loading import load_subject
-
-
-@pytest.fixture(scope="module")
-def pull(small_pull):
-    return without_cell(small_pull)
-
-
-@pytest.fixture(scope="module")
-def objective(small_bench, pull):
-    return small_bench.objective([pull], SETTINGS)
 
 
 @pytest.mark.parametrize("young", [1e3, 6e5, 1e8, 1e11])

@@ -7,7 +7,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from tests.stages.specified import Simulated
-from tests.subjects.meshes import box_mesh
 
 from limber.cli.main import call
 from limber.core.errors import ConvergenceError, InputError
@@ -22,21 +21,6 @@ from limber.store import Branch
 from limber.store.loading import load_model
 
 KEYS = {"converged", "frame_count", "energy_j", "grasp_force_n", "tip_displacement_m", "min_det_f"}
-
-
-@pytest.fixture
-def folder(tmp_path):
-    """A branch folder with the mesh of a short beam."""
-    mesh = box_mesh((0.01, 0.01, 0.3), (1, 1, 20))
-    count = mesh.tet_count
-    mesh = mesh.with_data(
-        cell_data={"young": np.full(count, 1e9), "poisson": np.full(count, 0.35),
-                   "density": np.full(count, 900.0)},
-        point_data={"grasp": (np.abs(mesh.nodes[:, 2] - 0.2) < 0.011).astype(np.int64)})
-    branch = Branch.create(tmp_path / "beam.branch")
-    with branch.stage("reconstruct") as stage:
-        mesh.write(stage.path("mesh.vtu"))
-    return branch.folder
 
 
 def test_motion_writes_what_the_design_says(folder):

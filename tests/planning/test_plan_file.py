@@ -12,7 +12,7 @@ from limber.planning.path_on_full_model import ResolvedPath, SolvedPoses
 from limber.planning.plan_file import (
     limits_of_motion,
     path_record,
-    plan_text,
+    plan_content,
     read_plan,
     whole_motion,
 )
@@ -79,7 +79,8 @@ def written(path, folder):
     motion = whole_motion(path, ("flower", "leaf"))
     summary = {"seed": 3, "baseline": {"length_m": 0.1}, "plan": {"length_m": 0.1}}
     file = folder / "plan.json"
-    file.write_text(plan_text(summary, *ways, motion, limits_of_motion(motion, Limits(energy=0.1))))
+    file.write_text(json.dumps(plan_content(
+        summary, *ways, motion, limits_of_motion(motion, Limits(energy=0.1)))))
     return file
 
 
@@ -132,7 +133,7 @@ def test_joints_are_carried(path, tmp_path):
     way = replace(path_record(path.solved), joints=np.ones((3, 6)))
     summary = {"baseline": {}, "plan": {}}
     file = tmp_path / "plan.json"
-    file.write_text(plan_text(summary, way, way, way, {}))
+    file.write_text(json.dumps(plan_content(summary, way, way, way, {})))
     np.testing.assert_array_equal(read_plan(file).motion.joints, np.ones((3, 6)))
 
 

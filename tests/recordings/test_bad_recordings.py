@@ -1,6 +1,7 @@
 """What goes wrong in recordings, each through the command that a user runs."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -187,14 +188,10 @@ def test_force_in_another_unit_and_a_modulus_at_its_bound(branch_folder, capsys)
     is no result.
     """
     def change(source):
-        def scaled(times, values):
-            values[:, 6:] *= 1e-4
-            return times, values
-        changed(source / "robot.csv", scaled)
+        changed(source / "robot.csv", lambda times, values: (
+            times, np.hstack([values[:, :6], 1e-4 * values[:, 6:]])))
         text = (source / "pull.toml").read_text()
-        (source / "pull.toml").write_text("\n".join(
-            "force_sigma_n = 1e-6" if row.startswith("force_sigma_n") else row
-            for row in text.splitlines()) + "\n")
+        (source / "pull.toml").write_text(re.sub("force_sigma_n.*", "force_sigma_n = 1e-6", text))
     pull_with(branch_folder, "tiny", change)
     line = estimated(branch_folder, capsys, "--pull", "tiny", code=3)
     assert warned(line, "another unit") and warned(line, "--force-unit")

@@ -36,7 +36,6 @@ from limber.mechanics.pull_simulation import SimulateSettings
 from limber.mechanics.strain import peak_load, strain_state
 from limber.reduced.strain_polynomial import make_polynomial
 from limber.results.exports.volumes import as_deformable, inp_text
-from limber.store import Branch
 
 SHARE = 0.4
 """Of the shear modulus that the second invariant bears."""
@@ -286,21 +285,6 @@ def test_derivatives(mesh, material):
         swing = (flown.displacement - swum.displacement)[:, [-1]] / (2 * step)
         error = np.abs(moving.sensitivities.displacement[..., column] - swing).max()
         assert error < 2e-4 * np.abs(swing).max()
-
-
-@pytest.fixture
-def folder(tmp_path):
-    """A branch folder with the mesh of a short beam."""
-    mesh = box_mesh((0.01, 0.01, 0.3), (1, 1, 10))
-    count = mesh.tet_count
-    mesh = mesh.with_data(
-        cell_data={"young": np.full(count, 1e9), "poisson": np.full(count, 0.35),
-                   "density": np.full(count, 900.0)},
-        point_data={"grasp": (np.abs(mesh.nodes[:, 2] - 0.2) < 0.016).astype(np.int64)})
-    branch = Branch.create(tmp_path / "beam.branch")
-    with branch.stage("reconstruct") as stage:
-        mesh.write(stage.path("mesh.vtu"))
-    return branch.folder
 
 
 def simulated(capsys, folder, material, *options):

@@ -25,7 +25,7 @@ import numpy as np
 
 from limber.cli.known import command_class
 from limber.core.errors import Command, InputError, LimberError, Option, Text
-from limber.core.json_values import plain
+from limber.core.json_values import plain, stored
 from limber.core.progress import BarSink, LineSink, Progress, Sink
 from limber.core.settings import checked_settings, nearest
 from limber.stages.registry import result_of
@@ -86,7 +86,7 @@ def run_stage(name: str, arguments: Mapping[str, Any], *, quiet: bool) -> tuple[
     finally:
         for text in caught:
             warnings.warn(text.shown(_in_python), stacklevel=_users_level())
-    return stage.entry, {"warnings": caught} | plain(result)
+    return stage.entry, {"warnings": caught} | stored(plain(result))
 
 
 def _checked(name: str, arguments: Mapping[str, Any]) -> Stage:

@@ -40,7 +40,7 @@ from limber.core.errors import (
     Option,
     WorkError,
 )
-from limber.core.json_values import plain
+from limber.core.json_values import plain, stored
 from limber.core.machine_errors import machine_error
 from limber.core.not_none import present
 from limber.core.optional import require_extra
@@ -70,7 +70,7 @@ def run_task(task: Stage, folder: Path, progress: Progress) -> Record:
     error, result = "", {}
     with _most_memory() as most_mb:
         try:
-            result = plain(task.run(progress.keeping(warnings)))
+            result = stored(plain(task.run(progress.keeping(warnings))))
         except (BranchBusyError, Cancelled):
             raise
         except LimberError as failure:

@@ -26,7 +26,7 @@ from limber.cli.terminal import (
     without_control,
 )
 from limber.core.errors import LimberError, PartlyFailedError, SafetyStop, Text, WorkError
-from limber.core.json_values import plain
+from limber.core.json_values import plain, stored
 from limber.core.machine_errors import machine_error
 from limber.core.processes.heartbeat import Heartbeat
 from limber.core.progress import BarSink, JsonSink, LogSink, Progress, report_damage_to
@@ -64,7 +64,7 @@ class StageCommand(GroupedCommand):
         try:
             with self._progress(ctx.params["progress_style"], warnings) as progress:
                 stage = made_of(self.stage, ctx.params)
-                result = plain(stage.run(progress))
+                result = stored(plain(stage.run(progress)))
                 closing = _closing(stage, result, progress)
         except KeyboardInterrupt:
             code = 130

@@ -129,9 +129,11 @@ class LimberError(Exception):
     exit_code = 3
     status = "failed"
 
-    def __init__(self, seen: str, why: str = "", *fix: Part):
-        """State what was ``seen``, ``why`` it is wrong and how to ``fix`` it, in parts."""
+    def __init__(self, seen: str, why: str = "", *fix: Part, result: Any = None):
+        """State what was ``seen``, ``why`` it is wrong and how to ``fix`` it, in parts; ``result``
+        is what was done before."""
         super().__init__(seen, why, *fix)
+        self.result = result
         self.seen, self.why, self.fix = Text(seen), Text(why), Text(*fix)
         self.place = self.seen.place
 
@@ -194,17 +196,9 @@ class WorkError(LimberError):
 class PartlyFailedError(WorkError):
     """Some of several inputs failed; ``result`` has what was done, for the command's JSON."""
 
-    def __init__(self, seen: str, why: str = "", *fix: Part, result: dict[str, Any]):
-        super().__init__(seen, why, *fix)
-        self.result = result
-
 
 class ConvergenceError(WorkError):
     """A solver ended without a solution; ``result`` holds its last state and history."""
-
-    def __init__(self, seen: str, why: str = "", *fix: Part, result: object = None):
-        super().__init__(seen, why, *fix)
-        self.result = result
 
 
 class MeshingError(WorkError):
@@ -226,10 +220,6 @@ class SafetyStop(LimberError):
     """
 
     exit_code = 4
-
-    def __init__(self, seen: str, why: str = "", *fix: Part, result: dict[str, Any] | None = None):
-        super().__init__(seen, why, *fix)
-        self.result = result or {}
 
 
 class DamagedCacheWarning(UserWarning):

@@ -197,7 +197,7 @@ class LogSink:
             self._stream.flush()
 
 
-class LineSink:
+class LineSink(contextlib.AbstractContextManager):
     """Rewrites one line of text: for a notebook, whose output does not support a bar."""
 
     def __init__(self, title: str, stream: TextIO | None = None, *, interval_seconds: float = 0.1):
@@ -206,9 +206,6 @@ class LineSink:
         self._interval = interval_seconds
         self._last = -interval_seconds
         self._shown = ""
-
-    def __enter__(self) -> "LineSink":
-        return self
 
     def __exit__(self, *_exception: object) -> None:
         self._write("")

@@ -27,7 +27,6 @@ and the energy and torque that they cost.
 pose, and the margin. ``robot`` is null for plans that were not made in a robot's cell.
 """
 
-import json
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -279,17 +278,17 @@ def limits_of_motion(motion: PlanPath, limits: Limits) -> dict[str, dict[str, fl
     return found
 
 
-def plan_text(summary: dict[str, Any], baseline: PlanPath, plan: PlanPath, motion: PlanPath,
-              limits: dict[str, dict[str, float]], pace: Pace = DEFAULT_PACE) -> str:
-    """Return a file of format 2; the summary has an entry for ``baseline`` and for ``plan``."""
-    content = {
+def plan_content(summary: dict[str, Any], baseline: PlanPath, plan: PlanPath, motion: PlanPath,
+                 limits: dict[str, dict[str, float]], pace: Pace = DEFAULT_PACE) -> dict[str, Any]:
+    """Return the content of a file of format 2; the summary has an entry for ``baseline`` and for
+    ``plan``."""
+    return plain({
         "format_version": FORMAT, **summary, "targets": sorted(plan.targets),
         "timing": {"kind": "limited acceleration", "speed_m_s": pace.speed,
                    "acceleration_m_s2": pace.acceleration}, "limits": limits,
         "robot": summary.get("robot"),
         "baseline": summary["baseline"] | _columns(baseline),
-        "plan": summary["plan"] | _columns(plan), "motion": _columns(motion)}
-    return json.dumps(plain(content), allow_nan=False, indent=1) + "\n"
+        "plan": summary["plan"] | _columns(plan), "motion": _columns(motion)})
 
 
 def read_plan(path: Path) -> PlanFile:

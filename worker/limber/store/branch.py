@@ -29,7 +29,7 @@ from pydantic import BaseModel
 from limber.core.constants import GRAVITY
 from limber.core.errors import BranchFolderError, Command, Option
 from limber.core.files.atomic import file_digest, owned_name, sweep
-from limber.core.json_values import plain
+from limber.core.json_values import plain, stored
 from limber.store import journal
 from limber.store.disk_errors import gone, in_words, require_room, require_there
 from limber.store.folder_state import (
@@ -88,9 +88,9 @@ class OpenStage:
         return path
 
     def write(self, name: str, content: Any, *, indent: int | None = 1) -> None:
-        """Write a text, or anything else as JSON, as file ``name``."""
+        """Write a text, or anything else as rounded JSON (:func:`stored`), as file ``name``."""
         text = content if isinstance(content, str) else json.dumps(
-            plain(content), indent=indent, allow_nan=False) + "\n"
+            stored(plain(content)), indent=indent, allow_nan=False) + "\n"
         self.path(name).write_text(text, encoding="utf-8")
 
     def remove(self, name: str) -> None:
@@ -353,7 +353,7 @@ class Branch:
                 yield stage
                 entry = StageEntry(
                     settings=plain(settings or {}), reads=read, writes=stage.written(),
-                    result=plain(stage.result),
+                    result=stored(plain(stage.result)),
                     programs=program_versions() | version_entry(settings),
                     seconds=round(time.perf_counter() - started, 3),
                     finished=datetime.now(UTC).isoformat(timespec="seconds"))

@@ -18,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, NoReturn, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
@@ -80,7 +80,7 @@ def read_json(path: str | os.PathLike, what: str) -> Any:
 def json_content(text: str, path: str | os.PathLike, what: str) -> Any:
     """Return the content of a JSON text read from ``path``; InputError as :func:`read_json`."""
     try:
-        return json.loads(text, parse_constant=_refused, parse_float=_finite, parse_int=_integer)
+        return json.loads(text, parse_constant=_finite, parse_float=_finite, parse_int=_integer)
     except (ValueError, RecursionError) as error:
         raise unreadable(path, what, error) from error
 
@@ -242,10 +242,6 @@ def _integer(text: str) -> int:
     if len(text) > _MOST_DIGITS:
         raise ValueError(f"it contains a number of {len(text)} digits")
     return int(text)
-
-
-def _refused(text: str) -> NoReturn:
-    raise ValueError(f"{text} is not a finite number")
 
 
 def unreadable(path: str | os.PathLike, what: str, error: Exception) -> InputError:

@@ -8,7 +8,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from limber.core.alignment import Alignment
+from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError
+from limber.core.json_values import stored_lengths
 from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.sweep import tangents
 
@@ -48,17 +50,13 @@ class Skeleton:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        count = len(self.nodes)
-        if self.radius_sigma is None:
-            object.__setattr__(self, "radius_sigma", np.zeros(count))
-        if self.radius_state is None:
-            object.__setattr__(self, "radius_state", np.zeros(count, np.int8))
-        if self.probability is None:
-            object.__setattr__(self, "probability", np.ones(count))
+        for name, value in (("radius_sigma", 0.0), ("radius_state", np.int8(0)),
+                            ("probability", 1.0)):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.full(len(self.nodes), value))
         if self.branch is None or self.order is None:
-            branch, order = _runs(self.parent, self.steps)
-            object.__setattr__(self, "branch", branch)
-            object.__setattr__(self, "order", order)
+            for name, run in zip(("branch", "order"), _runs(self.parent, self.steps), strict=True):
+                object.__setattr__(self, name, run)
 
     @classmethod
     def from_edges(cls, nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray,
@@ -215,9 +213,10 @@ class Skeleton:
         """Write an SWC file in the unit that its header states. All nodes have one type, 3: viewers
         of neurons refuse one that changes between forks, and take 1 for a cell's body."""
         lines = ["# Limber skeleton, SWC", f"# unit: {unit}", "# id type x y z radius parent"]
-        for i, (p, r) in enumerate(zip(self.nodes, self.radius, strict=True)):
-            up = self.parent[i] + 1 if self.parent[i] >= 0 else -1
-            lines.append(f"{i + 1} 3 {p[0]:.15g} {p[1]:.15g} {p[2]:.15g} {r:.9g} {up}")
+        nodes = stored_lengths(self.nodes * UNIT_METRES[unit]) / UNIT_METRES[unit]
+        parents = np.where(self.parent < 0, -1, self.parent + 1)
+        lines += [f"{i} 3 {x:.15g} {y:.15g} {z:.15g} {r:.9g} {up}" for i, ((x, y, z), r, up) in
+                  enumerate(zip(nodes, self.radius, parents, strict=True), 1)]
         Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

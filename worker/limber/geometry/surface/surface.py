@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import Command, InputError, MeshingError
 from limber.core.files.reading import check_ply
+from limber.core.json_values import stored_lengths
 from limber.core.numerics.compiled import compiled_exactly
 
 
@@ -53,12 +54,11 @@ class Surface:
         return np.arctan2(over, under).sum(axis=1) / (2 * np.pi)
 
     def write_ply(self, path: Path) -> None:
-        """Write a binary PLY file, in double precision: rounding could make faces cross."""
+        """Write a binary PLY file, in nanometres: single precision could make faces cross."""
         from plyfile import PlyData, PlyElement
 
-        vertex = np.zeros(len(self.vertices), [("x", "f8"), ("y", "f8"), ("z", "f8")])
-        for k, name in enumerate("xyz"):
-            vertex[name] = self.vertices[:, k]
+        vertex = np.ascontiguousarray(stored_lengths(self.vertices)).view(
+            [("x", "f8"), ("y", "f8"), ("z", "f8")])[:, 0]
         face = np.zeros(len(self.faces), [("vertex_indices", "i4", (3,))])
         face["vertex_indices"] = self.faces
         PlyData([PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")],

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from limber.core.errors import Command, InputError, MeshingError
+from limber.core.json_values import stored_lengths
 from limber.geometry.settings import GRASP_FRACTION
 from limber.geometry.skeleton.skeleton import FRACTIONS, Skeleton, control_points
 from limber.geometry.surface.surface import Surface
@@ -168,8 +169,8 @@ class TetMesh:
         # meshio converts tetra10 between its own (Gmsh-like) and VTK's node order, but not for VTU,
         # where it keeps the order; test_tet_mesh checks that.
         meshio.write_points_cells(
-            path, self.nodes, [(self.element.cell_type, self.tets)], file_format="vtu",
-            point_data=self.point_data,
+            path, stored_lengths(self.nodes), [(self.element.cell_type, self.tets)],
+            file_format="vtu", point_data=self.point_data,
             cell_data={name: [values] for name, values in self.cell_data.items()})
 
     @classmethod

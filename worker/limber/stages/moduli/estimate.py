@@ -335,8 +335,7 @@ def follow(asked: EstimateYoung, progress: Progress, training_count: int = 60,
         training_count=training_count, progress=progress,
         axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None)
     with branch.stage("estimate-online", asked, digests={"pull": name}) as stage:
-        stage.path("estimate-online.json").write_text(
-            json.dumps(plain(result | {"history": history}), indent=1), encoding="utf-8")
+        stage.write("estimate-online.json", result | {"history": history})
         stage.result.update(result)
     return stage.result
 

@@ -277,8 +277,6 @@ def _inputs(branch: Branch, settings: ApplyLoads) -> dict[str, Any]:
 def _keep(branch: Branch, settings: ApplyLoads, inputs: dict[str, Any], model: BranchModel,
           bent: Bent, result: dict[str, Any]) -> None:
     """Write the result, and the branch before and under the loads as frames."""
-    import json
-
     from limber.core.json_values import plain
     from limber.mechanics.strain import strain_state
     from limber.results.motion_files import surface_fields, surface_nodes, write_pc2
@@ -290,10 +288,10 @@ def _keep(branch: Branch, settings: ApplyLoads, inputs: dict[str, Any], model: B
         stage.write(f"loads/{settings.name}.json", result)
         write_pc2(stage.path(f"{name}.pc2"), model.mesh.nodes[nodes] + displacements[:, nodes])
         np.savez_compressed(stage.path(f"{name}.npz"), **surface_fields(model.mesh, states))
-        stage.path(f"{name}.json").write_text(json.dumps({
+        stage.write(f"{name}.json", {
             "frame_count": len(displacements), "rate": 1.0,
             "largest_principal_strains": [float(state.principal_strain[:, -1].max())
-                                          for state in states]}), encoding="utf-8")
+                                          for state in states]})
         stage.result.update({key: value for key, value in plain(result).items() if key != "along"})
 
 

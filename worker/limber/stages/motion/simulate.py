@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -10,7 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from limber.core.errors import Command, ConvergenceError, InputError, Option, Text
-from limber.core.files.atomic import write_atomically
 from limber.core.progress import SILENT, Progress
 from limber.mechanics.settings import FRAME_RATE, GRASP_RADIUS_M, SimulateSettings, SimulateSpec
 from limber.stages.result import FORCE, Picture, Result, Vector, frozen, of_files, shown
@@ -174,7 +172,7 @@ def _simulated(asked: Simulate, progress: Progress, along: PoseTable | None,
             f"{result['frame_count']} frames up to the last valid state are in "
             f"frames/{asked.name}.pc2. The grasp force there is {result['grasp_force_n']} N.",
             "Pull less far, or check units and Young's modulus.")
-    return result
+    return branch.manifest.stages[key].result
 
 
 def _model(branch: Branch, settings: SimulateSettings, progress: Progress) -> BranchModel:
@@ -224,7 +222,7 @@ def _write(stage: OpenStage, model: BranchModel, settings: SimulateSettings,
         "largest_principal_strains": strains,
         "largest_principal_stresses_pa": [
             float(s.principal_stress[:, -1].max()) for s in states]}
-    write_atomically(stage.path(f"frames/{settings.name}.json"), json.dumps(frames, indent=1))
+    stage.write(f"frames/{settings.name}.json", frames)
     return {
         "converged": motion.converged, "frame_count": len(displacement),
         "energy_j": float(motion.energy[-1]),

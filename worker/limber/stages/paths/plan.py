@@ -487,7 +487,7 @@ def _stiffer(branch: Branch) -> float:
 def _write(stage: OpenStage, name: str, limits: Limits, pace: Pace, motion: PlanPath,
            grasp_model: GraspModel, found: PlannedMotion) -> None:
     from limber.mechanics.strain import strain_state
-    from limber.planning.plan_file import limits_of_motion, path_record, plan_text
+    from limber.planning.plan_file import limits_of_motion, path_record, plan_content
     from limber.results.motion_files import surface_fields, write_pc2
     from limber.stages.paths.plan_tables import motion_table, path_table, trees_table
 
@@ -495,7 +495,7 @@ def _write(stage: OpenStage, name: str, limits: Limits, pace: Pace, motion: Plan
     baseline, plan = (path_record(path.solved, names, pace=pace,
                                   field_energies=found.field.energy(path.solved.poses[:, :3]))
                       for path in (found.baseline, found.plan))
-    stage.write(f"plans/{name}.json", plan_text(
+    stage.write(f"plans/{name}.json", plan_content(
         found.summary, baseline, plan, motion, limits_of_motion(motion, limits), pace))
     stage.write(f"plans/{name}.csv", path_table(plan))
     stage.write(f"plans/{name}-baseline.csv", path_table(baseline))

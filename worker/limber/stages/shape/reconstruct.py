@@ -22,6 +22,7 @@ from limber.core.errors import (
 )
 from limber.core.files.atomic import file_digest, replacing, require_file
 from limber.core.files.safe_names import same_named
+from limber.core.json_values import stored_lengths
 from limber.core.machine_errors import machine_error
 from limber.core.progress import SILENT, Progress
 from limber.geometry.io.clouds import CLOUDS, read_points, unit_of
@@ -328,7 +329,7 @@ def load_search(branch: Branch, settings: ReconstructSettings, digests: dict[str
 
 def write_branch(stage: OpenStage, cloud: Cloud, meshed: MeshedBranch) -> None:
     """Write the files of a branch that has been meshed."""
-    cloud.write_ply(stage.path("cloud.ply"))
+    cloud.with_points(stored_lengths(cloud.points)).write_ply(stage.path("cloud.ply"))
     meshed.skeleton.write_swc(stage.path("skeleton.swc"))
     write_cylinders(meshed.skeleton, stage.path("skeleton.csv"))
     meshed.surface.write_ply(stage.path("surface.ply"))
