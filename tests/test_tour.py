@@ -18,6 +18,8 @@ from limber.recordings.recording_formats import RECORDINGS
 from limber.recordings.tables import read_table, robot_stream, time_stream
 
 TOUR = Path(__file__).parent / "data" / "tour"
+REAL = TOUR.parent / "real"
+FOREIGN = tomllib.loads((REAL / "real.toml").read_text(encoding="utf-8"))
 STOPS = tomllib.loads((TOUR / "tour.toml").read_text(encoding="utf-8"))
 
 
@@ -92,6 +94,22 @@ def test_clouds_of_phones_and_radiance_fields(tmp_path, name, stop):
             np.testing.assert_allclose(found.attributes["normal"][0, 0], stop["normal"], atol=1e-6)
         found.write_ply(tmp_path / "again.ply")
         assert read_points(tmp_path / "again.ply").attributes.keys() == found.attributes.keys()
+
+
+@pytest.mark.parametrize(("name", "stop"), [
+    (name, stop) for stops in FOREIGN.values() for name, stop in stops.items()])
+def test_real_files_of_other_projects(name, stop):
+    """What those projects' own programs read."""
+    with pytest.raises(InputError, match=stop["refused"]) if "refused" in stop else nullcontext():
+        if name in FOREIGN["skeletons"]:
+            found = read_skeleton(REAL / name)
+            assert found.length == pytest.approx(stop["length"])
+        else:
+            found = read_points(REAL / name)
+            assert len(found) == stop["count"]
+            assert ("color" in found.attributes) == stop.get("colour", False)
+            np.testing.assert_allclose(np.ptp(found.points, axis=0), stop["size"], rtol=1e-4)
+        assert re.search(stop.get("note", ""), " ".join(found.notes))
 
 
 @pytest.mark.parametrize(("name", "count"), STOPS["bag"].items())

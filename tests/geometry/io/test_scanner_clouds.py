@@ -204,12 +204,6 @@ def test_units_that_are_not(tmp_path, points, record):
     assert cloud.unit is None
 
 
-def test_a_packed_file_states_its_unit_too(tmp_path, points):
-    """Its points are read in a process of their own."""
-    path = _written(tmp_path / "a.laz", points, _keys(_1024=1, _3076=9002))
-    np.testing.assert_allclose(read_points(path).points, _FOOT * points, atol=1e-9)
-
-
 @pytest.mark.parametrize("record", [WktCoordinateSystemVlr(_GEOGRAPHIC), _keys(_1024=2)])
 def test_degrees_are_refused(tmp_path, points, record):
     with pytest.raises(InputError, match="degrees"):

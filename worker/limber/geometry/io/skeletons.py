@@ -14,7 +14,7 @@ from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError, Option
 from limber.core.files.atomic import write_lines
 from limber.core.files.reading import read_text, require_finite
-from limber.core.files.text_columns import fields_of, plain, separator_of
+from limber.core.files.text_columns import coding_of, fields_of, lines_of, plain, separator_of
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.geometry.io import cylinder_models
@@ -53,7 +53,7 @@ class _Vertex:
 def read_mtg(path: Path, *, scale: float | None = None, near: Place = None) -> Skeleton:
     """Read an MTG; nodes without radius or diameter have that of the node before. ``scale`` is
     metres per unit (None: 1). InputError if it is not one tree with positions and radii."""
-    lines = read_text(path, _WHAT).splitlines()
+    lines = list(lines_of(path, coding_of(path)))
     scales, body = _sections(lines)
     reader = _Reader(path, scales, *_header(path, body))
     for number, line in body[1:]:
