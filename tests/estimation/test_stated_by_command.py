@@ -109,8 +109,6 @@ def test_stated_layers_give_the_modulus_of_the_wood(branch_of, branch_folder, tm
         stated["bending_stiffness_nm2"], rel=0.1)
 
 
-@pytest.mark.xfail(strict=True, reason="issue 51: the start from a beam takes the force as it is, "
-                   "so the path drives the fit; its error is not in the interval of the zero")
 @pytest.mark.slow
 def test_a_stated_missing_tare_is_fitted(branch_of, branch_folder, tmp_path, capsys):
     """The recording begins when the branch is bent, so that no reading at rest shows the zero.

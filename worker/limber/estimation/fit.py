@@ -214,10 +214,12 @@ class _Strategy:
             start = begun.values
             if begun.explained < EXPLAINED:
                 self.progress.warn(unexplained(begun))
-            shifts = far_from_stated(beams, start)
+            shifts = far_from_stated(beams, begun)
         for rounds_left in reversed(range(ROUNDS)):
             if shifts:
                 forwards = forwards_of(self.pulls, self.subject, self.settings, shifts)
+            for forward in filter(is_path_observed, forwards if beams else ()):
+                forward.begin_without(begun.zeros.get(forward.name, np.zeros(3)))
             objective = Objective(
                 forwards, parameter_space(self.subject, forwards, self.settings), log=log,
                 force_sigma=[pull.entry.sensor.force_sigma_n for pull in self.pulls],

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from scipy.spatial import cKDTree
 
 from limber.core.errors import WorkError
@@ -37,8 +38,9 @@ BEAM_M, BEAM_SHARE = 3e-3, 0.03
 """Deviation of the beam's points: constant [m], and a fraction of the longest motion. Chosen."""
 DECADES = np.arange(3.0, 12.01, 0.25)
 """Uniform moduli that are tried first, in decades of pascals."""
-BEAM_ROUNDS, BEAM_ENDING = 15, 1e-3
-"""Most steps of the beam's fit, and the relative fall of its cost at which it ends."""
+BEAM_ROUNDS, BEAM_ENDING, ZERO_ROUNDS = 30, 1e-3, 3
+"""Most steps of the beam's fit, the relative fall of its cost at which it ends, and steps for the
+force's zero with each of the first moduli."""
 PARTS = (0.25, 0.45, 0.7)
 """Fractions of a fast pull's frames that are fitted first: over a quarter the simulation cannot be
 a whole period off. The fractions between are chosen, not measured.
@@ -109,9 +111,10 @@ class Beam:
             :6 if forward.uses_torque else 3]])
         self.place = frames.poses[keys, :3]
         off = grasp - self.place[0]
+        self.zero_sigma = 0.0 if self.is_loaded else calibration_of(entry).force_bias_sigma_n
         if not self.is_loaded and np.linalg.norm(off) < AT_REST_M:
             # The sensor's reading at rest is its zero.
-            wrench, self.place = wrench - wrench[0], self.place + off
+            wrench, self.place, self.zero_sigma = wrench - wrench[0], self.place + off, 0.0
         self.force = wrench[:, :3]
         self.torque = wrench[:, 3:] if wrench.shape[1] == 6 else np.zeros_like(self.force)
         points = frames.positions.reshape(len(frames), -1)
@@ -120,9 +123,10 @@ class Beam:
         if self.is_loaded:
             self.seen[:, -1] = np.nan
 
-    def bent(self, values: Sequence[Values]) -> tuple[np.ndarray, np.ndarray]:
+    def bent(self, values: Sequence[Values], zeros: np.ndarray | float = 0.0,
+             ) -> tuple[np.ndarray, np.ndarray]:
         """Return ``rest`` moved under each of b values, [b, k, m + 1, 3], and sections' rotations
-        there [b, k, m + 1, 3, 3]."""
+        there [b, k, m + 1, 3, 3]; the force read is too large by ``zeros`` [b, 1, 3] [N]."""
         young = np.array([self._field.young(each) for each in values])
         stiffness = young * self._second, young * self._second / (1 + values[0].poisson)
         gravity = self._gravity
@@ -131,6 +135,7 @@ class Beam:
             np.eye(3), (1, 1, SECTIONS + 1, 3, 3))
         hung = self._hung(carried, places, turns, gravity)
         held = hung[0, 0] if self._forward.model.prestress is not None else 0 * hung[0, 0]
+        force = np.broadcast_to(self.force - zeros, (len(values), *self.force.shape))
         weight = _from_end(carried[:, :1] * gravity)
         for _ in range(WEIGHT_PASSES if gravity.any() or self.is_loaded else 1):
             hung = self._hung(carried, places, turns, gravity)
@@ -140,7 +145,7 @@ class Beam:
             places, turns = np.empty((*shape, SECTIONS + 1, 3)), np.empty(
                 (*shape, SECTIONS + 1, 3, 3))
             bend_rods(*(for_kernels(each) for each in (
-                self.axis, *stiffness, self.force, self.torque, np.broadcast_to(grasp, (*shape, 3)),
+                self.axis, *stiffness, force, self.torque, np.broadcast_to(grasp, (*shape, 3)),
                 weight, np.broadcast_to(hung, (*shape, SECTIONS + 1, 3)), held)), places, turns)
         found = turns[:, :, self._at]
         return places[:, :, self._at] + np.einsum(
@@ -153,10 +158,11 @@ class Beam:
         return _from_end(np.cross(carried[:, :1] * places + np.einsum(
             "bksij,sj->bksi", turns, carried[:, 1:]), gravity))
 
-    def residuals(self, values: Sequence[Values]) -> np.ndarray:
+    def residuals(self, values: Sequence[Values], zeros: np.ndarray) -> np.ndarray:
         """Difference of simulated and recorded motions over their deviation, [b, r]: from the
-        first frame on, as places at rest may be wrong; under a stated load, from rest."""
-        moved, _ = self.bent(values)
+        first frame on, as places at rest may be wrong; under a stated load, from rest. ``zeros``
+        [b, 3]: of the force, over their deviation."""
+        moved, _ = self.bent(values, self.zero_sigma * zeros[:, None])
         seen = self.seen - (self.rest if self.is_loaded else self.seen[0])
         off = moved - (self.rest if self.is_loaded else moved[:, :1]) - seen
         size = float(np.nanmax(np.linalg.norm(seen, axis=-1), initial=0.0))
@@ -167,10 +173,10 @@ class Beam:
         """Whether observed points may be elsewhere along the branch than stated."""
         return self._forward.may_be_off_along and not self.is_loaded
 
-    def shifts(self, values: Values) -> np.ndarray:
+    def shifts(self, begun: "BeamStart") -> np.ndarray:
         """Distances of the observed points along the branch from where they are stated [m], [m]."""
         sigma = calibration_of(self._forward.entry).point_sigma_m
-        moved, turns = self.bent([values])
+        moved, turns = self.bent([begun.values], begun.zeros.get(self.name, 0.0))
         axis = np.gradient(self.axis, axis=0)[self._at[:-1]]
         axis = np.einsum("kmij,mj->kmi", turns[0, :, :-1],
                          axis / np.linalg.norm(axis, axis=1, keepdims=True))
@@ -196,7 +202,7 @@ def bend_rods(axis: np.ndarray, bending: np.ndarray, twist: np.ndarray, force: n
               torque: np.ndarray, grasp: np.ndarray, weight: np.ndarray, hung: np.ndarray,
               held: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
     """Fill places [b, k, S + 1, 3] and rotations of the sections, from the base on. Each turns by
-    the moment at its middle: of the gripper and of the ``weight`` from there on, with moment
+    the moment at its middle: of the gripper (``force`` [b, k, 3]) and of the ``weight`` from there on, with moment
     ``hung`` about the origin, less that as scanned, ``held``. Stiffnesses are [b, S] [N m^2]."""
     inside, tangent, turn, at, middle = (np.empty(3), np.empty(3), np.empty(3), np.empty(3),
                                          np.empty(3))
@@ -216,7 +222,7 @@ def bend_rods(axis: np.ndarray, bending: np.ndarray, twist: np.ndarray, force: n
                     # The moment at the begin leads to the middle, and that there to the end.
                     for i in range(3):
                         middle[i] = axis[s, i] + 0.5 * part * step[i]
-                    pulled = crossed(grasp[b, k] - at, force[k])
+                    pulled = crossed(grasp[b, k] - at, force[b, k])
                     hanging, stood = crossed(at, weight[s + 1]), crossed(middle, weight[s + 1])
                     for i in range(3):
                         inside[i] = pulled[i] + torque[k, i] + hung[b, k, s + 1, i] - hanging[i]
@@ -263,10 +269,12 @@ def _turn_by(vector: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class BeamStart:
-    """Moduli by beam theory, and which part of the recorded motion they explain (0 to 1)."""
+    """Moduli by beam theory, which part of the recorded motion they explain (0 to 1), and by pull
+    the zero [N], [3], of a force that was not read at rest."""
 
     values: Values
     explained: float
+    zeros: Mapping[str, np.ndarray]
 
 
 EXPLAINED = 0.5
@@ -286,46 +294,52 @@ def beams_of(forwards: Sequence[Forward], *, weighs: bool = True) -> list[Beam]:
             and isinstance(forward, QuasiStaticForward) and forward.skeleton is not None]
 
 
-def far_from_stated(beams: Sequence[Beam], values: Values) -> dict[str, np.ndarray]:
+def far_from_stated(beams: Sequence[Beam], begun: BeamStart) -> dict[str, np.ndarray]:
     """Distances of pulls' points along the branch [m], by name, where one is far."""
-    found = {beam.name: beam.shifts(values) for beam in beams if beam.may_be_off}
+    found = {beam.name: beam.shifts(begun) for beam in beams if beam.may_be_off}
     return {name: each for name, each in found.items() if np.abs(each).max(initial=0) > FAR_M}
 
 
 def beam_start(beams: Sequence[Beam], base: Values) -> BeamStart:
-    """Fit rods to their pulls: uniform moduli of all decades first, then one at each control point.
-    It does not depend on the moduli of ``base``."""
-    count, lower, upper = len(base.young), *np.log(YOUNG_BOUNDS_PA)
+    """Fit rods to their pulls: uniform moduli of all decades first, then one at each control point;
+    with each the zero of a force that was not read at rest. It does not depend on the moduli of
+    ``base``."""
+    count = len(base.young)
+    unknown = [beam.zero_sigma > 0 for beam in beams]
+    at = count + 3 * (np.cumsum(unknown) - 1)
 
-    def residuals(logs: np.ndarray) -> np.ndarray:
-        values = [replace(base, young=np.exp(each)) for each in logs]
-        return np.hstack([*(beam.residuals(values) for beam in beams),
-                          np.diff(logs, axis=1) / LINK_DEVIATION])
+    def residuals(free: np.ndarray) -> np.ndarray:
+        values = [replace(base, young=np.exp(each[:count])) for each in free]
+        known = np.zeros((len(free), 3))
+        return np.hstack([*(beam.residuals(values, free[:, first:first + 3] if is_open else known)
+                            for beam, is_open, first in zip(beams, unknown, at, strict=True)),
+                          np.diff(free[:, :count], axis=1) / LINK_DEVIATION, free[:, count:]])
 
-    def costs(logs: np.ndarray) -> np.ndarray:
-        return np.sum(residuals(logs)**2, axis=1)
+    size, step = count + 3 * sum(unknown), 1e-3
+    tried = np.zeros((len(DECADES), size))
+    tried[:, :count] = np.log(10) * DECADES[:, None]
+    for _ in range(ZERO_ROUNDS if any(unknown) else 0):
+        rows = [residuals(tried + step * each) for each in np.eye(size)[count:]]
+        now = residuals(tried)
+        slopes = (np.array(rows) - now).transpose(1, 2, 0) / step
+        tried[:, count:] -= np.array([np.linalg.lstsq(*each, rcond=None)[0]
+                                      for each in zip(slopes, now, strict=True)])
+    costs = np.sum(residuals(tried)**2, axis=1)
 
-    tried = np.repeat(np.log(10) * DECADES[:, None], count, axis=1)
-    found = costs(tried)
-    stiff, cost, log_young = found[-1], found.min(), tried[found.argmin()]
-    damping, step = 1e-2, 1e-3
-    for _ in range(BEAM_ROUNDS):
-        rows = residuals(np.vstack([log_young, log_young + step * np.eye(count)]))
-        slopes = (rows[1:] - rows[0]).T / step
-        square, before = slopes.T @ slopes, cost
-        for _ in range(4):
-            change = -np.linalg.solve(square + damping * np.diag(np.diag(square) + 1e-9),
-                                      slopes.T @ rows[0])
-            change *= min(1.0, LONGEST_STEP / max(float(np.abs(change).max()), 1e-12))
-            other = np.clip(log_young + change, lower, upper)
-            if (left := costs(other[None])[0]) < cost:
-                log_young, cost, damping = other, left, damping / 5
-                break
-            damping *= 8
-        if before - cost < BEAM_ENDING * before:
-            break
-    young = np.clip(np.exp(log_young), *YOUNG_BOUNDS_PA)
-    return BeamStart(replace(base, young=young), 1 - float(cost / max(stiff, 1e-300)))
+    def slopes_at(free: np.ndarray) -> np.ndarray:
+        rows = residuals(np.vstack([free, free + step * np.eye(size)]))
+        return (rows[1:] - rows[0]).T / step
+
+    bound = np.where(np.arange(size) < count, np.log(YOUNG_BOUNDS_PA)[:, None],
+                     [[-np.inf], [np.inf]])
+    found = scipy.optimize.least_squares(
+        lambda free: residuals(free[None])[0], np.clip(tried[costs.argmin()], *bound), slopes_at,
+        bounds=bound, ftol=BEAM_ENDING, max_nfev=BEAM_ROUNDS)
+    free, young = found.x, np.exp(found.x[:count])
+    zeros = {beam.name: beam.zero_sigma * free[first:first + 3]
+             for beam, is_open, first in zip(beams, unknown, at, strict=True) if is_open}
+    explained = 1 - 2 * float(found.cost) / max(float(costs[-1]), 1e-300)
+    return BeamStart(replace(base, young=young), explained, zeros)
 
 
 def scaled_start(objective: Objective, values: Values) -> Values:

@@ -23,6 +23,9 @@ SETTLED_ITERATIONS = 4
 """
 SETTLED_FALL = 0.01
 """Negligible decrease of half the squared standardised residuals: a seventh of a deviation."""
+UNSETTLED_FALL = 0.03
+"""Fall of the cost that states settled to half a millimetre do not show: a quarter of a deviation.
+"""
 SETTLED_STEP = 0.005
 """Length of the remaining step, in standard deviations, at which Gauss-Newton ends."""
 WANDERING_STEP = 0.1
@@ -131,13 +134,15 @@ class _Search:
             step *= min(1.0, LONGEST_STEP / max(longest, 1e-12))
             tried = self._objective.evaluate(at.free + step, jacobian=True)
             fall = -np.inf if tried is None else _cost(at, robust) - _cost(tried, robust)
-            if tried is None or fall <= 0:
-                if damping > MOST_DAMPING:
+            linear = residual + slopes @ step
+            foreseen = 0.5 * float(residual @ residual - linear @ linear)
+            if fall <= 0:
+                # Too little was to be gained.
+                if damping > MOST_DAMPING or tried is not None and foreseen < max(
+                        ending * _cost(at, robust), UNSETTLED_FALL):
                     return Fit(at, FitStatus.converged, "No step descends.")
                 damping = max(FIRST_DAMPING, 8 * damping)
                 continue
-            linear = residual + slopes @ step
-            foreseen = 0.5 * float(residual @ residual - linear @ linear)
             damping = 0.0 if damping < FIRST_DAMPING else (
                 damping / 8 if fall > 0.25 * foreseen else 2 * damping)
             was, at = _cost(at, robust), tried

@@ -293,7 +293,6 @@ class ObservedPathForward(QuasiStaticForward):
         if known is not None:
             self._drives = list(known[self.keys])
         elif np.linalg.norm(first) < AT_REST_M:
-            self._zero[:self._measured.shape[1]] = self._measured[0]
             self._drives = [drive - self._measured[0] for drive in self._drives]
         self.keep()
 
@@ -326,6 +325,11 @@ class ObservedPathForward(QuasiStaticForward):
         model = held.model_with(values)
         return not all(model.equations(()).exact_tangent(model, state).is_positive_definite
                        for state in held.displacements())
+
+    def begin_without(self, zero: np.ndarray) -> None:
+        """Start from the readings less a zero [3] [N]."""
+        self._drives = [np.r_[drive[:3] - zero, drive[3:]] for drive in self._drives]
+        self.keep()
 
     def keep(self) -> None:
         """Store force and states; :meth:`step_back` returns to them."""

@@ -128,7 +128,6 @@ class QuasiStaticForward(Forward):
         self.uses_torque = uses_torque(entry, frames)
         self._operator = point_operator(model.mesh, self.rest_points)
         self._directions = self._directions_on(model.mesh)
-        self._zero = np.zeros(6)
         self.spread = np.empty((len(frames), 0))
         self._memory: list[_Memory | None] = []
         self.iteration_count = 0
@@ -350,25 +349,6 @@ class QuasiStaticForward(Forward):
     def hint(self, displacements: list[np.ndarray]) -> None:
         """Start the next simulation from these displacements [m] of the key frames."""
         self._hints = displacements
-
-    def linear_motion(self, values: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return forces [n, c], the response [c, d] [m/N] at rest without weight, which exists for
-        any modulus, and motions [n, d]: of the gripper since the first frame, or of the points
-        since rest if the force drives."""
-        frames = self.frames
-        known = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
-        components = 6 if self.uses_torque else 3
-        model = self.model_with(values).with_parameters(gravity=(0.0, 0.0, 0.0))
-        loads = nodal_loads(self.grasp, self.entry.grasp, frames.poses[0], self.mesh.nodes,
-                            components)
-        responses = compliance(model, np.zeros_like(self.mesh.nodes), loads)
-        forces = frames.wrenches[known, :components]
-        if self.entry.drive == "pose":
-            at = responses[:, self.grasp.nodes].swapaxes(1, 2) @ self.grasp.weights
-            place = frames.poses[known, :3]
-            return forces - forces[0], at, place - place[0]
-        at = np.array([self._observed(each).ravel() for each in responses])
-        return forces, at, (frames.positions[known] - self.rest_points).reshape(len(forces), -1)
 
     def stands(self, values: Values) -> bool:
         return carries_its_weight(self.model_with(values))
