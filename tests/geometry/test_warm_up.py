@@ -2,6 +2,7 @@
 
 from limber.geometry.cloud.leaves import _voted
 from limber.geometry.skeleton.bridge_kernels import far_sides, nearest_others, priced
+from limber.geometry.skeleton.exact_factor import _analysed, _factorised, _solved
 from limber.geometry.skeleton.radii.fit_kernels import (
     mean_on_circle,
     nearest_of,
@@ -16,5 +17,6 @@ def test_warm_up_compiles_the_loops():
     """After it they exist as machine code, each in one form."""
     warm_up()
     for kernel in (pierced, _distances, nearest_of, normal_blocks, mean_on_circle,
-                   reach_on_circle, priced, nearest_others, far_sides, _voted):
+                   reach_on_circle, priced, nearest_others, far_sides, _voted, _analysed,
+                   _factorised, _solved):
         assert len(kernel.signatures) == 1

@@ -4,6 +4,7 @@ import numpy as np
 
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.leaves import leaf_log_odds, surroundings
+from limber.geometry.skeleton.contraction import contract
 from limber.geometry.skeleton.joining import join_pieces
 from limber.geometry.skeleton.likeliest_tree import State, grown
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
@@ -23,6 +24,7 @@ def warm_up(progress: Progress = SILENT) -> None:
     progress(0.1, "compiling the surface's loops")
     surface = branch_surface(skeleton)
     distance_to_surface(skeleton.nodes, surface)
+    contract(surface.vertices)
     fit_axes(skeleton, surface.vertices, rounds=1, settled=True)
     grown(State.of(skeleton, PointLikelihood.of(surface.vertices)),
           PointSpacing.of(surface.vertices))  # used by thin scans alone

@@ -1,18 +1,11 @@
-"""Solvers for sparse symmetric matrices: choice of library and common interface.
+"""Sparse symmetric matrices: CHOLMOD (through cvxopt) and its order of elimination.
 
-CHOLMOD (through cvxopt) if installed, else SuperLU from scipy. Limber's own factorisation for
-branches is :mod:`limber.mechanics.linear.supernodal`.
+Limber's own factors are :mod:`limber.mechanics.linear.supernodal`, for meshes of branches, and
+:mod:`limber.geometry.skeleton.exact_factor`, whose digits are the same on every processor.
 """
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import sparse
-
-from limber.core.not_none import present
-
-if TYPE_CHECKING:
-    from scipy.sparse.linalg import SuperLU
 
 
 class NotPositiveDefiniteError(ArithmeticError):
@@ -21,11 +14,9 @@ class NotPositiveDefiniteError(ArithmeticError):
 
 class CholmodFactor:
     """Supernodal Cholesky factor of a matrix with a fixed pattern, analysed once: sorted entries
-    [nnz] of the lower triangle by columns, ``size`` rows, perhaps in a good elimination order
-    already; else CHOLMOD finds one."""
+    [nnz] of the lower triangle by columns, ``size`` rows, in a good elimination order already."""
 
-    def __init__(self, rows: np.ndarray, columns: np.ndarray, size: int, *,
-                 is_ordered: bool = True):
+    def __init__(self, rows: np.ndarray, columns: np.ndarray, size: int):
         from cvxopt import matrix, spmatrix
 
         self._matrix = spmatrix(1.0, matrix(rows.astype(np.int64)),
@@ -34,12 +25,11 @@ class CholmodFactor:
         self._values = matrix(0.0, (len(rows), 1))
         self._view = np.asarray(self._values)[:, 0]
         self._rows, self._columns, self._size = rows, columns, size
-        self._is_ordered = is_ordered
         self._factor = None
 
     def twin(self) -> "CholmodFactor":
         """Return a factor of the same pattern with memory of its own."""
-        return CholmodFactor(self._rows, self._columns, self._size, is_ordered=self._is_ordered)
+        return CholmodFactor(self._rows, self._columns, self._size)
 
     def factorise(self, values: np.ndarray) -> None:
         """Factorise the matrix with these ``values`` [nnz]; NotPositiveDefiniteError if it is
@@ -49,8 +39,7 @@ class CholmodFactor:
         self._view[:] = values
         self._matrix.V = self._values
         if self._factor is None:
-            order = (matrix(np.arange(self._size)),) if self._is_ordered else ()
-            self._factor = cholmod.symbolic(self._matrix, *order)
+            self._factor = cholmod.symbolic(self._matrix, matrix(np.arange(self._size)))
         try:
             cholmod.numeric(self._matrix, self._factor)
         except ArithmeticError as error:
@@ -65,52 +54,12 @@ class CholmodFactor:
         return np.array(work).reshape(right.shape)
 
 
-class SuperLuFactor:
-    """The scipy equivalent, about five times slower and without a reused symbolic part."""
+def little_fill(graph: sparse.csr_matrix) -> np.ndarray:
+    """Return an order of elimination (new to old) of little fill, by approximate minimum degree on
+    a symmetric pattern [n, n]."""
+    from cvxopt import amd, matrix, spmatrix
 
-    def __init__(self, rows: np.ndarray, columns: np.ndarray, size: int, *,
-                 is_ordered: bool = True):
-        self._rows, self._columns, self._size = rows, columns, size
-        self._is_ordered = is_ordered
-        self._factor: SuperLU | None = None
-
-    def twin(self) -> "SuperLuFactor":
-        """As :meth:`CholmodFactor.twin`."""
-        return SuperLuFactor(self._rows, self._columns, self._size, is_ordered=self._is_ordered)
-
-    def factorise(self, values: np.ndarray) -> None:
-        """As :meth:`CholmodFactor.factorise`."""
-        from scipy.sparse.linalg import splu
-
-        lower = sparse.csc_matrix((values, (self._rows, self._columns)), shape=(self._size,) * 2)
-        whole = (lower + sparse.tril(lower, -1).T).tocsc()
-        try:
-            factor = splu(
-                whole, permc_spec="NATURAL" if self._is_ordered else "MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        except RuntimeError as error:
-            raise NotPositiveDefiniteError("a pivot is zero") from error
-        self._factor = factor
-        swapped = (factor.perm_r != factor.perm_c).any()
-        if swapped or factor.U.diagonal().min() <= 0:
-            raise NotPositiveDefiniteError("a pivot is not positive")
-
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """As :meth:`CholmodFactor.solve`."""
-        return present(self._factor, "factor").solve(np.ascontiguousarray(right))
-
-
-def general_factor(rows: np.ndarray, columns: np.ndarray, size: int, *,
-                   is_ordered: bool = True) -> CholmodFactor | SuperLuFactor:
-    """Return a factor of the fastest installed library; arguments as for CholmodFactor."""
-    kind = CholmodFactor if has_cholmod() else SuperLuFactor
-    return kind(rows, columns, size, is_ordered=is_ordered)
-
-
-def has_cholmod() -> bool:
-    """Whether cvxopt, which brings CHOLMOD and AMD, is installed."""
-    try:
-        import cvxopt.cholmod  # noqa: F401
-    except ImportError:
-        return False
-    return True
+    lower = sparse.tril(graph).tocoo()
+    pattern = spmatrix(1.0, matrix(lower.row.astype(np.int64)),
+                       matrix(lower.col.astype(np.int64)), graph.shape)
+    return np.array(amd.order(pattern), np.int64).ravel()

@@ -7,15 +7,8 @@ from enum import StrEnum
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
-from scipy.spatial import Delaunay, QhullError, cKDTree
+from scipy.spatial import cKDTree
 
-from limber.core.errors import WorkError
-from limber.core.numerics.sparse import (
-    CholmodFactor,
-    NotPositiveDefiniteError,
-    SuperLuFactor,
-    general_factor,
-)
 from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.confidence import doubted
 from limber.geometry.skeleton.curve_graph import (
@@ -24,8 +17,9 @@ from limber.geometry.skeleton.curve_graph import (
     neighbour_links,
     spreads,
 )
+from limber.geometry.skeleton.exact_factor import ExactFactor
 from limber.geometry.skeleton.joining import edge_matrix, join_pieces, labels
-from limber.geometry.skeleton.repair import attached, resampled
+from limber.geometry.skeleton.repair import PointSpacing, attached, resampled
 from limber.geometry.skeleton.run_ends import limited, tapered, with_full_tips
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
 
@@ -82,18 +76,17 @@ def contract(points: np.ndarray, *, weight: float = 1.0, progress: Progress = SI
     # thin twigs are not shortened, and thick ones still close. W_H is constant. On 4 generated
     # branches the growing one of Cao et al. (section 4) was as good where all sides were seen; from
     # one side radii were 2.6 instead of 2.0 % off, and one fork of 12 was lost.
-    scale = float(np.linalg.norm(np.ptp(points, axis=0)))
+    scale = float(np.ptp(points, axis=0).max())
     centre = points.mean(axis=0)
     positions = (points - centre) / scale
     progress(0.0, "laplacian")
-    laplacian = cloud_laplacian(positions)
-    solver = _NormalEquations(laplacian)
+    laplacian, order = cloud_laplacian(positions), None
     weights = np.full(len(points), weight)
     history: list[dict[str, float]] = []
     status, linearity = ContractionStatus.iteration_limit, local_linearity(positions)
     for iteration in range(_SOLVES):
         started = time.perf_counter()
-        drawn = solver.solve(weights, positions)
+        drawn, order = _drawn(laplacian, weights, positions, order)
         moved = float(np.linalg.norm(drawn - positions, axis=1).mean())
         positions = drawn
         linearity = local_linearity(positions)
@@ -116,13 +109,9 @@ def contract(points: np.ndarray, *, weight: float = 1.0, progress: Progress = SI
 
 
 def cloud_laplacian(points: np.ndarray) -> sparse.csc_matrix:
-    """Return the cotangent Laplacian [n, n] of a cloud; rows sum to 0. By ``robust_laplacian``
-    (Sharp and Crane 2020) if installed, else of triangles in each point's tangent plane."""
-    try:
-        import robust_laplacian
-    except ImportError:
+    """Return the cotangent Laplacian [n, n] of a cloud (Sharp and Crane 2020); rows sum to 0."""
+    import robust_laplacian
 
-        return tangent_laplacian(points, NEIGHBOURS)
     laplacian, _ = robust_laplacian.point_cloud_laplacian(points, n_neighbors=NEIGHBOURS)
     return laplacian.tocsc()
 
@@ -132,7 +121,7 @@ def local_linearity(points: np.ndarray) -> np.ndarray:
     count = min(_LINE_NEIGHBOURS, len(points))
     _, near = cKDTree(points).query(points, k=count)
     offset = points[near] - points[near].mean(axis=1, keepdims=True)
-    variance = offset.transpose(0, 2, 1) @ offset
+    variance = np.einsum("nki,nkj->nij", offset, offset)  # a library's product rounds otherwise
     total = np.trace(variance, axis1=1, axis2=2)
     return _largest_eigenvalues(variance, total / 3) / np.maximum(total, 1e-300)
 
@@ -147,77 +136,12 @@ def _largest_eigenvalues(matrix: np.ndarray, mean: np.ndarray) -> np.ndarray:
     return mean + 2 * spread * np.cos(np.arccos(np.clip(half, -1.0, 1.0)) / 3)
 
 
-class _NormalEquations:
-    """(L' W_L^2 L + 1) P' = P by sparse Cholesky; the pattern stays the same."""
-
-    def __init__(self, laplacian: sparse.csc_matrix):
-        self._laplacian = laplacian
-        self._factor: CholmodFactor | SuperLuFactor | None = None
-
-    def solve(self, contraction: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Solve for the diagonal of W_L, shape [n]."""
-        weighted = sparse.diags(contraction) @ self._laplacian
-        matrix = (weighted.T @ weighted + sparse.identity(len(points))).tocsc()
-        lower = sparse.tril(matrix, format="csc")
-        lower.sort_indices()
-        if self._factor is None:
-            columns = np.repeat(np.arange(len(points)), np.diff(lower.indptr))
-            self._factor = general_factor(lower.indices, columns, len(points), is_ordered=False)
-        try:
-            self._factor.factorise(lower.data)
-        except NotPositiveDefiniteError as error:
-            raise WorkError(f"The linear system of the contraction is singular ({error}).",
-                            "Many points may coincide.", "Thin the cloud.") from error
-        return _finite(self._factor.solve(points))
-
-
-def _finite(points: np.ndarray) -> np.ndarray:
-    if not np.isfinite(points).all():
-        raise WorkError("The contraction produced numbers that are not finite.",
-                        "The Laplacian of the cloud may be degenerate.",
-                        "Thin the cloud.")
-    return points
-
-
-# Our own point-cloud Laplacian, for where the robust_laplacian wheel is missing.
-
-
-def tangent_laplacian(points: np.ndarray, neighbours: int) -> sparse.csc_matrix:
-    """Return a cotangent Laplacian of Delaunay triangles of each point's ``neighbours`` in its
-    tangent plane (Belkin, Sun, Wang: Constructing Laplace operator from point clouds in R^d, 2009;
-    as in Cao et al.). Each triangle is seen from up to three points, hence the third."""
-    count = min(neighbours + 1, len(points))
-    _, near = cKDTree(points).query(points, k=count)
-    offset = points[near] - points[near].mean(axis=1, keepdims=True)
-    _, axes = np.linalg.eigh(np.einsum("nij,nik->njk", offset, offset))
-    flat = np.einsum("nij,njk->nik", offset, axes[:, :, 1:])
-    triangles = [near[i][fan] for i in range(len(points)) if len(fan := _fan(flat[i]))]
-    corner = np.vstack(triangles)
-    rows, columns, values = [], [], []
-    for k in range(3):
-        a, b, c = corner[:, k], corner[:, (k + 1) % 3], corner[:, (k + 2) % 3]
-        first, second = points[b] - points[a], points[c] - points[a]
-        cross = np.linalg.norm(np.cross(first, second), axis=1)
-        size = np.maximum(cross, 1e-3 * np.linalg.norm(first, axis=1)
-                          * np.linalg.norm(second, axis=1) + 1e-300)
-        # Negative cotangents (obtuse corners) would let points repel each other.
-        half = np.clip(np.einsum("ij,ij->i", first, second) / size, 0.0, 10.0) / 6.0
-        rows += [b, c]
-        columns += [c, b]
-        values += [half, half]
-    shape = (len(points), len(points))
-    weights = sparse.coo_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape).tocsc()
-    return (sparse.diags(np.asarray(weights.sum(axis=1)).ravel()) - weights).tocsc()
-
-
-def _fan(flat: np.ndarray) -> np.ndarray:
-    """Triangles that touch point 0 in the Delaunay triangulation of points [k, 2]."""
-    try:
-        triangles = Delaunay(flat, qhull_options="QJ Qbb").simplices
-    except QhullError:
-        return np.empty((0, 3), np.int64)
-    return triangles[(triangles == 0).any(axis=1)]
+def _drawn(laplacian: sparse.csc_matrix, weights: np.ndarray, points: np.ndarray,
+           order: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """P' of (L' W_L^2 L + 1) P' = P with the diagonal of W_L, [n], and the order of elimination."""
+    weighted = sparse.diags(weights) @ laplacian
+    factor = ExactFactor((weighted.T @ weighted + sparse.identity(len(points))).tocsr(), order)
+    return factor.solve(points), factor.order
 
 
 # Level sets of the scan's connectivity, measured from the root: for sparse scans and for leaves.
@@ -342,19 +266,14 @@ def through_leaves(skeleton: Skeleton, points: np.ndarray, noise: float,
                    radius_limits: tuple[float, float]) -> Skeleton:
     """Place axes in the middle of stem and leaves without a fit, as leaves are no cylinders. A leaf
     gets its stalk's radius, for lack of a better one, marked as not measured."""
-    skeleton = attached(resampled(skeleton))
+    skeleton = attached(resampled(skeleton, 1.0, PointSpacing.of(points).at(skeleton.nodes)))
     for _ in range(_EVENED):
-        skeleton = skeleton.moved(_evened(skeleton))
+        nodes = skeleton.nodes.copy()
+        for members in skeleton.runs():
+            old = skeleton.nodes[members]
+            nodes[members[1:-1]] = 0.5 * old[1:-1] + 0.25 * (old[:-2] + old[2:])
+        skeleton = skeleton.moved(nodes)
     skeleton = with_full_tips(tapered(limited(skeleton, *radius_limits)), points, noise)
     skeleton = replace(skeleton, radius_sigma=0.25 * skeleton.radius,
                        radius_state=np.full(skeleton.node_count, INTERPOLATED, np.int8))
     return doubted(skeleton, points, noise)
-
-
-def _evened(skeleton: Skeleton) -> np.ndarray:
-    """Each node moved half way to the midpoint of its neighbours on the run [m], shape [n, 3]."""
-    nodes = skeleton.nodes.copy()
-    for members in skeleton.runs():
-        inner, old = members[1:-1], skeleton.nodes
-        nodes[inner] = 0.5 * old[inner] + 0.25 * (old[members[:-2]] + old[members[2:]])
-    return nodes

@@ -10,12 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from limber.core.numerics.compiled import for_kernels
-from limber.core.numerics.sparse import (
-    CholmodFactor,
-    NotPositiveDefiniteError,
-    SuperLuFactor,
-    general_factor,
-)
+from limber.core.numerics.sparse import CholmodFactor, NotPositiveDefiniteError, little_fill
 from limber.mechanics.elements.forces import lanes_last
 from limber.mechanics.elements.stiffness import LANES, moduli_stiffness, tangent_stiffness
 from limber.mechanics.grasp import Grasp
@@ -36,32 +31,22 @@ as fast as CHOLMOD, whose fraction of fast dense kernels grows with the fronts.
 """
 
 
-Factor = SupernodalFactor | CholmodFactor | SuperLuFactor
+Factor = SupernodalFactor | CholmodFactor
 
 
 def make_factor(pattern: "Pattern") -> Factor:
-    """Return the fastest installed factor for a pattern."""
+    """Return the faster factor for a pattern."""
     fronts = make_fronts(pattern.node_starts, pattern.node_rows)
     if fronts.flops <= _MOST_FLOPS:
         return SupernodalFactor(fronts)
     # The elimination order is Limber's own, found once on nodes instead of rows.
-    return general_factor(*pattern.entries(), pattern.size)
+    return CholmodFactor(*pattern.entries(), pattern.size)
 
 
 def elimination_order(graph: sp.csr_matrix) -> np.ndarray:
-    """Return an order of nodes (new to old) of little fill, by approximate minimum degree on a
-    symmetric pattern [n, n]. Each subtree is a contiguous run (postorder)."""
-    try:
-        from cvxopt import amd, matrix, spmatrix
-    except ImportError:
-        from scipy.sparse.csgraph import reverse_cuthill_mckee
-
-        order = reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
-        return postordered(graph, order)
-    lower = sp.tril(graph).tocoo()
-    pattern = spmatrix(1.0, matrix(lower.row.astype(np.int64)),
-                       matrix(lower.col.astype(np.int64)), graph.shape)
-    return postordered(graph, np.array(amd.order(pattern), np.int64).ravel())
+    """Return an order of nodes (new to old) of little fill for a symmetric pattern [n, n]. Each
+    subtree is a contiguous run (postorder)."""
+    return postordered(graph, little_fill(graph))
 
 
 # Elimination order, sparsity pattern and vector layout of the elements' stiffness.
