@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError, Option, Place, Text
 from limber.geometry.cloud.cloud import thinned
-from limber.geometry.cloud.leaves import Leaf, find_leaves, leaf_like
+from limber.geometry.cloud.leaves import Leaf, find_leaves, leaf_evidence
 from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
 from limber.geometry.cloud.surroundings import Support
 from limber.geometry.skeleton.search_result import SkeletonResult
@@ -72,7 +72,7 @@ def _leaves_of(points: np.ndarray) -> list[Leaf]:
 def show_leaves(prepared: Prepared, off: np.ndarray) -> bool:
     """Whether most of a scan's points off all axes, of mask ``off`` [n], look like leaves."""
     some = thinned(prepared.cloud.points, FIT_POINT_LIMIT)
-    like = leaf_like(prepared.cloud.points[some])[off[some]]
+    like = leaf_evidence(prepared.cloud.points[some])[off[some]] > 0
     return like.size > 0 and float(like.mean()) > _MOST
 
 

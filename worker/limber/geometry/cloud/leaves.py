@@ -115,14 +115,14 @@ def find_leaves(points: np.ndarray) -> list[Leaf]:
     return [Leaf(own.order[leaf.points], leaf.area) for leaf in _found(own.coordinates)]
 
 
-def leaf_like(points: np.ndarray) -> np.ndarray:
-    """Which points are likelier on a leaf than on wood, by their surroundings alone, shape [n]."""
+def leaf_evidence(points: np.ndarray) -> np.ndarray:
+    """What each point's surroundings add to the logarithm of the odds that a scan shows leaves,
+    shape [n]: over 0 if it is likelier on one. Neighbours share theirs, which count once."""
     own = OwnFrame.of(points)
-    spacing = point_spacing(own.coordinates)
-    like = np.zeros(len(points), bool)
+    spacing, odds = point_spacing(own.coordinates), np.full(len(points), prior_log_odds())
     if len(points) >= _SMALLEST and spacing > 0:
-        like[own.order] = leaf_log_odds(surroundings(own.coordinates, spacing)) > 0
-    return like
+        odds[own.order] = leaf_log_odds(surroundings(own.coordinates, spacing))
+    return np.clip(odds, -_MOST_ODDS, _MOST_ODDS) / _AROUND
 
 
 def point_spacing(points: np.ndarray) -> float:

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError, Option, Place, Text
+from limber.geometry.cloud.surroundings import find_sheet
 from limber.geometry.skeleton.contraction import ContractionStatus
 from limber.geometry.skeleton.curve_graph import CurveGraph
 from limber.geometry.skeleton.qsm_tables import cylinders
@@ -69,23 +69,10 @@ def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
 
 
 def check_no_sheet(points: np.ndarray) -> None:
-    share = _sheet_share(points, 0.06 * float(np.linalg.norm(np.ptp(points, axis=0))))
-    if share > 0.9:
-        raise InputError(
-            f"{100 * share:.0f} % of the points lie in wide flat sheets.",
-            "The cloud does not have the shape of a branch.", _FIX)
-
-
-def _sheet_share(points: np.ndarray, reach: float) -> float:
-    """Fraction of points whose surroundings within ``reach`` [m] are wide and flat, on a sample."""
-    tree = cKDTree(points)
-    sample = points[:: max(len(points) // 300, 1)]
-    flat = []
-    for near in tree.query_ball_point(sample, reach):
-        if len(near) > 10:
-            values = np.linalg.eigvalsh(np.cov(points[near].T))
-            flat.append(values[0] < 0.01 * values[1] and values[1] > 0.3 * values[2])
-    return float(np.mean(flat)) if flat else 0.0
+    """Refuse a cloud that is one wall, whose points would be removed, and nothing else."""
+    if find_sheet(points, 0.9 * len(points)) is not None:
+        raise InputError("Over 90 % of the points lie on one wide flat sheet.",
+                         "The cloud does not have the shape of a branch.", _FIX)
 
 
 def warnings(result: Any) -> list[str]:

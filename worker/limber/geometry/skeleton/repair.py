@@ -15,7 +15,6 @@ from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
 from limber.geometry.skeleton.radii.stations import registered
 from limber.geometry.skeleton.run_ends import (
-    ends_within,
     limited,
     steadied,
     with_full_tips,
@@ -301,12 +300,6 @@ class PointSpacing:
         return self.distance[near.reshape(len(places), -1)].mean(axis=1)
 
 
-LEAF_SHARE = 0.4
-"""Fraction of points over two radii off their axis from which a scan shows leaves, not branches. Of
-eleven bare scans, most with noise as large as their radii, it is at most 0.30; of leaves 0.48 and
-0.73.
-"""
-
 _COARSE = 1.5  # local radii between the nodes of the first fit
 _NOISY = 0.2  # fraction of the median radius
 _ROUNDS_NOISY, _ROUNDS_LATE = 18, 6  # rounds of the last fit
@@ -361,12 +354,6 @@ class Repaired:
     def noise(self) -> float:
         """Standard deviation of the points [m], as the last fit has it."""
         return self.last_fit.noise
-
-    @property
-    def off_axis_fraction(self) -> float:
-        """Fraction of points farther off their axis than twice its radius, as on leaves."""
-        fit = self.last_fit
-        return float(np.mean(fit.residual > fit.skeleton.radius[fit.segment]))
 
     @property
     def last_fit(self) -> AxisFit:
@@ -461,8 +448,6 @@ PASSES = (
     Pass("register stations", "The stations of a merged scan are a little apart, so that all radii "
          "are off together.", _register_stations, until=1.0),
     DROP_BARE_ENDS,
-    Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
-         lambda now: now.of(ends_within(now.skeleton, now.points))),
     LIMIT,
     Pass("find the likeliest axes and radii",
          "A radius that few points, the spacing or the noise determine, or that no wood has, is "

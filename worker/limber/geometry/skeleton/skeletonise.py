@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from limber.core.errors import InputError, places_moved
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import OwnFrame, thinned
+from limber.geometry.cloud.leaves import leaf_evidence
 from limber.geometry.cloud.single_view import View
 from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.confidence import assessed, likely
@@ -31,10 +32,11 @@ from limber.geometry.skeleton.plausibility import (
     check_round,
 )
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
-from limber.geometry.skeleton.repair import LEAF_SHARE, SPUR_REACH, Repaired, prune_spurs, repaired
+from limber.geometry.skeleton.repair import SPUR_REACH, Repaired, prune_spurs, repaired
 from limber.geometry.skeleton.root_end import RootChoice, root_node
 from limber.geometry.skeleton.search_result import SkeletonResult
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.tree_likelihood import PointLikelihood
 
 Apart = Callable[[np.ndarray], None]
 """Receives which points of a cloud belong to another plant or cluster, shape [n]."""
@@ -121,6 +123,28 @@ class _Search:
             some = some[graph.owner[cKDTree(thin).query(some)[1]] >= 0]
         return some
 
+    def through_leaves(self, first: Skeleton, fitted: Repaired, graph: CurveGraph, start: int,
+                       ) -> Skeleton | None:
+        """Axes through the middle of leaves, the ``first`` or those of levels; None if points are
+        likelier about the fitted cylinders, by their distances and the shape of their surroundings.
+        """
+        # A fit makes fat cylinders of leaves: that these are likely is no evidence of wood. But one
+        # side of a branch is likely about a thin axis, where nothing shows that it is one side. A
+        # depth camera's readings are flat where they graze wood.
+        if fitted.view is not None:
+            return None
+        some = fitted.points[::len(fitted.points) // _SEARCHED + 1]
+        scan, shape, rivals = PointLikelihood.of(some), float(leaf_evidence(some).sum()), [first]
+        if shape > 0:
+            rivals.append(self.pruned(*self.in_levels(fitted.points, graph.nodes[start], float(
+                np.median(graph.thickness))))[0])
+        best = max((through_leaves(one, some, fitted.noise, fitted.radius_limits)
+                    for one in rivals), key=scan.score)
+        if scan.score(best) > scan.score(fitted.skeleton):
+            scan = scan.where_seen(fitted.skeleton)
+        likelier = max(scan.score(best) - scan.score(fitted.skeleton), 0.0)
+        return best if likelier + shape > 0 else None
+
     def _joining(self) -> dict[str, Any]:
         settings = self.settings
         return {"gap_factor": settings.gap_factor, "up": self.up,
@@ -157,13 +181,8 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     check_round(fitted.skeleton, points, segment, residual)
     skeleton, more = fitted.skeleton, fitted.pruned
-    off_axis = float(np.mean(residual > skeleton.radius[segment]))
-    leafy = max(fitted.off_axis_fraction, off_axis) > LEAF_SHARE
-    if leafy:
-        graph, start = search.in_levels(thin, graph.nodes[start],
-                                        float(np.median(graph.thickness)))
-        (first, pruned), more = search.pruned(graph, start), 0
-        skeleton = through_leaves(first, some, fitted.noise, fitted.radius_limits)
+    if leafy := (middle := search.through_leaves(first, fitted, graph, start)) is not None:
+        skeleton, more = middle, 0
     skeleton, unlikely = likely(skeleton, twig_probability)
     noise, count = fitted.noise, pruned + more
     if not leafy and len(points) <= _SEARCHED:  # the score knows no leaves
