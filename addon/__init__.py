@@ -4,7 +4,9 @@ The add-on computes nothing. ``bridge`` is the only interface between arrays and
 each file of ``operators`` one action, each file of ``panels`` one step of the work.
 """
 
+import functools
 import importlib
+from collections.abc import Callable
 from pathlib import Path
 
 # The build puts the reader of tables beside these files; in a checkout the worker has it.
@@ -14,6 +16,7 @@ __path__.append(str(Path(__file__).resolve().parents[1] / "worker" / "limber" / 
 MODULES = (
     "preferences",
     "properties",
+    "operators.worker_operator",
     "operators.import_cloud",
     "operators.run_stage",
     "operators.take_choice",
@@ -57,16 +60,23 @@ MODULES = (
     "command",
 )
 
-_registered = []
+_undo: list[Callable[[], None]] = []
+"""What takes back each step of :func:`register`."""
 
 
 def register() -> None:
-    """Register every module; if one fails, those before it are unregistered."""
+    """Register every module: its ``CLASSES``, then by its own ``register`` if it has one. If one
+    fails, those before it are unregistered."""
+    import bpy
     try:
         for name in MODULES:
             module = importlib.import_module(f".{name}", __package__)
-            module.register()
-            _registered.append(module)
+            for each in getattr(module, "CLASSES", ()):
+                bpy.utils.register_class(each)
+                _undo.append(functools.partial(bpy.utils.unregister_class, each))
+            getattr(module, "register", bool)()
+            if hasattr(module, "unregister"):
+                _undo.append(module.unregister)
     except BaseException:
         unregister()
         raise
@@ -74,5 +84,5 @@ def register() -> None:
 
 def unregister() -> None:
     """Unregister everything that :func:`register` registered, in reverse order."""
-    while _registered:
-        _registered.pop().unregister()
+    while _undo:
+        _undo.pop()()

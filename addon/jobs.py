@@ -306,6 +306,12 @@ def _advance() -> None:
         job.state, job.error = JobState.FAILED, str(error)
 
 
+def dismiss() -> None:
+    """Forget the last job if it has ended."""
+    if not is_running():
+        _last.clear()
+
+
 def forget() -> None:
     """End the current job, if any, and forget it: the add-on is removed or Blender closes."""
     for job in (*_waiting, *_last):

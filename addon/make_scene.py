@@ -109,7 +109,8 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
 def _render_round(scene: bpy.types.Scene, folder: Path, sides: int) -> None:
     """Render the branch in its present display from all sides; the saved file stays."""
     sharing = importlib.import_module("limber_addon.operators.sharing")
-    sharing.register()
+    for each in sharing.CLASSES:
+        bpy.utils.register_class(each)
     bpy.ops.limber.turntable(frames=sides)
     pivot = bpy.data.objects[f"{sharing.RIG} pivot"]
     # The branch is at rest meanwhile: the camera turns by hand, not by the scene's frames.

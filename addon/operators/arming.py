@@ -21,7 +21,7 @@ class MovesRobot(StageOperator):
         name="Name to Confirm", options={"SKIP_SAVE"},
         description="The person beside the robot types the name to confirm the motion")
 
-    def invoke(self, context, event):
+    def begin(self, context, event):
         if bpy.app.background or context.window is None:
             return self.execute(context)
         self._is_asked = True
@@ -82,7 +82,7 @@ class LIMBER_OT_arm(MovesRobot, bpy.types.Operator):
     branch_uuid: branch_property()
 
     @classmethod
-    def poll(cls, context):
+    def can_start(cls, context):
         if trouble := why_not_armed(context):
             cls.poll_message_set(trouble)
         return not trouble

@@ -1,4 +1,4 @@
-"""Stop the worker."""
+"""Stop the worker, or dismiss its failure."""
 
 import bpy
 
@@ -17,10 +17,13 @@ class LIMBER_OT_cancel_job(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return jobs.is_running() or bool(jobs.waiting())
+        return jobs.current() is not None or bool(jobs.waiting())
 
     def execute(self, context):
-        queue = jobs.waiting()
+        queue, last = jobs.waiting(), jobs.current()
+        if self.waiting < 0 and last is not None and last.error:
+            jobs.dismiss()
+            return {"FINISHED"}
         if self.waiting >= len(queue) or (self.waiting < 0 and not jobs.is_running()):
             self.report({"WARNING"}, "The job has already ended or started.")
             return {"CANCELLED"}
@@ -28,10 +31,4 @@ class LIMBER_OT_cancel_job(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_cancel_job)
-
-
-def unregister() -> None:
-    jobs.forget()
-    bpy.utils.unregister_class(LIMBER_OT_cancel_job)
+CLASSES = (LIMBER_OT_cancel_job,)

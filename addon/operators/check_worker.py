@@ -29,9 +29,4 @@ class LIMBER_OT_check_worker(WorkerOperator, bpy.types.Operator):
         self.report({"INFO"}, status.replace("\n", ". "))
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_check_worker)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_check_worker)
+CLASSES = (LIMBER_OT_check_worker,)

@@ -165,11 +165,4 @@ def handles(context: bpy.types.Context) -> dict[str, tuple]:
     return {name: mark for name, mark in found.items() if mark[0].visible_get()}
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_drag_goal)
-    bpy.utils.register_class(LIMBER_GGT_goal)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_GGT_goal)
-    bpy.utils.unregister_class(LIMBER_OT_drag_goal)
+CLASSES = (LIMBER_OT_drag_goal, LIMBER_GGT_goal)

@@ -165,13 +165,4 @@ def _selected(scan: bpy.types.Object) -> list[Vector]:
     return [vertex.co for vertex in scan.data.vertices if vertex.select]
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_crop_scan)
-    bpy.utils.register_class(LIMBER_OT_from_object)
-    bpy.utils.register_class(LIMBER_OT_from_cursor)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_from_cursor)
-    bpy.utils.unregister_class(LIMBER_OT_from_object)
-    bpy.utils.unregister_class(LIMBER_OT_crop_scan)
+CLASSES = (LIMBER_OT_crop_scan, LIMBER_OT_from_object, LIMBER_OT_from_cursor)

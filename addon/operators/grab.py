@@ -387,10 +387,8 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         return None if seen is None else (seen.x, seen.y)
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_grab)
+CLASSES = (LIMBER_OT_grab,)
 
 
 def unregister() -> None:
     session.close_all()
-    bpy.utils.unregister_class(LIMBER_OT_grab)

@@ -24,9 +24,4 @@ class LIMBER_OT_help(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_help)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_help)
+CLASSES = (LIMBER_OT_help,)

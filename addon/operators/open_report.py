@@ -22,9 +22,4 @@ class LIMBER_OT_open_report(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_open_report)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_open_report)
+CLASSES = (LIMBER_OT_open_report,)

@@ -33,18 +33,18 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
     _temporary = None
     _is_asked = False
 
-    def invoke(self, context, event):
+    def begin(self, context, event):
         if not (self.directory or branches.current_path(context.scene) or bpy.app.background):
             self._is_asked = True
             context.window_manager.fileselect_add(self)
             return {"RUNNING_MODAL"}
-        return super().invoke(context, event)
+        return super().begin(context, event)
 
     def execute(self, context):
         if self._is_asked:
             # The folder has been chosen: from here on as from the button.
             self._is_asked = False
-            return super().invoke(context, None)
+            return super().begin(context, None)
         return super().execute(context)
 
     def arguments(self, context):
@@ -106,9 +106,4 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
         return Path(self._temporary.name) / "scene.npz"
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_open_result)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_open_result)
+CLASSES = (LIMBER_OT_open_result,)

@@ -101,9 +101,4 @@ def _remove_earlier() -> None:
     parts.remove_unused()
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_set_up_picture)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_set_up_picture)
+CLASSES = (LIMBER_OT_set_up_picture,)

@@ -36,9 +36,4 @@ class LIMBER_OT_place_goal(NeedsBranchInObjectMode, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_place_goal)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_place_goal)
+CLASSES = (LIMBER_OT_place_goal,)

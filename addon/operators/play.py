@@ -62,11 +62,4 @@ class LIMBER_OT_retime(NeedsBranch, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_retime)
-    bpy.utils.register_class(LIMBER_OT_play)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_retime)
-    bpy.utils.unregister_class(LIMBER_OT_play)
+CLASSES = (LIMBER_OT_retime, LIMBER_OT_play)

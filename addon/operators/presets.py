@@ -89,17 +89,7 @@ def _value(field: Field, value) -> str:
                      field.unit])
 
 
-_CLASSES = (LIMBER_OT_material, LIMBER_OT_sensor, *(
+CLASSES = (LIMBER_OT_material, LIMBER_OT_sensor, *(
     type(sensor_menu(stage), (_SensorMenu, bpy.types.Menu), {
         "bl_idname": sensor_menu(stage), "stage": stage, "__module__": __name__})
     for stage in SENSED))
-
-
-def register() -> None:
-    for each in _CLASSES:
-        bpy.utils.register_class(each)
-
-
-def unregister() -> None:
-    for each in reversed(_CLASSES):
-        bpy.utils.unregister_class(each)

@@ -45,9 +45,4 @@ def pulls_of(record: branch_folder.BranchRecord | None) -> list[str]:
     return record.names("pulls/{name}/pull.toml") if record else []
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_replay_pull)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_replay_pull)
+CLASSES = (LIMBER_OT_replay_pull,)

@@ -30,7 +30,7 @@ class StageOperator(WorkerOperator):
     def title(self) -> str:
         return self.stage.label
 
-    def invoke(self, context, event):
+    def begin(self, context, event):
         try:
             self._take_keywords(context)
             trouble = "" if self.replace else self._foreign(context)
@@ -38,7 +38,7 @@ class StageOperator(WorkerOperator):
             # Starting it reports the same, with the position.
             trouble = ""
         if not trouble or bpy.app.background or context.window is None:
-            return super().invoke(context, event)
+            return super().begin(context, event)
         self._is_asked = self.replace = True
         self.branch_uuid = self.branch_uuid or branches.current_uuid(context.scene)
         return context.window_manager.invoke_confirm(
@@ -49,7 +49,7 @@ class StageOperator(WorkerOperator):
         if self._is_asked:
             # The user has answered: from here on as from the button.
             self._is_asked = False
-            return super().invoke(context, None)
+            return super().begin(context, None)
         return super().execute(context)
 
     def arguments(self, context):

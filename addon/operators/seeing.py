@@ -109,13 +109,4 @@ class LIMBER_OT_graph(NeedsBranch, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_graph)
-    bpy.utils.register_class(LIMBER_OT_show)
-    bpy.utils.register_class(LIMBER_OT_color_by)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_color_by)
-    bpy.utils.unregister_class(LIMBER_OT_show)
-    bpy.utils.unregister_class(LIMBER_OT_graph)
+CLASSES = (LIMBER_OT_graph, LIMBER_OT_show, LIMBER_OT_color_by)

@@ -151,14 +151,4 @@ def _beside_file(branch: bpy.types.Collection) -> Path | None:
     return None
 
 
-_CLASSES = (LIMBER_OT_choose_branch, LIMBER_OT_side_by_side, LIMBER_OT_relink)
-
-
-def register() -> None:
-    for each in _CLASSES:
-        bpy.utils.register_class(each)
-
-
-def unregister() -> None:
-    for each in reversed(_CLASSES):
-        bpy.utils.unregister_class(each)
+CLASSES = (LIMBER_OT_choose_branch, LIMBER_OT_side_by_side, LIMBER_OT_relink)

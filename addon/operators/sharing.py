@@ -153,11 +153,4 @@ def _select(context: bpy.types.Context, things: list[bpy.types.Object],
     context.view_layer.objects.active = active
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_export_motion)
-    bpy.utils.register_class(LIMBER_OT_turntable)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_turntable)
-    bpy.utils.unregister_class(LIMBER_OT_export_motion)
+CLASSES = (LIMBER_OT_export_motion, LIMBER_OT_turntable)

@@ -14,7 +14,7 @@ import bpy
 from .. import branches
 from ..bridge import skeletons
 from ..skeleton_edits import Mark, SkeletonEditError, edits_of
-from .needs_result import NeedsSkeleton, check_identity
+from .needs_result import NeedsSkeleton, check_identity, is_open
 from .worker_operator import WorkerOperator
 
 _ACTIONS = (
@@ -156,7 +156,7 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
                                         if number in by_number], context="VERTS")
 
 
-class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator):
+class LIMBER_OT_apply_skeleton(WorkerOperator, bpy.types.Operator):
     """Make surface and mesh again with the edits of the skeleton. Later reconstructions keep the
     edits"""
 
@@ -174,9 +174,8 @@ class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator
     _temporary = None
 
     @classmethod
-    def poll(cls, context):
-        return NeedsSkeleton.poll.__func__(cls, context) and (
-            WorkerOperator.poll.__func__(cls, context))
+    def can_start(cls, context):
+        return is_open(cls, branches.find_skeleton(context.scene)) and super().can_start(context)
 
     def arguments(self, context):
         thing = branches.find_skeleton(context.scene)
@@ -225,15 +224,5 @@ class LIMBER_OT_discard_skeleton(NeedsSkeleton, bpy.types.Operator):
         return {"FINISHED"}
 
 
-_CLASSES = (LIMBER_OT_edit_skeleton, LIMBER_OT_edit_node, LIMBER_OT_apply_skeleton,
+CLASSES = (LIMBER_OT_edit_skeleton, LIMBER_OT_edit_node, LIMBER_OT_apply_skeleton,
             LIMBER_OT_discard_skeleton)
-
-
-def register() -> None:
-    for each in _CLASSES:
-        bpy.utils.register_class(each)
-
-
-def unregister() -> None:
-    for each in reversed(_CLASSES):
-        bpy.utils.unregister_class(each)

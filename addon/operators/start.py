@@ -123,11 +123,4 @@ def _own_folder() -> Path:
         return Path(bpy.app.tempdir) / "limber-example"
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_open_example)
-    bpy.utils.register_class(LIMBER_OT_workspace)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_workspace)
-    bpy.utils.unregister_class(LIMBER_OT_open_example)
+CLASSES = (LIMBER_OT_open_example, LIMBER_OT_workspace)

@@ -47,9 +47,4 @@ class LIMBER_OT_take_choice(bpy.types.Operator):
             return {"CANCELLED"}
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_OT_take_choice)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_take_choice)
+CLASSES = (LIMBER_OT_take_choice,)

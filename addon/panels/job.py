@@ -32,7 +32,9 @@ class LIMBER_PT_job(SidebarPanel, bpy.types.Panel):
         if job is not None and job.state is jobs.JobState.RUNNING:
             _draw_running(self.layout, context, job)
         elif job is not None and job.error:
-            draw_text(self.layout, context, f"{job.title} failed", "ERROR")
+            row = self.layout.row()
+            row.label(text=f"{job.title} failed", icon="ERROR")
+            row.operator("limber.cancel_job", text="", icon="X")
             draw_text(self.layout, context, " ".join(error_texts(job.outcome)))
         if job is not None:
             _draw_log(self.layout, context, job)
@@ -104,9 +106,4 @@ def _with_interval(value: str, factor: str) -> str:
         f"{value} (not yet known)")
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_PT_job)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_PT_job)
+CLASSES = (LIMBER_PT_job,)

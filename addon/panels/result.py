@@ -169,11 +169,4 @@ def _draw_in_sight(layout: bpy.types.UILayout, context: bpy.types.Context,
         draw_text(body, context, _NO_GRAPH[settings.graph], "INFO")
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_MT_colours)
-    bpy.utils.register_class(LIMBER_PT_result)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_PT_result)
-    bpy.utils.unregister_class(LIMBER_MT_colours)
+CLASSES = (LIMBER_MT_colours, LIMBER_PT_result)

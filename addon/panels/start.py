@@ -32,9 +32,4 @@ class LIMBER_PT_start(SidebarPanel, bpy.types.Panel):
             self.layout.operator("limber.workspace", icon="WORKSPACE")
 
 
-def register() -> None:
-    bpy.utils.register_class(LIMBER_PT_start)
-
-
-def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_PT_start)
+CLASSES = (LIMBER_PT_start,)

@@ -45,6 +45,11 @@ class StepPanel(SidebarPanel):
     def poll(cls, context):
         return cls.step.name != "robot" or not preferences.lacks_robot()
 
+    def draw_header(self, context):
+        """Show its number, among the steps that are shown."""
+        shown = [step for step in STEPS if step.name != "robot" or not preferences.lacks_robot()]
+        self.layout.label(text=str(shown.index(self.step) + 1))
+
     def draw_header_preset(self, context):
         """Show its state and the way to its help, at the right end of the header."""
         self.layout.label(text="", icon=step_state(context.scene, self.step).icon)
@@ -138,12 +143,15 @@ def step_state(scene: bpy.types.Scene, step: Step) -> StepState:
 
 
 def next_stage(scene: bpy.types.Scene) -> Stage | None:
-    """Return the first stage not yet run for the branch as it is, whose inputs exist or are set;
-    for a scan without a branch, the one that makes it. None if there is none.
+    """Return the first stage not yet run for the branch and the settings as they are, whose inputs
+    exist or are set; for a scan without a branch, the one that makes it. None if there is none,
+    while a job works in the folder, and after one that failed: its panel says what to do.
     """
     folder = branches.current_folder(scene)
     record = None if folder is None else branch_folder.read_record(folder)
-    if record is None:
+    if folder is not None and jobs.works_in(str(folder)):
+        return None
+    if record is None or not record.has(["mesh.vtu"]):
         first = stages()[STEPS[0].view.stage]
         is_due = properties.group_of(scene, first).cloud and (
             state_of(scene, first.name)[0] is StepState.NOT_RUN)
@@ -157,7 +165,10 @@ def next_stage(scene: bpy.types.Scene) -> Stage | None:
                  if name not in stages()[FIRST.get(stage.name, stage.name)].writes]
         is_ready = record.has(needs) and all(
             values[field.name] for field in stage.own_fields if field.is_required)
-        if is_ready and step_state(scene, step) in (StepState.NOT_RUN, StepState.STALE):
+        state = step_state(scene, step) if is_ready else StepState.DONE
+        if state is StepState.FAILED:
+            return None
+        if state in (StepState.NOT_RUN, StepState.STALE, StepState.CHANGED):
             return stage
     return None
 
@@ -201,9 +212,13 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
     outcome = properties.outcome_of(context.scene, stage, str(folder))
     if outcome.get("error"):
         draw_error(layout, context, stage, outcome)
-    for warning in outcome.get("warnings", []):
-        draw_text(layout, context, warning_text(outcome, warning, stage), "INFO")
     result = outcome.get("result", {}) if entry is None else entry.result
+    # Those of the folder stay: in a new file, and after an undo. A failed run has its own.
+    told = [] if entry is None else entry.result.get("warnings", [])
+    if entry is None or outcome.get("status") == "failed":
+        told = [*told, *outcome.get("warnings", [])]
+    for warning in dict.fromkeys(told):
+        draw_text(layout, context, warning_text(outcome, warning, stage), "INFO")
     if view.stage == "plan":
         draw_paths(layout, context, result, branch_folder.read_record(folder) if folder else None,
                    stress_share(context.scene))
@@ -324,7 +339,7 @@ def draw_error(layout: bpy.types.UILayout, context: bpy.types.Context, stage: St
 def register() -> None:
     for number, step in enumerate(STEPS):
         panel = type(f"LIMBER_PT_{step.name}", (StepPanel, bpy.types.Panel), {
-            "bl_idname": f"LIMBER_PT_{step.name}", "bl_label": f"{number + 1}  {step.title}",
+            "bl_idname": f"LIMBER_PT_{step.name}", "bl_label": step.title,
             "bl_order": _FIRST_ORDER + number, "step": step, "__module__": __name__,
             "bl_options": set() if step.name in ("scan", "skeleton") else {"DEFAULT_CLOSED"}})
         bpy.utils.register_class(panel)

@@ -9,19 +9,8 @@ import bpy
 from bpy_extras import view3d_utils
 
 sys.path.insert(0, str(Path(__file__).parent))
+import mouse
 from driving import KEY, drive, picture, processor_seconds, seen, started, view, waited
-from mouse import (
-    at,
-    click,
-    event,
-    find,
-    is_ours,
-    is_sidebar_open,
-    let_go,
-    open_sidebar,
-    point_at_tab,
-    press,
-)
 
 
 def is_open():
@@ -41,7 +30,7 @@ def is_held():
     sessions = sys.modules[f"{KEY}.session"]._open
     if not (sessions and sessions[0].hello):
         return False
-    at["before"] = places()
+    mouse.at["before"] = places()
     return waited(0.5)
 
 
@@ -56,16 +45,16 @@ def point_at_branch():
     nearest = min(front, key=lambda vertex: (vertex.co - origin).length)
     place = view3d_utils.location_3d_to_region_2d(
         region, area.spaces.active.region_3d, thing.matrix_world @ nearest.co)
-    at.update(x=region.x + place.x, y=region.y + place.y)
-    event("MOUSEMOVE")
+    mouse.at.update(x=region.x + place.x, y=region.y + place.y)
+    mouse.event("MOUSEMOVE")
     return True
 
 
 def drag():
-    at["x"] += 3
-    event("MOUSEMOVE")
+    mouse.at["x"] += 3
+    mouse.event("MOUSEMOVE")
     seen["clicks_to_bent"] = seen["clicks"]
-    seen["bent_m"] = max(abs(a - b) for a, b in zip(places(), at["before"], strict=True))
+    seen["bent_m"] = max(abs(a - b) for a, b in zip(places(), mouse.at["before"], strict=True))
     if seen["bent_m"] > 0.0 and "answer_s" not in seen:
         seen["answer_s"] = processor_seconds(sys.modules[f"{KEY}.session"]._open[0].pid)
     return seen["bent_m"] > 0.01
@@ -73,7 +62,7 @@ def drag():
 
 def leave():
     if "left" not in started:
-        event("ESC", "PRESS")
+        mouse.event("ESC", "PRESS")
         started["left"] = True
     if not waited(0.5):
         return False
@@ -90,15 +79,15 @@ def point_at_goal():
     _, area, region = view()
     place = view3d_utils.location_3d_to_region_2d(
         region, area.spaces.active.region_3d, goal().matrix_world.translation)
-    at.update(x=region.x + place.x, y=region.y + place.y, goal=goal().location.copy())
-    event("MOUSEMOVE")
+    mouse.at.update(x=region.x + place.x, y=region.y + place.y, goal=goal().location.copy())
+    mouse.event("MOUSEMOVE")
     return waited(0.3)
 
 
 def drag_goal():
-    at["x"] += 3
-    event("MOUSEMOVE")
-    seen["goal_moved_m"] = (goal().location - at["goal"]).length
+    mouse.at["x"] += 3
+    mouse.event("MOUSEMOVE")
+    seen["goal_moved_m"] = (goal().location - mouse.at["goal"]).length
     return seen["goal_moved_m"] > 0.01
 
 
@@ -109,8 +98,10 @@ def is_goal_planned():
     return waited(0.3)
 
 
-drive([open_sidebar, is_sidebar_open, point_at_tab, click, is_ours, picture("tab"),
-       find("open_example"), click, is_open, picture("example"),
-       find("grab"), click, is_held, point_at_branch, press, drag, picture("bent"), let_go, leave,
-       point_at_goal, press, drag_goal, picture("goal"), let_go, is_goal_planned],
+drive([mouse.open_sidebar, mouse.is_sidebar_open, mouse.point_at_tab, mouse.click, mouse.is_ours,
+       picture("tab"),
+       mouse.find("open_example"), mouse.click, is_open, picture("example"),
+       mouse.find("grab"), mouse.click, is_held, point_at_branch, mouse.press, drag,
+       picture("bent"), mouse.let_go, leave,
+       point_at_goal, mouse.press, drag_goal, picture("goal"), mouse.let_go, is_goal_planned],
       longest=120)

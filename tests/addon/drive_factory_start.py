@@ -10,22 +10,13 @@ import bpy
 from bpy_extras.view3d_utils import location_3d_to_region_2d
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, drive, is_tab_open, override, picture, seen, view
+from driving import FOLDER, KEY, drive, is_tab_open, override, picture, seen, start, view
 
 
 def begin():
     view()[1].spaces.active.show_region_ui = True
     seen["at_start"] = sorted(thing.name for thing in bpy.context.scene.objects)
     return True
-
-
-def start(operator, **keywords):
-    def step():
-        with override():
-            getattr(bpy.ops.limber, operator)("INVOKE_DEFAULT", **keywords)
-        return True
-    step.__name__ = operator
-    return step
 
 
 def shown(name):

@@ -11,23 +11,8 @@ import bpy
 from bpy_extras import view3d_utils
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, drive, picture, seen, view, waited
-from mouse import (
-    at,
-    click,
-    event,
-    find,
-    is_ours,
-    is_sidebar_open,
-    let_go,
-    open_sidebar,
-    point_at_tab,
-    press,
-)
-
-
-def part(name):
-    return sys.modules[f"{KEY}.{name}"]
+import mouse
+from driving import FOLDER, drive, part, picture, seen, view, waited
 
 
 def browser(kind):
@@ -44,8 +29,8 @@ def is_browser_open():
 def point_at_file():
     """At the first row of the list."""
     window, _, region = browser("WINDOW")
-    at.update(x=region.x + 120, y=region.y + region.height - 35, window=window)
-    event("MOUSEMOVE")
+    mouse.at.update(x=region.x + 120, y=region.y + region.height - 35, window=window)
+    mouse.event("MOUSEMOVE")
     return waited(0.3)
 
 
@@ -57,13 +42,13 @@ def is_chosen():
 def point_at_import():
     """At the button in the lower right corner."""
     window, _, region = browser("EXECUTE")
-    at.update(x=region.x + region.width - 70, y=region.y + region.height // 2, window=window)
-    event("MOUSEMOVE")
+    mouse.at.update(x=region.x + region.width - 70, y=region.y + region.height // 2, window=window)
+    mouse.event("MOUSEMOVE")
     return waited(0.3)
 
 
 def is_imported():
-    at.pop("window", None)
+    mouse.at.pop("window", None)
     return "scan scan" in bpy.data.objects and waited(0.5)
 
 
@@ -74,8 +59,8 @@ def is_made():
     cloud, surface = bpy.data.objects["scan scan"], bpy.data.collections["scan"].objects["scan"]
     seen["points"] = len(cloud.data.vertices)
     seen["scan_beside_branch_m"] = max(
-        (surface.closest_point_on_mesh(at)[1] - at).length
-        for at in (cloud.matrix_world @ vertex.co for vertex in cloud.data.vertices))
+        (surface.closest_point_on_mesh(mouse.at)[1] - mouse.at).length
+        for mouse.at in (cloud.matrix_world @ vertex.co for vertex in cloud.data.vertices))
     return True
 
 
@@ -85,8 +70,8 @@ def point_at_grasp():
     _, area, region = view()
     place = view3d_utils.location_3d_to_region_2d(
         region, area.spaces.active.region_3d, grasp.matrix_world.translation)
-    at.update(x=region.x + place.x, y=region.y + place.y)
-    event("MOUSEMOVE")
+    mouse.at.update(x=region.x + place.x, y=region.y + place.y)
+    mouse.event("MOUSEMOVE")
     return waited(0.3)
 
 
@@ -95,8 +80,8 @@ def goal():
 
 
 def drag():
-    at["x"] += 4
-    event("MOUSEMOVE")
+    mouse.at["x"] += 4
+    mouse.event("MOUSEMOVE")
     if goal() is None:
         return False
     grasp = part("branches").find_surface(bpy.context.scene)["limber_grasp_m"][:3]
@@ -126,12 +111,14 @@ def is_planned():
 
 
 steps = [
-    open_sidebar, is_sidebar_open, point_at_tab, click, is_ours,
-    find("import_cloud"), click, is_browser_open, picture("browser"), point_at_file, click,
-    is_chosen, point_at_import, picture("chosen"), click, is_imported, picture("scan"),
-    find("reconstruct"), click, is_made, picture("branch"),
-    point_at_grasp, press, drag, picture("goal"), let_go, is_goal_set, find("plan")]
+    mouse.open_sidebar, mouse.is_sidebar_open, mouse.point_at_tab, mouse.click, mouse.is_ours,
+    mouse.find("import_cloud"), mouse.click, is_browser_open, picture("browser"), point_at_file,
+    mouse.click, is_chosen, point_at_import, picture("chosen"), mouse.click, is_imported,
+    picture("scan"),
+    mouse.find("reconstruct"), mouse.click, is_made, picture("branch"),
+    point_at_grasp, mouse.press, drag, picture("goal"), mouse.let_go, is_goal_set,
+    mouse.find("plan")]
 if (FOLDER / "plan").exists():
     # It takes minutes.
-    steps += [click, is_planned, picture("path")]
+    steps += [mouse.click, is_planned, picture("path")]
 drive(steps, longest=400)

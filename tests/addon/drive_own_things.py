@@ -10,26 +10,13 @@ from pathlib import Path
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, drive, is_tab_open, override, picture, seen, started, view
+from driving import FOLDER, drive, is_tab_open, override, part, picture, seen, start, started, view
 
 idle = {"since": 0.0}
 
 
 def thing_of(name):
     return bpy.data.objects[name]
-
-
-def part(name):
-    return sys.modules[f"{KEY}.{name}"]
-
-
-def start(operator, **keywords):
-    def step():
-        with override():
-            getattr(bpy.ops.limber, operator)("INVOKE_DEFAULT", **keywords)
-        return True
-    step.__name__ = operator
-    return step
 
 
 def is_idle():

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, drive, is_tab_open, override, picture, seen, view, waited
+from driving import FOLDER, drive, is_tab_open, override, part, picture, seen, view, waited
 
 DRAWN_ERRORS = 30
 
@@ -37,10 +37,6 @@ class Open:
         layout, own = self._given
         header, body = layout.panel(f"{own}_{name}", default_closed=False)
         return Open(header, own), None if body is None else Open(body, own)
-
-
-def part(name):
-    return sys.modules[f"{KEY}.{name}"]
 
 
 def begin():

@@ -45,6 +45,21 @@ def is_tab_open():
     return True
 
 
+def part(name):
+    """Return a module of the add-on."""
+    return sys.modules[f"{KEY}.{name}"]
+
+
+def start(operator, **keywords):
+    """Return the step that presses the button of an operator."""
+    def step():
+        with override():
+            getattr(bpy.ops.limber, operator)("INVOKE_DEFAULT", **keywords)
+        return True
+    step.__name__ = operator
+    return step
+
+
 def override(kind="WINDOW"):
     window, area, region = view(kind)
     return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)

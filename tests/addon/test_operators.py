@@ -379,8 +379,9 @@ def test_a_job_that_blender_ends_is_no_failure(bpy, registered, tmp_path):
     """File > New while the worker works: the panel of the new file shows no failure."""
     jobs = importlib.import_module("limber_addon.jobs")
     operators = importlib.import_module("limber_addon.operators.worker_operator")
-    operator = operators.WorkerOperator()
-    operator._job = jobs.start("Working", [sys.executable, "-c", "import time; time.sleep(60)"])
-    operator.cancel(bpy.context)
-    assert operator._job.state is jobs.JobState.CANCELLED and not operator._job.error
-    assert operator._job._process.stdout.closed and operator._job._process.stderr.closed
+    job = jobs.start("Working", [sys.executable, "-c", "import time; time.sleep(60)"])
+    operators._beside.append(operators._Beside("limber.energy", job, {}, {}))
+    bpy.ops.wm.read_homefile()
+    assert job.state is jobs.JobState.CANCELLED and not job.error
+    assert job._process.stdout.closed and job._process.stderr.closed
+    assert jobs.current() is None and operators._look() is None

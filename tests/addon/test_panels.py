@@ -227,6 +227,9 @@ def test_paths_and_moduli_stand_side_by_side(bpy, panels, tmp_path):
     shutil.copytree(EXAMPLE, tmp_path / "example")
     bpy.ops.limber.open_result(directory=str(tmp_path / "example"))
     plan, estimate = _draw_step(bpy, "plan"), _draw_step(bpy, "estimate")
+    # It ran elsewhere: its warning is in the folder.
+    assert any("A gap of 32 mm was bridged" in text
+               for text in _draw_step(bpy, "skeleton").names("label"))
     result = json.loads((EXAMPLE / "plans" / "to-goal.json").read_text())
     texts = plan.names("label")
     for key in ("plan", "baseline"):
@@ -278,6 +281,10 @@ def test_without_a_client_for_robots_there_is_no_robot(bpy, panels, whole_texts,
         None if name == "rtde_control" else found(name)))
     is_there, after = shown()
     assert not is_there and "Record a Pull" not in after
+    layout = Layout()
+    panel = _step(bpy, "report")
+    panel.draw_header(SimpleNamespace(layout=layout, step=panel.step), bpy.context)
+    assert layout.names("label") == ["8"], "numbers without a gap"
     assert sum("ur-rtde" in text for text in after) == 1
 
 
@@ -331,7 +338,11 @@ def test_a_running_and_a_failed_job(bpy, panels):
     job.wait()
     assert not panels("job").poll(bpy.context)
     jobs.start("Reconstructing", [sys.executable, "-c", "raise SystemExit('no points')"]).wait()
-    assert "no points" in " ".join(_draw(panels("job"), bpy.context).names("label"))
+    drawn = _draw(panels("job"), bpy.context)
+    assert "no points" in " ".join(drawn.names("label"))
+    assert drawn.names("operator") == ["limber.cancel_job"]
+    assert bpy.ops.limber.cancel_job() == {"FINISHED"}
+    assert not panels("job").poll(bpy.context), "dismissed"
 
 
 def test_no_worker_is_said_in_the_panel(bpy, panels, monkeypatch):
@@ -376,28 +387,50 @@ def test_every_choice_has_a_tooltip(bpy, panels):
                 assert item.description, (stage.name, field.name, item.identifier)
 
 
+def _change(content, scene, *, without=(), rewritten="", ended=(), queued="", folder="",
+            **settings):
+    """Bring folder, settings, outcomes and queue into a state."""
+    for part in ("stages", "files"):
+        content[part] = {name: entry for name, entry in content[part].items()
+                         if not name.startswith(tuple(without) or "-")}
+    if rewritten:
+        content["stages"][content["files"][rewritten]["stage"]]["finished"] = "2100-01-01"
+        content["files"][rewritten]["sha256"] = "0" * 64
+    for name, value in settings.items():
+        group, name = name.split("_", 1)
+        group = getattr(scene.limber, group)
+        setattr(group, f"use_{name}", True)
+        setattr(group, name, value)
+    if ended:
+        stage, status = importlib.import_module("limber_addon.stages").stages()[ended[0]], ended[1]
+        importlib.import_module("limber_addon.properties").keep_outcome(
+            scene, stage, scene.limber.branch_folder, {"status": status, "error": "It broke."})
+    if queued:
+        jobs = importlib.import_module("limber_addon.jobs")
+        jobs._waiting.append(jobs.Job(queued, [], folder or scene.limber.branch_folder))
+
+
 @pytest.mark.slow
-def test_the_next_step_is_a_button(bpy, panels, tmp_path):
-    """What was not run and can be: not an estimate without pulls; the plan, which samples first."""
-    steps = importlib.import_module("limber_addon.panels.steps")
-    scene = bpy.context.scene
-    assert steps.next_stage(scene) is None
-    shutil.copytree(EXAMPLE, tmp_path / "example")
-    bpy.ops.limber.open_result(directory=str(tmp_path / "example"))
-    assert steps.next_stage(scene).name == "report"
-    path = tmp_path / "example" / "branch.json"
-    content = json.loads(path.read_text())
-    for key in ("plan:to-goal", "energy", "estimate"):
-        del content["stages"][key]
-    path.write_text(json.dumps(content))
-    assert steps.next_stage(scene).name == "estimate"
-    for name in [name for name in content["files"] if name.startswith("pulls/")]:
-        del content["files"][name]
-    content["files"].pop("energy.npz", None)
-    path.write_text(json.dumps(content))
-    assert steps.next_stage(scene).name == "plan"
-    drawn = _draw(panels("result"), bpy.context)
-    assert ("operator", "limber.plan", "Next: Plan Path") in drawn.calls
+def test_the_next_step_is_a_button_in_thirty_states(bpy, panels, tmp_path):
+    """From the folder, the settings, the last outcomes and the queue: not an estimate without
+    pulls; the plan, which samples first."""
+    path, found = tmp_path / "example" / "branch.json", []
+    table = json.loads(Path(__file__).with_name("next_steps.json").read_text())
+    shutil.copytree(EXAMPLE, path.parent)
+    whole = path.read_text()
+    for changes, _ in table:
+        path.write_text(whole)
+        bpy.ops.limber.open_result(directory=str(path.parent))
+        _change(content := json.loads(whole), bpy.context.scene, **changes)
+        path.write_text(json.dumps(content))
+        found.append(next((name.removeprefix("limber.") for kind, name, *title in
+                           _draw(panels("result"), bpy.context).calls
+                           if kind == "operator" and str(title[:1]).startswith("['Next: ")), None))
+        importlib.import_module("limber_addon.jobs")._waiting.clear()
+        for group in ("estimate", "plan"):
+            getattr(bpy.context.scene.limber, group).outcome = ""
+        bpy.context.scene.limber.plan.name = "to-goal"
+    assert list(enumerate(found)) == list(enumerate(name for _, name in table))
     menu = Layout()
     bpy.types.LIMBER_MT_colours.draw(SimpleNamespace(layout=menu), bpy.context)
     assert len(menu.names("operator")) == 7

@@ -24,7 +24,6 @@ from limber.planning.settings import PlanSpec
 RADIUS = 0.2  # [m] of the shell about the origin
 ALONG, OFF = 20.0, 4e4  # [N/m] along the shell and off it: it yields a two thousandth as easily
 GOAL = GraspGoal((0.06, 0.0, float(np.sqrt(RADIUS**2 - 0.06**2))), 0.004)
-HELD = ALONG * RADIUS * (np.arcsin(0.06 / RADIUS) - 0.02)  # [N] nearly, where the goal begins
 
 
 @pytest.fixture(scope="module")
