@@ -7,10 +7,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from tests.stages.specified import Simulated
-<<<<<<< HEAD
-=======
-from tests.subjects.meshes import beam_folder
->>>>>>> f6643d11 (Let timers look at the add-on's jobs; read warnings from the folder)
 
 from limber.cli.main import call
 from limber.core.errors import ConvergenceError, InputError
@@ -27,14 +23,6 @@ from limber.store.loading import load_model
 KEYS = {"converged", "frame_count", "energy_j", "grasp_force_n", "tip_displacement_m", "min_det_f"}
 
 
-<<<<<<< HEAD
-=======
-@pytest.fixture
-def folder(tmp_path):
-    return beam_folder(tmp_path / "beam.branch", 20, 0.011)
-
-
->>>>>>> f6643d11 (Let timers look at the add-on's jobs; read warnings from the folder)
 def test_motion_writes_what_the_design_says(folder):
     """A pull in time: keys, PC2 of the surface, first frame the scan, skipped when current."""
     settings = SimulateSettings(move=(0.02, 0, -0.001), duration=0.2, hold=0.1, grasp_mode="point")

@@ -1,12 +1,10 @@
 """Structured meshes, whose volume is exact."""
 
 from itertools import permutations, product
-from pathlib import Path
 
 import numpy as np
 
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.store import Branch
 
 
 def box_mesh(size=(0.01, 0.01, 0.03), counts=(2, 2, 3), quadratic=True) -> TetMesh:
@@ -27,20 +25,6 @@ def box_mesh(size=(0.01, 0.01, 0.03), counts=(2, 2, 3), quadratic=True) -> TetMe
     mesh = TetMesh(nodes, np.array(tets)).oriented()
     mesh = mesh.quadratic() if quadratic else mesh
     return mesh.with_data(point_data={"fixed": (mesh.nodes[:, 2] < 1e-9).astype(np.int64)})
-
-
-def beam_folder(path: Path, layers: int, reach: float) -> Path:
-    """A branch folder with the mesh of a short beam, held within ``reach`` of its 0.2 m."""
-    mesh = box_mesh((0.01, 0.01, 0.3), (1, 1, layers))
-    count = mesh.tet_count
-    mesh = mesh.with_data(
-        cell_data={"young": np.full(count, 1e9), "poisson": np.full(count, 0.35),
-                   "density": np.full(count, 900.0)},
-        point_data={"grasp": (np.abs(mesh.nodes[:, 2] - 0.2) < reach).astype(np.int64)})
-    branch = Branch.create(path)
-    with branch.stage("reconstruct") as stage:
-        mesh.write(stage.path("mesh.vtu"))
-    return branch.folder
 
 
 def round_mesh(radius_base, radius_tip, length, rings, layers, quadratic=True) -> TetMesh:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from scipy.optimize import brentq
-from tests.subjects.meshes import beam_folder, box_mesh
+from tests.subjects.meshes import box_mesh
 from tests.subjects.prescribed import solve_prescribed
 
 from limber.cli.main import call
@@ -287,14 +287,6 @@ def test_derivatives(mesh, material):
         assert error < 2e-4 * np.abs(swing).max()
 
 
-<<<<<<< HEAD
-=======
-@pytest.fixture
-def folder(tmp_path):
-    return beam_folder(tmp_path / "beam.branch", 10, 0.016)
-
-
->>>>>>> f6643d11 (Let timers look at the add-on's jobs; read warnings from the folder)
 def simulated(capsys, folder, material, *options):
     code = call(["simulate", str(folder), "--material", material, "--duration", "0.1", "--hold",
                  "0", "--move", "0.05", "0", "-0.005", "--json", *options])
