@@ -56,8 +56,8 @@ def require_no_slip(pull: Pull) -> Pull:
                              "Name the unit in the title of that column, such as t_ms.")
     if length > _LONGEST_S:
         raise InputError(f"{name}: the times of the gripper span {length:.4g} s.",
-                         "No pull lasts longer than an hour. They are likely milliseconds.",
-                         "Name the unit in the title of the column, such as t_ms.")
+                         "No pull lasts longer than an hour. They are likely milliseconds or "
+                         "microseconds.", "Name the unit in the title of the column: t_ms, t_us.")
     turn = float(np.nanmax(np.linalg.norm(poses[:, 3:], axis=1), initial=0.0))
     if turn > 2 * np.pi:
         raise InputError(f"{name}: the gripper's rotation vector has a length of {turn:.4g} rad.",

@@ -36,9 +36,10 @@ def current_manifest(folder: Path) -> Manifest:
 
 
 def current_path(folder: Path, name: str) -> Path:
-    """Return the path of file ``name`` of :func:`current_manifest`, in place or pending."""
-    waiting = inside(folder, f"{_COMMIT}/{name}")
-    return waiting if waiting.is_file() else inside(folder, name)
+    """Return the path of file ``name`` of :func:`current_manifest`, in place or pending. A missing
+    one takes no walk along its path: a damaged manifest may list any number."""
+    held = [part for part in (f"{_COMMIT}/{name}", name) if os.path.isfile(f"{folder}/{part}")]
+    return inside(folder, held[0]) if held else folder / name
 
 
 def unfinished_error(folder: Path) -> BranchFolderError:

@@ -39,7 +39,8 @@ class Batch(Tool):
     leaves = "keep"
     [[job.stage]]
     run = "import-pull"
-    source = "pulls/{scan}/*.csv"       # one run for each file that is found
+    source = "pulls/{scan}/markers/*.csv"       # one run for each file that is found
+    robot = "pulls/{scan}/robot/{file}.csv"     # the gripper's table of the same name
     name = "{file}"
     [[job.stage]]
     run = "estimate"

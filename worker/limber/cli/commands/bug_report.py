@@ -6,13 +6,16 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from limber.core.errors import InputError
-from limber.core.files.atomic import replacing
+from limber.core.errors import BranchFolderError, InputError
+from limber.core.files.atomic import file_digest, replacing
 from limber.core.files.safe_names import has_other_names, is_link
 from limber.core.json_values import plain
 from limber.core.progress import SILENT, Progress
 from limber.stages.stage import About, Tool, argument, given, option
 from limber.store.manifest import MANIFEST
+
+_MOST_BYTES = 2 << 30
+"""Size of a file that is read and packed; a larger one, perhaps full of holes, is named only."""
 
 
 class BugReport(Tool):
@@ -51,7 +54,8 @@ class BugReport(Tool):
         told["files"] = {names[path]: {"bytes": path.stat().st_size, "sha256": _digest(path)}
                          for path in files}
         # A file with a second name elsewhere may not belong to the branch either.
-        kept = {path for path in files if source.is_dir() and has_other_names(path)}
+        kept = {path for path in files if path.stat().st_size > _MOST_BYTES
+                or (source.is_dir() and has_other_names(path))}
         told["not_packed"] = sorted(names[path] for path in kept)
         count = 0
         try:
@@ -73,7 +77,6 @@ class BugReport(Tool):
 
 
 def _of_folder(folder: Path) -> dict[str, Any]:
-    from limber.core.errors import BranchFolderError
     from limber.store import Branch
 
     try:
@@ -86,9 +89,7 @@ def _of_folder(folder: Path) -> dict[str, Any]:
 
 
 def _digest(path: Path) -> str:
-    from limber.core.files.atomic import file_digest
-
     try:
-        return file_digest(path)
+        return "too large" if path.stat().st_size > _MOST_BYTES else file_digest(path)
     except OSError as error:
         return f"not readable: {error.strerror}"

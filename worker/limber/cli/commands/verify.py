@@ -36,7 +36,7 @@ class Verify(BranchStage, Tool):
         progress(0.0, "comparing with checksums")
         damages = branch.damages()
         if damages:
-            raise damage_error(branch.folder, damages, shown_count=len(damages))
+            raise damage_error(branch.folder, damages, shown_count=100)
         found = branch.manifest.files
         return {"uuid": branch.uuid, "file_count": len(found),
                 "byte_count": sum(entry.bytes for entry in found.values()),
