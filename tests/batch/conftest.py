@@ -52,3 +52,10 @@ def two_branches(tmp_path, branch_template):
     for name in ("one", "two"):
         shutil.copytree(branch_template, tmp_path / f"{name}.branch")
     return tmp_path
+
+
+@pytest.fixture
+def orchard(two_branches, request):
+    """Two branch folders, and the module's job file for them."""
+    (two_branches / "jobs.toml").write_text(request.module.JOBS)
+    return two_branches

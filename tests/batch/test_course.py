@@ -38,13 +38,6 @@ young = ["40 MPa", "22 MPa", "12 MPa", "3 MPa"]
 """
 
 
-@pytest.fixture
-def orchard(two_branches):
-    """Two branch folders and a job file for them."""
-    (two_branches / "jobs.toml").write_text(JOBS)
-    return two_branches
-
-
 def states(path: Path) -> list[list[str]]:
     jobs = read_jobs(path)
     records = Records(jobs)

@@ -24,13 +24,7 @@ at = [0.0, 0.0, 0.2]
 
 
 @pytest.fixture
-def orchard(two_branches, here):
-    (two_branches / "jobs.toml").write_text(JOBS)
-    return two_branches
-
-
-@pytest.fixture
-def batch(orchard, capsys):
+def batch(orchard, here, capsys):
     """Runs the batch; returns exit code, result and the state of each task."""
     def run(*more):
         code = main.call(["batch", str(orchard / "jobs.toml"), "--json", *more])

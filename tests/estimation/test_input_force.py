@@ -8,7 +8,6 @@ import pytest
 from benchmarks.paper_branches import measured
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import rotation_matrix
-from limber.estimation.fitting.optimise import nelder_mead
 from limber.estimation.forward.forward_model import course_of, motion_response, nodal_loads
 from limber.estimation.forward.observed_path import ObservedPathForward
 from limber.estimation.forward.solved_pull import DynamicForward
@@ -150,17 +149,6 @@ def test_response_of_a_small_motion(small_bench):
     true = np.array([operator @ frame.ravel() for frame in result.displacement])
     found = (response @ forces.ravel()).reshape(13, -1)
     assert np.linalg.norm(found - true) < 0.03 * np.linalg.norm(true)
-
-
-@pytest.mark.slow
-def test_nelder_mead_says_why_it_ended(small_bench, noisy):
-    """Too few simulations: not converged, and the reason says so."""
-    settings = SETTINGS.model_copy(update={"key_frames": 4})
-    pull = driven(noisy)
-    pull = replace(pull, entry=pull.entry.model_copy(update={"drive": "pose"}))
-    short = nelder_mead(small_bench.objective([pull], settings), np.log(TRUTH) + 0.3,
-                        evaluation_limit=12)
-    assert not short.converged and "12 simulations were not enough" in short.reason
 
 
 @pytest.mark.slow

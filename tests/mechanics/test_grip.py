@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.subjects.meshes import box_mesh
 
 from limber.core.numerics.rigid import rotation_matrix
 from limber.estimation.forward.forward_model import nodal_loads
@@ -103,3 +104,11 @@ def test_only_what_is_in_the_gripper_is_stiffer():
     assert held.with_young(2 * YOUNG).lame_mu == pytest.approx(2 * held.lame_mu)
     assert held.gripped().lame_mu == pytest.approx(model.lame_mu)
     assert model.gripped(Grasp.at(model.mesh, [0, 0, PLACE], HALF, "point")) is model
+
+
+@pytest.mark.parametrize("radius", [0.003, 0.006, 0.01, 0.012, 0.02])
+def test_a_load_on_an_edge_acts_there(radius):
+    """However wide the patch: nodes off the edge would give it another lever."""
+    mesh = box_mesh((0.03, 0.03, 0.1), (6, 6, 20))
+    grasp = Grasp.at(mesh, [0.0, 0.015, 0.1], radius, "point")
+    assert grasp.weights @ mesh.nodes[grasp.nodes] == pytest.approx([0.0, 0.015, 0.1], abs=1e-9)

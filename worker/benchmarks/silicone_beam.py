@@ -117,8 +117,7 @@ def estimate_beam(branch: Path, recording: Path, load: float, name: str) -> Beam
     x, y, z = in_scan(LOAD_POINT_M)
     pull = ImportPull(branch_folder=branch, source=recording, name=name,
                       nominal=str(branch.parent / "nominal.csv"), coordinates="scan", weight=load,
-                      own_weight=True, grasp_point=(float(x), float(y), float(z)),
-                      grasp_radius=0.012).run()
+                      own_weight=True, grasp_point=(float(x), float(y), float(z))).run()
     found = EstimateYoung(branch_folder=branch, pull=(name,), fractions=(0.5,), force=True).run()
     down = -np.array(pull["load_n"]) / load
     measured = -np.mean(np.array(pull["displacement_m"])[TIPS] @ down)
@@ -317,7 +316,7 @@ def _imported(branch: Branch, recording: Path, name: str,
     _write_places(places, NOMINAL_M)
     ImportPull(branch_folder=branch.folder, source=recording, name=name, nominal=str(places),
                weight=LOAD_N, own_weight=True, motion=motion,
-               grasp_point=tuple(LOAD_POINT_M.tolist()), grasp_radius=0.012).run()
+               grasp_point=tuple(LOAD_POINT_M.tolist())).run()
 
 
 def real_row(_setting: Setting) -> list[Row]:

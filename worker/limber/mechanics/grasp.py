@@ -161,6 +161,11 @@ class Grasp:
             if mesh.point_data.get("fixed", np.zeros(mesh.node_count))[nodes].any():
                 break
             grasp = cls.of_nodes(mesh, nodes, mode, point)
+        if mode == "point" and radius > 0 and np.linalg.norm(grasp.centre - point) > 1e-6 * radius:
+            nodes = np.flatnonzero(distance <= radius)
+            weights = _on_edge(_patch_weights(mesh, nodes), mesh.nodes[nodes] - point)
+            if weights is not None:
+                return cls(nodes, weights, weights @ mesh.nodes[nodes], mode)
         return grasp
 
     @classmethod
@@ -340,6 +345,19 @@ def _centred(weights: np.ndarray, offset: np.ndarray) -> np.ndarray:
                                                             * along.max(axis=0))
     slope = np.where(reached, intercept / np.where(reached, variance, 1.0), 0.0)
     return weights * (1.0 + along @ slope)
+
+
+def _on_edge(weights: np.ndarray, offset: np.ndarray) -> np.ndarray | None:
+    """Return weights, none negative, of a grasp on a body's edge, ``offset`` [k, 3] [m] from it:
+    only nodes of the edge have some. None if fewer than three would, or none are around it."""
+    while True:
+        arm = offset - weights @ offset
+        inverse = np.linalg.pinv((weights[:, None] * arm).T @ arm, 1e-9, hermitian=True)
+        found = weights * (1.0 - arm @ (inverse @ (weights @ offset)))
+        if found.min() > -1e-9:
+            is_there = np.abs(found @ offset).max() < 1e-7 * np.abs(offset).max()
+            return found if is_there and np.sum(found > 0) >= _FEWEST_HELD else None
+        weights = np.where(found > 0, found, 0.0) / found[found > 0].sum()
 
 
 def _patch_weights(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:

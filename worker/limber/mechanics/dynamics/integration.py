@@ -245,7 +245,10 @@ class NewmarkStepper(Stepper):
             first = increment is None
             if fresh:
                 self._tangent_error, fresh = norm / norms[-1], False
-            keep = self._may_keep(dt) if first else (
+            # The last tangent fits if its own solve reduced the residual a thousandfold.
+            keep = (settings.keep_factor > 0 and self.tangent is not None
+                    and self._tangent_step == dt and self._tangent_error <= _KEPT_TANGENT_ERROR
+                    ) if first else (
                 norm <= settings.keep_factor * reference and norm < 0.1 * norms[-1])
             if not keep:
                 if not self._make_tangent(new, increment, viscous, dt):
@@ -271,12 +274,6 @@ class NewmarkStepper(Stepper):
         new.velocity = old.velocity + dt * (
             (1 - gamma) * old.acceleration + gamma * new.acceleration)
         self.drive.hold(new)
-
-    def _may_keep(self, dt: float) -> bool:
-        """Whether the last tangent fits the state before this step. It does if its own solve
-        reduced the residual a thousandfold."""
-        return (self.settings.keep_factor > 0 and self.tangent is not None
-                and self._tangent_step == dt and self._tangent_error <= _KEPT_TANGENT_ERROR)
 
     def _make_tangent(self, new: MotionState, increment: np.ndarray | None,
                       viscous: Viscous | None, dt: float) -> bool:

@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.dynamics.motion import lowest_modes
 from limber.mechanics.materials.materials import RayleighDamping
@@ -180,7 +179,7 @@ class LoadedOutdoors:
                              "Start with gravity; check Young's modulus and the masses of targets.")
         self.skeleton = skeleton
         self.gone = _beyond(skeleton, loads.cuts)
-        self.is_gone = _tets_of(model.mesh, skeleton, self.gone)
+        self.is_gone = self.gone[cKDTree(skeleton.nodes).query(model.mesh.centroids)[1]]
         self._plain = model
         start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
         kept = ~self.gone[1:]
@@ -195,7 +194,8 @@ class LoadedOutdoors:
             self._wind += (point_operator(model.mesh, middle).T @ pushes.ravel()).reshape(-1, 3)
         self._forces = self._wind.copy()
         self.wind_force = self._wind.sum(axis=0)
-        self._model = self._cut(model)
+        self._model = model if not self.is_gone.any() else model.with_parameters(
+            density=np.where(self.is_gone, _REMAINS * model.density, model.density))
         # The scanned shape carries the weight of the cut-off part: without it, the branch springs
         # up.
         lost = model.mass_load - self._model.mass_load
@@ -276,12 +276,6 @@ class LoadedOutdoors:
                               "strain": float(strains[own].max())})
         return found
 
-    def _cut(self, model: BranchModel) -> BranchModel:
-        if not self.is_gone.any():
-            return model
-        return model.with_parameters(
-            density=np.where(self.is_gone, _REMAINS * model.density, model.density))
-
     def _model_under(self, share: float) -> BranchModel:
         if not self._masses:
             return self._model
@@ -341,6 +335,3 @@ def _beyond(skeleton: Skeleton, cuts: Sequence[tuple[float, float, float]]) -> n
     return gone
 
 
-def _tets_of(mesh: TetMesh, skeleton: Skeleton, gone: np.ndarray) -> np.ndarray:
-    nearest = cKDTree(skeleton.nodes).query(mesh.centroids)[1]
-    return gone[nearest]

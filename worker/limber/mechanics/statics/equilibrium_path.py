@@ -553,7 +553,7 @@ class Path:
         # The iteration's tangents belong to intermediate states; the exact one of the last state
         # decides.
         asked = part >= 1.0 or not stable or self.settings.keeps_factor
-        if asked and not self._is_stable(trial):
+        if asked and not self.equations.exact_tangent(self.model, trial).is_positive_definite:
             self.status, self.trouble = Status.unstable, "the equilibrium found is not stable"
             return None
         if not steady and self._lost(trial, state, part) > _LOST:
@@ -579,10 +579,6 @@ class Path:
         change = (state.energy - float((now * trial).sum())
                   - self.state.energy + float((before * self.displacement).sum()))
         return (work - change) / max(abs(work) + abs(change), float(np.finfo(float).tiny))
-
-    def _is_stable(self, trial: np.ndarray) -> bool:
-        """Whether no pivot of the exact tangent's factor is negative."""
-        return self.equations.exact_tangent(self.model, trial).is_positive_definite
 
     def _result(self) -> StaticResult:
         stretch = principal_stretch(self.model, self.displacement)

@@ -85,13 +85,8 @@ def _walked(path: Path, progress: Progress, guess: np.ndarray | None = None,
     uncertainty = why_uncertain(path, result) if asked else ""
     if not uncertainty:
         return result
-    return replace(
-        result, uncertainty=uncertainty, warnings=[*result.warnings, f"{_capital(uncertainty)}."]
-    )
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
+    return replace(result, uncertainty=uncertainty, warnings=[
+        *result.warnings, f"{uncertainty[:1].upper()}{uncertainty[1:]}."])
 
 
 def _verified(problem: StaticProblem, result: StaticResult, goal: Target, pose: np.ndarray | None,
