@@ -1,6 +1,8 @@
 """The paper's three branches: its table of E and nu as truth, on geometry of that size."""
 
+import time
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +25,18 @@ from limber.recordings.recording import Observations, Pull
 from limber.recordings.synchronisation import frames_of
 
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)
+
+
+class Fitted(NamedTuple):
+    """What a method finds of a branch: moduli [Pa] at 4 control points, Poisson's ratio, the sum of
+    squared distances of the points [m^2], simulations and seconds, and whether it converged."""
+
+    young: np.ndarray
+    poisson: float
+    loss: float
+    count: int
+    seconds: float
+    converged: bool
 
 
 @dataclass(frozen=True)
@@ -89,6 +103,20 @@ class PaperBranch:
                           control_points(skeleton, self.fractions), self.fractions,
                           np.array(self.young),
                           is_weightless=True)
+
+    def fitted(self, method: str, seed: int = 0, drive: str = "force",
+               also: tuple[str, ...] = ("poisson",)) -> Fitted:
+        """Fit one noisy pull by ``nelder-mead`` or ``gauss-newton``, as the paper does: the
+        measured force drives, E is interpolated by inverse distances, nu is one of the unknowns."""
+        bench = Bench(self, slice_length=2.4, sides=6)
+        pull = measured(exact_pull(self, 0, frames=30), seed)
+        pull = replace(pull, entry=pull.entry.model_copy(update={"drive": drive}))
+        began = time.process_time()
+        found = bench.fit([pull], FitSpec(hold_out=False, method=method, also=also, key_frames=6,
+                                          poisson=None if also else self.poisson))
+        fit = found.fit
+        return Fitted(found.values.young, found.values.poisson, fit.evaluation.loss,
+                      found.objective.forward_count, time.process_time() - began, fit.converged)
 
 
 BRANCHES = (
