@@ -82,8 +82,8 @@ def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: 
     if len(kept) < len(pairs):
         warnings.append(f"{path.name}: {len(pairs) - len(kept)} incomplete row(s) were discarded.")
     if len(kept) < 3:
-        raise InputError(f"{path} has {len(kept)} complete rows.", "A slope needs at least three.",
-                         "Record more of the push.")
+        raise InputError(f"{path} has too few complete rows ({len(kept)}).",
+                         "A slope needs at least three.", "Record more of the push.")
     return ForceTable(kept[:, 0] * moved_scale, kept[:, 1] * force_scale,
                       _distance(table, path), tuple(warnings))
 

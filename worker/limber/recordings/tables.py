@@ -433,7 +433,7 @@ def time_stream(table: Table, rate_hz: float | None = None, *, keep_repeated: bo
     times, values = in_order(table.path, times, table.values[:, kept], warnings,
                              keep_repeated=keep_repeated)
     if len(times) < 2:
-        raise InputError(f"{table.path} has {len(times)} complete rows.",
+        raise InputError(f"{table.path} has too few complete rows ({len(times)}).",
                          "A pull needs at least two samples.", "Record it again.")
     return Stream(times, values, tuple(table.titles[k] for k in kept), tuple(warnings))
 

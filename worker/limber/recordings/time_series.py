@@ -50,7 +50,7 @@ def read_stream(path: str | Path) -> Stream:
     at = header.index("t_s")
     times, values = in_order(path, table[:, at], np.delete(table, at, axis=1), warnings)
     if len(times) < 2:
-        raise InputError(f"{path} has {len(times)} complete rows.",
+        raise InputError(f"{path} has too few complete rows ({len(times)}).",
                          "A pull needs at least two samples.", "Record it again.")
     return Stream(times, values, tuple(name for name in header if name != "t_s"), tuple(warnings))
 

@@ -266,7 +266,7 @@ class Table:
                                f"values.", "A point of COLMAP has at least "
                                f"{len(titles)}: {', '.join(titles)}.", "Export it again.")
         if values.shape[1] < 3:
-            raise ColumnsError(f"{self._path} has {values.shape[1]} columns.",
+            raise ColumnsError(f"{self._path} has too few columns ({values.shape[1]}).",
                                "Coordinates need three columns.", "Export it again.")
         used = [k for k in range(self._width) if k not in self._words]
         if len(titles) == values.shape[1] - 1 and counts_up(values[:, 0]):
