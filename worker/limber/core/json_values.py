@@ -39,13 +39,15 @@ def plain(value: Any) -> Any:
 
 def stored(value: Any, largest: float = 0.0) -> Any:
     """Return a value in JSON form with the digits that do not depend on the processor: nine of each
-    number, and of the ``largest`` of a vector [3], since its parts share their error; at least six
-    decimals, for places on a map and stamps of clocks.
+    number, and of the ``largest`` of a vector [3], since its parts share their error. A vector,
+    perhaps a place on a map, keeps six decimals at least; a number, perhaps a stamp, three.
 
     >>> stored([0.1 + 0.2, 1, None, True, 1.2345678912345e-12, 5234567.1234567])
-    [0.3, 1, None, True, 1.23456789e-12, 5234567.123457]
+    [0.3, 1, None, True, 1.23456789e-12, 5234567.123]
     >>> stored({"vector": [1.0, 1e-17, -2e-10], "numbers": [1.0, 1e-17, -0.0, 2.0]})
     {'vector': [1.0, 0.0, 0.0], 'numbers': [1.0, 1e-17, 0.0, 2.0]}
+    >>> stored([5234567.1234567, 0.0, 1.0])
+    [5234567.123457, 0.0, 1.0]
     """
     if isinstance(value, dict):
         return {key: stored(item) for key, item in value.items()}
@@ -55,7 +57,7 @@ def stored(value: Any, largest: float = 0.0) -> Any:
     if not isinstance(value, float):
         return value
     size = max(abs(value), largest) or 1.0
-    return round(value, max(8 - int(np.floor(np.log10(size))), 6)) + 0.0
+    return round(value, max(8 - int(np.floor(np.log10(size))), 6 if largest else 3)) + 0.0
 
 
 def stored_lengths(lengths: np.ndarray) -> np.ndarray:
