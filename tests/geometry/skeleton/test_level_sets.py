@@ -116,3 +116,10 @@ def test_a_shuffled_leafy_scan_has_the_same_skeleton(leaves, of_leaves) -> None:
 
 def _middles(skeleton) -> np.ndarray:
     return (skeleton.nodes[1:] + skeleton.nodes[skeleton.parent[1:]]) / 2
+
+
+def test_thin_leaves_are_no_fat_cylinders(tomato_draws) -> None:
+    """A seedling whose curated axes are 79 mm long: a fit made cylinders, and a search twigs of it.
+    """
+    found = skeletonise(1e-3 * tomato_draws[0][:900])
+    assert found.leafy and found.skeleton.length == pytest.approx(0.079, rel=0.12)

@@ -50,7 +50,7 @@ class SkeletonResult:
             :class:`~limber.geometry.skeleton.root_end.RootChoice`.
         unlikely: Dropped twigs, more likely absent than not, as
             :func:`~limber.geometry.skeleton.confidence.likely` returns them.
-        leafy: Most points were on no cylinder, and axes were placed in the middle of leaves.
+        leafy: Points show leaves, and axes were placed in their middle.
     """
 
     skeleton: Skeleton
