@@ -109,6 +109,8 @@ class _Estimate(_Told):
     creep: _Creep | None = None
     orders: bool = False
     section: dict[str, float] = {}
+    initial: dict[str, float] = {}
+    lumping_error: _Maybe = None
     order_moduli: list[_OrderModulus] = []
     causes: list[Cause] | None = None
     next_actions: list[NextAction] | None = None
@@ -217,6 +219,9 @@ def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, A
                 found.uncertainty.covariance)), strict=True))),
         "field_form_deviations": ([] if subject.field is None
                                   else subject.field.deviations(found.values)),
+        "initial": {"young": subject.start.young[0], "poisson": subject.start.poisson,
+                    "density": subject.start.density},
+        "lumping_error": None if subject.lumping is None else subject.lumping.error,
         "groups": objective.space.groups, "links": objective.space.links,
         "covariance": found.uncertainty.covariance,
         "correlation": found.uncertainty.correlation,

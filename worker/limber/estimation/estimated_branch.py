@@ -1,7 +1,7 @@
 """The branch to estimate: its model and the control points of Young's modulus."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from limber.core.errors import Command, InputError, Option
+from limber.core.json_values import stored
 from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.forward_model import (
@@ -33,6 +34,10 @@ from limber.mechanics.model import BranchModel, CarriedWeight
 from limber.mechanics.points import point_operator
 from limber.recordings.recording import CalibrationEntry, Pull, PullEntry, calibration_of, grasp_on
 from limber.recordings.synchronisation import Frames, frames_of
+
+
+MODEL_YOUNG_PA = 1e8
+"""Modulus of a model before its values are known: fixed, so that none is in a result's rounding."""
 
 
 @dataclass(frozen=True)
@@ -96,12 +101,10 @@ LUMPED_ERROR = 5e-3
 
 @dataclass(frozen=True)
 class Lumping:
-    """How many of a branch's tetrahedra are not meshed, and the largest relative change by that of
-    the linear response of grasps and points to the grippers' forces; ``weight`` is how the mesh's
-    shape carries what is not meshed (None: weightless)."""
+    """Twigs that are not meshed: the largest relative change by that of the linear response of
+    grasps and points to the grippers' forces, and how the mesh's shape carries their weight (None:
+    weightless)."""
 
-    tet_count: int
-    whole_count: int
     error: float
     weight: CarriedWeight | None
 
@@ -123,7 +126,7 @@ def lumped(whole: Subject, pulls: list[Pull], settings: FitSpec) -> Subject:
     if field is not None:
         field = field.on(kept)
     weight: CarriedWeight | None = None
-    bare = BranchModel(mesh, young=whole.start.young[0], poisson=whole.start.poisson,
+    bare = BranchModel(mesh, young=MODEL_YOUNG_PA, poisson=whole.start.poisson,
                        density=whole.start.density, gravity=tuple(model.gravity),
                        point_masses=model.point_masses)
     if model.prestress is not None:
@@ -138,7 +141,7 @@ def lumped(whole: Subject, pulls: list[Pull], settings: FitSpec) -> Subject:
     if error > LUMPED_ERROR:
         return whole
     return replace(whole, mesh=mesh, weights=weights, field=field, model=bare,
-                   lumping=Lumping(mesh.tet_count, whole.mesh.tet_count, error, weight))
+                   lumping=Lumping(error, weight))
 
 
 def _reached(mesh: TetMesh, skeleton: Skeleton, points: np.ndarray,
@@ -220,15 +223,13 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
                          f"tetrahedron {wrong[0]} of mesh.vtu.", "The initial modulus must be "
                          "positive.", "Correct the mesh, or make the branch again with ",
                          Option("young"), ".")
-    young = settings.young or float(np.exp(np.mean(np.log(mesh.cell_data["young"]))))
+    young = settings.young or stored(float(np.exp(np.mean(np.log(mesh.cell_data["young"])))))
     poisson = _or_mean(settings.poisson, mesh.cell_data["poisson"])
     density = _or_mean(settings.density, mesh.cell_data["density"])
-    damping = RayleighDamping()
-    model = BranchModel(mesh, young=young, poisson=poisson, density=density,
+    model = BranchModel(mesh, young=MODEL_YOUNG_PA, poisson=poisson, density=density,
                         gravity=gravity if settings.gravity else None, point_masses=masses)
     model = model.as_scanned() if settings.gravity else model
-    start = Values(np.full(len(points), young), poisson, density,
-                   (damping.mass, damping.stiffness))
+    start = Values(np.full(len(points), young), poisson, density, astuple(RayleighDamping()))
     factor = LayeredSection(**settings.section).on(mesh, skeleton) if settings.section else 1.0
     weights = np.reshape(factor, (-1, 1)) * young_weights(mesh, points)
     field = None
@@ -249,7 +250,8 @@ def observed(folder: Path, pull: Pull, subject: Subject, settings: FitSpec,
 
 
 def _or_mean(value: float | None, field: np.ndarray) -> float:
-    return float(np.mean(field)) if value is None else value
+    # In the digits that files keep: an estimate done again begins with the same.
+    return stored(float(np.mean(field))) if value is None else value
 
 
 # Prepare a fit: forward simulations and free parameters of a branch and its pulls.

@@ -18,6 +18,7 @@ from limber.core.constants import FOUND_SKELETON, UNIT_METRES
 from limber.core.errors import Command, InputError
 from limber.core.files.reading import FileContent, read_json_as
 from limber.core.progress import SILENT, Progress
+from limber.estimation.estimate_file import read_estimate
 from limber.estimation.estimated_branch import Subject, observed, subject_of
 from limber.estimation.settings import EstimateSettings, FitSpec
 from limber.geometry.io.skeletons import read_cylinders, read_skeleton, read_swc
@@ -173,9 +174,8 @@ def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDampin
     swings = [branch.manifest.stages[key] for key in ("swing", "vibration")
               if key in branch.manifest.stages]
     known = max(swings, key=lambda entry: entry.finished).result if swings else {}
-    mass, stiffness = known.get("damping_mass_per_s"), known.get("damping_stiffness_s")
-    if (isinstance(mass, int | float) and isinstance(stiffness, int | float)
-            and mass >= 0 and stiffness >= 0):
+    mass, stiffness = known.get("damping_mass_per_s", -1), known.get("damping_stiffness_s", -1)
+    if all(isinstance(each, int | float) and each >= 0 for each in (mass, stiffness)):
         return RayleighDamping(float(mass), float(stiffness))
     progress.warn("No swing has been fitted, so the damping of simulations is used.")
     return DEFAULT_DAMPING
@@ -195,8 +195,6 @@ def stiffness_deviation(branch: Branch) -> float | None:
             return abs(math.log(interval[1] / interval[0])) / (2 * 1.96)
     if not branch.has("estimate.json"):
         return None
-    from limber.estimation.estimate_file import read_estimate
-
     known = read_estimate(branch.path("estimate.json"))
     intervals = np.array(known.get("bending_stiffness_interval_nm2")
                          or known.get("young_interval_pa") or np.zeros((0, 2)), float)
@@ -216,12 +214,10 @@ def load_model(branch: Branch, *, gravity: bool = True, young: float | np.ndarra
     mesh = load_mesh(branch)
 
     def known(name: str, value: float | np.ndarray | None) -> float | np.ndarray:
-        if value is not None:
-            return value
-        if name not in mesh.cell_data:
+        if value is None and name not in mesh.cell_data:
             raise InputError(f"{branch.folder}/mesh.vtu has no cell data {name!r}.",
                              "The material is unknown.", "Reconstruct again.")
-        return mesh.cell_data[name]
+        return mesh.cell_data[name] if value is None else value
 
     return BranchModel(
         mesh, young=known("young", young), poisson=known("poisson", poisson),
@@ -239,8 +235,7 @@ def load_grasp_model(branch: Branch, *, gravity: bool, progress: Progress = SILE
 
 def density_sigma(branch: Branch) -> float:
     """Return the relative standard deviation of the density with which the branch was made."""
-    return branch.made.settings.get("density_sigma", DENSITY_SIGMA) if branch.made else (
-        DENSITY_SIGMA)
+    return (branch.made.settings if branch.made else {}).get("density_sigma", DENSITY_SIGMA)
 
 
 def density_digest(branch: Branch) -> dict[str, str]:
@@ -250,10 +245,15 @@ def density_digest(branch: Branch) -> dict[str, str]:
 
 
 def fit_spec(branch: Branch, settings: EstimateSettings) -> FitSpec:
-    """Return what an estimate of the branch does; what Python gives whole stays as it is."""
+    """Return what an estimate of the branch does; what Python gives whole stays as it is. It begins
+    as the first one did: what that found is in the mesh, and no knowledge from before the pulls."""
     spec = FitSpec.of(settings)
-    return spec if isinstance(settings, FitSpec) else spec.model_copy(
-        update={"density_sigma": density_sigma(branch)})
+    update: dict[str, float] = {} if isinstance(settings, FitSpec) else {
+        "density_sigma": density_sigma(branch)}
+    if branch.has("mesh.vtu") and branch.manifest.files["mesh.vtu"].stage == "estimate":
+        before = read_estimate(branch.path("estimate.json")).get("initial", {})
+        update |= {name: value for name, value in before.items() if getattr(spec, name) is None}
+    return spec.model_copy(update=update)
 
 
 def load_subject(branch: Branch, settings: FitSpec) -> Subject:

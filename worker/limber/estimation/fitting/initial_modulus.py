@@ -383,7 +383,7 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
     for number, part in enumerate(PARTS):
         forwards = [forward.until(max(int(part * len(forward.frames)), FEWEST_FRAMES))
                     for forward in objective.forwards]
-        short = objective.with_forwards(forwards).with_space(likely)
+        short = objective.with_space(likely, forwards)
         if number == 0:
             values = _scanned(short, standing(short, values))
         fit = gauss_newton(short, likely.pack(values), evaluation_limit=12, tolerance=1e-2,

@@ -300,17 +300,13 @@ class Objective:
                                                             strict=True)]
         self.cell_errors = CellErrors(forwards)
 
-    def with_space(self, space: ParameterSpace) -> "Objective":
-        """Return an objective on other parameters with the same log and count."""
-        other = Objective(self.forwards, space, log=self.log, force_sigma=self.force_sigma,
-                          progress=self._progress, expected_count=self._expected)
-        other.forward_count = self.forward_count
-        return other
-
-    def with_forwards(self, forwards: list[Forward]) -> "Objective":
-        """Return an objective with other models of the same pulls and the same log and count."""
-        other = Objective(forwards, self.space, log=self.log, force_sigma=self.force_sigma,
-                          progress=self._progress, expected_count=self._expected)
+    def with_space(self, space: ParameterSpace, forwards: list[Forward] | None = None,
+                   ) -> "Objective":
+        """Return an objective on other parameters, and perhaps other models of the same pulls, with
+        the same log and count."""
+        other = Objective(forwards or self.forwards, space, log=self.log,
+                          force_sigma=self.force_sigma, progress=self._progress,
+                          expected_count=self._expected)
         other.forward_count = self.forward_count
         return other
 

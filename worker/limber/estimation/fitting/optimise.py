@@ -136,7 +136,7 @@ class _Search:
             fall = -np.inf if tried is None else _cost(at, robust) - _cost(tried, robust)
             linear = residual + slopes @ step
             foreseen = 0.5 * float(residual @ residual - linear @ linear)
-            if fall <= 0:
+            if tried is None or fall <= 0:
                 # Too little was to be gained.
                 if damping > MOST_DAMPING or tried is not None and foreseen < max(
                         ending * _cost(at, robust), UNSETTLED_FALL):

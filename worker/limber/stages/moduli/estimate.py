@@ -121,6 +121,8 @@ class Estimate(Result):
             f"Method: {estimate['method']}; {estimate['forward_count']} forward simulations; "
             f"loss {estimate['loss_m2']:.3g} m²; "
             f"{'converged' if estimate['converged'] else 'NOT converged'}.")
+        if error := estimate.get("lumping_error"):
+            section.text.append(f"Rigid twigs change the pulls' response by {100 * error:.2g} %.")
         for figure, caption in report_figures(estimate):
             section.draw(figure, caption)
         section.text += estimate.get("warnings", [])
@@ -212,10 +214,9 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
     subject = load_subject(branch, settings)
     digests = {"mesh geometry": subject.mesh.geometry_digest(),
                "pulls": pulls_digest(branch, names)} | density_digest(branch)
-    if asked.is_kept(branch, digests=digests):
-        stored = branch.manifest.stages["estimate"].result
-        if not stored.get("stopped"):
-            return stored
+    if asked.is_kept(branch, digests=digests) and not (
+            stored := branch.manifest.stages["estimate"].result).get("stopped"):
+        return stored
     warnings: list[str] = []
     heard = progress.keeping(warnings)
     pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
@@ -350,8 +351,7 @@ def _followed(branch: Branch, settings: EstimateSettings) -> tuple[str, Callable
         return name, lambda: branch.growing(f"pulls/{name}") or branch.folder / "pulls" / name
     if name is None or not (branch.folder / "pulls" / name / "pull.toml").is_file():
         name = pull_names(branch, settings)[0]
-    folder = branch.path(f"pulls/{name}")
-    return name, lambda: folder
+    return name, lambda: branch.path(f"pulls/{name}")
 
 
 def _cloud(branch: Branch) -> np.ndarray | None:
