@@ -35,7 +35,6 @@ from limber.mechanics.points import point_operator
 from limber.recordings.recording import CalibrationEntry, Pull, PullEntry, calibration_of, grasp_on
 from limber.recordings.synchronisation import Frames, frames_of
 
-
 MODEL_YOUNG_PA = 1e8
 """Modulus of a model before its values are known: fixed, so that none is in a result's rounding."""
 

@@ -202,8 +202,9 @@ def bend_rods(axis: np.ndarray, bending: np.ndarray, twist: np.ndarray, force: n
               torque: np.ndarray, grasp: np.ndarray, weight: np.ndarray, hung: np.ndarray,
               held: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
     """Fill places [b, k, S + 1, 3] and rotations of the sections, from the base on. Each turns by
-    the moment at its middle: of the gripper (``force`` [b, k, 3]) and of the ``weight`` from there on, with moment
-    ``hung`` about the origin, less that as scanned, ``held``. Stiffnesses are [b, S] [N m^2]."""
+    the moment at its middle: of the gripper (``force`` [b, k, 3]) and of the ``weight`` from there
+    on, with moment ``hung`` about the origin, less that as scanned, ``held``. Stiffnesses are
+    [b, S] [N m^2]."""
     inside, tangent, turn, at, middle = (np.empty(3), np.empty(3), np.empty(3), np.empty(3),
                                          np.empty(3))
     step, rotation, half, unit = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.eye(3)

@@ -138,8 +138,8 @@ class _Search:
             foreseen = 0.5 * float(residual @ residual - linear @ linear)
             if tried is None or fall <= 0:
                 # Too little was to be gained.
-                if damping > MOST_DAMPING or tried is not None and foreseen < max(
-                        ending * _cost(at, robust), UNSETTLED_FALL):
+                if damping > MOST_DAMPING or (tried is not None and foreseen < max(
+                        ending * _cost(at, robust), UNSETTLED_FALL)):
                     return Fit(at, FitStatus.converged, "No step descends.")
                 damping = max(FIRST_DAMPING, 8 * damping)
                 continue
