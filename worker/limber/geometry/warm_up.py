@@ -6,7 +6,7 @@ from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.leaves import leaf_log_odds, surroundings
 from limber.geometry.skeleton.contraction import contract
 from limber.geometry.skeleton.joining import join_pieces
-from limber.geometry.skeleton.likeliest_tree import State, grown
+from limber.geometry.skeleton.likeliest_tree import State, grown, pruned
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
 from limber.geometry.skeleton.repair import PointSpacing
@@ -26,7 +26,7 @@ def warm_up(progress: Progress = SILENT) -> None:
     distance_to_surface(skeleton.nodes, surface)
     contract(surface.vertices)
     fit_axes(skeleton, surface.vertices, rounds=1, settled=True)
-    grown(State.of(skeleton, PointLikelihood.of(surface.vertices)),
+    grown(pruned(State.of(skeleton, PointLikelihood.of(surface.vertices))),
           PointSpacing.of(surface.vertices))  # used by thin scans alone
     line = np.array([[0, 0, 0.01 * k] for k in (*range(4), *range(6, 10))])
     join_pieces(line, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [5, 6], [6, 7]]), np.full(8, 0.01),

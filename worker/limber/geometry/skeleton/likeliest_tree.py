@@ -9,6 +9,7 @@ the noise, and a maximisation step moves axes and radii to fit (Dempster, Laird,
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
@@ -20,8 +21,13 @@ from limber.core.numerics.compiled import compiled_exactly
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.confidence import assessed, doubted
+from limber.geometry.skeleton.likelihood_kernels import left, mixed
 from limber.geometry.skeleton.radii.axis_fit import TargetDistances, data_terms
-from limber.geometry.skeleton.radii.fit_kernels import match_cylinders, nearest_cylinders
+from limber.geometry.skeleton.radii.fit_kernels import (
+    cylinders_around,
+    match_cylinders,
+    nearest_cylinders,
+)
 from limber.geometry.skeleton.radii.projected_widths import by_projected_widths
 from limber.geometry.skeleton.radii.wood import Bends, Wood, turn_cost, turn_variance
 from limber.geometry.skeleton.repair import PointSpacing, resampled, without_kinks
@@ -38,6 +44,7 @@ _CHANGE = 0.5  # most that a step changes the logarithm of a radius
 _FIRM = 0.02  # least part of a point's weight with which it holds the axis across
 _TWIG = 0.6  # radius of a new twig over that of its carrier
 _BADLY, _FEET, _TIPS = 400, 8, 2  # points explained worst; nodes and ends from which twigs may lead
+_BESIDE, _KNOWN = 6, 32  # cylinders a point may be of, of so many around it
 _TABLE, _FACINGS = 48, 5  # distances and angles at which the density of a new twig is known
 _POSITIONS = (2 * np.arange(24) + 1) / 24 - 1  # around an axis, within so many deviations:
 _WIDE = 4.5
@@ -213,9 +220,9 @@ def _places(axes: np.ndarray, normal: np.ndarray, sharpness: np.ndarray, scan: P
     """Mean direction [m, 3] from the axis to where each point is on the skin, given where it was
     measured: a von Mises distribution of this ``sharpness``, and what the sensor sees. ``across``
     [m, 3] is the direction around the axis."""
-    facing, aside = (scan.facing(axes, ways) for ways in (normal, across))
-    if facing is None or aside is None:
+    if scan.sight is None:
         return (i1e(sharpness) / i0e(sharpness))[:, None] * normal
+    facing, aside = (scan.facing(axes, ways) for ways in (normal, across))
     turn = np.minimum(_WIDE / np.sqrt(np.maximum(sharpness, 1e-300)), np.pi)[:, None] * _POSITIONS
     density = scan.seen(facing[:, None] * np.cos(turn) + aside[:, None] * np.sin(turn)) * np.exp(
         sharpness[:, None] * (np.cos(turn) - 1))
@@ -246,10 +253,9 @@ class State:
            ) -> "State":
         """The state of a tree; with the likeliest scatter if none is given."""
         match = scan.match(skeleton)
-        density = scan.densities(skeleton, match)
-        scatter = scatter or scan.scattered(skeleton, density)
-        return cls(skeleton, scan, scatter, density @ scatter.shares, match.segment,
-                   match.residual, Bends.of(skeleton).costs(skeleton.nodes))
+        scatter = scatter or scan.scattered(skeleton, scan.densities(skeleton, match))
+        return cls(skeleton, scan, scatter, scan.wood(skeleton, match, scatter.shares),
+                   match.segment, match.residual, Bends.of(skeleton).costs(skeleton.nodes))
 
     def after(self, skeleton: Skeleton) -> "State":
         """The state of another tree with the same scatter."""
@@ -261,20 +267,23 @@ class State:
         return self.scan.log(self.wood, self.scatter, self.skeleton.length,
                              self.skeleton.branch_count) - float(self.turns.sum())
 
+    @cached_property
+    def _near(self) -> np.ndarray:
+        """Upper nodes of the cylinders around each point, nearest first, shape [m, k]."""
+        return cylinders_around(self.skeleton.parent, self.skeleton.nodes, self.scan.points, _KNOWN)
+
     def without(self, nodes: np.ndarray, runs: int = 0) -> float:
         """The score without nodes, a mask [n], whose children are all among them; ``runs`` of them
         are whole."""
         skeleton, own = self.skeleton, np.flatnonzero(nodes[self.segment])
         wood = self.wood
         if len(own):
-            ends = np.flatnonzero(~nodes[1:]) + 1
-            middle = (skeleton.nodes[ends] + skeleton.nodes[skeleton.parent[ends]]) / 2
-            near = cKDTree(middle).query(self.scan.points[own], k=min(6, len(ends)))[1]
+            near, wood = left(self._near[own], nodes, _BESIDE), wood.copy()
+            wood[own] = 0.0  # what is farther off is background
+            some, near = own[near[:, 0] > 0], near[near[:, 0] > 0]
             match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes,
-                                    skeleton.radius, self.scan.points[own],
-                                    ends[near.reshape(len(own), -1)])
-            wood = wood.copy()
-            wood[own] = self.scan.densities(skeleton, match, own) @ self.scatter.shares
+                                    skeleton.radius, self.scan.points[some], near)
+            wood[some] = self.scan.wood(skeleton, match, self.scatter.shares, some)
         return self.scan.log(wood, self.scatter,
                              skeleton.length - float(skeleton.steps[nodes].sum()),
                              skeleton.branch_count - runs) - float(self.turns[~nodes].sum())
@@ -371,10 +380,10 @@ class _Twigs:
         radius[table_of] = self.radius
         size = float(np.linalg.norm(np.ptp(scan.points, axis=0)))
         distance = np.append(0.0, np.geomspace(1e-4, 1.0, _TABLE)) * size
-        facing = np.linspace(-1, 1, _FACINGS) if scan.sight is not None else np.zeros(1)
+        facing = np.linspace(-1, 1, _FACINGS) if scan.sight is not None else np.full(1, np.nan)
         grid = np.array(np.meshgrid(radius, facing, distance, indexing="ij"))
-        density = scan.across(grid[2].ravel(), grid[0].ravel(), None if scan.sight is None
-                              else grid[1].ravel()) @ state.scatter.shares
+        density = mixed(grid[2].ravel(), grid[0].ravel(), grid[1].ravel(), scan.noises,
+                        state.scatter.shares)
         table = np.log(np.maximum(density, 1e-300)).reshape(grid.shape[1:])
         return _raised(
             skeleton.nodes[self.foot], self.end, self.radius, table_of, table, np.log(

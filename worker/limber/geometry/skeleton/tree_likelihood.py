@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from operator import itemgetter
 
 import numpy as np
-from scipy.special import i0e
 
 from limber.core.numerics.rigid import any_normal
+from limber.geometry.skeleton.likelihood_kernels import HIDDEN, densities, mixed
 from limber.geometry.skeleton.radii.fit_kernels import Match, match_cylinders
 from limber.geometry.skeleton.radii.wood import Bends
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -28,7 +28,6 @@ _NOISES = np.geomspace(2e-4, 0.03, 24)  # fractions of the scan's diagonal
 _FREEDOM = 4.0  # of Student's distribution of the noise
 _BACKGROUND, _ROUNDS = 0.05, 4  # first share of the background; rounds that find it
 _MARGIN = 0.02  # [m] around the scan where background may be
-_HIDDEN = 0.03  # density of the hidden half, as a fraction of that all around
 _OPEN = 0.2  # sine of the angle between axis and sight under which an axis has no seen half
 # A twig's fork, direction (2), length, radius and bend: each costs half the logarithm of the points
 # (Schwarz 1978, Bayes' information criterion).
@@ -79,29 +78,10 @@ class PointLikelihood:
         return match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
                                self.points)
 
-    def across(self, distance: np.ndarray, radius: np.ndarray, facing: np.ndarray | None = None,
-               ) -> np.ndarray:
-        """Density [1/m^2] at distances from axes [m] with radii [m] for each noise, [m, k];
-        ``facing`` is the cosine of the angle to the sensor, [m]; None: from all around."""
-        sharpness = distance[:, None] * radius[:, None] / self.noises**2
-        off = (distance - radius)[:, None] / self.noises
-        density = i0e(sharpness) * np.exp(-0.5 * off**2) / (2 * np.pi * self.noises**2)
-        if facing is None:
-            return density
-        # Fourier's series of the half-wave rectified cosine. Around the circle the noise is von
-        # Mises'; its harmonics are nearly those of a wrapped normal distribution.
-        first = sharpness / (0.5 + np.sqrt(sharpness**2 + 2.25))
-        once = np.clip(facing, -1.0, 1.0)[:, None]
-        twice = 2 * once**2 - 1
-        seen = (1 + np.pi / 2 * first * once + 2 / 3 * first**4 * twice
-                - 2 / 15 * first**16 * (2 * twice**2 - 1)
-                + 2 / 35 * first**36 * (4 * twice**3 - 3 * twice))
-        return density * (_HIDDEN + (1 - _HIDDEN) * np.maximum(seen, 0.0))
-
     @staticmethod
     def seen(cosine: np.ndarray) -> np.ndarray:
         """Density on a skin by the cosine of the angle to the sensor, over that all around."""
-        return _HIDDEN + (1 - _HIDDEN) * np.pi * np.maximum(cosine, 0.0)
+        return HIDDEN + (1 - HIDDEN) * np.pi * np.maximum(cosine, 0.0)
 
     @staticmethod
     def axes(skeleton: Skeleton, match: Match) -> np.ndarray:
@@ -110,22 +90,30 @@ class PointLikelihood:
         return axis / np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
 
     def facing(self, axes: np.ndarray, ways: np.ndarray, some: np.ndarray | slice = slice(None),
-               ) -> np.ndarray | None:
+               ) -> np.ndarray:
         """Cosine of the angle around the ``axes`` between the sensor and ``ways`` across them at
-        ``some`` of the points [m, 3], shape [m]; 0 where it looks along them; None: all around."""
+        ``some`` of the points [m, 3], shape [m]; 0 where it looks along them; NaN: all around."""
         if self.sight is None:
-            return None
+            return np.full(len(ways), np.nan)
         sight = self.sight[some]
         sight = sight - np.einsum("mj,mj->m", axes, sight)[:, None] * axes
         size = np.linalg.norm(sight, axis=1)
         return np.where(size > _OPEN, np.einsum("mj,mj->m", ways, sight)
                         / np.maximum(size, _OPEN), 0.0)
 
-    def densities(self, skeleton: Skeleton, match: Match, some: np.ndarray | slice = slice(None),
-                  ) -> np.ndarray:
-        """Density [1/m^2] across the axes at ``some`` of the points, shape [m, k]."""
-        return self.across(np.maximum(match.residual + match.thick, 0.0), match.thick,
-                           self.facing(self.axes(skeleton, match), match.normal, some))
+    def densities(self, skeleton: Skeleton, match: Match) -> np.ndarray:
+        """Density [1/m^2] across the axes at the points for each noise, shape [m, k]."""
+        return densities(*self._across(skeleton, match), self.noises)
+
+    def wood(self, skeleton: Skeleton, match: Match, shares: np.ndarray,
+             some: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """The same at ``some`` of the points with these shares of the noises [k], shape [m]."""
+        return mixed(*self._across(skeleton, match, some), self.noises, shares)
+
+    def _across(self, skeleton: Skeleton, match: Match, some: np.ndarray | slice = slice(None),
+                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return (np.maximum(match.residual + match.thick, 0.0), match.thick,
+                self.facing(self.axes(skeleton, match), match.normal, some))
 
     def scattered(self, skeleton: Skeleton, density: np.ndarray) -> Scatter:
         """The likeliest scatter for densities [m, k] across the axes of a tree."""
@@ -154,11 +142,11 @@ class PointLikelihood:
         """By how much a twig must raise the logarithm of the likelihood."""
         return _TWIG_NUMBERS / 2 * float(np.log(len(self.points)))
 
-    def score(self, skeleton: Skeleton) -> float:
+    def score(self, skeleton: Skeleton, match: Match | None = None) -> float:
         """The logarithm of the likelihood of the points given a tree, less the cost of its twigs
         and bends, with the likeliest scatter. Only differences between trees of one scan mean
         something."""
-        density = self.densities(skeleton, self.match(skeleton))
+        density = self.densities(skeleton, match or self.match(skeleton))
         scatter = self.scattered(skeleton, density)
         return self.log(density @ scatter.shares, scatter, skeleton.length, skeleton.branch_count,
                         ) - float(Bends.of(skeleton).costs(skeleton.nodes).sum())
@@ -167,9 +155,9 @@ class PointLikelihood:
         """The same for a sensor where a tree scores most, or all around."""
         def scored(direction: np.ndarray, near: float = 0.0) -> tuple[float, np.ndarray, float]:
             direction = direction / np.linalg.norm(direction)
-            return self.seen_from(direction, near).score(skeleton), direction, near
+            return self.seen_from(direction, near).score(skeleton, match), direction, near
 
-        around = replace(self, sight=None)
+        around, match = replace(self, sight=None), self.match(skeleton)
         score, direction, near = max(map(scored, _DIRECTIONS), key=itemgetter(0))
         if score <= around.score(skeleton) + _SIGHT_NUMBERS / 2 * np.log(len(self.points)):
             return around

@@ -216,9 +216,10 @@ def match_cylinders(parent: np.ndarray, order: np.ndarray, nodes: np.ndarray, ra
     return Match(segment, share, normal, residual, thick, own[segment])
 
 
-def cylinders_around(parent: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+def cylinders_around(parent: np.ndarray, nodes: np.ndarray, points: np.ndarray,
+                     count: int = _CANDIDATES) -> np.ndarray:
     """Upper nodes of the cylinders whose middles are nearest to each point, shape [m, k]."""
     ends = np.arange(1, len(nodes))
     tree = cKDTree((nodes[ends] + nodes[parent[ends]]) / 2)
-    _, near = tree.query(points, k=min(_CANDIDATES, len(ends)))
+    _, near = tree.query(points, k=min(count, len(ends)))
     return ends[near.reshape(len(points), -1)]
