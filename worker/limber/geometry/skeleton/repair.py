@@ -26,11 +26,6 @@ from limber.geometry.skeleton.sweep import arc_lengths, resample
 # Attachment of twigs to their carriers.
 
 
-# Nodes at a twig's start that may mislead, and nodes that show its direction.
-_MISLEADING_NODES, _NODES_AHEAD = 5, 7
-_KINK = np.deg2rad(50.0)
-# Longest start of a twig, in radii of its carrier; least kink at its end; nodes to each side.
-_HOOK_REACH, _SHARP_KINK, _BESIDE = 6.0, np.deg2rad(45.0), 3
 _LINE = 2.0  # length of a twig's start in carrier radii over which its direction is measured
 
 
@@ -45,7 +40,7 @@ def attached(skeleton: Skeleton) -> Skeleton:
         distance, near = cKDTree(skeleton.nodes[carrier]).query(skeleton.nodes[members])
         outside = distance > 1.05 * skeleton.radius[carrier[near]]
         first = int(np.argmax(outside)) if outside.any() else len(members) - 1
-        first = _past_hook(skeleton, members, min(first, max(len(members) - 2, 0)))
+        first = min(first, max(len(members) - 2, 0))
         keep[members[:first]] = False
         # A very thin run's first nodes are so close together that there is only noise between them.
         along = np.cumsum(np.linalg.norm(np.diff(skeleton.nodes[members[first:]], axis=0), axis=1))
@@ -62,34 +57,6 @@ def attached(skeleton: Skeleton) -> Skeleton:
         while parent[node] >= 0 and not keep[parent[node]]:
             parent[node] = parent[parent[node]]
     return skeleton.subset(keep, parent)
-
-
-def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
-    """The position in a twig from which its direction continues. Where the scan lacks its base, a
-    short path across attaches it to its carrier, with a kink where its own axis begins."""
-    nodes = skeleton.nodes
-    last = min(first + _MISLEADING_NODES, len(members) - _NODES_AHEAD)
-    start = max(first, last)
-    for k in range(first, last):
-        step = nodes[members[k + 1]] - nodes[members[k]]
-        ahead = nodes[members[k + _NODES_AHEAD - 1]] - nodes[members[k + 1]]
-        size = np.linalg.norm(step) * np.linalg.norm(ahead)
-        if size > 0 and step @ ahead > np.cos(_KINK) * size:
-            start = k
-            break
-    reach = _HOOK_REACH * skeleton.radius[skeleton.parent[members[0]]]
-    length = 0.0
-    for k in range(start + 1, len(members) - _NODES_AHEAD):
-        step = nodes[members[k]] - nodes[members[k - 1]]
-        length += float(np.linalg.norm(step))
-        if length > reach:
-            break
-        before = nodes[members[k]] - nodes[members[max(k - _BESIDE, start)]]
-        ahead = nodes[members[k + _NODES_AHEAD - 1]] - nodes[members[k]]
-        size = np.linalg.norm(before) * np.linalg.norm(ahead)
-        if size > 0 and before @ ahead < np.cos(_SHARP_KINK) * size:
-            start = k
-    return start
 
 
 def _meeting(skeleton: Skeleton, carrier: np.ndarray, first: int, direction: np.ndarray) -> int:
@@ -432,7 +399,6 @@ PASSES = (
          _fit_coarsely, until=0.4),
     Pass("attach twigs", "The contraction pulls a fork towards its twig.",
          lambda now: now.of(attached(now.skeleton))),
-    DROP_BARE_ENDS,
     Pass("lengthen ends", "The contraction shortens an end.",
          lambda now: now.of(with_full_tips(now.skeleton, now.points, now.noise))),
     Pass("prune spurs", "A twig hardly extends beyond its parent and the noise.", _prune_spurs),
