@@ -46,6 +46,7 @@ class SearchDoubts:
     unlikely: Sequence[dict[str, Any]] = ()
     other_root: np.ndarray | None = None
     root_probability: float = 1.0
+    length_spread: float | None = None
 
     @classmethod
     def of(cls, result: dict[str, Any]) -> "SearchDoubts":
@@ -53,7 +54,7 @@ class SearchDoubts:
         root = result.get("other_root")
         return cls(result.get("bridges") or (), result.get("unlikely_twigs") or (),
                    None if root is None else np.array(root, float),
-                   result.get("root_probability", 1.0))
+                   result.get("root_probability", 1.0), result.get("length_spread"))
 
 
 @dataclass(frozen=True)

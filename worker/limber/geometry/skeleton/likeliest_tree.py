@@ -9,7 +9,6 @@ the noise, and a maximisation step moves axes and radii to fit (Dempster, Laird,
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
@@ -21,13 +20,9 @@ from limber.core.numerics.compiled import compiled_exactly
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.confidence import assessed, doubted
-from limber.geometry.skeleton.likelihood_kernels import left, mixed
+from limber.geometry.skeleton.likelihood_kernels import HIDDEN, densities, left
 from limber.geometry.skeleton.radii.axis_fit import TargetDistances, data_terms
-from limber.geometry.skeleton.radii.fit_kernels import (
-    cylinders_around,
-    match_cylinders,
-    nearest_cylinders,
-)
+from limber.geometry.skeleton.radii.fit_kernels import cylinders_around, nearest_cylinders
 from limber.geometry.skeleton.radii.projected_widths import by_projected_widths
 from limber.geometry.skeleton.radii.wood import Bends, Wood, turn_cost, turn_variance
 from limber.geometry.skeleton.repair import PointSpacing, resampled, without_kinks
@@ -42,8 +37,11 @@ _SLENDER, _SLENDER_SIGMA = 92.0, 0.5
 _ALONG, _HELD = 0.3, 10.0  # radii that a step moves nodes along their axis, and at all
 _CHANGE = 0.5  # most that a step changes the logarithm of a radius
 _FIRM = 0.02  # least part of a point's weight with which it holds the axis across
-_TWIG = 0.6  # radius of a new twig over that of its carrier
+_TWIG = 0.4  # radius of a new twig over that of its carrier
 _BADLY, _FEET, _TIPS = 400, 8, 2  # points explained worst; nodes and ends from which twigs may lead
+# Deviation of the logarithm of a tree's length, besides that between searches: in the score's own
+# measure each twig is sure, but twigs are missed and false together (42 scans of the worlds).
+_APART = 0.08
 _BESIDE, _KNOWN = 6, 32  # cylinders a point may be of, of so many around it
 _TABLE, _FACINGS = 48, 5  # distances and angles at which the density of a new twig is known
 _POSITIONS = (2 * np.arange(24) + 1) / 24 - 1  # around an axis, within so many deviations:
@@ -51,26 +49,24 @@ _WIDE = 4.5
 
 
 def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View | None = None,
-               progress: Progress = SILENT) -> tuple[Skeleton, float, int] | None:
+               progress: Progress = SILENT) -> tuple[Skeleton, float, int, float]:
     """Return the likeliest tree found from the ``first``, that of the contracted points with all
-    its spurs, or from the ``known``, the noise [m] and the number of twigs left out, if it scores
-    more than the known with axes and radii fitted alike; ``points`` [m, 3] [m] are the scan's."""
+    its spurs, or from the ``known``, the noise [m], the number of twigs left out, and the standard
+    deviation of the logarithm of its length; ``points`` [m, 3] [m] are the scan's."""
     apart = PointSpacing.of(points)
+    # A beam wider than twigs shows them like thick axes; a thin one shows skins by their area.
+    scan = max((replace(PointLikelihood.of(points), power=power) for power in (0.0, 0.5, 1.0)),
+               key=lambda one: one.score(known))
+    around = [likeliest_tree(start, scan, apart, progress.part(part, part + 0.35))
+              for part, start in ((0.0, first), (0.35, known))]
+    skeleton, count = max(around, key=lambda one: scan.score(one[0]))
     # Whether one sensor saw them is asked of whole searches: twigs that hang to one side of a
     # thick axis look so too, and a thin axis beside a branch's middle hides it.
-    scan = PointLikelihood.of(points)
-    around = [likeliest_tree(start, scan, apart, progress.part(part, part + 0.25))
-              for part, start in ((0.0, first), (0.25, known))]
-    skeleton, count = max(around, key=lambda one: scan.score(one[0]))
-    seen = scan.where_seen(known)
+    seen = scan.where_seen(skeleton)
     if seen.sight is not None:
-        other = likeliest_tree(known, seen, apart, progress.part(0.5, 0.75))
-        if seen.score(other[0]) > scan.score(skeleton):
-            scan, more = seen, likeliest_tree(first, seen, apart, progress.part(0.75, 1.0))
-            skeleton, count = max(other, more, key=lambda one: seen.score(one[0]))
-    alike = fitted(_spaced(known, apart), scan, _LAST_STEPS)
-    if scan.score(skeleton) <= scan.score(alike):
-        return None
+        other, more = likeliest_tree(skeleton, seen, apart, progress.part(0.7, 1.0))
+        if seen.score(other) > scan.score(skeleton):
+            scan, skeleton, count = seen, other, count + more
     residual = nearest_cylinders(skeleton, points)[1]
     noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
     if rays := scan.sight is not None:
@@ -78,7 +74,8 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
         skeleton, _ = by_projected_widths(skeleton, points, view)
     found = assessed(skeleton.on_grid(), points, noise, rays=rays, view=view if rays else None)
     even, kinks = without_kinks(found)
-    return doubted(even, points, noise) if kinks else found, noise, count
+    return doubted(even, points, noise) if kinks else found, noise, count, float(np.hypot(
+        _APART, np.std([np.log(one.length) for one, _ in around])))
 
 
 def likeliest_tree(first: Skeleton, scan: PointLikelihood, apart: PointSpacing,
@@ -120,7 +117,7 @@ def _step(skeleton: Skeleton, scan: PointLikelihood, prior: "_Prior") -> Skeleto
     distance = np.maximum(match.residual + match.thick, 1e-12)
     density = scan.densities(skeleton, match)
     scatter = scan.scattered(skeleton, density)
-    share = density * scatter.shares / skeleton.length
+    share = density * scatter.shares / scan.skin(skeleton).sum()
     share /= (share.sum(axis=1) + scatter.background / scan.volume)[:, None]
     weight = (share / scan.noises**2).sum(axis=1)
     axes = scan.axes(skeleton, match)
@@ -224,7 +221,8 @@ def _places(axes: np.ndarray, normal: np.ndarray, sharpness: np.ndarray, scan: P
         return (i1e(sharpness) / i0e(sharpness))[:, None] * normal
     facing, aside = (scan.facing(axes, ways) for ways in (normal, across))
     turn = np.minimum(_WIDE / np.sqrt(np.maximum(sharpness, 1e-300)), np.pi)[:, None] * _POSITIONS
-    density = scan.seen(facing[:, None] * np.cos(turn) + aside[:, None] * np.sin(turn)) * np.exp(
+    seen = np.maximum(facing[:, None] * np.cos(turn) + aside[:, None] * np.sin(turn), 0.0)
+    density = (HIDDEN + (1 - HIDDEN) * np.pi * seen) * np.exp(
         sharpness[:, None] * (np.cos(turn) - 1))
     density /= density.sum(axis=1)[:, None]
     return (np.sum(density * np.cos(turn), axis=1)[:, None] * normal
@@ -236,14 +234,17 @@ def _places(axes: np.ndarray, normal: np.ndarray, sharpness: np.ndarray, scan: P
 
 @dataclass(frozen=True)
 class State:
-    """A tree, the density of the scan's points across its axes [1/m^2], shape [m], their cylinders
-    [m] and distances from those [m], shape [m], under a scatter that the proposals leave, and what
-    the turn before each node costs [n]."""
+    """A tree, the density of the scan's points on its skin [1/m], shape [m], under a scatter that
+    the proposals leave; the skin of each cylinder [m^2], shape [n]; the cylinders around each point
+    [m, k], nearest first, its own [m] and distance from that [m], shape [m]; and what the turn
+    before each node costs [n]."""
 
     skeleton: Skeleton
     scan: PointLikelihood
     scatter: Scatter
     wood: np.ndarray
+    skin: np.ndarray
+    near: np.ndarray
     segment: np.ndarray
     residual: np.ndarray
     turns: np.ndarray
@@ -252,25 +253,18 @@ class State:
     def of(cls, skeleton: Skeleton, scan: PointLikelihood, scatter: Scatter | None = None,
            ) -> "State":
         """The state of a tree; with the likeliest scatter if none is given."""
-        match = scan.match(skeleton)
-        scatter = scatter or scan.scattered(skeleton, scan.densities(skeleton, match))
-        return cls(skeleton, scan, scatter, scan.wood(skeleton, match, scatter.shares),
+        near = cylinders_around(skeleton.parent, skeleton.nodes, scan.points, _KNOWN)
+        match = scan.match(skeleton, near[:, :_BESIDE])
+        density = scan.densities(skeleton, match)
+        scatter = scatter or scan.scattered(skeleton, density)
+        return cls(skeleton, scan, scatter, density @ scatter.shares, scan.skin(skeleton), near,
                    match.segment, match.residual, Bends.of(skeleton).costs(skeleton.nodes))
-
-    def after(self, skeleton: Skeleton) -> "State":
-        """The state of another tree with the same scatter."""
-        return State.of(skeleton, self.scan, self.scatter)
 
     @property
     def log(self) -> float:
         """Its score."""
-        return self.scan.log(self.wood, self.scatter, self.skeleton.length,
+        return self.scan.log(self.wood, self.scatter, float(self.skin.sum()),
                              self.skeleton.branch_count) - float(self.turns.sum())
-
-    @cached_property
-    def _near(self) -> np.ndarray:
-        """Upper nodes of the cylinders around each point, nearest first, shape [m, k]."""
-        return cylinders_around(self.skeleton.parent, self.skeleton.nodes, self.scan.points, _KNOWN)
 
     def without(self, nodes: np.ndarray, runs: int = 0) -> float:
         """The score without nodes, a mask [n], whose children are all among them; ``runs`` of them
@@ -278,14 +272,13 @@ class State:
         skeleton, own = self.skeleton, np.flatnonzero(nodes[self.segment])
         wood = self.wood
         if len(own):
-            near, wood = left(self._near[own], nodes, _BESIDE), wood.copy()
+            near, wood = left(self.near[own], nodes, _BESIDE), wood.copy()
             wood[own] = 0.0  # what is farther off is background
             some, near = own[near[:, 0] > 0], near[near[:, 0] > 0]
-            match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes,
-                                    skeleton.radius, self.scan.points[some], near)
-            wood[some] = self.scan.wood(skeleton, match, self.scatter.shares, some)
+            match = self.scan.match(skeleton, near, some)
+            wood[some] = self.scan.densities(skeleton, match, some) @ self.scatter.shares
         return self.scan.log(wood, self.scatter,
-                             skeleton.length - float(skeleton.steps[nodes].sum()),
+                             float(self.skin[~nodes].sum()),
                              skeleton.branch_count - runs) - float(self.turns[~nodes].sum())
 
 
@@ -298,7 +291,8 @@ def pruned(state: State) -> State:
         scores = [state.without(run == each, 1) for each in bare]
         if max(scores, default=-np.inf) <= state.log:
             break
-        state = state.after(skeleton.subset(run != bare[int(np.argmax(scores))]))
+        state = State.of(skeleton.subset(run != bare[int(np.argmax(scores))]), state.scan,
+                         state.scatter)
     return state
 
 
@@ -315,7 +309,7 @@ def drawn_back(state: State) -> State:
                 best, shorter = score, tried.copy()
             node = int(skeleton.parent[node])
         gone = shorter
-    return state.after(skeleton.subset(~gone)) if gone.any() else state
+    return State.of(skeleton.subset(~gone), state.scan, state.scatter) if gone.any() else state
 
 
 def grown(state: State, apart: PointSpacing) -> State:
@@ -332,7 +326,8 @@ def grown(state: State, apart: PointSpacing) -> State:
             if not used[nearer].any():
                 used |= nearer
                 chosen.append(int(k))
-        after = state.after(twigs.added(chosen, state.skeleton, apart)) if chosen else state
+        after = State.of(twigs.added(chosen, state.skeleton, apart), state.scan,
+                         state.scatter) if chosen else state
         if after.log <= state.log:
             return state
         state = after
@@ -378,18 +373,19 @@ class _Twigs:
         feet, table_of = np.unique(self.foot, return_inverse=True)
         radius = np.zeros(len(feet))
         radius[table_of] = self.radius
-        size = float(np.linalg.norm(np.ptp(scan.points, axis=0)))
-        distance = np.append(0.0, np.geomspace(1e-4, 1.0, _TABLE)) * size
+        distance = np.append(0.0, np.geomspace(
+            scan.noises[0] / 2, 33 * scan.noises[-1], _TABLE))
         facing = np.linspace(-1, 1, _FACINGS) if scan.sight is not None else np.full(1, np.nan)
         grid = np.array(np.meshgrid(radius, facing, distance, indexing="ij"))
-        density = mixed(grid[2].ravel(), grid[0].ravel(), grid[1].ravel(), scan.noises,
-                        state.scatter.shares)
+        density = densities(grid[2].ravel(), grid[0].ravel(), grid[1].ravel(), scan.noises,
+                            scan.power) @ state.scatter.shares
         table = np.log(np.maximum(density, 1e-300)).reshape(grid.shape[1:])
         return _raised(
-            skeleton.nodes[self.foot], self.end, self.radius, table_of, table, np.log(
-                distance[1:3]), scan.points, np.zeros((0, 3)) if scan.sight is None else scan.sight,
-            state.wood, state.residual, skeleton.length, state.scatter.background / scan.volume,
-        ) - self.cost
+            skeleton.nodes[self.foot], self.end, self.radius, table_of, scan.power, table,
+            np.log(distance[1:3]), scan.points, np.zeros((0, 3)) if scan.sight is None
+            else scan.sight,
+            state.wood, state.residual, float(state.skin.sum()),
+            state.scatter.background / scan.volume) - self.cost
 
     def nearer(self, k: int, state: State) -> np.ndarray:
         """Which points would be a twig's, a mask [m]."""
@@ -418,16 +414,17 @@ class _Twigs:
 
 @compiled_exactly
 def _raised(foot: np.ndarray, end: np.ndarray, radius: np.ndarray, table_of: np.ndarray,
-            table: np.ndarray, first: np.ndarray, points: np.ndarray, sight: np.ndarray,
-            wood: np.ndarray, residual: np.ndarray, length: float, elsewhere: float) -> np.ndarray:
+            power: float, table: np.ndarray, first: np.ndarray, points: np.ndarray,
+            sight: np.ndarray, wood: np.ndarray, residual: np.ndarray, skin: float,
+            elsewhere: float) -> np.ndarray:
     """By how much each of t cylinders raises the logarithm of the likelihood of points [m, 3] with
-    densities ``wood`` [m] across the axes. ``table`` [tables, facings, distances] holds logarithms
-    of the density across theirs, at 0 and at distances whose logarithms are evenly spaced."""
+    densities ``wood`` [m] on a ``skin``. ``table`` [tables, facings, distances] holds logarithms of
+    that on theirs, at 0 and at distances whose logarithms are evenly spaced."""
     rise = np.zeros(len(foot))
     for k in range(len(foot)):
         ax, ay, az = end[k, 0] - foot[k, 0], end[k, 1] - foot[k, 1], end[k, 2] - foot[k, 2]
         square = ax * ax + ay * ay + az * az
-        after = length + np.sqrt(square)
+        after = skin + radius[k]**power * np.sqrt(square)
         for i in range(len(points)):
             px, py, pz = (points[i, 0] - foot[k, 0], points[i, 1] - foot[k, 1],
                           points[i, 2] - foot[k, 2])
@@ -456,5 +453,5 @@ def _raised(foot: np.ndarray, end: np.ndarray, radius: np.ndarray, table_of: np.
                     log += beside * ((1 - part) * table[table_of[k], row + 1, low] + part * table[
                         table_of[k], row + 1, low + 1] - log)
                 here = np.exp(log)
-            rise[k] += np.log((here / after + elsewhere) / (wood[i] / length + elsewhere))
+            rise[k] += np.log((here / after + elsewhere) / (wood[i] / skin + elsewhere))
     return rise

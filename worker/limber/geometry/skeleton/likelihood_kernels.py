@@ -24,48 +24,36 @@ def _bessel(x: float) -> float:
 
 
 @compiled_exactly
-def _density(distance: float, radius: float, facing: float, noise: float) -> float:
-    """Density [1/m^2] across an axis; ``facing`` is NaN where points are seen from all around."""
+def _density(distance: float, radius: float, facing: float, noise: float, power: float) -> float:
+    """Density [1/m^2] across an axis times a ``power`` of its radius [m]; ``facing`` is NaN where
+    points are seen from all around."""
     off = (distance - radius) / noise
     if abs(off) > _NOWHERE:
         return 0.0
     sharpness = distance * radius / noise**2
-    density = _bessel(sharpness) * np.exp(-0.5 * off**2) / (2 * np.pi * noise**2)
+    density = radius**power * _bessel(sharpness) * np.exp(-0.5 * off**2) / (
+        2 * np.pi * noise**2)
     if np.isnan(facing):
         return density
     # Fourier's series of the half-wave rectified cosine. Around the circle the noise is von
     # Mises'; its harmonics are nearly those of a wrapped normal distribution.
     first = sharpness / (0.5 + np.sqrt(sharpness**2 + 2.25))
-    fourth, once = first**4, min(max(facing, -1.0), 1.0)
-    sixteenth = fourth**4
-    twice = 2 * once**2 - 1
-    seen = (1 + np.pi / 2 * first * once + 2 / 3 * fourth * twice
-            - 2 / 15 * sixteenth * (2 * twice**2 - 1)
-            + 2 / 35 * sixteenth * sixteenth * fourth * (4 * twice**3 - 3 * twice))
+    twice = 2 * facing**2 - 1
+    seen = (1 + np.pi / 2 * first * facing + 2 / 3 * first**4 * twice
+            - 2 / 15 * first**16 * (2 * twice**2 - 1)
+            + 2 / 35 * first**36 * (4 * twice**3 - 3 * twice))
     return density * (HIDDEN + (1 - HIDDEN) * max(seen, 0.0))
 
 
 @compiled_exactly
 def densities(distance: np.ndarray, radius: np.ndarray, facing: np.ndarray, noises: np.ndarray,
-              ) -> np.ndarray:
-    """Density [1/m^2] at distances from axes [m] with radii [m] for each noise [m], shape [m, k];
-    ``facing`` [m] is the cosine of the angle to the sensor, or NaN."""
+              power: float) -> np.ndarray:
+    """Density times a ``power`` of the radius at distances from axes [m] with radii [m] for each
+    noise [m], shape [m, k]; ``facing`` [m] is the cosine of the angle to the sensor, or NaN."""
     found = np.empty((len(distance), len(noises)))
     for i in range(len(distance)):
         for k in range(len(noises)):
-            found[i, k] = _density(distance[i], radius[i], facing[i], noises[k])
-    return found
-
-
-@compiled_exactly
-def mixed(distance: np.ndarray, radius: np.ndarray, facing: np.ndarray, noises: np.ndarray,
-          shares: np.ndarray) -> np.ndarray:
-    """The same, shape [m], with these shares of the noises [k]."""
-    found, least = np.zeros(len(distance)), 1e-15 * shares.max()
-    for k in range(len(noises)):
-        if shares[k] > least:
-            for i in range(len(distance)):
-                found[i] += shares[k] * _density(distance[i], radius[i], facing[i], noises[k])
+            found[i, k] = _density(distance[i], radius[i], facing[i], noises[k], power)
     return found
 
 

@@ -51,6 +51,8 @@ class SkeletonResult:
         unlikely: Dropped twigs, more likely absent than not, as
             :func:`~limber.geometry.skeleton.confidence.likely` returns them.
         leafy: Points show leaves, and axes were placed in their middle.
+        length_spread: Standard deviation of the logarithm of the length of the likeliest tree of a
+            thin scan; None where none was searched.
     """
 
     skeleton: Skeleton
@@ -66,6 +68,7 @@ class SkeletonResult:
     root_ends: list[dict] = field(default_factory=list)
     leafy: bool = False
     unlikely: list[dict] = field(default_factory=list)
+    length_spread: float | None = None
 
     @property
     def root_probability(self) -> float:
@@ -85,7 +88,8 @@ class SkeletonResult:
     @property
     def doubts(self) -> SearchDoubts:
         """What the search left open."""
-        return SearchDoubts(self.bridges, self.unlikely, self.other_root, self.root_probability)
+        return SearchDoubts(self.bridges, self.unlikely, self.other_root, self.root_probability,
+                            self.length_spread)
 
     def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> "SkeletonResult":
         """Return the result in another frame; ``move`` transforms points [n, 3] to it."""
@@ -108,7 +112,7 @@ class SkeletonResult:
                     self.skeleton.probability < 0.5]}), "split_off": self.split_off,
                 "unlikely_twigs": self.unlikely, "root_ends": self.root_ends,
                 "other_root": self.other_root,
-                "root_probability": self.root_probability,
+                "root_probability": self.root_probability, "length_spread": self.length_spread,
                 "loop_lengths_m": self.loops, "pruned_spur_count": self.pruned}
 
 
@@ -155,7 +159,7 @@ class FoundSkeleton:
         result = self.result
         values = {name: getattr(result, name) for name in (
             "noise", "bridges", "split_off", "loops", "pruned", "second_base", "root_ends",
-            "leafy", "unlikely")} | {
+            "leafy", "unlikely", "length_spread")} | {
             "iterations": result.contraction.iterations, "status": result.contraction.status,
             "leaves": [{"count": len(leaf.points), "area": leaf.area} for leaf in self.leaves]}
         np.savez(path, told=np.array(json.dumps(plain(values))),
@@ -187,7 +191,7 @@ class FoundSkeleton:
             [piece.found() for piece in stored.split_off], stored.loops, stored.pruned,
             None if (base := stored.second_base) is None else np.array(base),
             [end.found() for end in stored.root_ends],
-            stored.leafy, [twig.found() for twig in stored.unlikely]),
+            stored.leafy, [twig.found() for twig in stored.unlikely], stored.length_spread),
                    _leaves(path, arrays, stored))
 
 
@@ -251,6 +255,7 @@ class _Stored(BaseModel):
     root_ends: list[_End]
     leafy: bool
     unlikely: list[_Twig]
+    length_spread: float | None
     iterations: int
     status: ContractionStatus
     leaves: list[_Leaf]

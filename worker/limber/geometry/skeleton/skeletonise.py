@@ -184,12 +184,11 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
     if leafy := (middle := search.through_leaves(first, fitted, graph, start)) is not None:
         skeleton, more = middle, 0
     skeleton, unlikely = likely(skeleton, twig_probability)
-    noise, count = fitted.noise, pruned + more
+    noise, count, spread = fitted.noise, pruned + more, None
     if not leafy and len(points) <= _SEARCHED:  # the score knows no leaves
-        rival = rival_tree(search.unpruned(graph, start), skeleton, some, view,
-                           progress.part(0.95, 1.0))
-        if rival is not None:
-            (skeleton, noise, count), unlikely = rival, []
+        skeleton, noise, count, spread = rival_tree(
+            search.unpruned(graph, start), skeleton, some, view, progress.part(0.95, 1.0))
+        unlikely = []
     if skeleton is not fitted.skeleton:
         segment, residual = nearest_cylinders(skeleton, points)
     if len(ends) > 1 and ends[0]["probability"] < OPEN and not leafy:
@@ -197,7 +196,7 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
     progress(1.0, "skeleton", nodes=skeleton.node_count)
     return SkeletonResult(skeleton, contraction, segment, residual, noise, graph.bridges,
                           graph.split_off, graph.loops, count, second_base(skeleton, up), ends,
-                          leafy, unlikely)
+                          leafy, unlikely, spread)
 
 
 def _of_either_root(skeleton: Skeleton, fitted: Repaired, ends: list[dict[str, Any]]) -> Skeleton:

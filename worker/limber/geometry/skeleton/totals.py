@@ -4,6 +4,7 @@ An uncertain twig counts by its probability, whether the skeleton has it or drop
 so does the other place of a piece that may be attached there.
 So two scans of one plant agree, even if one shows a twig a little better. The odds of all twigs of
 a scan are off together, since scans differ. What a scan does not show at all is not counted.
+Of a thin scan the likeliest tree counts as a whole, and its length is off as such trees' are.
 """
 
 from dataclasses import dataclass
@@ -52,6 +53,9 @@ def total_length(skeleton: Skeleton, doubts: SearchDoubts = _NOTHING_OPEN) -> To
         gap = float(step[skeleton.radius_state[members[1:]] == BRIDGED].sum())
         spread[run] = np.linalg.norm([skeleton.radius[members[-1]], skeleton.radius[members[0]],
                                       _BRIDGED * gap])
+    if doubts.length_spread is not None:  # of the likeliest tree as a whole
+        return Total(skeleton.length, float(np.hypot(
+            np.linalg.norm(spread), doubts.length_spread * skeleton.length)))
     mean, variance = _of_tree(skeleton, own, spread**2)
     elsewhere = attachments(skeleton, doubts.bridges)
     chance = np.array([*(twig["probability"] for twig in doubts.unlikely),

@@ -4,10 +4,10 @@ A point lies on the skin of a round axis, anywhere along the tree and around it,
 across; or it is background, anywhere in the scan. Its density across an axis of radius r with noise
 s is Rice's: (2 pi s^2)^-1 exp(-(d^2 + r^2) / 2 s^2) I0(d r / s^2) at the distance d. So a skin
 needs points around its section and none inside, and a cylinder that is too thick, or goes through
-several twigs, is not flattered. Along the tree points are evenly spread: more axes must show more
-points. The noise differs from point to point by Student's distribution. A sensor at one place sees
-points evenly spread across its sight: on a skin by the cosine of the angle to it. Twigs cost what
-their numbers do, and bends what they do by the prior of wood.
+several twigs, is not flattered. On the tree's skin, or along its axes, points are evenly spread:
+more axes must show more points. The noise differs from point to point by Student's distribution. A
+sensor at one place sees points evenly spread across its sight: on a skin by the cosine of the angle
+to it. Twigs cost what their numbers do, and bends what they do by the prior of wood.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from operator import itemgetter
 import numpy as np
 
 from limber.core.numerics.rigid import any_normal
-from limber.geometry.skeleton.likelihood_kernels import HIDDEN, densities, mixed
+from limber.geometry.skeleton.likelihood_kernels import densities
 from limber.geometry.skeleton.radii.fit_kernels import Match, match_cylinders
 from limber.geometry.skeleton.radii.wood import Bends
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -32,7 +32,6 @@ _OPEN = 0.2  # sine of the angle between axis and sight under which an axis has 
 # A twig's fork, direction (2), length, radius and bend: each costs half the logarithm of the points
 # (Schwarz 1978, Bayes' information criterion).
 _TWIG_NUMBERS = 6.0
-_SIGHT_NUMBERS = 3.0  # direction (2) and distance of a sensor, likewise
 
 
 @dataclass(frozen=True)
@@ -53,12 +52,14 @@ class PointLikelihood:
         noises: Standard deviations across the axes that occur [m], shape [k].
         volume: Where background may be [m^3].
         sight: Unit vectors from points to the sensor, shape [m, 3]; None: seen from all around.
+        power: Of the radius, by which axes show points: 1 by their skin's area, 0 by their length.
     """
 
     points: np.ndarray
     noises: np.ndarray
     volume: float
     sight: np.ndarray | None = None
+    power: float = 1.0
 
     @classmethod
     def of(cls, points: np.ndarray) -> "PointLikelihood":
@@ -73,18 +74,13 @@ class PointLikelihood:
         way = direction - near / size * (self.points - self.points.mean(axis=0))
         return replace(self, sight=way / np.linalg.norm(way, axis=1)[:, None])
 
-    def match(self, skeleton: Skeleton) -> Match:
-        """The cylinder of each point."""
+    def match(self, skeleton: Skeleton, near: np.ndarray | None = None,
+              some: np.ndarray | slice = slice(None)) -> Match:
+        """The cylinder of each or ``some`` of the points, of those of the upper nodes ``near``."""
         return match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
-                               self.points)
+                               self.points[some], near)
 
-    @staticmethod
-    def seen(cosine: np.ndarray) -> np.ndarray:
-        """Density on a skin by the cosine of the angle to the sensor, over that all around."""
-        return HIDDEN + (1 - HIDDEN) * np.pi * np.maximum(cosine, 0.0)
-
-    @staticmethod
-    def axes(skeleton: Skeleton, match: Match) -> np.ndarray:
+    def axes(self, skeleton: Skeleton, match: Match) -> np.ndarray:
         """Unit vector along the axis of each point's cylinder, shape [m, 3]."""
         axis = skeleton.nodes[match.segment] - skeleton.nodes[skeleton.parent[match.segment]]
         return axis / np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
@@ -101,24 +97,18 @@ class PointLikelihood:
         return np.where(size > _OPEN, np.einsum("mj,mj->m", ways, sight)
                         / np.maximum(size, _OPEN), 0.0)
 
-    def densities(self, skeleton: Skeleton, match: Match) -> np.ndarray:
-        """Density [1/m^2] across the axes at the points for each noise, shape [m, k]."""
-        return densities(*self._across(skeleton, match), self.noises)
-
-    def wood(self, skeleton: Skeleton, match: Match, shares: np.ndarray,
-             some: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """The same at ``some`` of the points with these shares of the noises [k], shape [m]."""
-        return mixed(*self._across(skeleton, match, some), self.noises, shares)
-
-    def _across(self, skeleton: Skeleton, match: Match, some: np.ndarray | slice = slice(None),
-                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return (np.maximum(match.residual + match.thick, 0.0), match.thick,
-                self.facing(self.axes(skeleton, match), match.normal, some))
+    def densities(self, skeleton: Skeleton, match: Match, some: np.ndarray | slice = slice(None),
+                  ) -> np.ndarray:
+        """Density across the axes at ``some`` of the points, times a power of their radii, for
+        each noise, shape [m, k]."""
+        return densities(np.maximum(match.residual + match.thick, 0.0), match.thick,
+                         self.facing(self.axes(skeleton, match), match.normal, some), self.noises,
+                         self.power)
 
     def scattered(self, skeleton: Skeleton, density: np.ndarray) -> Scatter:
         """The likeliest scatter for densities [m, k] across the axes of a tree."""
         found = []
-        along, elsewhere = density / skeleton.length, 1 / self.volume
+        along, elsewhere = density / self.skin(skeleton).sum(), 1 / self.volume
         for scale in self.noises:
             ratio = (scale / self.noises)**2
             shares = ratio**(_FREEDOM / 2) * np.exp(-0.5 * _FREEDOM * ratio)
@@ -131,10 +121,16 @@ class PointLikelihood:
             found.append((log, Scatter(float(scale), (1 - background) * shares, background)))
         return max(found, key=lambda one: one[0])[1]
 
-    def log(self, wood: np.ndarray, scatter: Scatter, length: float, runs: int) -> float:
-        """Logarithm of the likelihood of a tree of ``length`` [m] and so many ``runs``, given the
-        density of the points across its axes [1/m^2], shape [m], less the cost of its twigs."""
-        return float(np.log(wood / length + scatter.background / self.volume).sum()
+    def skin(self, skeleton: Skeleton) -> np.ndarray:
+        """Each node's cylinder's share of the points: with power 1 its area [m^2], shape [n]."""
+        radius, order, parent = skeleton.radius, skeleton.order, skeleton.parent
+        return skeleton.steps * np.where(order > order[parent], radius,
+                                         (radius + radius[parent]) / 2)**self.power
+
+    def log(self, wood: np.ndarray, scatter: Scatter, skin: float, runs: int) -> float:
+        """Logarithm of the likelihood of a tree with a ``skin`` [m^2] and so many ``runs``, given
+        the density of the points on it [1/m], shape [m], less the cost of its twigs."""
+        return float(np.log(wood / skin + scatter.background / self.volume).sum()
                      ) - self.twig_cost * runs
 
     @property
@@ -148,19 +144,20 @@ class PointLikelihood:
         something."""
         density = self.densities(skeleton, match or self.match(skeleton))
         scatter = self.scattered(skeleton, density)
-        return self.log(density @ scatter.shares, scatter, skeleton.length, skeleton.branch_count,
-                        ) - float(Bends.of(skeleton).costs(skeleton.nodes).sum())
+        bends = float(Bends.of(skeleton).costs(skeleton.nodes).sum())
+        return self.log(density @ scatter.shares, scatter, float(self.skin(skeleton).sum()),
+                        skeleton.branch_count) - bends
 
     def where_seen(self, skeleton: Skeleton) -> "PointLikelihood":
-        """The same for a sensor where a tree scores most, or all around."""
+        """The same for a sensor where a tree scores most, or itself, seen from all around."""
         def scored(direction: np.ndarray, near: float = 0.0) -> tuple[float, np.ndarray, float]:
             direction = direction / np.linalg.norm(direction)
             return self.seen_from(direction, near).score(skeleton, match), direction, near
 
-        around, match = replace(self, sight=None), self.match(skeleton)
+        match = self.match(skeleton)
         score, direction, near = max(map(scored, _DIRECTIONS), key=itemgetter(0))
-        if score <= around.score(skeleton) + _SIGHT_NUMBERS / 2 * np.log(len(self.points)):
-            return around
+        if score <= self.score(skeleton, match) + self.twig_cost:  # it has three numbers too
+            return self
         step, halvings = _TURN, 0
         while halvings < _HALVINGS:
             beside = any_normal(direction)
