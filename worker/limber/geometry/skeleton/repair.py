@@ -15,6 +15,7 @@ from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
 from limber.geometry.skeleton.radii.stations import registered
 from limber.geometry.skeleton.run_ends import (
+    ends_within,
     limited,
     steadied,
     with_full_tips,
@@ -26,6 +27,11 @@ from limber.geometry.skeleton.sweep import arc_lengths, resample
 # Attachment of twigs to their carriers.
 
 
+# Nodes at a twig's start that may mislead, and nodes that show its direction.
+_MISLEADING_NODES, _NODES_AHEAD = 5, 7
+_KINK = np.deg2rad(50.0)
+# Longest start of a twig, in radii of its carrier; least kink at its end; nodes to each side.
+_HOOK_REACH, _SHARP_KINK, _BESIDE = 6.0, np.deg2rad(45.0), 3
 _LINE = 2.0  # length of a twig's start in carrier radii over which its direction is measured
 
 
@@ -40,7 +46,7 @@ def attached(skeleton: Skeleton) -> Skeleton:
         distance, near = cKDTree(skeleton.nodes[carrier]).query(skeleton.nodes[members])
         outside = distance > 1.05 * skeleton.radius[carrier[near]]
         first = int(np.argmax(outside)) if outside.any() else len(members) - 1
-        first = min(first, max(len(members) - 2, 0))
+        first = _past_hook(skeleton, members, min(first, max(len(members) - 2, 0)))
         keep[members[:first]] = False
         # A very thin run's first nodes are so close together that there is only noise between them.
         along = np.cumsum(np.linalg.norm(np.diff(skeleton.nodes[members[first:]], axis=0), axis=1))
@@ -57,6 +63,34 @@ def attached(skeleton: Skeleton) -> Skeleton:
         while parent[node] >= 0 and not keep[parent[node]]:
             parent[node] = parent[parent[node]]
     return skeleton.subset(keep, parent)
+
+
+def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
+    """The position in a twig from which its direction continues. Where the scan lacks its base, a
+    short path across attaches it to its carrier, with a kink where its own axis begins."""
+    nodes = skeleton.nodes
+    last = min(first + _MISLEADING_NODES, len(members) - _NODES_AHEAD)
+    start = max(first, last)
+    for k in range(first, last):
+        step = nodes[members[k + 1]] - nodes[members[k]]
+        ahead = nodes[members[k + _NODES_AHEAD - 1]] - nodes[members[k + 1]]
+        size = np.linalg.norm(step) * np.linalg.norm(ahead)
+        if size > 0 and step @ ahead > np.cos(_KINK) * size:
+            start = k
+            break
+    reach = _HOOK_REACH * skeleton.radius[skeleton.parent[members[0]]]
+    length = 0.0
+    for k in range(start + 1, len(members) - _NODES_AHEAD):
+        step = nodes[members[k]] - nodes[members[k - 1]]
+        length += float(np.linalg.norm(step))
+        if length > reach:
+            break
+        before = nodes[members[k]] - nodes[members[max(k - _BESIDE, start)]]
+        ahead = nodes[members[k + _NODES_AHEAD - 1]] - nodes[members[k]]
+        size = np.linalg.norm(before) * np.linalg.norm(ahead)
+        if size > 0 and before @ ahead < np.cos(_SHARP_KINK) * size:
+            start = k
+    return start
 
 
 def _meeting(skeleton: Skeleton, carrier: np.ndarray, first: int, direction: np.ndarray) -> int:
@@ -414,6 +448,8 @@ PASSES = (
     Pass("register stations", "The stations of a merged scan are a little apart, so that all radii "
          "are off together.", _register_stations, until=1.0),
     DROP_BARE_ENDS,
+    Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
+         lambda now: now.of(ends_within(now.skeleton, now.points))),
     LIMIT,
     Pass("find the likeliest axes and radii",
          "A radius that few points, the spacing or the noise determine, or that no wood has, is "

@@ -34,6 +34,25 @@ def without_bare_ends(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
     return skeleton.subset(keep, parent)
 
 
+def ends_within(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
+    """Shorten ends that slid along their axis beyond the points during a fit."""
+    nodes = skeleton.nodes.copy()
+    segment, _ = nearest_cylinders(skeleton, points)
+    inner = np.flatnonzero(skeleton.parent == 0)
+    ends = [(int(tip), int(skeleton.parent[tip])) for tip in skeleton.tips()]
+    for end, before in [*ends, *([(0, int(inner[0]))] if len(inner) == 1 else [])]:
+        step = nodes[end] - skeleton.nodes[before]
+        length = float(np.linalg.norm(step))
+        mine = points[np.isin(segment, [end, before] if end else [
+            before, *np.flatnonzero(skeleton.parent == before)])]
+        if length == 0 or len(mine) < 3:
+            continue
+        reach = float(np.quantile((mine - skeleton.nodes[before]) @ step / length, _REACHED))
+        if length > reach + 0.5 * skeleton.radius[end]:
+            nodes[end] = skeleton.nodes[before] + step * max(reach / length, 0.1)
+    return skeleton.moved(nodes)
+
+
 def with_full_tips(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
     """Lengthen ends that the contraction shortened, as far as there are points [m, 3] [m], whose
     standard deviation is ``noise`` [m]."""

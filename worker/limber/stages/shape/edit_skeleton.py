@@ -187,7 +187,8 @@ def _effects(branch: Branch, edits: list[Edit], alignment: Alignment, progress: 
     for message in misfits:
         progress.warn(message)
     return [{"do": each.do, "at": np.round(alignment.undo(each.node[None])[0], 6),
-             "at_m": each.node, "off_m": each.distance, "length_change_m": each.length_change}
+             "at_m": each.node, "off_m": round(each.distance, 9),
+             "length_change_m": each.length_change}
             for each in effects]
 
 
