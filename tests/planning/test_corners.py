@@ -13,7 +13,7 @@ from limber.planning.certificate.subsolution import off_zero
 from limber.planning.cost import CostWeights
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import fit_field
-from limber.planning.field.radial import RadialInterpolant
+from limber.planning.field.radial import KERNELS, RadialInterpolant
 from limber.planning.field.stored_states import GraspSamples
 from limber.planning.goals.goal import allowed_points
 from limber.planning.goals.goal_kinds import GraspGoal
@@ -145,20 +145,22 @@ POINTS = GENERATOR.uniform(-0.2, 0.2, (100, 3))
 ELSEWHERE = GENERATOR.uniform(-0.15, 0.15, (60, 3))
 
 
-def test_without_gradients_it_is_scipys(ridge):
+@pytest.mark.parametrize(("kernel", "degree"), [("cubic", 1), ("quintic", 2)])
+def test_without_gradients_it_is_scipys(kernel, degree, ridge):
     """Fitted to values alone, it is what scipy's RBFInterpolator gives."""
     values = ridge.energy(POINTS)
-    wanted = RBFInterpolator(POINTS, values, kernel="cubic", degree=1)(ELSEWHERE)
-    found = RadialInterpolant.fit(POINTS, values).value(ELSEWHERE)[:, 0]
+    wanted = RBFInterpolator(POINTS, values, kernel=kernel, degree=degree)(ELSEWHERE)
+    found = RadialInterpolant.fit(POINTS, values, kernel=kernel).value(ELSEWHERE)[:, 0]
     assert np.allclose(found, wanted, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("with_gradients", [False, True])
-def test_gradient_is_that_of_the_value(with_gradients, ridge):
+def test_gradient_is_that_of_the_value(kernel, with_gradients, ridge):
     """The compiled gradient agrees with central differences of the compiled value."""
     fitted = RadialInterpolant.fit(POINTS, ridge.energy(POINTS),
-                                   ridge.force(POINTS) if with_gradients else None,
-                                   smoothing=1e-9)
+                                   ridge.force(POINTS) if with_gradients else None, kernel=kernel,
+                                   shape=2.5, smoothing=1e-9)
     step = 1e-4
     differences = np.stack(
         [(fitted.value(ELSEWHERE + step * axis) - fitted.value(ELSEWHERE - step * axis))[:, 0]
@@ -166,9 +168,11 @@ def test_gradient_is_that_of_the_value(with_gradients, ridge):
     assert np.allclose(fitted.gradient(ELSEWHERE)[:, :, 0], differences, atol=2e-4)
 
 
-def test_values_and_gradients_are_matched(ridge):
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_values_and_gradients_are_matched(kernel, ridge):
     """Without smoothing the field passes through the values and gradients it was given."""
-    fitted = RadialInterpolant.fit(POINTS, ridge.energy(POINTS), ridge.force(POINTS))
+    fitted = RadialInterpolant.fit(POINTS, ridge.energy(POINTS), ridge.force(POINTS),
+                                   kernel=kernel, shape=2.5)
     assert np.allclose(fitted.value(POINTS)[:, 0], ridge.energy(POINTS), atol=1e-6)
     assert np.allclose(fitted.gradient(POINTS)[:, :, 0], ridge.force(POINTS), atol=1e-4)
 
@@ -182,8 +186,9 @@ def test_forces_make_the_same_samples_tell_more(ridge):
         force = fitted.gradient(ELSEWHERE)[:, :, 0] - ridge.force(ELSEWHERE)
         return np.sqrt(np.mean(energy**2)), np.sqrt(np.mean(force**2))
 
-    plain = errors(RadialInterpolant.fit(POINTS, values))
-    hermite = errors(RadialInterpolant.fit(POINTS, values, forces))
+    plain = errors(RadialInterpolant.fit(POINTS, values, kernel="multiquadric", shape=2.0))
+    hermite = errors(RadialInterpolant.fit(POINTS, values, forces, kernel="multiquadric",
+                                           shape=2.0))
     assert hermite[0] < plain[0] / 2
     assert hermite[1] < plain[1] / 2
 

@@ -7,6 +7,7 @@ import pytest
 from tests.planning.conftest import small_grasp_model
 
 from limber.core.errors import InputError, WorkError
+from limber.planning.field import energy_field
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, error_measures, fit_field
 from limber.planning.field.radial import RadialInterpolant
@@ -16,16 +17,12 @@ from limber.planning.field.valid_region import TrustRegion
 ELSEWHERE = np.random.default_rng(9).uniform(-0.1, 0.1, (80, 3))
 
 
-def test_analytic_energy_and_force_are_reproduced(ridge, well):
-    """At unseen points inside, energy within 3 % and force within 12 % (root mean square); of a
-    ridge as narrow as its samples are apart. Without the ridge within 0.1 and 0.2 %."""
-    for truth, most, steepest in ((ridge, 0.03, 0.12), (well, 1e-3, 2e-3)):
-        field = fit_field(truth.samples(count=300))
-        energy = field.energy(ELSEWHERE) - truth.energy(ELSEWHERE)
-        force = field.force(ELSEWHERE) - truth.force(ELSEWHERE)
-        assert np.sqrt(np.mean(energy**2)) < most * np.sqrt(np.mean(truth.energy(ELSEWHERE) ** 2))
-        assert np.sqrt(np.mean(force**2)) < steepest * np.sqrt(
-            np.mean(truth.force(ELSEWHERE) ** 2))
+def test_analytic_energy_and_force_are_reproduced(ridge, ridge_field):
+    """At unseen points inside, energy within 2 % and force within 5 % (root mean square)."""
+    energy = ridge_field.energy(ELSEWHERE) - ridge.energy(ELSEWHERE)
+    force = ridge_field.force(ELSEWHERE) - ridge.force(ELSEWHERE)
+    assert np.sqrt(np.mean(energy**2)) < 0.02 * np.sqrt(np.mean(ridge.energy(ELSEWHERE) ** 2))
+    assert np.sqrt(np.mean(force**2)) < 0.05 * np.sqrt(np.mean(ridge.force(ELSEWHERE) ** 2))
 
 
 def test_energy_gradient_is_that_of_the_clamped_energy(ridge_field):
@@ -47,11 +44,27 @@ def test_held_out_error_tells_the_true_error(ridge, ridge_field):
         assert 0.2 < ridge_field.errors[name] / true[name] < 5.0
 
 
+def test_a_fit_is_chosen_for_most_poses_and_not_for_the_stiffest(ridge, monkeypatch):
+    """One that is wrong at the five stiffest of 150 poses alone is better than one that is three
+    times as wrong at all others."""
+    samples = ridge.samples()
+    stiff = np.argsort(samples.energies)[-5:]
+
+    def left_out(some, _chart, choice, _face):
+        off = np.full(len(some.poses), 0.01 if choice.kernel == "quintic" else 0.03)
+        off[stiff] = 0.5 if choice.kernel == "quintic" else 0.01
+        return error_measures(some, (1.0 + off) * some.energies,
+                              (1.0 + off[:, None]) * some.forces), np.zeros((len(some.poses), 4))
+
+    monkeypatch.setattr(energy_field, "cross_validated_errors", left_out)
+    assert fit_field(samples).energy_fit.kernel == "quintic"
+
+
 def test_left_out_errors_are_those_of_fits_without_the_sample(ridge):
     """The closed form agrees with fitting again without each of five samples, value and gradient,
     and values alone."""
     samples = ridge.samples(count=40)
-    options = {"smoothing": 1e-6}
+    options = {"kernel": "quintic", "smoothing": 1e-6}
     missed = RadialInterpolant.leave_one_out(samples.positions, samples.energies, samples.forces,
                                              **options)
     alone = RadialInterpolant.leave_one_out(samples.positions, samples.tips[:, :2] ** 2, **options)
@@ -135,12 +148,12 @@ def test_bend_of_the_chart_is_the_most_within_reach():
 
 def test_energy_below_that_of_the_hanging_state_is_clamped(well):
     """Where round-off or a snap takes the energy below 0, the field says 0, with no gradient."""
-    samples = well.samples(count=300)
+    samples = well.samples(count=80)
     samples = replace(samples, energies=samples.energies - samples.positions @ [0.0, 0.0, 0.5],
                       forces=samples.forces - [0.0, 0.0, 0.5])
     field = fit_field(samples)
     wanted = np.maximum(well.energy(ELSEWHERE) - ELSEWHERE @ [0.0, 0.0, 0.5], 0.0)
-    assert np.allclose(field.energy(ELSEWHERE), wanted, atol=1e-3)
+    assert np.allclose(field.energy(ELSEWHERE), wanted, atol=1e-4)
     assert (wanted == 0.0).any(), "the case must include poses where energy is clamped"
     assert not field.energy_gradient(ELSEWHERE)[wanted == 0.0].any()
 
@@ -179,16 +192,16 @@ def test_saved_field_is_the_same(tmp_path, ridge_field):
 @pytest.mark.parametrize(("name", "change"), [
     ("chart_layers", lambda values: values[:1]),
     ("chart_layers", lambda values: np.repeat(values, 2, axis=0)),
-    ("energies_j", lambda values: values * 1e300)])
+    ("energy_fit_value_weights", lambda values: values * 1e300)])
 def test_a_field_of_odd_numbers_is_refused(tmp_path, ridge_field, name, change):
-    """One chart too many or too few, energies whose sums are not finite."""
+    """One chart too many or too few, weights whose sums are not finite."""
     path = tmp_path / "energy.npz"
     ridge_field.write(path)
     with np.load(path, allow_pickle=False) as file:
         arrays = {key: file[key] for key in file.files}
     arrays[name] = change(arrays[name])
     np.savez(path, **arrays)
-    with pytest.raises(InputError, match=r"energies_j has|two charts"):
+    with pytest.raises(InputError, match=r"is not an energy field|energy_fit_value_weights has"):
         EnergyField.read(path)
 
 

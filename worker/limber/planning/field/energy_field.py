@@ -8,7 +8,7 @@ The field also gives the natural rotation of the grasped piece, and the position
 tip.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 from limber.core.errors import Command, InputError, Option, Text, WorkError
 from limber.core.files.reading import read_arrays, require_shapes
 from limber.core.numerics.compiled import compiled
+from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart, mapped, pulled_back_size
 from limber.planning.field.radial import (
     LocalError,
@@ -29,28 +30,88 @@ from limber.planning.field.radial import (
     slack_of,
     value_at,
 )
-from limber.planning.field.stored_states import GraspSamples
+from limber.planning.field.stored_states import LOADS, GraspSamples
 from limber.planning.field.valid_region import TrustRegion, trusted_at
 
-# The charts of a field's fit: that of the shape is fixed, that of the energy is the one of least
-# cross-validation error, since it depends on the curvature off the shell. At fresh poses of the
-# paper's three branches and a drawn one, a choice among ten charts and four kernels had about the
-# same error of energy; that of force was lower on two of them (95 %: 4.3 against 7.0 %).
+# The kernel and the charts of a field's fit, chosen by cross-validation.
 
-LAYERS = ((5.0, 0.02), (12.0, 0.02), (30.0, 0.005), (80.0, 0.005))
-"""Stretch, and depth over the shell's radius."""
-_CHOSEN_BY = ("energy_error_median", "energy_error_most", "force_error_median", "force_error_most")
+KERNELS_TRIED = (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0), ("multiquadric", 2.0))
+CHARTS_TRIED = ((1.0, np.inf), (2.0, np.inf), (4.0, np.inf), (8.0, np.inf), (5.0, 0.02),
+                (12.0, 0.02), (30.0, 0.02), (12.0, 0.005), (30.0, 0.005), (80.0, 0.005))
+"""Stretch and depth; they depend on the curvature off the shell, for any kernel."""
+_FINALISTS = 3  # best charts with the first kernel; the other kernels are tried on them
 SMOOTHING = 1e-6  # fraction of the scaled system; more blurs, less invites rounding errors
+_CHOSEN_BY = ("energy_error_median", "energy_error_most", "force_error_median", "force_error_most")
 _MOST = 0.95  # quantile of the samples
+_MOST_TIPS = 0.9  # the same; beyond it the branch may buckle either way
+_CHOOSE_FROM = 150  # most samples; more change the choice little but take time
 
 
-def misplaced(samples: GraspSamples, chart: Chart) -> np.ndarray:
-    """Return the errors of the tip and targets at each sample in the fit to all the others [m],
-    shape [m, 1 + targets]."""
+@dataclass(frozen=True)
+class FitChoice:
+    """Choices of a field's fit: kernel and shape; stretch and depth of the chart (in radii)."""
+
+    kernel: str
+    shape: float
+    stretch: float = 1.0
+    depth: float = np.inf
+
+    def on(self, chart: Chart) -> Chart:
+        """Return the chart with this stretch and depth."""
+        return replace(chart, stretch=self.stretch, depth=self.depth * (chart.radius or 1.0))
+
+
+def chosen_fits(samples: GraspSamples, region: TrustRegion, charts: Sequence[tuple[float, float]],
+                progress: Progress) -> tuple[FitChoice, FitChoice]:
+    """Return the choices of least cross-validation error for the energy and for the shape;
+    ``charts`` are stretch and depth of those to try."""
+    chart = region.chart
+    picked = _spread_out(region.is_face(), _CHOOSE_FROM)
+    some, face = samples.take(picked), region.is_face()[picked]
+    sure = with_slopes(some)
+    bending, inside = some.take(sure), ~face[sure]
+
+    def energy_missed(choice: FitChoice) -> float:
+        errors = cross_validated_errors(some, choice.on(chart), choice, face)[0]
+        # Each relative to its own value: a few stiff poses, compressed and buckled, dominate means.
+        return float(np.prod([errors[name] for name in _CHOSEN_BY]))
+
+    def shape_missed(choice: FitChoice) -> float:
+        size = misplaced_tips(bending, choice, chart)[inside, 0]
+        return float(np.median(size) * np.quantile(size, _MOST_TIPS))
+
+    return (_least(energy_missed, charts, progress.part(0.0, 0.5)),
+            _least(shape_missed, charts, progress.part(0.5, 1.0)))
+
+
+def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, float]],
+           progress: Progress) -> FitChoice:
+    """Return the choice with the least ``missed``: the first kernel on all charts, then every other
+    kernel on the best of those."""
+    first, *others = KERNELS_TRIED
+    asked = [FitChoice(*first, *chart) for chart in charts]
+    scores: dict[FitChoice, float] = {}
+    while asked:
+        for choice in asked:
+            progress(len(scores) / (len(charts) + _FINALISTS * len(others)),
+                     "choosing the interpolation")
+            scores[choice] = missed(choice)
+        best = sorted(scores, key=scores.__getitem__)
+        asked = [replace(chosen, kernel=kernel, shape=shape) for kernel, shape in others
+                 for chosen in best[:_FINALISTS]] if len(scores) == len(charts) else []
+    return best[0]
+
+
+def misplaced_tips(samples: GraspSamples, choice: FitChoice, chart: Chart,
+                   channels: slice = slice(3)) -> np.ndarray:
+    """Return the tip's error at each sample in the fit to all the others [m], and its targets' with
+    more ``channels`` than those of the tip, shape [m, channels / 3]."""
+    chart = choice.on(chart)
     slopes = slopes_on(chart, samples)
     missed = RadialInterpolant.leave_one_out(
-        chart.map(samples.positions), samples.shape[:, 3:],
-        None if slopes is None else slopes[:, :, 3:], smoothing=SMOOTHING)[:, 0]
+        chart.map(samples.positions), samples.shape[:, 3:][:, channels],
+        None if slopes is None else slopes[:, :, 3:][:, :, channels],
+        kernel=choice.kernel, shape=choice.shape, smoothing=SMOOTHING)[:, 0]
     return np.linalg.norm(missed.reshape(len(missed), -1, 3), axis=2)
 
 
@@ -72,7 +133,17 @@ def slopes_on(chart: Chart, samples: GraspSamples) -> np.ndarray | None:
                      for c in range(samples.shape_slopes.shape[2])], axis=2)
 
 
-def cross_validated_errors(samples: GraspSamples, chart: Chart, face: np.ndarray,
+def _spread_out(face: np.ndarray, count: int) -> np.ndarray:
+    """Return at most ``count`` indices, those on the hull's face and others at even steps."""
+    if len(face) <= count:
+        return np.arange(len(face))
+    inner = np.flatnonzero(~face)
+    left = max(count - int(face.sum()), count // 2)
+    picked = inner[np.linspace(0, len(inner) - 1, min(left, len(inner))).astype(int)]
+    return np.sort(np.concatenate([np.flatnonzero(face), picked]))
+
+
+def cross_validated_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face: np.ndarray,
                            ) -> tuple[dict[str, float], np.ndarray]:
     """Errors of a fit at each sample left out, in closed form: :func:`error_measures`, and
     prediction less truth of energy [J] and force [N] [m, 4]. Samples on the hull's ``face`` do not
@@ -84,7 +155,7 @@ def cross_validated_errors(samples: GraspSamples, chart: Chart, face: np.ndarray
     in_chart = chart.map(samples.positions)
     missed = RadialInterpolant.leave_one_out(
         in_chart, samples.energies, chart.push_forward(samples.positions, samples.forces),
-        smoothing=SMOOTHING)[:, :, 0]
+        kernel=choice.kernel, shape=choice.shape, smoothing=SMOOTHING)[:, :, 0]
     energy = np.maximum(samples.energies - missed[:, 0], 0.0)
     off = -chart.pull_back(samples.positions, missed[:, 1:])
     inside = np.flatnonzero(~face)
@@ -122,17 +193,22 @@ def _rms(values: np.ndarray) -> float:
 
 _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
-             "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n",
-             "corrected": "corrected"}
+             "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n", "reduced": "reduced"}
 _WHAT = Text("an energy field (", Command("energy", Option("force", True)), " creates one)")
 _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
-           "min_det_f": ("m",), "rejected_poses": ("q", 6),
-           "chart_pivot_m": (3,), "chart_radius_m": ()}
+           "min_det_f": ("m",), "rejected_poses": ("q", 6)}
 _OPTIONAL_SHAPES = {
     "strains": ("m",), "targets_m": ("m", "t", 3), "torques_nm": ("m", 3),
     "strain_places_m": ("m", 3), "stresses_pa": ("m",), "shape_slopes": ("m", 3, "s"),
-    "axial_forces_n": ("m",), "corrected": ("m",),
-    "rest_pose": (6,)}
+    "axial_forces_n": ("m",), "reduced": ("m",), "left_out_place_errors_m": ("m", "places"),
+    "rest_pose": (6,), "chart_pivot_m": (3,), "chart_radius_m": (), "energy_error": (),
+    "force_error": (),
+    **{f"{fit}_{name}": shape for fit in ("energy_fit", "shape_fit", "load_fit")
+       for name, shape in {
+           "shape": (), "smoothing": (), "scale": (), "shift": (3,), "centres": (f"{fit} m", 3),
+           "value_weights": (f"{fit} m", f"{fit} c"),
+           "gradient_weights": (f"{fit} g", 3, f"{fit} c"),
+           "polynomial": (f"{fit} p", f"{fit} c"), "powers": (f"{fit} p", 3)}.items()}}
 """Shapes of the arrays in a file; equal letters are equal lengths."""
 """In any unit here: with larger numbers, sums would not be finite."""
 
@@ -286,25 +362,30 @@ class EnergyField:
                            slack or slack_of(("energy", "force", *self.load_names), {}, 0.0))
 
     def write(self, path: Path, extra: dict[str, Any] | None = None) -> None:
-        """Write ``energy.npz``: samples, charts, errors and ``extra`` arrays; without pickling."""
+        """Write ``energy.npz``: samples, weights, errors and ``extra`` arrays; without pickling."""
         samples = self.samples
         arrays = {
             "poses": samples.poses, "energies_j": samples.energies,
             "forces_n": samples.forces, "tips_m": samples.tips, "min_det_f": samples.min_det_f,
             "rejected_poses": samples.rejected_poses,
+            "left_out_errors": self.missed, "left_out_place_errors_m": self.misplaced,
             "chart_pivot_m": self.chart.pivot, "chart_radius_m": np.array(self.chart.radius),
             "chart_layers": np.array([[chart.stretch, chart.depth]
                                       for chart in (self.chart, self.shape_chart)]),
             "error_names": np.array(list(self.errors)),
             "error_values": np.array(list(self.errors.values())),
+            "energy_error": np.array(self.errors["energy_error"]),
+            "force_error": np.array(self.errors["force_error"]),
         }
         arrays |= {stored: getattr(samples, name) for name, stored in _OPTIONAL.items()
                    if getattr(samples, name) is not None}
+        for name in ("energy_fit", "shape_fit", "load_fit"):
+            arrays |= getattr(self, name).to_arrays(f"{name}_")
         np.savez_compressed(path, **arrays, **(extra or {}))
 
     @classmethod
     def read(cls, path: Path) -> "EnergyField":
-        """Read a file that :meth:`write` wrote, and fit its samples in its charts.
+        """Read a file that :meth:`write` wrote; nothing is fitted again.
 
         Raises:
             InputError: the file is not an energy field.
@@ -313,29 +394,35 @@ class EnergyField:
             arrays = read_arrays(path, _WHAT)
             require_shapes(path, arrays, _SHAPES | {
                 name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays},
-                           _WHAT, flags=("corrected",))
+                           _WHAT, flags=("reduced",))
             stored: dict[str, Any] = {name: arrays.get(key) for name, key in _OPTIONAL.items()}
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],
                 **stored)
+            energy, shape, loads = (RadialInterpolant.from_arrays(arrays, f"{name}_")
+                                    for name in ("energy_fit", "shape_fit", "load_fit"))
             region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3],
                                     arrays["chart_pivot_m"], float(arrays["chart_radius_m"]))
             if arrays["chart_layers"].shape != (2, 2):
                 raise ValueError("two charts are needed")
             chart, shape_chart = (replace(region.chart, stretch=float(stretch), depth=float(depth))
                                   for stretch, depth in arrays["chart_layers"])
+            missed, misplaced = _errors_in(arrays, samples)
+            errors = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
+                              strict=True))
         except (KeyError, ValueError, OSError, TypeError) as error:
             raise InputError(f"{path} is not an energy field ({error}).",
                              Text("It was not written by ", Command("energy"), ", or is damaged."),
                              "Run ", Command("energy"), " again with ", Option("force", True),
                              ".") from error
-        return _fitted(samples, chart, shape_chart, region)
+        return cls(samples, chart, shape_chart, energy, shape, loads, region, errors, missed,
+                   misplaced)
 
 
 def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: float | None = None,
-              ) -> EnergyField:
-    """Fit the field, and measure its error on samples left out.
+              *, progress: Progress = SILENT) -> EnergyField:
+    """Fit the field with the kernel and chart of least cross-validation error.
 
     Args:
         samples: Results of the branch model.
@@ -355,52 +442,71 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
     if radius is None:
         radius = 0.0 if base is None else float(np.linalg.norm(samples.positions[0] - base))
     region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3], base, radius)
-    plain, face = region.chart, region.is_face()
-    charts = [replace(plain, stretch=stretch, depth=depth * plain.radius)
-              for stretch, depth in LAYERS] if plain.radius else [plain]
+    charts = CHARTS_TRIED if base is not None else CHARTS_TRIED[:1]
+    return _fitted(samples, *chosen_fits(samples, region, charts, progress), region)
 
-    def missed(chart: Chart) -> float:
-        errors, _ = cross_validated_errors(samples, chart, face)
-        # Each relative to its own value: a few stiff poses, compressed and buckled, dominate means.
-        return float(np.prod([errors[name] for name in _CHOSEN_BY]))
 
-    return _fitted(samples, min(charts, key=missed), charts[0], region)
+def _errors_in(arrays: dict[str, np.ndarray], samples: GraspSamples,
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``missed`` and ``misplaced`` from a file; nan if it does not contain them."""
+    column_count = 1 + (0 if samples.targets is None else samples.targets.shape[1])
+    found = []
+    for name, columns in (("left_out_errors", 4 + len(LOADS)),
+                          ("left_out_place_errors_m", column_count)):
+        whole = np.full((len(samples.poses), columns), np.nan)
+        known = arrays.get(name, np.empty((len(whole), 0)))
+        if known.ndim != 2 or len(known) != len(whole) or known.shape[1] > columns:
+            raise ValueError(f"{name} does not match the poses")
+        whole[:, :known.shape[1]] = known
+        found.append(whole)
+    return found[0], found[1]
 
 
 def refit(field: EnergyField, added: GraspSamples) -> EnergyField:
-    """Return the field fitted to ``added`` samples as well."""
-    return _again(field, field.samples.joined(added))
+    """Return the field fitted to ``added`` samples as well, in the same manner."""
+    return _as_before(field, field.samples.joined(added))
 
 
 def knowing(field: EnergyField, added: dict[str, np.ndarray]) -> EnergyField:
     """Return the field with ``added`` quantities at its samples as loads, by name, [m] each."""
-    return _again(field, replace(field.samples, added=added))
+    return _as_before(field, replace(field.samples, added=added))
 
 
-def _again(field: EnergyField, samples: GraspSamples) -> EnergyField:
+def _as_before(field: EnergyField, samples: GraspSamples) -> EnergyField:
+    energy, shape = (FitChoice(fit.kernel, fit.shape, chart.stretch,
+                               chart.depth / (chart.radius or 1.0))
+                     for fit, chart in ((field.energy_fit, field.chart),
+                                        (field.shape_fit, field.shape_chart)))
     region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3], field.chart.pivot,
                             field.chart.radius)
-    return _fitted(samples, field.chart, field.shape_chart, region)
+    return _fitted(samples, energy, shape, region)
 
 
-def _fitted(samples: GraspSamples, chart: Chart, bent: Chart, region: TrustRegion) -> EnergyField:
-    errors, missed = cross_validated_errors(samples, chart, region.is_face())
-    energy = RadialInterpolant.fit(
-        chart.map(samples.positions), samples.energies,
-        chart.push_forward(samples.positions, samples.forces), smoothing=SMOOTHING)
-    in_chart, sure = bent.map(samples.positions), with_slopes(samples)
-    bending, table = samples.take(sure), samples.load_table
-    shape = RadialInterpolant.fit(in_chart[sure], bending.shape, slopes_on(bent, bending),
-                                  smoothing=SMOOTHING)
-    loads = RadialInterpolant.fit(in_chart, table, smoothing=SMOOTHING)
-    off = -RadialInterpolant.leave_one_out(in_chart, table, smoothing=SMOOTHING)[:, 0]
+def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: TrustRegion,
+            ) -> EnergyField:
+    chart = choice.on(region.chart)
+    errors, missed = cross_validated_errors(samples, chart, choice, region.is_face())
+    in_chart = chart.map(samples.positions)
+    forces = chart.push_forward(samples.positions, samples.forces)
+    energy = RadialInterpolant.fit(in_chart, samples.energies, forces, kernel=choice.kernel,
+                                   shape=choice.shape, smoothing=SMOOTHING)
+    shape_chart = bent.on(region.chart)
+    in_chart = shape_chart.map(samples.positions)
+    options: dict[str, Any] = {"kernel": bent.kernel, "shape": bent.shape, "smoothing": SMOOTHING}
+    sure = with_slopes(samples)
+    bending = samples.take(sure)
+    shape = RadialInterpolant.fit(in_chart[sure], bending.shape, slopes_on(shape_chart, bending),
+                                  **options)
+    loads = RadialInterpolant.fit(in_chart, samples.load_table, **options)
+    off = -RadialInterpolant.leave_one_out(in_chart, samples.load_table, **options)[:, 0]
     off[:, [one is None for one in samples.loads.values()]] = np.nan
-    found = misplaced(bending, bent)
-    away = np.full((len(samples.poses), found.shape[1]), np.nan)
-    away[sure] = found
-    errors["tip_error_median_m"] = float(np.median(found[~region.is_face()[sure], 0]))
-    return EnergyField(samples, chart, bent, energy, shape, loads, region, errors,
-                       np.column_stack([missed, off]), away)
+    found = misplaced_tips(bending, bent, region.chart, slice(None))
+    misplaced = np.full((len(samples.poses), found.shape[1]), np.nan)
+    misplaced[sure] = found
+    inside = ~region.is_face()[sure]
+    errors["tip_error_median_m"] = float(np.median(found[inside, 0]))
+    return EnergyField(samples, chart, shape_chart, energy, shape, loads, region, errors,
+                       np.column_stack([missed, off]), misplaced)
 
 
 def _rows(points: np.ndarray) -> np.ndarray:

@@ -1,20 +1,21 @@
 """Radial basis function interpolation of scattered values, and of their gradients where known.
 
-    f(x) = sum_j c_j phi(|x - x_j|) - sum_j g_j . grad phi(|x - x_j|) + p(x),    phi(r) = r^3
+    f(x) = sum_j c_j phi(|x - x_j|) - sum_j g_j . grad phi(|x - x_j|) + p(x)
 
 With values alone this is the interpolation of the paper (Wright 2003). A finite element solution
 gives, besides the energy, the force, which is the energy's gradient. The second sum
 (Hermite-Birkhoff interpolation, Wu 1992) makes the field match both, so each solution contributes
-four times as much data. ``p`` is linear, which a cubic needs to be conditionally definite.
+``1 + dimension`` times as much data.
 
-The fit is dense linear algebra. Values and gradients are evaluated by compiled loops that the
-planner calls some million times, each over all samples. Their arrays hold one coordinate each in
-the order of the loop, so that the processor vectorises.
+The fit is dense linear algebra. Values and gradients, in three coordinates, are evaluated by
+compiled loops that the planner calls some million times, each over all samples. Their arrays hold
+one coordinate each in the order of the loop, so that the processor vectorises.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations_with_replacement
 from typing import NamedTuple
 
 import numpy as np
@@ -22,58 +23,83 @@ import numpy as np
 from limber.core.errors import WorkError
 from limber.core.numerics.compiled import compiled
 
+KERNELS = {"cubic": 0, "quintic": 1, "multiquadric": 2, "gaussian": 3}
+"""Kernel name to its number in the compiled loops."""
+
+# The polynomial that a kernel needs to be conditionally definite, or one degree more.
+_DEGREE = {"cubic": 1, "quintic": 2, "multiquadric": 1, "gaussian": 1}
+
 
 @dataclass(frozen=True)
 class RadialInterpolant:
-    """A fitted field in scaled coordinates ``(x - shift) / scale``: centres [m, 3], weights of
-    values [m, channels] and of gradients [m, 3, channels], 0 if they were not given, and a linear
-    ``polynomial`` [4, channels]."""
+    """A fitted field in scaled coordinates ``(x - shift) / scale``: centres [m, dimension], weights
+    of values [m, channels] and of gradients [m or 0, dimension, channels], and a polynomial [terms,
+    channels] with ``powers`` [terms, dimension]. ``smoothing`` is the ridge."""
 
+    kernel: str
+    shape: float
+    smoothing: float
     shift: np.ndarray
     scale: float
     centres: np.ndarray
     value_weights: np.ndarray
     gradient_weights: np.ndarray
     polynomial: np.ndarray
+    powers: np.ndarray
 
     @classmethod
     def fit(cls, points: np.ndarray, values: np.ndarray, gradients: np.ndarray | None = None, *,
-            smoothing: float = 0.0) -> "RadialInterpolant":
-        """Fit values [m] or [m, channels] at points [m, 3], and gradients [m, 3] or [m, 3,
-        channels] if given. ``smoothing`` is the ridge. WorkError if the samples do not determine
-        the field."""
-        full, right, shift, scale = _system(points, values, gradients, smoothing)
-        count, channels = len(points), right.shape[1]
-        size = np.abs(right[:count]).max(axis=0)
+            kernel: str = "cubic", shape: float = 1.0, smoothing: float = 0.0,
+            ) -> "RadialInterpolant":
+        """Fit values [m] or [m, channels] at points [m, dimension], and gradients [m, dimension] or
+        [m, dimension, channels] if given. WorkError if the samples do not determine the field."""
+        points = np.asarray(points, float)
+        values = np.asarray(values, float).reshape(len(points), -1)
+        count, dimension = points.shape
+        shift, scale = _frame(points)
+        centres = np.ascontiguousarray((points - shift) / scale)
+        powers = _monomials(dimension, _DEGREE[kernel])
+        with_gradients = gradients is not None
+        right = values
+        if with_gradients:
+            slopes = np.asarray(gradients, float).reshape(count, dimension, -1) * scale
+            right = np.concatenate([values, slopes.reshape(count * dimension, -1)])
+        size = np.abs(values).max(axis=0)
         size[size == 0] = 1.0
-        try:
-            weights = np.linalg.solve(full, right / size) * size
-        except np.linalg.LinAlgError:
-            weights = np.full_like(right, np.nan)
-        if not np.isfinite(weights).all():
-            raise WorkError(
-                f"The interpolation of {count} samples has no unique solution.",
-                "It needs at least 4 samples that do not coincide or lie in one plane.",
-                "Sample more grasp poses, or use a larger deflection.")
-        slopes = np.zeros((count, 3, channels))
-        if gradients is not None:
-            slopes[:] = weights[count:-4].reshape(-1, 3, channels)
-        return cls(shift, scale, np.ascontiguousarray((points - shift) / scale),
-                   weights[:count].copy(), slopes, weights[-4:].copy())
+        weights = _solve(centres, right / size, powers, kernel, shape, smoothing, with_gradients)
+        weights *= size
+        ends = [count, len(right)]
+        value_weights, gradient_weights, polynomial = np.split(weights, ends)
+        return cls(kernel, float(shape), float(smoothing), shift, scale, centres,
+                   np.ascontiguousarray(value_weights),
+                   gradient_weights.reshape(-1, dimension, values.shape[1]).copy(),
+                   np.ascontiguousarray(polynomial), powers)
 
     @staticmethod
     def leave_one_out(points: np.ndarray, values: np.ndarray,
-                      gradients: np.ndarray | None = None, *, smoothing: float = 0.0) -> np.ndarray:
-        """Truth less the fit without a sample, at that sample [m, 4, channels], or [m, 1, channels]
-        without gradients: ``((A^-1)_BB)^-1 (A^-1 b)_B`` with the rows B of a sample (Rippa 1999,
-        here for blocks of value and gradient)."""
-        full, right, _, scale = _system(points, values, gradients, smoothing)
+                      gradients: np.ndarray | None = None, *, kernel: str,
+                      shape: float = 1.0, smoothing: float = 0.0) -> np.ndarray:
+        """Truth less the fit without a sample, at that sample [m, 1 + dimension, channels], or [m,
+        1, channels] without gradients: ``((A^-1)_BB)^-1 (A^-1 b)_B`` with the rows B of a sample
+        (Rippa 1999, here for blocks of value and gradient)."""
+        points = np.asarray(points, float)
+        count, dimension = points.shape
+        shift, scale = _frame(points)
+        centres = np.ascontiguousarray((points - shift) / scale)
+        both = gradients is not None
+        right = np.asarray(values, float).reshape(count, -1)
+        if both:
+            slopes = np.asarray(gradients, float).reshape(count * dimension, -1)
+            right = np.concatenate([right, scale * slopes])
+        full = _bordered(centres, _monomials(dimension, _DEGREE[kernel]), kernel, shape, smoothing,
+                         both)
         inverse = np.linalg.inv(full)
-        rows = np.arange(len(points))[:, None]
-        if gradients is not None:
-            rows = np.hstack([rows, len(points) + 3 * rows + np.arange(3)])
+        weights = inverse[:, :len(right)] @ right
+        rows = np.arange(count)[:, None]
+        if both:
+            rows = np.hstack([rows, count + dimension * rows + np.arange(dimension)])
         blocks = inverse[rows[:, :, None], rows[:, None, :]]
-        missed = np.linalg.solve(blocks, (inverse @ right)[rows])
+        missed = np.linalg.solve(blocks, weights[rows])
         missed[:, 1:] /= scale
         return missed
 
@@ -91,97 +117,222 @@ class RadialInterpolant:
     @cached_property
     def arrays(self) -> tuple:
         """Arguments of the compiled loops after the point; samples along the last axis."""
-        return (self.scale, self.shift, np.ascontiguousarray(self.centres.T),
-                np.ascontiguousarray(self.value_weights.T),
-                np.ascontiguousarray(self.gradient_weights.transpose(2, 1, 0)), self.polynomial)
+        return (KERNELS[self.kernel], self.shape, self.scale, self.shift,
+                np.ascontiguousarray(self.centres.T), np.ascontiguousarray(self.value_weights.T),
+                np.ascontiguousarray(self.gradient_weights.transpose(2, 1, 0)), self.polynomial,
+                self.powers)
+
+    def to_arrays(self, prefix: str) -> dict[str, np.ndarray]:
+        """Return plain arrays for an ``npz`` file, names starting with ``prefix``."""
+        names = ("shape", "smoothing", "shift", "scale", "centres", "value_weights",
+                 "gradient_weights", "polynomial", "powers")
+        return {f"{prefix}kernel": np.array(self.kernel)} | {
+            prefix + name: np.asarray(getattr(self, name)) for name in names}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, np.ndarray], prefix: str) -> "RadialInterpolant":
+        """Undo :meth:`to_arrays`."""
+        part = {name.removeprefix(prefix): value for name, value in arrays.items()
+                if name.startswith(prefix)}
+        plain = {"kernel": str(part.pop("kernel")), "shape": float(part.pop("shape")),
+                 "smoothing": float(part.pop("smoothing")), "scale": float(part.pop("scale"))}
+        powers = np.ascontiguousarray(part.pop("powers"), np.int64)
+        found = cls(**plain, powers=powers, **{
+            name: np.ascontiguousarray(value, float) for name, value in part.items()})
+        if found.kernel not in KERNELS or not (found.scale > 0 and found.shape > 0):
+            raise ValueError(f"unknown kernel {found.kernel} of shape {found.shape}")
+        if len(found.gradient_weights) not in (0, len(found.centres)) or not (
+                (powers >= 0) & (powers <= 8)).all() or len(found.value_weights) != len(
+                found.centres):
+            raise ValueError("weights that do not match their samples")
+        return found
 
 
-def _system(points: np.ndarray, values: np.ndarray, gradients: np.ndarray | None, smoothing: float,
-            ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return matrix [k, k] and right side [k, channels] of a fit, the polynomial's rows last, and
-    shift and scale that bring the points within a box of half edge 1."""
-    points, count = np.asarray(points, float), len(points)
+def _frame(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return shift and scale that bring points within a box of half edge 1."""
     shift = points.mean(axis=0)
-    scale = float(np.abs(points - shift).max()) or 1.0
-    centres = np.ascontiguousarray((points - shift) / scale)
-    right = np.asarray(values, float).reshape(count, -1)
-    basis = np.hstack([np.ones((count, 1)), centres])
-    if gradients is not None:
-        slopes = scale * np.asarray(gradients, float).reshape(3 * count, -1)
-        right = np.concatenate([right, slopes])
-        basis = np.concatenate([basis, np.tile(np.eye(4)[1:], (count, 1))])
-    matrix = _matrix(centres, gradients is not None)
-    matrix[np.diag_indices(len(matrix))] += smoothing
-    return (np.block([[matrix, basis], [basis.T, np.zeros((4, 4))]]),
-            np.concatenate([right, np.zeros((4, right.shape[1]))]), shift, scale)
+    return shift, float(np.abs(points - shift).max()) or 1.0
+
+
+def _bordered(centres: np.ndarray, powers: np.ndarray, kernel: str, shape: float, smoothing: float,
+              with_gradients: bool) -> np.ndarray:
+    """Return the system with the polynomial's rows and columns beside it."""
+    system = _system(centres, KERNELS[kernel], shape, with_gradients)
+    system[np.diag_indices(len(system))] += smoothing
+    basis = _polynomial_rows(centres, powers, with_gradients)
+    terms = basis.shape[1]
+    return np.block([[system, basis], [basis.T, np.zeros((terms, terms))]])
+
+
+def _monomials(dimension: int, degree: int) -> np.ndarray:
+    rows = [[0] * dimension]
+    for total in range(1, degree + 1):
+        for picked in combinations_with_replacement(range(dimension), total):
+            rows.append([picked.count(axis) for axis in range(dimension)])
+    return np.array(rows, np.int64)
+
+
+def _solve(centres: np.ndarray, right: np.ndarray, powers: np.ndarray, kernel: str, shape: float,
+           smoothing: float, with_gradients: bool) -> np.ndarray:
+    full = _bordered(centres, powers, kernel, shape, smoothing, with_gradients)
+    terms = len(powers)
+    padded = np.concatenate([right, np.zeros((terms, right.shape[1]))])
+    try:
+        weights = np.linalg.solve(full, padded)
+    except np.linalg.LinAlgError:
+        weights = np.full_like(padded, np.nan)
+    if not np.isfinite(weights).all():
+        raise WorkError(
+            f"The {kernel} interpolation of {len(centres)} samples has no unique solution.",
+            f"It needs at least {terms} samples that do not coincide or lie in one plane.",
+            "Sample more grasp poses, or use a larger deflection.")
+    return weights
+
+
+def _polynomial_rows(centres: np.ndarray, powers: np.ndarray, with_gradients: bool) -> np.ndarray:
+    count, dimension = centres.shape
+    rows = np.prod(centres[:, None, :] ** powers, axis=2)
+    if not with_gradients:
+        return rows
+    slopes = np.zeros((count, dimension, len(powers)))
+    for axis in range(dimension):
+        lowered = powers.copy()
+        lowered[:, axis] = np.maximum(lowered[:, axis] - 1, 0)
+        slopes[:, axis] = powers[:, axis] * np.prod(centres[:, None, :] ** lowered, axis=2)
+    return np.concatenate([rows, slopes.reshape(count * dimension, -1)])
 
 
 @compiled
-def radial_terms(squared):
+def radial_terms(kernel, shape, squared):
     """Return ``phi``, ``a``, ``b`` at squared distance: grad phi = a d, Hessian = a I + b d d^T."""
-    r = np.sqrt(squared)
-    return r * squared, 3.0 * r, 3.0 / r if r > 0.0 else 0.0
+    if kernel == 0:
+        r = np.sqrt(squared)
+        return r * squared, 3.0 * r, 3.0 / r if r > 0.0 else 0.0
+    if kernel == 1:
+        r = np.sqrt(squared)
+        return -r * squared * squared, -5.0 * r * squared, -15.0 * r
+    square = shape * shape
+    if kernel == 2:
+        s = np.sqrt(1.0 + square * squared)
+        return -s, -square / s, square * square / (s * s * s)
+    phi = np.exp(-square * squared)
+    return phi, -2.0 * square * phi, 4.0 * square * square * phi
 
 
 @compiled
-def _matrix(centres, with_gradients):
-    count = len(centres)
-    size = 4 * count if with_gradients else count
+def _system(centres, kernel, shape, with_gradients):
+    count, dimension = centres.shape
+    size = count * (1 + dimension) if with_gradients else count
     matrix = np.zeros((size, size))
-    offset = np.empty(3)
+    offset = np.empty(dimension)
     for i in range(count):
         for j in range(count):
             squared = 0.0
-            for k in range(3):
+            for k in range(dimension):
                 offset[k] = centres[i, k] - centres[j, k]
                 squared += offset[k] * offset[k]
-            phi, a, b = radial_terms(squared)
+            phi, a, b = radial_terms(kernel, shape, squared)
             matrix[i, j] = phi
             if not with_gradients:
                 continue
-            for k in range(3):
-                row = count + i * 3 + k
-                matrix[i, count + j * 3 + k] = -a * offset[k]
+            for k in range(dimension):
+                row = count + i * dimension + k
+                matrix[i, count + j * dimension + k] = -a * offset[k]
                 matrix[row, j] = a * offset[k]
-                for m in range(3):
-                    matrix[row, count + j * 3 + m] = -b * offset[k] * offset[m]
-                matrix[row, count + j * 3 + k] -= a
+                for m in range(dimension):
+                    matrix[row, count + j * dimension + m] = -b * offset[k] * offset[m]
+                matrix[row, count + j * dimension + k] -= a
     return matrix
 
 
 @compiled
-def value_at(point, channel, scale, shift, centres, value_weights, gradient_weights, polynomial):
+def value_at(point, channel, kernel, shape, scale, shift, centres, value_weights,
+             gradient_weights, polynomial, powers):
     """Return one channel of the field at ``point`` [3]; arrays as ``RadialInterpolant.arrays``."""
-    x, y, z = _scaled(point, shift, scale)
+    scaled = _scaled(point, shift, scale)
     weights, slopes = value_weights[channel], gradient_weights[channel]
-    first, second, third = centres[0], centres[1], centres[2]
-    along_x, along_y, along_z = slopes[0], slopes[1], slopes[2]
-    total = polynomial[0, channel] + polynomial[1, channel] * x + (
-        polynomial[2, channel] * y + polynomial[3, channel] * z)
-    for j in range(len(weights)):
-        dx, dy, dz = x - first[j], y - second[j], z - third[j]
-        phi, a, _b = radial_terms(dx * dx + dy * dy + dz * dz)
-        total += weights[j] * phi - a * (dx * along_x[j] + dy * along_y[j] + dz * along_z[j])
+    # With the kernel's number written out, the choice is made outside the loop, as required.
+    if kernel == 0:
+        total = _value_sum(0, scaled, shape, centres, weights, slopes)
+    elif kernel == 1:
+        total = _value_sum(1, scaled, shape, centres, weights, slopes)
+    elif kernel == 2:
+        total = _value_sum(2, scaled, shape, centres, weights, slopes)
+    else:
+        total = _value_sum(3, scaled, shape, centres, weights, slopes)
+    x, y, z = scaled
+    for t in range(len(powers)):
+        total += polynomial[t, channel] * (
+            _power(x, powers[t, 0]) * _power(y, powers[t, 1]) * _power(z, powers[t, 2]))
     return total
 
 
 @compiled
-def gradient_at(point, channel, scale, shift, centres, value_weights, gradient_weights, polynomial,
-                out):
-    """Write the gradient of one channel at ``point`` [3] into ``out`` [3]."""
-    x, y, z = _scaled(point, shift, scale)
-    weights, slopes = value_weights[channel], gradient_weights[channel]
+def _value_sum(kernel, scaled, shape, centres, weights, slopes):
+    x, y, z = scaled
     first, second, third = centres[0], centres[1], centres[2]
     along_x, along_y, along_z = slopes[0], slopes[1], slopes[2]
-    sum_x, sum_y, sum_z = (polynomial[1, channel], polynomial[2, channel], polynomial[3, channel])
+    total = 0.0
+    if len(along_x) > 0:
+        for j in range(len(weights)):
+            dx, dy, dz = x - first[j], y - second[j], z - third[j]
+            phi, a, _b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
+            total += weights[j] * phi - a * (dx * along_x[j] + dy * along_y[j] + dz * along_z[j])
+        return total
     for j in range(len(weights)):
         dx, dy, dz = x - first[j], y - second[j], z - third[j]
-        _phi, a, b = radial_terms(dx * dx + dy * dy + dz * dz)
-        radial = weights[j] * a - b * (dx * along_x[j] + dy * along_y[j] + dz * along_z[j])
-        sum_x += radial * dx - a * along_x[j]
-        sum_y += radial * dy - a * along_y[j]
-        sum_z += radial * dz - a * along_z[j]
-    out[0], out[1], out[2] = sum_x / scale, sum_y / scale, sum_z / scale
+        phi, _a, _b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
+        total += weights[j] * phi
+    return total
+
+
+@compiled
+def gradient_at(point, channel, kernel, shape, scale, shift, centres, value_weights,
+                gradient_weights, polynomial, powers, out):
+    """Write the gradient of one channel at ``point`` [3] into ``out`` [3]."""
+    scaled = _scaled(point, shift, scale)
+    weights, slopes = value_weights[channel], gradient_weights[channel]
+    if kernel == 0:
+        total = _slope_sum(0, scaled, shape, centres, weights, slopes)
+    elif kernel == 1:
+        total = _slope_sum(1, scaled, shape, centres, weights, slopes)
+    elif kernel == 2:
+        total = _slope_sum(2, scaled, shape, centres, weights, slopes)
+    else:
+        total = _slope_sum(3, scaled, shape, centres, weights, slopes)
+    (x, y, z), (along_x, along_y, along_z) = scaled, total
+    for t in range(len(powers)):
+        p, q, r = powers[t, 0], powers[t, 1], powers[t, 2]
+        term = polynomial[t, channel]
+        along_x += term * p * _power(x, p - 1) * _power(y, q) * _power(z, r)
+        along_y += term * q * _power(x, p) * _power(y, q - 1) * _power(z, r)
+        along_z += term * r * _power(x, p) * _power(y, q) * _power(z, r - 1)
+    out[0], out[1], out[2] = along_x / scale, along_y / scale, along_z / scale
+
+
+@compiled
+def _slope_sum(kernel, scaled, shape, centres, weights, slopes):
+    x, y, z = scaled
+    first, second, third = centres[0], centres[1], centres[2]
+    along_x, along_y, along_z = slopes[0], slopes[1], slopes[2]
+    sum_x, sum_y, sum_z = 0.0, 0.0, 0.0
+    if len(along_x) > 0:
+        for j in range(len(weights)):
+            dx, dy, dz = x - first[j], y - second[j], z - third[j]
+            _phi, a, b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
+            radial = weights[j] * a - b * (
+                dx * along_x[j] + dy * along_y[j] + dz * along_z[j])
+            sum_x += radial * dx - a * along_x[j]
+            sum_y += radial * dy - a * along_y[j]
+            sum_z += radial * dz - a * along_z[j]
+        return sum_x, sum_y, sum_z
+    for j in range(len(weights)):
+        dx, dy, dz = x - first[j], y - second[j], z - third[j]
+        _phi, a, _b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
+        sum_x += weights[j] * a * dx
+        sum_y += weights[j] * a * dy
+        sum_z += weights[j] * a * dz
+    return sum_x, sum_y, sum_z
 
 
 @compiled
@@ -191,24 +342,33 @@ def _scaled(point, shift, scale):
 
 
 @compiled
-def _values(points, channels, scale, shift, centres, value_weights, gradient_weights, polynomial):
-    out = np.empty((len(points), len(channels)))
-    for i in range(len(points)):
-        for c in range(len(channels)):
-            out[i, c] = value_at(points[i], channels[c], scale, shift, centres, value_weights,
-                                 gradient_weights, polynomial)
+def _power(x, exponent):
+    out = 1.0
+    for _ in range(exponent):
+        out *= x
     return out
 
 
 @compiled
-def _gradients(points, channels, scale, shift, centres, value_weights, gradient_weights,
-               polynomial):
+def _values(points, channels, kernel, shape, scale, shift, centres, value_weights,
+            gradient_weights, polynomial, powers):
+    out = np.empty((len(points), len(channels)))
+    for i in range(len(points)):
+        for c in range(len(channels)):
+            out[i, c] = value_at(points[i], channels[c], kernel, shape, scale, shift, centres,
+                                 value_weights, gradient_weights, polynomial, powers)
+    return out
+
+
+@compiled
+def _gradients(points, channels, kernel, shape, scale, shift, centres, value_weights,
+               gradient_weights, polynomial, powers):
     out = np.empty((len(points), 3, len(channels)))
     slope = np.empty(3)
     for i in range(len(points)):
         for c in range(len(channels)):
-            gradient_at(points[i], channels[c], scale, shift, centres, value_weights,
-                        gradient_weights, polynomial, slope)
+            gradient_at(points[i], channels[c], kernel, shape, scale, shift, centres,
+                        value_weights, gradient_weights, polynomial, powers, slope)
             out[i, :, c] = slope
     return out
 

@@ -8,10 +8,9 @@ from typing import Self
 import numpy as np
 
 from limber.core.errors import Command, InputError, NoPathError, Option, Text
-from limber.planning.field.correction import far_apart
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.field.sampling import solve_branch
+from limber.planning.field.sampling import SolverPool, solve_branch
 from limber.planning.field.valid_region import nearest_of
 from limber.planning.goals.goal import (
     NEARER,
@@ -420,7 +419,8 @@ class CellGoal(TargetGoal):
         """Return the goal with the results at poses of the field. NoPathError if the target is in
         the region at some of them, and valid at none."""
         if self.cell_place.of_surface:
-            found = self._of_states(field)
+            with SolverPool(self.grasp_model, 1) as solvers:
+                found = self._of_states(field, solvers)
         else:
             points = np.concatenate([field.rest[None], field.region.draw(
                 _PLACES_DRAWN, np.random.default_rng(0))])
@@ -438,7 +438,7 @@ class CellGoal(TargetGoal):
         ones; ``causes_at`` gives why each of some poses [n, 3] is not valid."""
         if not len(self.taken) or not len(self.refused):
             return self
-        chosen = far_apart(self.refused, pairs)
+        chosen = _far_apart(self.refused, pairs)
         wrong, causes = self.refused[chosen], [self.causes[k] for k in chosen]
         distance = np.linalg.norm(wrong[:, None] - self.taken[None], axis=2)
         right = self.taken[distance.argmin(axis=1)]
@@ -452,7 +452,7 @@ class CellGoal(TargetGoal):
                        refused=np.concatenate([self.refused, wrong]),
                        causes=(*self.causes, *causes))
 
-    def _of_states(self, field: EnergyField) -> Self:
+    def _of_states(self, field: EnergyField, solvers: SolverPool) -> Self:
         """Test states of the branch model at samples of the field in the region, far apart, and
         between them."""
         samples = field.samples
@@ -461,15 +461,15 @@ class CellGoal(TargetGoal):
         inside = np.flatnonzero(self.region.distance(positions) <= 0.0)
         if not len(inside):
             return self
-        chosen = inside[far_apart(samples.positions[inside], _SOLVED)]
-        states = solve_branch(self.grasp_model, samples.positions[chosen], workers=1)[0][1:]
+        chosen = inside[_far_apart(samples.positions[inside], _SOLVED)]
+        states = solve_branch(solvers, samples.positions[chosen])[0][1:]
         which = [chosen[one.target] for one in states]
         found = self._asked(samples.positions[which], positions[which],
                             np.array([one.displacement for one in states]))
 
         def causes_at(middle: np.ndarray) -> list[str]:
             causes = ["the branch has no equilibrium there"] * len(middle)
-            for one in solve_branch(self.grasp_model, middle, workers=1)[0][1:]:
+            for one in solve_branch(solvers, middle, states)[0][1 + len(states):]:
                 place = one.tip if self.target is None else one.targets[self.target]
                 causes[one.target] = self._cause(place, one.displacement)
             return causes
@@ -509,6 +509,16 @@ class CellGoal(TargetGoal):
                            f"{count} poses that were checked: {counted}.", "At these poses "
                            f"{self.what} lies {self.where}.", self.advice, ", or sample farther (",
                            Command("energy", Option("deflection")), ").")
+
+
+def _far_apart(points: np.ndarray, count: int) -> np.ndarray:
+    """Return numbers of at most ``count`` of ``points`` [n, 3], each far from those before."""
+    chosen = [0]
+    away = np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < min(count, len(points)) and away.max() > 0.0:
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)
 
 
 _ENTRIES = {"view": "[camera] at a fixed position", "second_arm": "[second_arm]"}

@@ -5,11 +5,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from limber.core.errors import Option
+from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.settings import EnergySettings, EnergySpec
 from limber.stages.result import FORCE, Picture, Result, frozen, of_files, shown
 from limber.stages.stage import About, BranchStage, Repeatable
 from limber.store import Branch
+
+_MOST_TIMES = 4  # multiple of the requested samples that --field-error may take
 
 
 class EnergyField(Result):
@@ -76,7 +79,8 @@ class SampleEnergy(EnergySettings, Repeatable, BranchStage):
             WorkError: too few poses could be solved.
         """
         from limber.planning.field.energy_field import fit_field
-        from limber.planning.field.sampling import energy_inputs, sample_field
+        from limber.planning.field.grasp_model import LearntGraspModel
+        from limber.planning.field.sampling import energy_inputs, refined, sample_field
         from limber.store.loading import load_grasp_model
 
         branch = Branch.open(self.branch_folder)
@@ -86,22 +90,29 @@ class SampleEnergy(EnergySettings, Repeatable, BranchStage):
         if self.is_kept(branch, digests=digests):
             return branch.manifest.stages["energy"].result
         with branch.stage("energy", self, digests=digests) as stage:
-            count = self.samples
-            while True:
-                sampled = sample_field(grasp_model, self.model_copy(update={"samples": count}),
-                                       progress=progress.part(0.0, 0.9))
-                field = fit_field(sampled.samples, sampled.energy_surface.pivot,
-                                  sampled.energy_surface.radius)
+            if self.forward == "reduced":
+                grasp_model = LearntGraspModel.learnt(grasp_model,
+                                                      progress=progress.part(0.0, 0.02))
+            progress(0.0, "rest state")
+            sampled = sample_field(grasp_model, self,
+                                   progress=progress.part(0.02, 0.7))
+            field = fit_field(
+                sampled.samples,
+                sampled.energy_surface.pivot,
+                sampled.energy_surface.radius,
+                progress=progress.part(0.7, 0.8),
+            )
+            if self.field_error is not None:
+                sampled, field = refined(grasp_model, sampled, field, self.field_error / 100.0,
+                                         _MOST_TIMES * self.samples,
+                                         progress=progress.part(0.8, 1.0))
                 off = 100.0 * field.errors["energy_error"]
-                if off <= (self.field_error or np.inf) or count >= 4 * self.samples:
-                    break
-                count *= 2
-            if off > (self.field_error or np.inf):
-                progress.warn(
-                    f"The error of the energy field is {off:.2g} % with "
-                    f"{len(field.samples.poses)} poses, more than the {self.field_error:g} % "
-                    "of ", Option("field_error"), ". Increase ", Option("samples"),
-                    ", or reduce ", Option("deflection"), ".")
+                if off > self.field_error:
+                    progress.warn(
+                        f"The error of the energy field is {off:.2g} % with "
+                        f"{len(field.samples.poses)} poses, more than the {self.field_error:g} % "
+                        "of ", Option("field_error"), ". Increase ", Option("samples"),
+                        ", or reduce ", Option("deflection"), ".")
             samples, reasons = sampled.samples, sampled.reasons
             rejected = len(samples.rejected_poses)
             if rejected > 0.2 * self.samples:
@@ -113,9 +124,13 @@ class SampleEnergy(EnergySettings, Repeatable, BranchStage):
                 "arc_length_m": np.array(grasp_model.reach.arc_length)})
             stage.result.update(
                 sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
+                taut_count=sampled.taut_count,
                 energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
-                solved_count=sampled.solved_count,
-                errors=field.errors,
+                forward=self.forward,
+                reduced_count=int(present(samples.reduced, "mark of reduced samples").sum()),
+                errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
+                chart_stretch=field.chart.stretch,
+                chart_depth_m=field.chart.depth if np.isfinite(field.chart.depth) else None,
                 max_energy_j=float(samples.energies.max()),
                 max_force_n=float(np.linalg.norm(samples.forces, axis=1).max()),
                 rest_position_m=samples.poses[0, :3], arc_length_m=grasp_model.reach.arc_length)
