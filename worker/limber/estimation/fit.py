@@ -346,9 +346,8 @@ def _fitted(objective: Objective, start: np.ndarray, settings: FitSpec,
 
 def _resumed(objective: Objective, start: np.ndarray) -> np.ndarray:
     best = objective.log.best
-    if objective.log.resumed_count and best and len(best.parameters) == len(start):
-        return np.array(best.parameters)
-    return start
+    return np.array(best.parameters) if objective.log.resumed_count and best and len(
+        best.parameters) == len(start) else start
 
 
 def _refined(fit: Fit, objective: Objective, settings: FitSpec,
@@ -371,6 +370,9 @@ def _refined(fit: Fit, objective: Objective, settings: FitSpec,
         for forward in coarse:
             forward.refine()
         fresh = objective.with_space(objective.space)
+        if fresh.evaluate(fit.evaluation.free, jacobian=True) is None:
+            for forward in coarse:  # the states between known ones lead nowhere: from rest
+                forward.hint(None)
         fit = gauss_newton(fresh, fit.evaluation.free, evaluation_limit=EVALUATION_LIMIT)
         objective.forward_count = fresh.forward_count
     return fit

@@ -346,8 +346,8 @@ class QuasiStaticForward(Forward):
         if len(states) == other.key_count:
             self.hint(list(np.tensordot(other.spread[self.keys], states, axes=1)))
 
-    def hint(self, displacements: list[np.ndarray]) -> None:
-        """Start the next simulation from these displacements [m] of the key frames."""
+    def hint(self, displacements: list[np.ndarray] | None) -> None:
+        """Start the next simulation from these displacements [m] of the key frames; None: rest."""
         self._hints = displacements
 
     def stands(self, values: Values) -> bool:
