@@ -87,7 +87,8 @@ def test_a_goal_from_outside_is_planned_to(planned_branch, tmp_path):
     says, and file and picture show it."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
     rest = read_plan(folder / "plans/there.json").motion.poses[0]
-    asked = SidePaths(goal_side=round(rest[0] + 0.08, 6), iterations=100, branch_folder=folder, name="side")
+    asked = SidePaths(goal_side=round(rest[0] + 0.08, 6), iterations=100, branch_folder=folder,
+                      name="side")
     done = asked.run()
     told = json.loads((folder / "plans/side.json").read_text())
     assert told["goal"] == {"kind": "side", "x_m": asked.goal_side, "chosen": False,
