@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from limber.core.errors import InputError, LimberError
-from limber.core.json_values import plain
+from limber.core.json_values import plain, stored
 from limber.mechanics.added_masses import PointMass
 from limber.mechanics.loads.load_effects import load_effects
 from limber.mechanics.loads.outdoor import LoadedOutdoors, Outdoors
@@ -113,8 +113,7 @@ def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     gale = ApplyLoads(branch_folder=folder, wind=(6.0, 0.0, 0.0), gust=0.2, name="gale")
     result = gale.run()
     branch = Branch.open(folder, verify=True)
-    kept = branch.manifest.stages["load:gale"].result
-    assert kept["sag_m"] == pytest.approx(result["sag_m"], rel=1e-8)
+    assert branch.manifest.stages["load:gale"].result["sag_m"] == stored(result["sag_m"])
     section = next(one for one in page_of(branch)[1] if one.title == "Load: gale")
     told = dict(row[:2] for row in section.tables[0][1])
     assert told["peak load of the gusts over the mean load"] == f"{result['gusts']['factor']:.2f}"
@@ -123,7 +122,7 @@ def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     assert data.info["frames"]["name"] == "load-gale" and "frame_scalar:strain" in data.arrays
     assert len(data.arrays["frame_strain"]) == 2
     # The same again is not worked out again; of other moduli it is.
-    assert gale.run() == plain(result)
+    assert gale.run() == stored(plain(result))
     assert Branch.open(folder).manifest.stages["load:gale"] == branch.manifest.stages["load:gale"]
     assert branch.is_current("load:gale", branch.manifest.stages["load:gale"].settings,
                              **_inputs(branch, gale))
