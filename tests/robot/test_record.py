@@ -212,8 +212,7 @@ def test_what_goes_wrong_during_a_pull_is_noticed_within_ten_millimetres(
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="the guard's prediction lacks the error of the place times "
-                   "the branch's stiffness along its axis: it takes 4 of 22 N for a slip")
+@pytest.mark.xfail(strict=True, reason="no error of the place times the stiffness: 4 of 22 N: slip")
 def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folder, tmp_path,
                                                                     stepped, capfd):
     """Along its axis a branch is stiff: 30 N within a millimetre or two, and more on the way."""

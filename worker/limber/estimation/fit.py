@@ -52,6 +52,7 @@ from limber.estimation.fitting.optimise import (
 )
 from limber.estimation.forward.forward_model import under_its_weight
 from limber.estimation.forward.observed_path import is_path_observed
+from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import LINK_DEVIATION, Values, bump_deviations, hats, stations_of
 from limber.estimation.settings import FitSpec
 from limber.estimation.uncertainty.covariance import (
@@ -360,7 +361,7 @@ def _refined(fit: Fit, objective: Objective, settings: FitSpec,
             error = forward.thinning_error(values)
             sigma = float(np.sqrt(np.median(np.einsum("fmii->fm", forward.frames.covariance)) / 3
                                   )) if forward.frames.covariance.size else np.inf
-            if error > 0.3 * sigma:
+            if isinstance(forward, QuasiStaticForward) and error > 0.3 * sigma:
                 coarse.append(forward)
         if not coarse or settings.method == "nelder-mead":
             if coarse:

@@ -355,7 +355,8 @@ def _on_edge(weights: np.ndarray, offset: np.ndarray) -> np.ndarray | None:
         inverse = np.linalg.pinv((weights[:, None] * arm).T @ arm, 1e-9, hermitian=True)
         found = weights * (1.0 - arm @ (inverse @ (weights @ offset)))
         if found.min() > -1e-9:
-            is_there = np.abs(found @ offset).max() < 1e-7 * np.abs(offset).max()
+            # Points are stored in single precision, or to nanometres.
+            is_there = np.abs(found @ offset).max() < 1e-5 * np.abs(offset).max()
             return found if is_there and np.sum(found > 0) >= _FEWEST_HELD else None
         weights = np.where(found > 0, found, 0.0) / found[found > 0].sum()
 
