@@ -27,7 +27,6 @@ def rows(response: np.ndarray, *, bias=(0.0, 0.0, 0.0), seed: int = 0) -> np.nda
     rng = np.random.default_rng(seed)
     ways = np.arange(0, 0.015, 0.01 / 500)
     samples = np.full((len(ways), 37), np.nan)
-    samples[:, 4:7] = 0.0
     samples[:, 0] = 5.0 + np.arange(len(ways)) / 500
     samples[:, 1:4] = [0.1, 0.2, 0.3] + ways[:, None] * WAY
     felt = ways[:, None] * STIFF @ response.T + bias
@@ -53,7 +52,6 @@ def slipping(share: float, after: float, speed: float, seed: int) -> np.ndarray:
     ways = np.arange(0, 0.025, speed / 500)
     held = np.minimum(ways, after) + share * np.maximum(ways - after, 0)
     samples = np.full((len(ways), 37), np.nan)
-    samples[:, 4:7] = 0.0
     samples[:, 0] = np.arange(len(ways)) / 500
     samples[:, 1:4] = ways[:, None] * WAY
     single = held[:, None] * STIFF + 0.15 * rng.standard_normal((len(ways), 3))
@@ -69,7 +67,7 @@ def test_a_slow_slip_is_noticed_within_ten_millimetres_of_it(after, speed):
     """The moduli are not known: the force alone would do, but it stops to follow the model."""
     for seed in range(5):
         reason, way = judged(slipping(0.1, after, speed, seed), None, farthest=0.025)
-        assert reason is not None and "it slip" in reason
+        assert reason is not None and "slips slowly" in reason
         assert after < way <= after + LOOKED_M
 
 
@@ -86,7 +84,7 @@ SWAPPED = np.eye(3)[[1, 2, 0]]
 
 @pytest.mark.parametrize("response, factor, told", [
     (-np.eye(3), None, "against the predicted one"),
-    (SWAPPED, None, "the sensor's axes are turned"),
+    (SWAPPED, None, "across the predicted one"),
     (0.1 * np.eye(3), 3.0, "smaller than the known moduli allow"),
     (10.0 * np.eye(3), 3.0, "larger than the known moduli allow"),
     (np.zeros((3, 3)), 2.0, "is not held"),
@@ -151,18 +149,17 @@ def test_a_tool_off_by_five_millimetres_is_told_before_a_pull():
 
 
 def seen_along(way: np.ndarray, response: np.ndarray, farthest: float, seed: int) -> str | None:
-    """The doubt of a branch of 80 N/m that is moved along ``way`` [3] and read by ``response``."""
+    """The doubt of a branch of 60 N/m that is moved along ``way`` [3] and read by ``response``."""
     rng = np.random.default_rng(seed)
-    ways = np.r_[np.zeros(50), np.arange(0, farthest, 0.01 / 500), np.full(500, farthest)]
+    ways = np.r_[np.zeros(50), np.arange(0, farthest, 0.01 / 500), np.full(250, farthest)]
     samples = np.full((len(ways), 37), np.nan)
-    samples[:, 4:7] = 0.0
     samples[:, 0] = np.arange(len(ways)) / 500
     samples[:, 1:4] = ways[:, None] * way
-    samples[:, 7:10] = 80.0 * samples[:, 1:4] @ response.T + 0.15 * rng.standard_normal(
+    samples[:, 7:10] = 60.0 * samples[:, 1:4] @ response.T + 0.15 * rng.standard_normal(
         (len(ways), 3))
     samples[:, 13:16] = samples[:, 7:10]
     places = np.array([0.0, farthest])
-    doubt = PullPlausibility(CELL, PredictedPull(places, 80.0 * places[:, None] * way, None))
+    doubt = PullPlausibility(CELL, PredictedPull(places, 60.0 * places[:, None] * way, None))
     for batch in np.array_split(samples, len(samples) // 10):
         doubt.take(batch)
     return doubt.reason
@@ -179,7 +176,7 @@ def test_axes_exchanged_about_the_pull_itself_show_in_a_nudge_across_it():
         assert side @ diagonal == pytest.approx(0, abs=1e-12)
         assert side @ axis == pytest.approx(0, abs=1e-12)
         assert seen_along(diagonal, SWAPPED, 0.01, seed) is None
-        assert "sensor's" in seen_along(side, SWAPPED, NUDGE_M, seed)
+        assert "predicted one: the sensor's" in seen_along(side, SWAPPED, NUDGE_M, seed)
         assert seen_along(side, np.eye(3), NUDGE_M, seed) is None
 
 

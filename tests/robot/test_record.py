@@ -194,7 +194,7 @@ def test_a_sensor_that_a_nudge_finds_wrong_stops_before_the_pull(branch_folder, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("action, values, told", [
-    ("creep", {"part": 1.0}, "slips in the gripper"),
+    ("creep", {"part": 1.0}, "slips slowly in the gripper"),
     ("tool", {"offset": [0.005, 0, 0.15, 0, 0, 0]}, "tool centre point in the controller was")])
 def test_what_goes_wrong_during_a_pull_is_noticed_within_ten_millimetres(
         branch_folder, tmp_path, stepped, action, values, told):
@@ -212,7 +212,6 @@ def test_what_goes_wrong_during_a_pull_is_noticed_within_ten_millimetres(
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="no error of the place times the stiffness: 4 of 22 N: slip")
 def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folder, tmp_path,
                                                                     stepped, capfd):
     """Along its axis a branch is stiff: 30 N within a millimetre or two, and more on the way."""

@@ -17,9 +17,11 @@ from benchmarks.robot_branches import (
     FOLLOWED_ROWS,
     LEAST_STREAM_S,
     LOOP_ROWS,
+    LOST_ROW,
     STREAM_ROWS,
     closed_loops,
     followed_paths,
+    lost_branches,
     recorded_stream,
 )
 from benchmarks.robot_calibration import CALIBRATION_ROWS, calibrations
@@ -34,9 +36,8 @@ from benchmarks.robot_faults import (
     restored,
     straight,
 )
-from benchmarks.robot_guard import GUARD_ROWS, guarded_paths
 from benchmarks.robot_ros import LEAST_ROS_S, ROS_ROWS, ros_door
-from benchmarks.robot_stops import RETREAT_ROW, retreats
+from benchmarks.robot_stops import RETREAT_ROW, STATES_ROW, retreats, wrong_states
 from benchmarks.table import Asked, Part, Row, Setting
 from benchmarks.trials import Trial, column, sound
 from limber.robot.driver.link import RobotLink
@@ -233,12 +234,13 @@ PARTS = {
     "path": Part(_watched(_path), 20, (_PATH,)),
     "faults": Part(_watched(_faults), 150, _faults_asked(_faults_told(tuple(EVERY))),
                    grows=True),
+    "wrong-states": Part(wrong_states, 30, (STATES_ROW,), grows=True),
     "retreats": Part(retreats, 60, (RETREAT_ROW,), grows=True),
     "calibration": Part(calibrations, 30, CALIBRATION_ROWS, grows=True),
     "ros": Part(_watched(ros_door), LEAST_ROS_S, ROS_ROWS, grows=True),
     "branches": Part(_watched(partial(followed_paths, address=_ADDRESS)), 60, FOLLOWED_ROWS,
                      grows=True),
-    "guard": Part(guarded_paths, 300, GUARD_ROWS, grows=True),
+    "lost": Part(_watched(partial(lost_branches, address=_ADDRESS)), 100, (LOST_ROW,), grows=True),
     "loops": Part(_watched(partial(closed_loops, address=_ADDRESS)), 240, LOOP_ROWS, grows=True),
     "stream": Part(partial(recorded_stream, address=_ADDRESS), LEAST_STREAM_S, STREAM_ROWS,
                    grows=True)}

@@ -137,10 +137,13 @@ class ApproachEntry(_Entry):
 class SensorEntry(_Entry):
     """The force-torque sensor that the guard and recordings use."""
 
-    kind: Literal["controller", "ft300", "ft300_usb", "none"] = Field(
+    kind: Literal["controller", "ft300", "ft300_usb", "replay", "none"] = Field(
         "controller", description="ft300: by its URCap's stream (port 63351 of the robot's "
-        "address). ft300_usb: by Modbus on device.")
+        "address). ft300_usb: by Modbus on device. replay reads a file and works only with the "
+        "virtual robot.")
     device: str | None = Field(None, description="Serial line of kind = \"ft300_usb\".")
+    file: str | None = Field(None, description="CSV of a replay: t_s and six columns, in the "
+                             "sensor's frame.")
     topic: str | None = Field(None, min_length=1, description="Topic of its wrench in ROS "
                               "(geometry_msgs/msg/WrenchStamped). `limber ros` takes that of the "
                               "UR driver only for the own sensor of an e-Series arm.")
@@ -152,7 +155,9 @@ class SensorEntry(_Entry):
     drift_n_per_minute: float = Field(0.8, ge=0)
 
     @model_validator(mode="after")
-    def _has_its_line(self) -> "SensorEntry":
+    def _has_its_file(self) -> "SensorEntry":
+        if (self.kind == "replay") != (self.file is not None):
+            raise ValueError("file is the CSV of kind = \"replay\", and is allowed only with it")
         if self.kind == "ft300_usb" and self.device is None:
             raise ValueError("device, the serial line of kind = \"ft300_usb\", is missing")
         return self
@@ -168,8 +173,9 @@ class LimitsEntry(_Entry):
     hard_force_n: float = Field(20.0, gt=0, description="Motion stops.")
     hard_torque_nm: float = Field(3.0, gt=0)
     unexpected_force_n: float = Field(
-        3.0, gt=0, description="By how much the force may rise during a return [N]. Differences "
-        "from a predicted force are judged by their likelihood.")
+        3.0, gt=0, description="Largest difference between measured and predicted force [N]. With "
+        "the branch held the guard allows less: two fifths of the predicted force, and the "
+        "sensor's noise and drift.")
     singularity: float = Field(0.05, gt=0, le=0.5)
     joint_margin_rad: float = Field(0.05, ge=0, le=1)
     contact_n_per_m: float = Field(

@@ -13,9 +13,7 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import Option, WorkError
 from limber.core.files.tables import table_line
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
-from limber.core.numerics.rigid_kernels import frame_of
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, CalibrationEntry, SensorEntry
-from limber.robot.driver.force_test import BLOCK_SECONDS, Block, ForceErrors, ForceTest
 
 _FRAMES_FOR_NOISE = 15
 _LEAST_NOISE_M = 1e-4  # a tracker that smooths its points hides their noise
@@ -186,15 +184,24 @@ class MarkerStream:
 LOOKED_M = 0.01
 """Travel by which a wrong sensor has been detected."""
 NUDGE_M, NUDGE_M_S, NUDGE_SECONDS = 0.004, 0.01, 1.0
-"""Way, speed and rest at its end of a nudge: a branch of 80 N/m is judged by it with certainty."""
+"""Way, speed and rest at its end of a nudge: a branch of 50 N/m is judged by it with certainty."""
 
-_NOISES = 6.0  # times the noise of a block; less is not significant
+_NOISES = 4.0  # times the noise of a smoothed force; less is not significant
+_MOSTLY = 0.5  # cosine of the angle to the predicted force
+_AGREE = 10  # consecutive samples that agree
 _FROM_M = 0.002  # of travel; before that slack and the bark dominate
 _BACK_SHARE = 0.15  # fraction of the peak force that may remain when the gripper is back
+_SMOOTHED = 3  # fewest readings in a smoothed force
 _RAW, _COLUMNS = slice(7, 10), slice(13, 16)
-_REST_M = 2.5e-4  # of travel, during which the branch still rests
+_BIN_M, _MOVED_M = 2.5e-4, 1e-6
+_RECENT_M = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012, 0.02)  # over which the force's growth is
+_RECENT_SHARE = 0.2  # measured, and of the whole travel at least: a stop relaxes the wood
+_SLIPS = 0.5  # of the growth before: less is a slip
 _CERTAIN = 5.0  # standard deviations
-_ANY_FACTOR, _OTHERWISE = 10.0, 0.05  # deviations: of a pull's factor, and of the rest of its force
+_LARGER = ("the force is larger than the known moduli allow: the sensor's unit is wrong, or "
+           "something stiff is in the way")
+_SMALLER = ("the force is smaller than the known moduli allow: the sensor's unit is wrong, or the "
+            "branch is not held")
 _BASE_DEVIATIONS, _AXIS_M = 2.0, 0.002  # of a calibration; error of a scanned axis
 _TURNED_RAD, _UNCERTAIN = 0.1, 0.5  # of a model; fraction of its force that it may change
 _TURNED_M = 1e-3  # back from the farthest point: the outward motion is over
@@ -256,74 +263,217 @@ class PredictedPull:
                         axis=-1)
 
 
+class _Growth:
+    """The growth of a force along the predicted one, now and before, over bins of travel up to
+    ``end`` [m], so that a long pull takes no longer to judge; ``noise`` of a single reading [N]."""
+
+    def __init__(self, noise: float, end: float):
+        self._noise = noise
+        # Of each bin: count, and sums of the predicted force, the measured one, and their products.
+        self._sums = np.zeros((int(end / _BIN_M) + 1, 5))
+        self._farthest = 0.0
+        self._is_over = False
+
+    def take(self, travels: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> None:
+        """Take ``predicted`` forces [N] at travels [m], and those measured along them, shape [n]
+        each."""
+        farthest = np.maximum.accumulate(np.r_[self._farthest, travels])[1:]
+        back = np.flatnonzero(travels < farthest - _TURNED_M)
+        out = len(travels) if not len(back) else int(back[0])
+        if self._is_over or not len(travels):
+            return
+        self._is_over = out < len(travels)
+        self._farthest = float(farthest[-1])
+        bins = (travels[:out] / _BIN_M).astype(int)
+        rows = np.column_stack([np.ones(len(travels)), predicted, measured,
+                                predicted * predicted, predicted * measured])
+        known = bins < len(self._sums)
+        np.add.at(self._sums, bins[known], rows[:out][known])
+
+    def slip(self) -> tuple[float, float] | None:
+        """Return how much of the predicted growth the force has now over that before, and the
+        travel [m] over which; None if it grows on, or noise explains it."""
+        end = min(int(self._farthest / _BIN_M), len(self._sums))
+        if self._is_over or not self._sums[0, 0]:
+            return None
+        for recent in _RECENT_M:
+            first = end - int(recent / _BIN_M)
+            if first * _BIN_M < _FROM_M:
+                return None
+            if recent < _RECENT_SHARE * self._farthest:
+                continue
+            before, sigma = self._whole(self._sums[1:first].sum(axis=0))
+            now, sigma_now = self._slope(self._sums[first:end].sum(axis=0))
+            missing = _SLIPS * before - now
+            if missing > _CERTAIN * float(np.hypot(_SLIPS * sigma, sigma_now)):
+                return now / before, recent
+        return None
+
+    def whole(self) -> tuple[float, float] | None:
+        """Return the growth per predicted newton since the start, and its deviation; None over too
+        short a travel."""
+        # Slack of a millimetre counts little over such a travel.
+        if self._farthest < 3 * _FROM_M or not self._sums[0, 0]:
+            return None
+        return self._whole(self._sums[1:].sum(axis=0))
+
+    def _slope(self, sums: np.ndarray) -> tuple[float, float]:
+        """Growth of the force per predicted newton, and its standard deviation."""
+        count, predicted, measured, square, product = sums
+        spread = square - predicted * predicted / max(count, 1.0)
+        if not spread > 0.0:
+            return 0.0, np.inf
+        slope = (product - predicted * measured / count) / spread
+        return slope, self._noise / float(np.sqrt(spread))
+
+    def _whole(self, sums: np.ndarray) -> tuple[float, float]:
+        """The same since the start, where the first bin's force is that of the resting branch."""
+        _, predicted, _, square, product = sums
+        first, rest = self._sums[0, 0], self._sums[0, 2] / self._sums[0, 0]
+        if not square > 0.0:
+            return 0.0, np.inf
+        sigma = self._noise * float(np.sqrt(1.0 / square + (predicted / square) ** 2 / first))
+        return (product - rest * predicted) / square, sigma
+
+
+class _Direction:
+    """The direction in which a force grows, against the predicted one; ``noise`` of a reading
+    [N]."""
+
+    def __init__(self, noise: float):
+        self._noise = noise
+        self._rest_count, self._rest = 0, np.zeros(3)
+        # Sums: predicted magnitudes, their squares, and products of the measured force with the
+        # magnitudes and with the predicted forces.
+        self._size = self._square = self._along = 0.0
+        self._predicted, self._measured = np.zeros(3), np.zeros(3)
+
+    def take(self, travels: np.ndarray, predicted: np.ndarray, measured: np.ndarray) -> None:
+        """Take readings and predictions [N], shape [n, 3] each, at travels [m], shape [n]."""
+        rests = travels < _BIN_M
+        self._rest_count += int(rests.sum())
+        self._rest += measured[rests].sum(axis=0)
+        used = (travels >= _FROM_M) & (travels <= LOOKED_M)
+        predicted, measured = predicted[used], measured[used]
+        sizes = np.linalg.norm(predicted, axis=1)
+        self._size += float(sizes.sum())
+        self._square += float((sizes**2).sum())
+        self._along += float((measured * predicted).sum())
+        self._predicted += predicted.sum(axis=0)
+        self._measured += sizes @ measured
+
+    def suspicion(self) -> str | None:
+        """Return why the direction cannot be right; None if noise explains it."""
+        if not self._rest_count or not self._square > 0.0:
+            return None
+        rest = self._rest / self._rest_count
+        along = (self._along - rest @ self._predicted) / self._square
+        size = float(np.linalg.norm(self._measured - rest * self._size)) / self._square
+        sigma = self._noise * float(np.sqrt(
+            1.0 / self._square + (self._size / self._square) ** 2 / self._rest_count))
+        if along + _CERTAIN * sigma >= _MOSTLY * size:
+            return None
+        angle = np.degrees(np.arccos(np.clip(along / size, -1.0, 1.0)))
+        angle_text = f"it grows at {angle:.0f} degrees to it"
+        if along < -_MOSTLY * size:
+            return ("the force points against the predicted one: the sensor's sign or pose "
+                    f"(sensor.pose) is wrong ({angle_text})")
+        return ("the force lies across the predicted one: the sensor's axes or pose (sensor.pose) "
+                f"are wrong, or another part is pulled ({angle_text})")
+
+
 class PullPlausibility:
-    """Checks the samples of a pull against expected forces as they arrive, by the guard's test;
-    ``reason``: why the force cannot be right, once that is certain."""
+    """Checks the samples of a pull against expected forces as they arrive, by the cell's noise and
+    drift; ``reason``: why the sensor cannot be right, once that is certain."""
 
     def __init__(self, cell: Cell, predicted: PredictedPull):
-        self._errors = ForceErrors.of_cell(cell)
+        self._noise = _NOISES * cell.sensor.force_sigma_n / np.sqrt(_SMOOTHED)
+        self._drift = cell.sensor.drift_n_per_minute / 60.0
         self.predicted = predicted
-        # One factor scales all of the prediction: what it is tells no hypothesis, but its value.
-        self._test = ForceTest(self._errors, gain=_ANY_FACTOR, unknown=_OTHERWISE)
-        self._rows: list[np.ndarray] = []
-        self._rest: list[np.ndarray] = []
-        self._start = self._last = np.zeros(0)
-        self._peak = self._farthest = 0.0
+        self._direction = _Direction(cell.sensor.force_sigma_n)
+        self._growth = _Growth(cell.sensor.force_sigma_n, float(predicted.travels[-1]))
+        self._start: np.ndarray | None = None
+        self._began = self._peak = 0.0
+        self._suspicion_streak = ("", 0)
         self.reason: str | None = None
 
     def take(self, samples: np.ndarray) -> str | None:
         """Judge samples [n, 19 or more], as in :data:`limber.robot.driver.link.COLUMNS`; returns
-        why the force cannot be right, or None."""
-        for row in samples[np.isfinite(samples[:, _RAW]).all(axis=1)]:
-            if not len(self._start):
-                self._start = self._last = row
-            self._rows.append(row)
-            self._peak = max(self._peak, float(np.linalg.norm(row[_COLUMNS])))
-            if row[0] - self._last[0] >= BLOCK_SECONDS:
-                self._judge(np.mean(self._rows, axis=0), row)
-                self._rows, self._last = [], row
+        why the sensor cannot be right, or None."""
+        if self._start is None:
+            self._start, self._began = samples[0, 1:4].copy(), float(samples[0, 0])
+        travels = np.linalg.norm(samples[:, 1:4] - self._start, axis=1)
+        for travel, force in zip(travels, samples[:, _COLUMNS], strict=True):
+            if not np.isfinite(force).all():
+                continue
+            self._peak = max(self._peak, float(np.linalg.norm(force)))
+            if self.reason is None and _FROM_M <= travel <= LOOKED_M:
+                self._agree(self._suspicion(float(travel), force))
+        self._grow(samples, travels)
+        if self.reason is None:
+            self.reason = self._direction.suspicion() or self._slip() or self._scale()
         return self.reason
-
-    def _judge(self, mean: np.ndarray, row: np.ndarray) -> None:
-        """Judge the mean of a block of samples that ends with ``row``."""
-        travel = float(np.linalg.norm(mean[1:4] - self._start[1:4]))
-        self._farthest = max(self._farthest, travel)
-        if not self._rest or self._farthest < _REST_M:
-            self._rest.append(mean[_RAW])
-        # On the way back, and where the way is no longer straight, the force is another.
-        if (self.reason is not None or travel < self._farthest - _TURNED_M
-                or travel > self.predicted.travels[-1] + _TURNED_M):
-            return
-        step, certain = row[1:4] - self._last[1:4], self.predicted.certain
-        predicted = certain @ self.predicted.at(travel)
-        self._test.take(Block(
-            certain @ (mean[_RAW] - np.mean(self._rest, axis=0)) - predicted, predicted,
-            _TURNED_RAD**2 * (predicted @ predicted * np.eye(3) - np.outer(predicted, predicted)),
-            frame_of(row[1:7])[:3, :3], np.zeros(3), float(np.linalg.norm(step)),
-            float(row[0] - self._last[0])))
-        self.reason = self._wrong_factor(travel) or self._test.alarm()
-
-    def _wrong_factor(self, travel: float) -> str:
-        factor, sigma = self._test.factor
-        least, most = factor - _CERTAIN * sigma, factor + _CERTAIN * sigma
-        # Slack of a millimetre counts little over three times that travel.
-        known = self.predicted.factor if travel > 3 * _FROM_M else None
-        text = ("points against the predicted one: the sensor's sign or pose (sensor.pose) is wrong"
-                if most < 0.0 and travel > _FROM_M else
-                "is larger than the known moduli allow: the sensor's unit is wrong, or something "
-                "stiff is in the way" if known is not None and least > known else
-                "is smaller than the known moduli allow: the sensor's unit is wrong, or the branch "
-                "is not held" if known is not None and most < 1.0 / known else "")
-        return text and f"the force {text} (it grows by {100 * factor:.0f} % of the prediction)"
 
     def left_at_end(self, samples: np.ndarray) -> str | None:
         """Return in words a force that remains in the last samples [n, 37], back at the start, and
         is not explained by noise, drift and the branch."""
         left = float(np.linalg.norm(samples[:, _COLUMNS].mean(axis=0)))
-        drift = self._errors.drift * float(samples[-1, 0] - self._start[0])
-        allowed = _NOISES * self._errors.noise + drift + _BACK_SHARE * self._peak
+        drift = self._drift * (float(samples[-1, 0]) - self._began)
+        allowed = self._noise + drift + _BACK_SHARE * self._peak
         if not left > allowed:
             return None
         return (f"A force of {left:.2g} N is left where the gripper closed on the resting branch; "
                 f"{allowed:.2g} N are explained by noise, drift and the branch. The sensor "
                 "drifted, or the branch slipped in the gripper")
+
+    def _agree(self, suspected: str) -> None:
+        """Take a suspected error as certain when it is repeated."""
+        kind = suspected.split(":", maxsplit=1)[0]
+        self._suspicion_streak = (kind, self._suspicion_streak[1] + 1 if suspected
+                                  and kind == self._suspicion_streak[0] else 1)
+        if suspected and self._suspicion_streak[1] >= _AGREE:
+            self.reason = suspected
+
+    def _grow(self, samples: np.ndarray, travels: np.ndarray) -> None:
+        # Before it moves nothing is predicted, but the direction is known.
+        predicted = self.predicted.at(np.maximum(travels, _MOVED_M)) @ self.predicted.certain
+        sizes = np.linalg.norm(predicted, axis=1)
+        good = np.isfinite(samples[:, _RAW]).all(axis=1) & (sizes > 0.0)
+        self._direction.take(travels[good], predicted[good],
+                             samples[good, _RAW] @ self.predicted.certain)
+        along = (samples[good, _RAW] * predicted[good]).sum(axis=1) / sizes[good]
+        self._growth.take(travels[good], sizes[good], along)
+
+    def _scale(self) -> str | None:
+        """As :meth:`_suspicion`, for a soft branch, whose single readings are mostly noise."""
+        factor, whole = self.predicted.factor, self._growth.whole()
+        if factor is None or whole is None:
+            return None
+        share, margin = whole[0], _CERTAIN * whole[1]
+        detail = f"it grows by {100 * share:.0f} % of the predicted force"
+        if share > factor + margin:
+            return f"{_LARGER} ({detail})"
+        return f"{_SMALLER} ({detail})" if share < 1.0 / factor - margin else None
+
+    def _slip(self) -> str | None:
+        slip = self._growth.slip()
+        if slip is None:
+            return None
+        share, travel = slip
+        return ("the force no longer grows as it did before: the branch slips slowly in the "
+                f"gripper, or gives way (over the last {1000 * travel:.0f} mm it grew by "
+                f"{100 * max(share, 0.0):.0f} % of what came before)")
+
+    def _suspicion(self, travel: float, force: np.ndarray) -> str:
+        factor, certain = self.predicted.factor, self.predicted.certain
+        predicted, force = self.predicted.at(travel) @ certain, force @ certain
+        size = float(np.linalg.norm(predicted))
+        if size < 1e-9 or factor is None:
+            return ""
+        along = float(force @ predicted) / size
+        when = f"after {1000 * travel:.1f} mm"
+        if along > factor * size + self._noise:
+            return f"{_LARGER} ({along:.2g} N {when}, {size:.2g} N predicted)"
+        if along < size / factor - self._noise:
+            return f"{_SMALLER} ({along:.2g} N {when}, {size:.2g} N predicted)"
+        return ""

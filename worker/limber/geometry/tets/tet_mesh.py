@@ -124,10 +124,9 @@ class TetMesh:
                        point_data=self.point_data | (point_data or {}))
 
     def geometry_digest(self) -> str:
-        """Return a sha256 of nodes as files store them, tetrahedra and point data, which E does not
-        change."""
+        """Return a sha256 of nodes, tetrahedra and point data, which E does not change."""
         digest = hashlib.sha256()
-        arrays = [stored_lengths(self.nodes), self.tets.astype(np.int64)]
+        arrays = [self.nodes, self.tets.astype(np.int64)]
         arrays += [self.point_data[name] for name in sorted(self.point_data)]
         for array in arrays:
             digest.update(np.ascontiguousarray(array).tobytes())

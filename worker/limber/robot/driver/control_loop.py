@@ -14,6 +14,7 @@ import numpy as np
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.core.numerics.rigid_kernels import frame_of, pose_of, turn_between
 from limber.robot.controller_settings import require_tool
 from limber.robot.driver.controls import control_of
 from limber.robot.driver.force_samples import (
@@ -22,8 +23,8 @@ from limber.robot.driver.force_samples import (
     HoldUps,
     Senses,
     UnderWay,
+    WrenchChain,
     open_sensor,
-    rehearse,
 )
 from limber.robot.driver.guard import Guard, GuardSettings, State
 from limber.robot.driver.real_time import (
@@ -58,7 +59,7 @@ class Driver:
         self.cell, self.tell = cell, words.tell
         self._control = control_of(cell)
         sensor = open_sensor(cell)
-        self.guard = Guard(cell.arm, GuardSettings.of_cell(cell), self._control.rate)
+        self.guard = _guard_of(cell, self._control)
         _warm_up(cell, self._control, sensor)
         # Now: if it has just compiled, this takes longer than the watchdog would wait.
         self.facts = self._control.facts | {
@@ -307,13 +308,29 @@ def _ordered(order: dict[str, Any]) -> Trajectory:
         None if joints is None else np.array(joints, float), by_joints=joints is not None)
 
 
+def _guard_of(cell: Cell, control: ArmControl) -> Guard:
+    return Guard(cell.arm, GuardSettings.of_cell(cell, control.rate), control.rate)
+
+
 def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> None:
     """Run the loop's functions once: compiling during a motion would starve the watchdog."""
     samples: list[Sample] = []
     while len(samples) < 3:
         samples += control.read(1.0)
+    guard, chain = _guard_of(cell, control), WrenchChain(cell)
+    base = frame_of(np.array(cell.base.pose))
+    guard.tared(np.zeros((3, 3)))
+    guard.hold(np.zeros(3))
+    guard.begin()
     for sample in samples:
-        rehearse(cell, sample, sensor.read(sample))
+        reading = sensor.read(sample)
+        now, _ = chain.wrench(sample, reading)
+        guard.look(sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]),
+                   expected=now, uncertainty=np.eye(6), grasp=sample.pose[:3])
+        turn_between(sample.pose, sample.pose)
+        guard.state = State.MOVING
+        guard.permit(sample.pose, sample.pose + 1e-3, 0.002)
+        pose_of(base @ frame_of(sample.pose))
     _walk_back(samples[0], RetreatPath(cell.arm.joint_names))
 
 
