@@ -59,8 +59,8 @@ def is_made():
     cloud, surface = bpy.data.objects["scan scan"], bpy.data.collections["scan"].objects["scan"]
     seen["points"] = len(cloud.data.vertices)
     seen["scan_beside_branch_m"] = max(
-        (surface.closest_point_on_mesh(mouse.at)[1] - mouse.at).length
-        for mouse.at in (cloud.matrix_world @ vertex.co for vertex in cloud.data.vertices))
+        (surface.closest_point_on_mesh(place)[1] - place).length
+        for place in (cloud.matrix_world @ vertex.co for vertex in cloud.data.vertices))
     return True
 
 
