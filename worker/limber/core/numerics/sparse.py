@@ -1,11 +1,21 @@
-"""Sparse symmetric matrices: CHOLMOD (through cvxopt) and its order of elimination.
+"""Sparse symmetric matrices: CHOLMOD (through cvxopt) and its order of elimination; where it is not
+installed, as in Blender's zips, SuperLU from scipy.
 
 Limber's own factors are :mod:`limber.mechanics.linear.supernodal`, for meshes of branches, and
 :mod:`limber.geometry.skeleton.exact_factor`, whose digits are the same on every processor.
 """
 
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy import sparse
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from limber.core.not_none import present
+
+if TYPE_CHECKING:
+    from scipy.sparse.linalg import SuperLU
 
 
 class NotPositiveDefiniteError(ArithmeticError):
@@ -54,9 +64,48 @@ class CholmodFactor:
         return np.array(work).reshape(right.shape)
 
 
+class SuperLuFactor:
+    """The scipy equivalent, about five times slower and without a reused symbolic part."""
+
+    def __init__(self, rows: np.ndarray, columns: np.ndarray, size: int):
+        self._rows, self._columns, self._size = rows, columns, size
+        self._factor: SuperLU | None = None
+
+    def twin(self) -> "SuperLuFactor":
+        """As :meth:`CholmodFactor.twin`."""
+        return SuperLuFactor(self._rows, self._columns, self._size)
+
+    def factorise(self, values: np.ndarray) -> None:
+        """As :meth:`CholmodFactor.factorise`."""
+        from scipy.sparse.linalg import splu
+
+        lower = sparse.csc_matrix((values, (self._rows, self._columns)), shape=(self._size,) * 2)
+        whole = (lower + sparse.tril(lower, -1).T).tocsc()
+        try:
+            factor = splu(whole, permc_spec="NATURAL", diag_pivot_thresh=0.0,
+                          options={"SymmetricMode": True})
+        except RuntimeError as error:
+            raise NotPositiveDefiniteError("a pivot is zero") from error
+        self._factor = factor
+        if (factor.perm_r != factor.perm_c).any() or factor.U.diagonal().min() <= 0:
+            raise NotPositiveDefiniteError("a pivot is not positive")
+
+    def solve(self, right: np.ndarray) -> np.ndarray:
+        """As :meth:`CholmodFactor.solve`."""
+        return present(self._factor, "factor").solve(np.ascontiguousarray(right))
+
+
+def general_factor(rows: np.ndarray, columns: np.ndarray, size: int,
+                   ) -> CholmodFactor | SuperLuFactor:
+    """Return a factor of the fastest installed library; arguments as for CholmodFactor."""
+    return (CholmodFactor if find_spec("cvxopt") else SuperLuFactor)(rows, columns, size)
+
+
 def little_fill(graph: sparse.csr_matrix) -> np.ndarray:
     """Return an order of elimination (new to old) of little fill, by approximate minimum degree on
     a symmetric pattern [n, n]."""
+    if not find_spec("cvxopt"):
+        return reverse_cuthill_mckee(sparse.csr_matrix(graph), symmetric_mode=True).astype(np.int64)
     from cvxopt import amd, matrix, spmatrix
 
     lower = sparse.tril(graph).tocoo()

@@ -10,7 +10,13 @@ import numpy as np
 import scipy.sparse as sp
 
 from limber.core.numerics.compiled import for_kernels
-from limber.core.numerics.sparse import CholmodFactor, NotPositiveDefiniteError, little_fill
+from limber.core.numerics.sparse import (
+    CholmodFactor,
+    NotPositiveDefiniteError,
+    SuperLuFactor,
+    general_factor,
+    little_fill,
+)
 from limber.mechanics.elements.forces import lanes_last
 from limber.mechanics.elements.stiffness import LANES, moduli_stiffness, tangent_stiffness
 from limber.mechanics.grasp import Grasp
@@ -31,7 +37,7 @@ as fast as CHOLMOD, whose fraction of fast dense kernels grows with the fronts.
 """
 
 
-Factor = SupernodalFactor | CholmodFactor
+Factor = SupernodalFactor | CholmodFactor | SuperLuFactor
 
 
 def make_factor(pattern: "Pattern") -> Factor:
@@ -40,7 +46,7 @@ def make_factor(pattern: "Pattern") -> Factor:
     if fronts.flops <= _MOST_FLOPS:
         return SupernodalFactor(fronts)
     # The elimination order is Limber's own, found once on nodes instead of rows.
-    return CholmodFactor(*pattern.entries(), pattern.size)
+    return general_factor(*pattern.entries(), pattern.size)
 
 
 def elimination_order(graph: sp.csr_matrix) -> np.ndarray:
