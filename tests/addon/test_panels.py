@@ -429,7 +429,6 @@ def test_the_next_step_is_a_button_in_thirty_states(bpy, panels, tmp_path):
         importlib.import_module("limber_addon.jobs")._waiting.clear()
         for group in ("estimate", "plan"):
             getattr(bpy.context.scene.limber, group).outcome = ""
-        bpy.context.scene.limber.plan.name = "to-goal"
     assert list(enumerate(found)) == list(enumerate(name for _, name in table))
     menu = Layout()
     bpy.types.LIMBER_MT_colours.draw(SimpleNamespace(layout=menu), bpy.context)

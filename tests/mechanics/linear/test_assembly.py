@@ -1,14 +1,14 @@
 """Forces and stiffness against rigid motion, patch test and finite differences."""
 
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from tests.subjects.meshes import box_mesh
 from tests.subjects.prescribed import solve_prescribed
 
+from limber.core.numerics import sparse as sparse_module
 from limber.core.numerics.rigid import rotation_matrix
-from limber.core.numerics.sparse import CholmodFactor, NotPositiveDefiniteError
+from limber.core.numerics.sparse import CholmodFactor, NotPositiveDefiniteError, SuperLuFactor
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tree_sweep import straight_beam
 from limber.mechanics import BranchModel, Grasp
@@ -138,11 +138,12 @@ def test_pinned_solution_keeps_the_mean_and_balances(short_box):
 
 
 def factor_of(name, pattern):
-    return CholmodFactor(*pattern.entries(), pattern.size) if name == "CHOLMOD" else (
+    kinds = {"CHOLMOD": CholmodFactor, "SuperLU": SuperLuFactor}
+    return kinds[name](*pattern.entries(), pattern.size) if name in kinds else (
         equations_module.SupernodalFactor(make_fronts(pattern.node_starts, pattern.node_rows)))
 
 
-@pytest.mark.parametrize("name", ["own", "CHOLMOD"])
+@pytest.mark.parametrize("name", ["own", "CHOLMOD", "SuperLU"])
 @pytest.mark.parametrize("quadratic", [True, False])
 def test_every_factor_solves_and_refuses(name, quadratic):
     """Each factor solves to round-off, for one and several right sides, refuses an indefinite
@@ -168,7 +169,7 @@ def test_every_factor_solves_and_refuses(name, quadratic):
             candidate.factorise(raised)
 
 
-@pytest.mark.parametrize("name", ["own", "CHOLMOD"])
+@pytest.mark.parametrize("name", ["own", "CHOLMOD", "SuperLU"])
 def test_a_tangent_stays_what_it_is(name, short_box, monkeypatch):
     """Another tangent of the same equations changes nothing in one that is still held; the memory
     of one that is not serves the next, and one that cannot be factorised takes none along."""
@@ -215,11 +216,14 @@ def test_fronts_hold_all_that_fills_in():
 
 
 def test_bulky_meshes_go_to_a_general_library(short_box, monkeypatch):
-    """Above a number of operations CHOLMOD takes over."""
+    """Above a number of operations CHOLMOD takes over; without cvxopt, as in zips, SuperLU."""
     pattern = make_model(short_box).equations().pattern
     assert isinstance(equations_module.make_factor(pattern), equations_module.SupernodalFactor)
     monkeypatch.setattr(equations_module, "_MOST_FLOPS", 1.0)
-    assert isinstance(equations_module.make_factor(pattern), equations_module.CholmodFactor)
+    assert isinstance(equations_module.make_factor(pattern), CholmodFactor)
+    monkeypatch.setattr(sparse_module, "find_spec", lambda _name: None)
+    assert isinstance(equations_module.make_factor(pattern), SuperLuFactor)
+    assert sorted(sparse_module.little_fill(sp.eye(9))) == list(range(9))
 
 
 @pytest.mark.parametrize("mesh", [box_mesh(), box_mesh(quadratic=False), curved_box()],
