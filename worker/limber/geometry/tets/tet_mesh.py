@@ -169,7 +169,7 @@ class TetMesh:
         # meshio converts tetra10 between its own (Gmsh-like) and VTK's node order, but not for VTU,
         # where it keeps the order; test_tet_mesh checks that.
         meshio.write_points_cells(
-            path, stored_lengths(self.nodes), [(self.element.cell_type, self.tets)],
+            path, self.nodes, [(self.element.cell_type, self.tets)],
             file_format="vtu", point_data=self.point_data,
             cell_data={name: [values] for name, values in self.cell_data.items()})
 
@@ -226,8 +226,10 @@ CLAMP_BAND = 0.2
 def mark(mesh: TetMesh, skeleton: Skeleton, *, young: float, poisson: float, density: float,
          fractions: tuple[float, ...] = FRACTIONS, grasp_fraction: float = GRASP_FRACTION,
          ) -> TetMesh:
-    """Return a quadratic mesh with material (Pa, kg/m^3), base, and control points and grasp patch
-    at fractions of the main path. MeshingError if base or patch has under three nodes."""
+    """Return a quadratic mesh, its nodes as files store them, with material (Pa, kg/m^3), base, and
+    control points and grasp patch at fractions of the main path. MeshingError if base or patch has
+    under three nodes."""
+    mesh = replace(mesh, nodes=stored_lengths(mesh.nodes))
     tree = cKDTree(mesh.nodes)
     control = np.full(mesh.node_count, -1, np.int64)
     # Last first: where two are at the same node, the earlier one keeps it.
