@@ -20,10 +20,7 @@ from limber.estimation.parameters import Values
 from limber.estimation.settings import FitSpec
 from limber.estimation.simulated_pull import marked_points
 from limber.estimation.uncertainty.covariance import uncertainty
-from limber.estimation.uncertainty.identifiability import (
-    identifiability,
-    require_scale,
-)
+from limber.estimation.uncertainty.identifiability import identifiability, require_scale
 from limber.estimation.uncertainty.model_error import total_interval
 from limber.recordings.recording import CalibrationEntry
 

@@ -14,12 +14,7 @@ from limber.geometry.cloud.camera import D455, read_camera, read_mask, write_cam
 from limber.geometry.io.depth_images import depth_metres
 from limber.perception.observe import list_frames, write_depth
 from limber.recordings.import_request import ImportRequest
-from limber.recordings.recording import (
-    POSE_COLUMNS,
-    WRENCH_COLUMNS,
-    read_pull,
-    write_pull,
-)
+from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, read_pull, write_pull
 from limber.recordings.recording_formats import RECORDINGS
 from limber.recordings.settings import ImportSpec
 from limber.recordings.time_series import Stream, read_stream, write_stream

@@ -21,14 +21,7 @@ from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.session import client
 from limber.session.client import InteractiveSession
 from limber.session.frame_buffer import MAGIC, FrameReader, FrameWriter, HeldAt, Status
-from limber.session.protocol import (
-    LINE_LIMIT,
-    PROTOCOL,
-    Lines,
-    Move,
-    NotUnderstood,
-    parse_command,
-)
+from limber.session.protocol import LINE_LIMIT, PROTOCOL, Lines, Move, NotUnderstood, parse_command
 from limber.store import Branch
 from limber.store.loading import load_model
 

@@ -15,7 +15,7 @@ from benchmarks.scan_probabilities import skeletonised
 from benchmarks.scan_scores import Outcomes, outcomes, seen_part
 from benchmarks.table import Asked, Part, Row, Setting
 from benchmarks.worlds.sources import BARE_VIEWS, LEFT_OUT, SOURCES, thinned_case
-from limber.geometry.skeleton.plausibility import OPEN
+from limber.geometry.settings import OPEN
 
 _COUNTS = {"one-sided": 60, "2-mm": 60, "3-mm": 60, "round": 60, "single-view": 20, "gaps": 60}
 _QUICK = 15  # times as few

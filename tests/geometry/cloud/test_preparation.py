@@ -11,6 +11,7 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
 from limber.geometry.cloud.surroundings import find_sheet
 from limber.geometry.generated import generate_branch
+from limber.geometry.settings import OPEN
 
 RNG = np.random.default_rng(0)
 
@@ -128,10 +129,31 @@ def test_a_fan_is_no_wall_and_a_shadowed_wall_is(count):
     twig, slope = RNG.integers(0, 9, count), RNG.uniform(-0.3, 0.3, 9)
     wide = 0.1 * twig + slope[twig] * flat + RNG.normal(0, 3e-3, count)
     fan = np.column_stack([wide, RNG.normal(0, 1e-3, count), flat])
-    assert find_sheet(fan, 0.08 * count) is None
+    assert find_sheet(fan, 0.08 * count).probability < 1 - OPEN
     wall = np.column_stack([foot, RNG.normal(0, 1e-3, count), flat])
     wall = wall[np.abs(foot - 0.5 - 0.3 * (flat - 0.5)) > 0.03]
-    assert find_sheet(wall, 0.08 * count).mean() > 0.9
+    sheet = find_sheet(wall, 0.08 * count)
+    assert sheet.on.mean() > 0.9 and sheet.probability > 0.5
+
+
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_a_sheet_near_even_is_asked_about(is_kept):
+    """Many crossing twigs in a plane beside a branch: points do not tell them from a wall. What is
+    done is said, with the option that does the other, which settles it."""
+    rng = np.random.default_rng(5 if is_kept else 3)
+    branch, flat = generate_branch(71, length=0.9).cloud.points, rng.uniform(0, 1, 1400)
+    twig, slope = rng.integers(0, 20, 1400), rng.uniform(-0.3, 0.3, 20)
+    wide = 0.045 * twig + slope[twig] * flat + rng.normal(0, 0.01, 1400)
+    fan = np.column_stack([wide - 0.5, 0.4 + rng.normal(0, 1e-3, 1400), flat])
+    both = Cloud(np.vstack([branch[rng.permutation(len(branch))[:1500]], fan]))
+    prepared = prepare(both, 1.0)
+    (asked,) = (text for text in prepared.warnings if "or the plant's?" in text)
+    (option,) = asked.named
+    assert np.abs(fan - asked.place).sum(axis=1).min() < 1e-3
+    assert (prepared.counts["sheets"] == 0) is is_kept
+    settled = prepare(both, 1.0, PreparationSettings(**{option.name: option.value}))
+    assert "or the plant's?" not in " ".join(settled.warnings)
+    assert (len(settled.cloud) < 1550) is is_kept
 
 
 def test_two_flat_neighbourhoods_are_no_plane():
@@ -167,4 +189,5 @@ def test_leaves_are_no_sheets(tomato):
     for axis in range(3):
         middle = (points[:, axis].min() + points[:, axis].max()) / 2
         for half in (points[points[:, axis] < middle], points[points[:, axis] > middle]):
-            assert find_sheet(half, 0.08 * len(half)) is None
+            sheet = find_sheet(half, 0.08 * len(half))
+            assert sheet is None or sheet.probability < 1 - OPEN

@@ -7,13 +7,7 @@ import pytest
 
 from limber.geometry.skeleton.confidence import assessed
 from limber.geometry.skeleton.radii.wood import ShapeEvidence, likeliest_shape
-from limber.geometry.skeleton.skeleton import (
-    INTERPOLATED,
-    LIMITED,
-    MEASURED,
-    UNRESOLVED,
-    Skeleton,
-)
+from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, UNRESOLVED, Skeleton
 
 _STEM, _TWIG = 81, 40
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from limber.geometry.settings import OPEN
 from limber.geometry.skeleton.curve_graph import CurveGraph
-from limber.geometry.skeleton.plausibility import OPEN, root_question
+from limber.geometry.skeleton.plausibility import root_question
 from limber.geometry.skeleton.root_end import root_node
 from limber.geometry.skeleton.skeletonise import skeletonise
 

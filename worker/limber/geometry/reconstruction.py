@@ -37,11 +37,10 @@ from limber.geometry.pruned_twigs import (
     touching_texts,
     twig_mass,
 )
-from limber.geometry.settings import ESTIMATORS, ReconstructSettings
+from limber.geometry.settings import ESTIMATORS, OPEN, ReconstructSettings
 from limber.geometry.skeleton.alternatives import alternatives, entries
 from limber.geometry.skeleton.edits import Edit, SetRoot, edited
 from limber.geometry.skeleton.plausibility import (
-    OPEN,
     RESOLVED,
     check_explained,
     off_axes,

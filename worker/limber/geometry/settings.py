@@ -19,6 +19,8 @@ ESTIMATORS = Choices("limber.radii", {
 """Estimators of a skeleton's radii: called with the aligned skeleton as fitted, the aligned points
 [m], shape [m, 3], and the settings, they return the skeleton with their radii; ``fit`` leaves it.
 """
+OPEN = 0.8
+"""Probability below which a decision is an open question."""
 GRASP_FRACTION = 2.0 / 3.0
 """Position along the main path at which a branch is held by default."""
 DENSITY_SIGMA = 0.1

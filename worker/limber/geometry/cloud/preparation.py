@@ -10,8 +10,8 @@ from limber.core.constants import UNIT_METRES
 from limber.core.errors import InputError, Option, Place, Text
 from limber.geometry.cloud.cloud import Cloud, own_axes
 from limber.geometry.cloud.single_view import Sight, View, find_sight, flying_pixels, scan_line_view
-from limber.geometry.cloud.surroundings import find_ground, find_sheet
-from limber.geometry.settings import PreparationSettings
+from limber.geometry.cloud.surroundings import Sheet, find_ground, find_sheet
+from limber.geometry.settings import OPEN, PreparationSettings
 
 POINT_MINIMUM = 50
 _SHEET_LEAST = 0.08  # smallest fraction of the points that makes a wall or the ground
@@ -81,14 +81,14 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
                          "A branch has a thickness.",
                          "Check the columns and the number of digits of the export.")
     cloud = cloud.with_points(points)
-    keep, flat = _without_outliers(points), None
+    keep, flat = _without_outliers(points), list[str]()
     if "sheets" not in settings.keep:
-        beside = np.flatnonzero(keep)[_beside_plant(points[keep], up, counts)]
-        if len(beside):
-            middle = np.linalg.norm(points[beside] - np.median(points[beside], axis=0), axis=1)
-            flat = Place((points[beside[np.argmin(middle)]] + origin) / scale)
+        used = np.flatnonzero(keep)
+        on, open_ = _beside_plant(points[keep], up, counts)
+        flat = _sheet_texts((points[used] + origin) / scale, on, open_, counts)
+        if on.any():
             # What is usual for a plant does not depend on the ground around it.
-            rest = np.setdiff1d(np.arange(len(points)), beside)
+            rest = np.setdiff1d(np.arange(len(points)), used[on])
             keep[:] = False
             keep[rest] = _without_outliers(points[rest])
     counts["outliers"] = len(points) - int(keep.sum()) - sum(
@@ -126,15 +126,20 @@ def _cropped(cloud: Cloud, settings: PreparationSettings) -> Cloud:
 
 
 def _beside_plant(points: np.ndarray, up: np.ndarray | None, counts: dict[str, int],
-                  ) -> np.ndarray:
-    """Mask of walls and ground, unless little else remains: that is refused later."""
+                  ) -> tuple[np.ndarray, list[Sheet]]:
+    """Mask of walls and ground, unless little else remains: that is refused later. Also the sheets
+    of which it is an open question whether they are any."""
     on, least = np.zeros(len(points), bool), max(0.1 * len(points), POINT_MINIMUM)
-    rest = np.arange(len(points))
+    rest, open_ = np.arange(len(points)), list[Sheet]()
     for _ in range(_SHEETS_MOST):
         sheet = find_sheet(points[rest], _SHEET_LEAST * len(points))
         if sheet is None:
             break
-        rest = rest[~sheet]
+        if 1 - OPEN < sheet.probability < OPEN:
+            open_.append(sheet._replace(on=np.isin(np.arange(len(points)), rest[sheet.on])))
+        if sheet.probability < 0.5:
+            break
+        rest = rest[~sheet.on]
     counts["sheets"] = 0
     if len(rest) >= least:
         on[np.setdiff1d(np.arange(len(points)), rest)] = True
@@ -144,7 +149,30 @@ def _beside_plant(points: np.ndarray, up: np.ndarray | None, counts: dict[str, i
     if ground is not None and (~ground).sum() >= max(0.1 * len(rest), POINT_MINIMUM):
         on[rest[ground]] = True
         counts["ground"] = int(ground.sum())
-    return on
+    return on, open_
+
+
+def _sheet_texts(points: np.ndarray, on: np.ndarray, open_: list[Sheet], counts: dict[str, int],
+                 ) -> list[str]:
+    """What was removed of points [n, 3] in the file's coordinates, and which sheets are open."""
+    def middle(mask: np.ndarray) -> Place:
+        away = np.linalg.norm(points[mask] - np.median(points[mask], axis=0), axis=1)
+        return Place(points[mask][np.argmin(away)])
+
+    keep = Option("keep", ("sheets",))
+    texts: list[str] = [Text(
+        f"{on.sum()} of {counts['read']} points lie on wide flat sheets or rough ground, as at ",
+        middle(on), ", and were removed (", keep, " keeps them).")] if on.any() else []
+    for sheet in open_:
+        rest = points[~sheet.on]
+        box = (*rest.min(axis=0).tolist(), *rest.max(axis=0).tolist()) if len(rest) else None
+        done = ("They were removed. If they are the plant's: ", keep) if on[sheet.on].all() else (
+            "They were kept. If they are a wall: ", Option("crop", box))
+        texts.append(Text(
+            f"Are {sheet.on.sum()} points a wide flat sheet, as at ", middle(sheet.on), ", or the "
+            f"plant's? They are a sheet with a probability of {sheet.probability:.2f}. ", *done,
+            "."))
+    return texts
 
 
 def _enough_digits(points: np.ndarray) -> None:
@@ -273,8 +301,8 @@ def _rounding(points: np.ndarray) -> float:
     return steps[0] if max(steps) < 1.01 * min(steps) and near < 1.5 * steps[0] else 0.0
 
 
-def _plausible(points: np.ndarray, counts: dict[str, int], flat: Place | None) -> list[str]:
-    texts = []
+def _plausible(points: np.ndarray, counts: dict[str, int], flat: list[str]) -> list[str]:
+    texts = list(flat)
     if counts.get("not_finite"):
         texts.append("Points with coordinates that are not finite (NaN or infinity) were "
                      f"discarded: {counts['not_finite']}.")
@@ -283,11 +311,6 @@ def _plausible(points: np.ndarray, counts: dict[str, int], flat: Place | None) -
                      f"kept, {counts['read'] - counts['thinned_on_reading']} in all: more do not "
                      "make the axes better. Crop the scan before the export if finer twigs are "
                      "missing.")
-    if flat is not None:
-        count = counts["sheets"] + counts.get("ground", 0)
-        texts.append(Text(f"{count} of {counts['read']} points lie on wide flat sheets or rough "
-                          "ground, as at ", flat, ", and were removed (", Option("keep"),
-                          " sheets keeps them)."))
     step = _rounding(points)
     if step > 0:
         texts.append(f"The coordinates are rounded to {1000 * step:.4g} mm, which limits the "

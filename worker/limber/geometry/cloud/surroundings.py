@@ -3,10 +3,12 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from scipy.spatial import cKDTree
+from scipy.special import ndtr
 
 from limber.core.errors import InputError, Option, Place, Text
 from limber.core.numerics.rigid import principal_axes
@@ -335,9 +337,17 @@ _IN_PLANE = 3  # fewest flat neighbourhoods that span a plane
 _BROAD = 0.11  # smallest standard deviation across a sheet, over the diagonal; leaves have 0.08
 
 
-def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
-    """Mask [n] of the largest plane that points [n, 3] [m] fill in both directions; None if none
-    has ``least`` points."""
+class Sheet(NamedTuple):
+    """Mask ``on`` [n] of points on a plane, and the probability that they fill it evenly, as a wall
+    does, and not along lines, as twigs of a flat-grown plant do."""
+
+    on: np.ndarray
+    probability: float
+
+
+def find_sheet(points: np.ndarray, least: float) -> Sheet | None:
+    """Return the largest plane that points [n, 3] [m] may fill in both directions; None if none has
+    ``least`` points."""
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     reach = _REACH * diagonal
     order, rng = own_order(points), np.random.default_rng(0)
@@ -371,35 +381,36 @@ def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
     axes = principal_axes(middles[best])
     offset = (points - middle) @ axes.T
     on = np.abs(offset[:, 2]) < thick
-    if on.sum() < least or not _is_broad(offset[order[on[order]], :2], diagonal):
-        return None
-    return on
+    return None if on.sum() < least else Sheet(
+        on, _even(offset[order[on[order]], :2], diagonal))
 
 
-def _is_broad(flat: np.ndarray, diagonal: float) -> bool:
-    """Whether points of a plane, shape [n, 2], fill an area evenly, and are no flat-grown plant.
+def _even(flat: np.ndarray, diagonal: float) -> float:
+    """The probability that points of a plane, shape [n, 2], fill an area evenly, and are no
+    flat-grown plant.
 
     Twice as far around a point there are four times as many of an even sheet, also beside its
     border, and twice as many of a curve. Each scale between a few points and the sheet's size
-    is asked which of the two explains its counts: twigs are curves up to the gap between them.
+    is asked which of the two explains its counts: twigs are curves up to the gap between them. How
+    sure the least even scale is follows from the scatter between discs that do not overlap.
     """
     size = flat.std(axis=0).min()
     if size < _BROAD * diagonal:
-        return False
+        return 0.0
     tree, some = cKDTree(flat), flat[:20 * _SAMPLE:5]
     least = max(3, len(flat) // 200)  # wider than a scanner's lines are apart
     near = float(np.median(tree.query(some, k=least + 1)[0][:, -1]))
+    least_even = np.inf
     while 0 < 2 * near <= size:
-        left, inner, both = some, 0, 0
+        left, logs = some, list[float]()
         while len(left):
             off = np.linalg.norm(flat - left[0], axis=1)
-            inner += int((off < near).sum()) - 1
-            both += int((off < 2 * near).sum()) - 1
+            inner, both = int((off < near).sum()) - 1, int((off < 2 * near).sum()) - 1
+            logs.append((both - inner) * np.log(1.5) - inner * np.log(2))
             left = left[np.linalg.norm(left - left[0], axis=1) > 4 * near]
-        if inner * np.log(2) > (both - inner) * np.log(1.5):
-            return False
+        least_even = min(least_even, sum(logs) / max(float(np.linalg.norm(logs)), 1e-12))
         near *= np.sqrt(2)
-    return True
+    return float(ndtr(least_even))
 
 
 # Ground in a scan, rough or on a slope: one layer of points below everything else.
@@ -426,7 +437,7 @@ def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray 
     flat, height = points @ across.T, points @ up
     index = np.floor((flat - flat.min(axis=0)) / (_CELL * diagonal)).astype(np.int64)
     shape = tuple(index.max(axis=0) + 1)
-    _, cell = np.unique(np.ravel_multi_index(tuple(index.T), shape), return_inverse=True)
+    where, cell = np.unique(np.ravel_multi_index(tuple(index.T), shape), return_inverse=True)
     count = np.bincount(cell)
     middle = np.stack([np.bincount(cell, values) for values in flat.T], axis=1) / count[:, None]
     if len(count) < _LEAST_CELLS or middle.std(axis=0).min() < _BROAD * diagonal:
@@ -442,8 +453,6 @@ def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray 
     # Bumps are followed from the lower points of the neighbouring cells; a stem's cell has none
     # lower.
     bumps = np.full(shape, np.nan)
-    where = np.full(len(count), 0)
-    where[cell] = np.ravel_multi_index(tuple(index.T), shape)
     bumps.ravel()[where] = np.clip(off, -_BELOW * rough, _BELOW * rough)
     bumps = scipy.ndimage.generic_filter(bumps, _known_median, size=3, mode="constant", cval=np.nan)
     over = height - plane(flat) - bumps.ravel()[where][cell]

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import InputError
 from limber.core.json_values import validated
+from limber.geometry.settings import OPEN
 from limber.geometry.skeleton.confidence import (
     DoubtfulKind,
     DoubtfulPart,
@@ -29,7 +30,6 @@ from limber.geometry.skeleton.edits import (
     SplitBranch,
     edited,
 )
-from limber.geometry.skeleton.plausibility import OPEN
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _DETOUR = 1.5  # longest path over a bridge that is still its own, in its lengths

@@ -11,12 +11,7 @@ from scipy.spatial import cKDTree
 
 from limber.core.progress import SILENT, Progress
 from limber.geometry.skeleton.confidence import doubted
-from limber.geometry.skeleton.curve_graph import (
-    CurveGraph,
-    keep_largest,
-    neighbour_links,
-    spreads,
-)
+from limber.geometry.skeleton.curve_graph import CurveGraph, keep_largest, neighbour_links, spreads
 from limber.geometry.skeleton.exact_factor import ExactFactor
 from limber.geometry.skeleton.joining import edge_matrix, join_pieces, labels
 from limber.geometry.skeleton.repair import PointSpacing, attached, resampled

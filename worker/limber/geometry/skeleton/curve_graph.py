@@ -4,11 +4,7 @@ from dataclasses import dataclass, field
 from typing import cast
 
 import numpy as np
-from scipy.sparse.csgraph import (
-    breadth_first_order,
-    dijkstra,
-    minimum_spanning_tree,
-)
+from scipy.sparse.csgraph import breadth_first_order, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.joining import (

@@ -7,6 +7,7 @@ import numpy as np
 
 from limber.core.errors import InputError, Option, Place, Text
 from limber.geometry.cloud.surroundings import find_sheet
+from limber.geometry.settings import OPEN
 from limber.geometry.skeleton.contraction import ContractionStatus
 from limber.geometry.skeleton.curve_graph import CurveGraph
 from limber.geometry.skeleton.qsm_tables import cylinders
@@ -15,8 +16,6 @@ from limber.geometry.skeleton.skeleton import Skeleton
 _STOUT = 0.13  # median distance from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
 _ROUND = 0.3  # fraction of the radius by which points of a round branch may scatter
 _MOST_OFF = 0.5  # fraction of points off all axes above which these do not describe the scan
-OPEN = 0.8
-"""Probability below which a decision is an open question."""
 _NAMED = 3  # gaps and loops named one by one
 _FIX = Text("Crop the scan to one branch (", Option("crop"), "), or provide a "
             "skeleton (", Option("skeleton"), ").")
@@ -70,7 +69,8 @@ def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
 
 def check_no_sheet(points: np.ndarray) -> None:
     """Refuse a cloud that is one wall, whose points would be removed, and nothing else."""
-    if find_sheet(points, 0.9 * len(points)) is not None:
+    sheet = find_sheet(points, 0.9 * len(points))
+    if sheet is not None and sheet.probability >= OPEN:
         raise InputError("Over 90 % of the points lie on one wide flat sheet.",
                          "The cloud does not have the shape of a branch.", _FIX)
 

@@ -10,20 +10,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.core.errors import InputError, Option
-from limber.core.files.reading import (
-    checked_as,
-    json_content,
-    read_arrays,
-    require_shapes,
-)
+from limber.core.files.reading import checked_as, json_content, read_arrays, require_shapes
 from limber.core.json_values import plain
 from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.skeleton.alternatives import SearchDoubts
 from limber.geometry.skeleton.confidence import shares
-from limber.geometry.skeleton.contraction import (
-    Contraction,
-    ContractionStatus,
-)
+from limber.geometry.skeleton.contraction import Contraction, ContractionStatus
 from limber.geometry.skeleton.plausibility import warnings
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.skeleton import STATES, Skeleton

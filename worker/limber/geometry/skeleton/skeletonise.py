@@ -12,7 +12,7 @@ from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import OwnFrame, thinned
 from limber.geometry.cloud.leaves import leaf_evidence
 from limber.geometry.cloud.single_view import View
-from limber.geometry.settings import SkeletonSettings
+from limber.geometry.settings import OPEN, SkeletonSettings
 from limber.geometry.skeleton.confidence import assessed, likely
 from limber.geometry.skeleton.contraction import (
     POINT_LIMIT,
@@ -25,12 +25,7 @@ from limber.geometry.skeleton.curve_graph import CurveGraph, curve_graph, rooted
 from limber.geometry.skeleton.edits import SetRoot, edited
 from limber.geometry.skeleton.joining import second_base
 from limber.geometry.skeleton.likeliest_tree import rival_tree
-from limber.geometry.skeleton.plausibility import (
-    OPEN,
-    check_no_sheet,
-    check_one_plant,
-    check_round,
-)
+from limber.geometry.skeleton.plausibility import check_no_sheet, check_one_plant, check_round
 from limber.geometry.skeleton.radii.fit_kernels import nearest_cylinders
 from limber.geometry.skeleton.repair import SPUR_REACH, Repaired, prune_spurs, repaired
 from limber.geometry.skeleton.root_end import RootChoice, root_node
