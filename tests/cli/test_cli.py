@@ -1,5 +1,6 @@
 """The command line's contract: exit codes, the last JSON line, progress lines, options."""
 
+import io
 import json
 import os
 import shlex
@@ -100,6 +101,8 @@ def test_exit_codes(failure, code, status, capfd):
     ([], {}),
     (["--size", "2", "--deep", "--goal", "1", "2", "3", "--fractions", "0.5,0.9"],
      {"size": 2, "deep": True, "goal": (1, 2, 3), "fractions": (0.5, 0.9)}),
+    (["--size", "8mm", "--goal", "-1 cm", "2e1mm", ".5"],
+     {"size": 0.008, "goal": (-0.01, 0.02, 0.5)}),
 ])
 def test_settings_become_options(arguments, wanted, capfd):
     """Every field is an option with its type; the stage that runs has what was typed."""
@@ -136,7 +139,8 @@ def test_a_word_may_stand_for_the_numbers_of_an_option(arguments, wanted, capfd)
     assert code_of(["--root", "1", "auto", "2"]) == 2
 
 
-@pytest.mark.parametrize("arguments", [["--size=-1"], ["--size=nan"], ["--fractions", "0.1,x"]])
+@pytest.mark.parametrize("arguments", [["--size=-1"], ["--size=nan"], ["--fractions", "0.1,x"],
+                                       ["--size=4N"], ["--fractions", "0.1 mm,0.2 mm"]])
 def test_refused_setting_is_named(arguments, capfd):
     """A value out of range is a usage error (2); the last JSON line names option and value."""
     code, lines = invoke(lambda *_: {}, [*arguments, "--json"], capfd)
@@ -159,8 +163,67 @@ def test_an_unknown_command_or_option_is_answered_with_those_like_it(capfd):
                             (["robot", "chek"], "Did you mean 'check'?"),
                             (["simulate", "x.branch", "--duratoin", "1"], "--duration"),
                             (["xyzzy"], "`limber --help` lists all.")):
-        assert main.call(arguments) == 2
-        assert told in capfd.readouterr().err
+        assert main.call([*arguments, "--json"]) == 2
+        said = capfd.readouterr()
+        assert told in said.err and said.err.startswith("error: ")
+        assert told in json.loads(said.out)["error"] and json.loads(said.out)["status"] == "failed"
+
+
+class Reader(Tool):
+    """Probe."""
+
+    about = About("probe")
+    scan: Path = Field(description="A scan.", json_schema_extra={"argument": True})
+
+
+def read(capfd, *arguments):
+    """The path that a stage got, its content, exit code and standard output's lines."""
+    got = []
+
+    def function(stage, _progress):
+        got.append((stage.scan, stage.scan.read_bytes()))
+        return {}
+    return got, *invoke(function, [*arguments, "--progress", "none"], capfd, Reader)
+
+
+@pytest.mark.parametrize(("content", "name"), [
+    (b"x,y,z\n0,1,2\n", "stdin.txt"), (b"ply\nformat ascii 1.0\n", "stdin"),
+    (b"\x93NUMPY\x01\0", "stdin")])
+def test_standard_input_is_a_file(content, name, capfd, monkeypatch):
+    """It is read to its end, and recognised as a file would be."""
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO(content + 9000 * b"\n")))
+    [(path, held)], code, _ = read(capfd, "-")
+    assert code == 0 and path.name == name and held.strip() == content.strip()
+    assert len(held) == len(content) + 9000 and not path.exists()
+
+
+def test_a_quoted_pattern_names_one_file(tmp_path, capfd):
+    """Of several one must be named; a file of that name is meant before a pattern."""
+    (tmp_path / "one.xyz").write_text("1")
+    assert read(capfd, str(tmp_path / "o*.xyz"))[0] == [(tmp_path / "one.xyz", b"1")]
+    (tmp_path / "two.xyz").write_text("2")
+    got, code, lines = read(capfd, str(tmp_path / "*.xyz"), "--json")
+    error = json.loads(lines[-1])["error"]
+    assert not got and code == 2 and "2 files match" in error and "limber batch" in error
+    (tmp_path / "scan[1].xyz").write_text("3")
+    assert read(capfd, str(tmp_path / "scan[1].xyz"))[0] == [(tmp_path / "scan[1].xyz", b"3")]
+
+
+@pytest.mark.parametrize(("about", "said"), [
+    ({}, "warning: careful\n"), ({"moves_robot": "always"}, "a table\nwarning: careful\n")])
+def test_a_quiet_command_prints_warnings_and_errors_only(about, said, capsys):
+    """Lines for the person at a robot stay."""
+    class Quiet(Probe):
+        """Probe."""
+
+        def run(self, progress=SILENT):
+            progress.say("a table")
+            progress.warn("careful")
+            return {"tet_count": 12}
+    Quiet.about = About("probe", **about)
+    with pytest.raises(SystemExit, match="0"):
+        StageCommand(Quiet).main(["--quiet"], standalone_mode=False)
+    assert capsys.readouterr() == ("", said)
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -220,10 +220,10 @@ class _Reader:
         try:
             value = in_unit(self.content[key], unit)
             if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-                raise ValueError(f"{self.content[key]!r} is not a positive number of {unit}.")
+                raise ValueError(f"it is not a positive number of {unit}")
             return float(value)
         except ValueError as error:
-            self.refuse((key,), f"{key}: {error}")
+            self.refuse((key,), f"{key} {self.content[key]!r}: {error}.")
             return None
 
     def job(self, job: dict[str, Any], key_path: KeyPath) -> list[BranchJob]:
@@ -309,11 +309,7 @@ class _Reader:
             elif key not in fields:
                 self.refuse(at, f"{name} has no {key!r}. {nearest(key, list(fields))}")
             else:
-                try:
-                    values[key] = self.value(branch, fields[key], at, value)
-                except ValueError as error:
-                    refused.add(key)
-                    self.refuse(at, f"{at[-1]}: {error}")
+                values[key] = self.value(branch, fields[key], at, value)
         tasks = []
         for run in self.runs(fields, {key: at for key, (at, _) in given.items()}, values):
             try:
@@ -323,17 +319,17 @@ class _Reader:
                     key = str(one["loc"][0]) if one["loc"] else ""
                     unit = fields.get(key, {}).get("unit")
                     seen = "" if one["type"] == "missing" else f", not {one['input']!r}"
+                    why = one.get("ctx", {}).get("error", one["msg"])
                     if key not in refused:
                         self.refuse(given[key][0] if key in given else (*key_path, key), (
-                            f"{name} {key}: {one['msg']}{seen}" + (f" [{unit}]." if unit else ".")))
+                            f"{name} {key}: {why}{seen}" + (f" [{unit}]." if unit else ".")))
         self.check_results(branch, tasks, {*given}, key_path)
         return tasks
 
     def value(self, branch: BranchJob, about: dict[str, Any], key_path: KeyPath, value: Any) -> Any:
-        """Return a value with its unit and its placeholders resolved; ValueError if its unit is
-        wrong."""
-        if about.get("unit") or "string" not in _said_of(about, "type"):
-            return in_unit(value, about.get("unit", ""))
+        """Return a value with its placeholders resolved."""
+        if "string" not in _said_of(about, "type"):
+            return value
 
         def fill(match: re.Match) -> str:
             if match.group(1) == "scan":

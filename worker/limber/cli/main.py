@@ -6,6 +6,7 @@ Each is made from a class with its fields (:mod:`limber.cli.known`), by
 
 import contextlib
 import difflib
+import json
 import os
 import signal
 import sys
@@ -86,8 +87,7 @@ def call(arguments: list[str] | None = None) -> int:
         main.main(args=arguments, prog_name="limber", standalone_mode=False)
         sys.stdout.flush()
     except click.ClickException as error:
-        error.show()
-        return error.exit_code
+        return _misused(error, "--json" in (sys.argv if arguments is None else arguments))
     except (click.Abort, KeyboardInterrupt):
         return 130
     except LimberError as error:
@@ -98,6 +98,16 @@ def call(arguments: list[str] | None = None) -> int:
     except OSError as error:
         return _output_lost(error)
     return 0
+
+
+def _misused(error: click.ClickException, as_json: bool) -> int:
+    """State an error in what was typed, as other errors are; return its exit code."""
+    seen, path = error.format_message(), getattr(getattr(error, "ctx", None), "command_path", "")
+    if as_json:
+        print(json.dumps({"command": path.partition(" ")[2], "status": "failed", "seconds": 0.0,
+                          "warnings": [], "error": seen}))
+    say(f"error: {seen}" + (f" `{path} --help` lists what it takes." if path else ""))
+    return error.exit_code
 
 
 def _output_lost(error: OSError) -> int:

@@ -10,12 +10,13 @@ import json
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 
+from limber.cli.input_files import input_files
 from limber.cli.terminal import (
     closing_lines,
     command_to_type,
@@ -62,8 +63,10 @@ class StageCommand(GroupedCommand):
         closing: list[str] = []
         code = 0
         try:
-            with self._progress(ctx.params["progress_style"], warnings) as progress:
-                stage = made_of(self.stage, ctx.params)
+            with (self._progress(ctx.params["progress_style"], warnings,
+                                 is_quiet=ctx.params["quiet"]) as progress,
+                  input_files(self.params, ctx.params) as typed):
+                stage = made_of(self.stage, typed)
                 result = stored(plain(stage.run(progress)))
                 closing = _closing(stage, result, progress)
         except KeyboardInterrupt:
@@ -87,8 +90,7 @@ class StageCommand(GroupedCommand):
         if told := [text for text in warnings if text.named or text.place]:
             outcome["warning_parts"] = [{"text": text, "parts": text.as_json(),
                                          "place": text.place} for text in told]
-        _print_outcome(outcome, result, closing, as_json=ctx.params["as_json"],
-                       verbose=ctx.params["verbose"])
+        _print_outcome(outcome, result, closing, ctx.params)
         sys.exit(code)
 
     def _running(self) -> list[click.Parameter]:
@@ -98,6 +100,8 @@ class StageCommand(GroupedCommand):
                           help="Print the result as one JSON object in the last line."),
             GroupedOption(["-v", "--verbose"], is_flag=True,
                           help="Print every value of the result."),
+            GroupedOption(["-q", "--quiet"], is_flag=True,
+                          help="Print warnings and errors only."),
             GroupedOption(["--progress", "progress_style"], default="auto", show_default=True,
                           type=click.Choice(["auto", "bar", "json", "none"]),
                           help="auto: a bar on a terminal, otherwise a line every ten seconds. "
@@ -113,9 +117,11 @@ class StageCommand(GroupedCommand):
             ctx.exit()
 
     @contextlib.contextmanager
-    def _progress(self, style: str, warnings: list[Text]) -> Iterator[Progress]:
+    def _progress(self, style: str, warnings: list[Text], *, is_quiet: bool = False,
+                  ) -> Iterator[Progress]:
         """The progress of a run in a style; its warnings are printed and kept."""
-        title = str(self.name)
+        title, is_quiet = str(self.name), is_quiet and not self.stage.about.moves_robot
+        style = "none" if is_quiet else style
         if style == "auto":
             style = "bar" if sys.stderr.isatty() else "log"
 
@@ -133,7 +139,7 @@ class StageCommand(GroupedCommand):
             elif style == "json":
                 sink = JsonSink()
                 around.enter_context(Heartbeat(sink.say))
-            progress = Progress(sink, on_warning, told)
+            progress = Progress(sink, on_warning, (lambda _line: None) if is_quiet else told)
             around.enter_context(report_damage_to(progress.warn))
             yield progress
 
@@ -159,16 +165,16 @@ def _written(writes: tuple[str, ...], values: dict[str, Any]) -> object:
     return written if written.exists() else folder
 
 
-def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], closing: list[str], *,
-                   as_json: bool, verbose: bool) -> None:
-    if as_json:
+def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], closing: list[str],
+                   typed: Mapping[str, Any]) -> None:
+    if typed["as_json"]:
         print(json.dumps(plain(outcome | result), allow_nan=False), flush=True)
     if outcome["error"]:
         say(f"error: {outcome['error']}")
-    elif not as_json:
+    elif not typed["as_json"] and not typed["quiet"]:
         # Warnings were printed when they occurred.
         summary = {k: v for k, v in result.items() if k != "warnings"}
-        is_short = bool(closing) and not verbose
+        is_short = bool(closing) and not typed["verbose"]
         for line in closing if is_short else [*result_lines(summary), *closing]:
             click.echo(without_control(line))
         click.echo(f"{outcome['command']}: done in {outcome['seconds']:.1f} s"

@@ -12,13 +12,21 @@ import shlex
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 from pydantic_core import core_schema
 
 from limber.core.errors import InputError, Option, Text
 from limber.core.json_values import validated
+from limber.core.units import in_unit
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -152,6 +160,13 @@ class Settings(BaseModel):
             name: getattr(settings, name) for name in settings.model_fields_set
             if name in cls.model_fields} | more)
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _in_its_unit(cls, value: Any, info: ValidationInfo) -> Any:
+        """Take a number with a unit, such as "2.5 mm", in the unit that the description states."""
+        field = cls.model_fields[str(info.field_name)]
+        return in_unit(value, _unit(field.description)) if _is_number(field.annotation) else value
+
     @classmethod
     def group_of(cls, name: str) -> str:
         """Return the title that a field belongs to."""
@@ -176,9 +191,20 @@ class Settings(BaseModel):
             content["title"] = name.replace("_", " ").capitalize()
             content["group"] = cls.group_of(name)
             content["expert"] = cls.is_expert(name)
-            if unit := _UNIT.search(content.get("description", "")):
-                content["unit"] = unit.group(1)
+            if unit := _unit(content.get("description")):
+                content["unit"] = unit
         return schema
+
+
+def _unit(description: str | None) -> str:
+    found = _UNIT.search(description or "")
+    return found.group(1) if found else ""
+
+
+def _is_number(annotation: Any) -> bool:
+    """Whether a field takes a number, or several, and no free text."""
+    parts = get_args(annotation)
+    return annotation in (int, float) or (str not in parts and any(map(_is_number, parts)))
 
 
 def _extra(model: type[BaseModel], name: str) -> dict[str, Any]:
@@ -207,7 +233,8 @@ def _refusal(model: type[BaseModel], values: dict[str, Any], error: ValidationEr
         return _missing(model, values, missing)
     first = error.errors()[0]
     cause = first.get("ctx", {}).get("error")
-    message = Text(*cause.args) if isinstance(cause, ValueError) else first["msg"]
+    message = (Text(*cause.args) if isinstance(cause, ValueError) else
+               "it must be a number" if first["type"].endswith("_parsing") else first["msg"])
     if not first["loc"]:
         # It concerns several values, and names them.
         return InputError(Text(message, "."), "", "See the options' help.")

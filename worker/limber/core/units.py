@@ -1,11 +1,10 @@
-"""Values with a unit, as a job file may give them: ``"2.5 mm"`` for a setting in metres."""
+"""Values with a unit, as any setting may be given: ``2.5 mm`` for one in metres."""
 
 import math
 import re
 from collections.abc import Callable, Iterable
+from numbers import Real
 from typing import Any
-
-import numpy as np
 
 from limber.core.constants import FORCE_UNITS_N, UNIT_METRES
 
@@ -18,23 +17,22 @@ UNITS: dict[str, dict[str, float]] = {
     "MB": {"MB": 1.0, "GB": 1e3}, "m/s": {"m/s": 1.0, "mm/s": 1e-3}, "m^2": {"m^2": 1.0}}
 """Units that may be written for a value, each by its size in the unit named first."""
 
-_QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s].*?)\s*$")
+_QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?![\d.]|[eE][-+]?\d)"
+                       r"\s*([^\d\s].*?)\s*")
 
 
 def in_unit(value: Any, unit: str) -> Any:
     """Return a number, or numbers, of a text with a unit in ``unit``; other values unchanged.
     ValueError for a unit that cannot be converted."""
-    if isinstance(value, list):
-        return [in_unit(item, unit) for item in value]
-    match = _QUANTITY.match(value) if isinstance(value, str) else None
+    if isinstance(value, list | tuple):
+        return type(value)(in_unit(item, unit) for item in value)
+    match = _QUANTITY.fullmatch(value) if isinstance(value, str) else None
     if match is None:
         return value
     number, unit_text = match.groups()
     known = UNITS.get(unit, {unit: 1.0} if unit else {})
     if unit_text not in known:
-        advice = (f"It must be in {unit}. Known units: {', '.join(known)}." if unit
-                  else "This value has no unit.")
-        raise ValueError(f"{value!r} is in {unit_text!r}. {advice}")
+        raise ValueError(f"it must be in {' or '.join(known)}" if unit else "it has no unit")
     return float(number) * known[unit_text]
 
 
@@ -51,7 +49,7 @@ def text_of(value: Any, form: str = "") -> str:
     """Return a value in SI units with the digits and unit of ``form``, such as ".1f mm"."""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if not isinstance(value, int | float | np.floating):
+    if not isinstance(value, Real):
         return str(value)
     digits, _, unit = form.partition(" ")
     return f"{SCALES.get(unit, ('', 1))[1] * value:{digits}}{BESIDE.get(unit, '')}"

@@ -81,10 +81,14 @@ class GroupedCommand(click.Command):
             formatter.write_text(f"{hidden} more options: --help-all")
 
 
-class _NumberOrWord(click.ParamType):
-    """A number, or one of the words that stand for all numbers of an option."""
+class _Number(click.ParamType):
+    """A number, with its unit or without: the model reads it, as it reads those of other doors."""
 
     name = "number"
+
+
+class _NumberOrWord(_Number):
+    """A number, or one of the words that stand for all numbers of an option."""
 
     def __init__(self, words: Collection[str]):
         self.words = words
@@ -101,9 +105,6 @@ class _NumberOrWord(click.ParamType):
             else:
                 found.append(text)
         return found
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        return value if value in self.words else click.FLOAT.convert(value, param, ctx)
 
     def joined(self, _ctx: click.Context, _param: click.Parameter, values: Any) -> Any:
         """A word that was given for all numbers, or the numbers; a callback of click."""
@@ -232,7 +233,8 @@ def _tuple_option(names: list[str], items: tuple, common: dict[str, Any], words:
                   ) -> click.Option:
     if items[-1] is Ellipsis and typing.get_origin(items[0]) is tuple:
         parts = typing.get_args(items[0])
-        return GroupedOption(names, nargs=len(parts), type=parts[0], multiple=True, **common)
+        return GroupedOption(names, nargs=len(parts), type=_click_type(parts[0]), multiple=True,
+                             **common)
     if items[-1] is Ellipsis:
         # Repeated values add up: using only the last would silently drop the others.
         return GroupedOption(names, callback=_listed, multiple=True,
@@ -243,10 +245,12 @@ def _tuple_option(names: list[str], items: tuple, common: dict[str, Any], words:
         kind = _NumberOrWord(words)
         common = {"callback": kind.joined, **common}
         return GroupedOption(names, nargs=len(items), type=kind, **common)
-    return GroupedOption(names, nargs=len(items), type=items[0], **common)
+    return GroupedOption(names, nargs=len(items), type=_click_type(items[0]), **common)
 
 
 def _click_type(kind: Any) -> Any:
+    if kind in (int, float):
+        return _Number()
     if typing.get_origin(kind) is Literal:
         return click.Choice(typing.get_args(kind))
     return click.Path(path_type=Path) if kind is Path else kind

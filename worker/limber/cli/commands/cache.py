@@ -3,10 +3,8 @@
 from typing import Any
 
 from limber.cli.terminal import table_text
-from limber.core.errors import InputError, Option, Text
 from limber.core.files import caches
 from limber.core.progress import SILENT, Progress
-from limber.core.units import in_unit
 from limber.stages.stage import About, Tool, option
 
 
@@ -18,23 +16,16 @@ class Cache(Tool):
 
     about = About("cache", found=("{byte_count:MB} are kept, {freed_bytes:MB} were freed.",))
 
-    limit: str | None = option(
-        "Remove the least recently used entries until the total is at most this size: 500 MB, 2 "
-        "GB.", metavar="SIZE")
+    limit: float | None = option(
+        "Remove the least recently used entries until the total is at most this, such as 2 GB "
+        "[MB].", ge=0)
     clear: bool = option("Remove everything. It is computed again when needed.", False,
                          switch=True)
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         folder, freed = caches.cache_folder(), 0
         if self.limit is not None:
-            try:
-                most = 1e6 * float(in_unit(self.limit, "MB"))
-                if not 0 <= most < float("inf"):
-                    raise ValueError(self.limit)
-            except (TypeError, ValueError) as error:
-                raise InputError(Text(Option("limit"), f" {self.limit!r} is not a size."), "",
-                                 "Write 500 MB or 2 GB.") from error
-            freed = 0 if self.clear else caches.trim(folder, most)
+            freed = 0 if self.clear else caches.trim(folder, 1e6 * self.limit)
         if self.clear:
             freed = caches.clear(folder)
         known = caches.known_caches()
