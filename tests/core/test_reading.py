@@ -26,6 +26,9 @@ from limber.core.files.reading import (
 )
 from limber.core.files.tables import csv_records, read_columns
 from limber.core.machine_errors import machine_error
+from limber.geometry.io.clouds import read_points
+from limber.geometry.io.skeletons import read_skeleton
+from limber.recordings.tables import text_of
 
 
 @pytest.mark.parametrize("text", [
@@ -106,6 +109,21 @@ def test_a_long_field_of_a_table_is_refused(tmp_path):
     for read in (lambda: read_columns(path, ("b",), "numbers"), lambda: csv_records(path, "rows")):
         with pytest.raises(InputError, match=r"a\.csv.*field"):
             read()
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a.ptx", "a.swc", "a.mtg", "a.csv", "pull.csv"])
+def test_zeros_without_end_are_refused_at_once(name, tmp_path):
+    """A disk that was full, or a sparse file: one line of gigabytes, of which none is read."""
+    path = tmp_path / name
+    path.touch()
+    os.truncate(path, 4 << 30)
+    read = text_of if name == "pull.csv" else (
+        read_skeleton if name in ("a.swc", "a.mtg", "a.csv") else read_points)
+    with pytest.raises(InputError, match=rf"{name} (is not a text file|has 4295 MB)"):
+        read(path)
+    path.write_bytes(b"1 2 3\n" + bytes(9))
+    with pytest.raises(InputError, match="zero bytes"):
+        read(path)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")

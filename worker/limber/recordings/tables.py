@@ -56,14 +56,12 @@ def is_clock(part: str) -> bool:
 def text_of(path: Path) -> str:
     """Return the text of a file; InputError if it cannot be read, or is not text."""
     try:
-        text = path.read_text(encoding=text_columns.coding_of(path), errors="replace")
+        return path.read_text(encoding=text_columns.coding_of(path), errors="replace")
+    except text_columns.ColumnsError as error:
+        raise InputError(error.seen, error.why, error.fix) from error
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
                          "Check the path and the file.") from error
-    if "\x00" in text:
-        raise InputError(f"{path} is not a text file.", "A table of numbers was expected.",
-                         "Export it as CSV.")
-    return text
 
 
 def number_of(text: str, comma: bool) -> float | None:

@@ -38,7 +38,6 @@ _MOST_DIGITS = 40
 """Of an integer: a seed has up to 39."""
 MOST_TOML_BYTES = 2 << 20
 """Largest hand-written TOML file; its parser takes two seconds per megabyte of tables."""
-MOST_JSON_BYTES = 512 << 20
 _MOST_KEY_PARTS = 32
 _LONG_KEY = re.compile(r"""(?<![\w.-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+)"""
                        f"{{{_MOST_KEY_PARTS}}}")
@@ -51,29 +50,28 @@ class FileContent(BaseModel):
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
 
-def read_text(path: str | os.PathLike, what: str) -> str:
+def read_text(path: str | os.PathLike, what: str, most_bytes: int = 512 << 20) -> str:
     """Return a file's text (UTF-8, with or without a BOM); ``what`` names it in errors. InputError
-    if it cannot be read, or is not text."""
+    if it cannot be read, is not text, or has more than ``most_bytes``."""
     require_no_pipe(path)
-    try:
-        return Path(path).read_text(encoding="utf-8-sig")
-    except (OSError, ValueError) as error:
-        raise unreadable(path, what, error) from error
-
-
-def _require_modest_text(path: str | os.PathLike, most_bytes: int, what: str) -> None:
     with contextlib.suppress(OSError, ValueError):
         size = os.stat(path).st_size
         if size > most_bytes:
             raise InputError(f"{path} has {size / 1e6:.0f} MB.",
                              f"{what[0].upper()}{what[1:]} was expected; it has at most "
                              f"{most_bytes / 1e6:.0f} MB.", "Check that this is the right file.")
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+        if "\0" in text:
+            raise ValueError("it has zero bytes")
+    except (OSError, ValueError) as error:
+        raise unreadable(path, what, error) from error
+    return text
 
 
 def read_json(path: str | os.PathLike, what: str) -> Any:
     """Return the content of a JSON file; InputError if it is not JSON, or a number is not finite,
     or beyond ``LARGEST_NUMBER``."""
-    _require_modest_text(path, MOST_JSON_BYTES, what)
     return json_content(read_text(path, what), path, what)
 
 
@@ -113,8 +111,7 @@ def read_toml(path: str | os.PathLike, what: str, *, finite: bool = True) -> dic
     """Return the content of a TOML file; InputError if it is not TOML (with the line), or a number
     is not finite, unless not ``finite``: the caller refuses such values itself, by name and
     line."""
-    _require_modest_text(path, MOST_TOML_BYTES, what)
-    return toml_content(read_text(path, what), path, what, finite=finite)
+    return toml_content(read_text(path, what, MOST_TOML_BYTES), path, what, finite=finite)
 
 
 def toml_content(text: str, path: str | os.PathLike, what: str, *, finite: bool = True,

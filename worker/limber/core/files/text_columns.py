@@ -167,7 +167,7 @@ class Columns:
 
 def coding_of(path: Path) -> str:
     """Return the coding of a text file: UTF-8, UTF-16 or, as of spreadsheets, a Windows code
-    page."""
+    page. ColumnsError for zero bytes: one line of them may take all memory."""
     reader = codecs.getincrementaldecoder("utf-8")()
     with open(path, "rb") as stream:
         start = stream.read(_BLOCK)
@@ -175,14 +175,22 @@ def coding_of(path: Path) -> str:
                              (codecs.BOM_UTF16_BE, "utf-16")):
             if start.startswith(mark):
                 return coding
+        found = "utf-8"
+        while start:
+            if b"\0" in start:
+                raise ColumnsError(f"{path} is not a text file: it has zero bytes.",
+                                   "A table was expected.", "Export it as text in UTF-8.")
+            if found == "utf-8":
+                try:
+                    reader.decode(start)
+                except UnicodeDecodeError:
+                    found = "cp1252"
+            start = stream.read(_BLOCK)
         try:
-            while start:
-                reader.decode(start)
-                start = stream.read(_BLOCK)
             reader.decode(b"", final=True)
         except UnicodeDecodeError:
             return "cp1252"
-    return "utf-8"
+    return found
 
 
 def lines_of(path: Path, coding: str) -> Iterator[str]:

@@ -471,13 +471,10 @@ def _read_text(path: Path) -> Cloud:
         raise InputError(f"{path} holds the cylinders or segments of a tree's model.",
                          "A point cloud was expected.", "Mesh the model with ", Command("mesh"),
                          ", or give it beside its cloud with ", Option("skeleton", path.name), ".")
-    try:
-        table = text_columns.Table(path)
-        held = gathered(Cloud(piece[:, table.axes], {"others": np.delete(piece, table.axes, 1)})
-                        for piece in table.pieces())
-        read = table.columns(_joined(held, table.axes))
-    except text_columns.ColumnsError as error:
-        raise InputError(error.seen, error.why, error.fix) from error
+    table = text_columns.Table(path)
+    held = gathered(Cloud(piece[:, table.axes], {"others": np.delete(piece, table.axes, 1)})
+                    for piece in table.pieces())
+    read = table.columns(_joined(held, table.axes))
     # A column with the name of an earlier one would replace it.
     names = property_names(read.names)
     cloud = Cloud.from_columns(dict(zip(names, read.values.T, strict=True)),

@@ -19,6 +19,7 @@ from typing import Any, Generic, TypeVar
 
 from limber.core.errors import InputError, LimberError, MissingDependencyError
 from limber.core.files.atomic import require_no_pipe
+from limber.core.files.text_columns import ColumnsError
 from limber.core.machine_errors import machine_error
 from limber.core.optional import loaded
 from limber.geometry.io.isolated_readers import read_apart
@@ -112,6 +113,8 @@ class Registry(Generic[Kind]):
             return self._read(chosen, path, options)
         except (LimberError, MemoryError):
             raise
+        except ColumnsError as error:
+            raise InputError(error.seen, error.why, error.fix) from error
         except ImportError as error:
             raise MissingDependencyError(f"Reading {path.suffix} files requires the package "
                                          f"{error.name}.", "It is not installed.",
