@@ -106,7 +106,8 @@ def _misused(error: click.ClickException, as_json: bool) -> int:
     if as_json:
         print(json.dumps({"command": path.partition(" ")[2], "status": "failed", "seconds": 0.0,
                           "warnings": [], "error": seen}))
-    say(f"error: {seen}" + (f" `{path} --help` lists what it takes." if path else ""))
+    say(f"error: {seen}" + (
+        f" `{path} --help` lists what it takes." if path and "--help" not in seen else ""))
     return error.exit_code
 
 
