@@ -74,6 +74,17 @@ def test_pages_of_accuracy_are_those_of_their_data(page, written_pages):
     assert (GUIDE / page).read_text(encoding="utf-8") == written_pages[page]
 
 
+@pytest.mark.parametrize("path", [GUIDE.parents[1] / "README.md", *sorted(GUIDE.rglob("*.md"))],
+                         ids=lambda path: path.stem)
+def test_sentences_are_short(path):
+    """At most 30 words each, tables and code aside."""
+    text = re.sub(r"```.*?```|<!--.*?-->|^\s*\|.*?$", "", path.read_text(encoding="utf-8"),
+                  flags=re.DOTALL | re.MULTILINE)
+    sentences = re.split(r"\n\s*\n|\n(?=\s*(?:[-*]|\d+\.) |#)|(?<=[.?!:])\s+",
+                         re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text))
+    assert not [each for each in sentences if len(re.findall(r"\S*\w\S*", each)) > 30]
+
+
 @pytest.mark.parametrize("path", sorted((GUIDE / "data").glob("*.json")), ids=lambda p: p.stem)
 def test_data_of_accuracy_say_where_they_are_from(path):
     """Date, commit, seed and the number of trials: without them nobody can measure again."""

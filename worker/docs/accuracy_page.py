@@ -19,15 +19,15 @@ CHAPTERS = {
         "tomato seedling: there the truth is not known, so points and surface are compared.")),
     "worlds": ("Plants and sensors of other kinds", (
         "Six generators after published rules (space colonisation, L-systems, Weber and Penn, and "
-        "others) that share no code with the project's own, seen by models of laser scanners, "
-        "depth cameras, hand scanners and photogrammetry, bare, in leaf and in pots; and real "
-        "scans with skeletons of others.")),
+        "others) share no code with the project's own. Models of laser scanners, depth cameras, "
+        "hand scanners and photogrammetry see their plants bare, in leaf and in pots. Real scans "
+        "come with skeletons of others.")),
     "sparse": ("Sparse scans, and other programs on them", (
         "Branches of 300 to 1,500 points with 2 to 3 mm noise and 1 to 3 % stray points, and real "
         "scans that are as sparse, or thinned. No constant was fitted on the generator "
         "`drooping`, but the search for the likeliest tree was designed looking at its scans of "
         "other seeds, and at both scans of puu. So neither is unseen. The first nine rows have "
-        "seed 6511, at which nobody looked before, and are of the last code; the others are older "
+        "seed 6511, at which nobody looked before, and are of the last code. The others are older "
         "than the change of the score by which a scan says whether axes show points by their area "
         "or by their length. PyTLidar (TreeQSM in Python) and PC-skeletor get the same clouds, "
         "turned so that the true root is the lowest; Limber finds its root. Lengths, volumes and "
@@ -38,7 +38,7 @@ CHAPTERS = {
         "shooting, a manufactured solution for the order of convergence, a beam's frequency.")),
     "estimation": ("Young's modulus", (
         "Pulls are simulated on a finer mesh with known moduli and the noise of sensors, and the "
-        "moduli are estimated from them; `silicone_beam` is a recording of a real beam under a "
+        "moduli are estimated from them. `silicone_beam` is a recording of a real beam under a "
         "weight.")),
     "truth": ("Young's modulus where more is wrong", (
         "As above, with all that a real cell does: wrong gain and zero of the force sensor, a "
