@@ -67,8 +67,7 @@ def find_supports(points: np.ndarray, up: np.ndarray) -> list[Support]:
     found = _in_sample(points[some], up / np.linalg.norm(up))
     if len(some) < len(points) and found:
         near = cKDTree(points[some]).query(points)[1]
-        found = [replace(each, points=np.flatnonzero(np.isin(near, each.points)))
-                 for each in found]
+        found = [replace(each, points=np.flatnonzero(np.isin(near, each.points))) for each in found]
     return found
 
 
@@ -176,8 +175,7 @@ def _pot(flat: np.ndarray, layer: np.ndarray, thick: float) -> np.ndarray | None
 def _stake(flat: np.ndarray, layer: np.ndarray, height: np.ndarray, rest: np.ndarray,
            thick: float) -> tuple[np.ndarray, float] | None:
     """Indices of the points of the longest stake among ``rest``, and its radius [m]."""
-    cell, of = np.unique(np.floor(flat[rest] / thick).astype(np.int64), axis=0,
-                         return_inverse=True)
+    cell, of = np.unique(np.floor(flat[rest] / thick).astype(np.int64), axis=0, return_inverse=True)
     pairs = np.unique(np.column_stack([of.ravel(), layer[rest]]), axis=0)
     crossed = np.bincount(pairs[:, 0], minlength=len(cell))
     for start in np.argsort(-crossed, kind="stable")[:2 * _STAKES_MOST]:
@@ -268,8 +266,7 @@ def _wire(places: np.ndarray, free: np.ndarray, supports: cKDTree | None, every:
         line, hang = np.polyfit(along, own[near, 1], 1), np.polyfit(
             along, own[near, 2], 2 if high - low > 6 * reach else 1)
         hang = np.pad(hang, (3 - len(hang), 0))
-        wide = max(4 * float(np.median(np.linalg.norm(_off(own[near], line, hang), axis=1))),
-                   1e-9)
+        wide = max(4 * float(np.median(np.linalg.norm(_off(own[near], line, hang), axis=1))), 1e-9)
         if along.min() > low - 1e-3 * reach and along.max() < high + 1e-3 * reach and high > low:
             break
         low, high = float(along.min()), float(along.max())
@@ -381,8 +378,7 @@ def find_sheet(points: np.ndarray, least: float) -> Sheet | None:
     axes = principal_axes(middles[best])
     offset = (points - middle) @ axes.T
     on = np.abs(offset[:, 2]) < thick
-    return None if on.sum() < least else Sheet(
-        on, _even(offset[order[on[order]], :2], diagonal))
+    return None if on.sum() < least else Sheet(on, _even(offset[order[on[order]], :2], diagonal))
 
 
 def _even(flat: np.ndarray, diagonal: float) -> float:

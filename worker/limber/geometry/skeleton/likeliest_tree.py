@@ -39,9 +39,12 @@ _CHANGE = 0.5  # most that a step changes the logarithm of a radius
 _FIRM = 0.02  # least part of a point's weight with which it holds the axis across
 _TWIG = 0.4  # radius of a new twig over that of its carrier
 _BADLY, _FEET, _TIPS = 400, 8, 2  # points explained worst; nodes and ends from which twigs may lead
-# Deviation of the logarithm of a tree's length, besides that between searches: in the score's own
-# measure each twig is sure, but twigs are missed and false together (42 scans of the worlds).
+# Deviation of the logarithm of a tree's length, besides that between searches and by what twigs
+# cost (42 scans of the worlds).
 _APART = 0.08
+# A deviation of what a twig costs, as a factor: points of twigs side by side are not independent,
+# nor is their noise the same everywhere, so what a twig must explain is not known well.
+_DEARER = 4.0
 _BESIDE, _KNOWN = 6, 32  # cylinders a point may be of, of so many around it
 _TABLE, _FACINGS = 48, 5  # distances and angles at which the density of a new twig is known
 _POSITIONS = (2 * np.arange(24) + 1) / 24 - 1  # around an axis, within so many deviations:
@@ -67,6 +70,10 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
         other, more = likeliest_tree(skeleton, seen, apart, progress.part(0.7, 1.0))
         if seen.score(other) > scan.score(skeleton):
             scan, skeleton, count = seen, other, count + more
+    spaced, cost = _spaced(skeleton, apart), scan.twig_numbers
+    few, many = (State.of(spaced, replace(scan, twig_numbers=each)) for each in (
+        _DEARER * cost, cost / _DEARER))
+    unknown = np.log(grown(many, apart).skeleton.length / drawn_back(pruned(few)).skeleton.length)
     residual = nearest_cylinders(skeleton, points)[1]
     noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
     if rays := scan.sight is not None:
@@ -74,8 +81,8 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
         skeleton, _ = by_projected_widths(skeleton, points, view)
     found = assessed(skeleton.on_grid(), points, noise, rays=rays, view=view if rays else None)
     even, kinks = without_kinks(found)
-    return doubted(even, points, noise) if kinks else found, noise, count, float(np.hypot(
-        _APART, np.std([np.log(one.length) for one, _ in around])))
+    return doubted(even, points, noise) if kinks else found, noise, count, float(np.linalg.norm(
+        [_APART, unknown / 2, np.std([np.log(one.length) for one, _ in around])]))
 
 
 def likeliest_tree(first: Skeleton, scan: PointLikelihood, apart: PointSpacing,
@@ -373,8 +380,7 @@ class _Twigs:
         feet, table_of = np.unique(self.foot, return_inverse=True)
         radius = np.zeros(len(feet))
         radius[table_of] = self.radius
-        distance = np.append(0.0, np.geomspace(
-            scan.noises[0] / 2, 33 * scan.noises[-1], _TABLE))
+        distance = np.append(0.0, np.geomspace(scan.noises[0] / 2, 33 * scan.noises[-1], _TABLE))
         facing = np.linspace(-1, 1, _FACINGS) if scan.sight is not None else np.full(1, np.nan)
         grid = np.array(np.meshgrid(radius, facing, distance, indexing="ij"))
         density = densities(grid[2].ravel(), grid[0].ravel(), grid[1].ravel(), scan.noises,
@@ -408,8 +414,7 @@ class _Twigs:
             parent.append(np.append(self.foot[k], made + np.arange(count - 1)))
             radius.append(np.full(count, self.radius[k]))
             made += count
-        return Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent),
-                                   np.concatenate(radius))
+        return Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent), np.concatenate(radius))
 
 
 @compiled_exactly

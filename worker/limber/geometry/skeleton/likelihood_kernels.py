@@ -31,8 +31,7 @@ def _density(distance: float, radius: float, facing: float, noise: float, power:
     if abs(off) > _NOWHERE:
         return 0.0
     sharpness = distance * radius / noise**2
-    density = radius**power * _bessel(sharpness) * np.exp(-0.5 * off**2) / (
-        2 * np.pi * noise**2)
+    density = radius**power * _bessel(sharpness) * np.exp(-0.5 * off**2) / (2 * np.pi * noise**2)
     if np.isnan(facing):
         return density
     # Fourier's series of the half-wave rectified cosine. Around the circle the noise is von

@@ -100,14 +100,11 @@ def read_calipers(path: Path) -> list[Caliper]:
         raise InputError(f"{path} has a field that is not a number ({error}).",
                          "Both columns must hold numbers.", "Correct the file.") from error
     for number, one in enumerate(values, start=2):
-        if not (0 < one.diameter < np.inf and np.isfinite(one.along)):
-            raise InputError(f"{path}, line {number}: {1e3 * one.diameter:g} mm at {one.along:g} "
-                             "m.", "A diameter must be positive, and both values must be finite.",
-                             "Correct that line.")
-        if one.diameter > _THICKEST:
-            raise InputError(f"{path}, line {number}: a diameter of {one.diameter:g} m.",
-                             f"No branch is thicker than {_THICKEST:g} m; the column is in "
-                             "millimetres.", "Correct that line.")
+        if not (0 < one.diameter <= _THICKEST and np.isfinite(one.along)):
+            raise InputError(
+                f"{path}, line {number}: {1e3 * one.diameter:g} mm at {one.along:g} m.",
+                f"A diameter must be positive and at most {_THICKEST:g} m; the column is in "
+                "millimetres.", "Correct that line.")
     return values
 
 

@@ -118,14 +118,15 @@ class _Search:
             some = some[graph.owner[cKDTree(thin).query(some)[1]] >= 0]
         return some
 
-    def through_leaves(self, first: Skeleton, fitted: Repaired, graph: CurveGraph, start: int,
-                       ) -> Skeleton | None:
+    def through_leaves(self, first: Skeleton, fitted: Repaired, wood: Skeleton, graph: CurveGraph,
+                       start: int) -> Skeleton | None:
         """Axes through the middle of leaves, the ``first`` or those of levels; None if points are
-        likelier about the fitted cylinders, by their distances and the shape of their surroundings.
-        """
-        # A fit makes fat cylinders of leaves: that these are likely is no evidence of wood. But one
-        # side of a branch is likely about a thin axis, where nothing shows that it is one side. A
-        # depth camera's readings are flat where they graze wood.
+        likelier about the cylinders that were fitted and those of ``wood``, by distances and the
+        shape of their surroundings."""
+        # A fit makes fat cylinders of leaves, and a search many thin twigs: that either is likely
+        # is no evidence of wood, and a fit alone misses twigs of a thin scan. But one side of a
+        # branch is likely about a thin axis, where nothing shows that it is one side. A depth
+        # camera's readings are flat where they graze wood.
         if fitted.view is not None:
             return None
         some = fitted.points[::len(fitted.points) // _SEARCHED + 1]
@@ -135,10 +136,13 @@ class _Search:
                 np.median(graph.thickness))))[0])
         best = max((through_leaves(one, some, fitted.noise, fitted.radius_limits)
                     for one in rivals), key=scan.score)
-        if scan.score(best) > scan.score(fitted.skeleton):
-            scan = scan.where_seen(fitted.skeleton)
-        likelier = max(scan.score(best) - scan.score(fitted.skeleton), 0.0)
-        return best if likelier + shape > 0 else None
+
+        def lead(scan: PointLikelihood) -> float:
+            return scan.score(best) - (scan.score(fitted.skeleton) + scan.score(wood)) / 2
+
+        if lead(scan) > 0:
+            scan = scan.where_seen(wood)
+        return best if max(lead(scan), 0.0) + shape > 0 else None
 
     def _joining(self) -> dict[str, Any]:
         settings = self.settings
@@ -175,15 +179,15 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
                       progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     check_round(fitted.skeleton, points, segment, residual)
-    skeleton, more = fitted.skeleton, fitted.pruned
-    if leafy := (middle := search.through_leaves(first, fitted, graph, start)) is not None:
-        skeleton, more = middle, 0
-    skeleton, unlikely = likely(skeleton, twig_probability)
-    noise, count, spread = fitted.noise, pruned + more, None
-    if not leafy and len(points) <= _SEARCHED:  # the score knows no leaves
-        skeleton, noise, count, spread = rival_tree(
-            search.unpruned(graph, start), skeleton, some, view, progress.part(0.95, 1.0))
-        unlikely = []
+    wood, (skeleton, unlikely) = fitted.skeleton, likely(fitted.skeleton, twig_probability)
+    noise, count, spread = fitted.noise, pruned + fitted.pruned, None
+    if len(points) <= _SEARCHED:
+        wood, noise, count, spread = rival_tree(search.unpruned(graph, start), skeleton, some, view,
+                                                progress.part(0.95, 1.0))
+        skeleton, unlikely = wood, []
+    if leafy := (middle := search.through_leaves(first, fitted, wood, graph, start)) is not None:
+        skeleton, unlikely = likely(middle, twig_probability)
+        noise, count, spread = fitted.noise, pruned, None
     if skeleton is not fitted.skeleton:
         segment, residual = nearest_cylinders(skeleton, points)
     if len(ends) > 1 and ends[0]["probability"] < OPEN and not leafy:

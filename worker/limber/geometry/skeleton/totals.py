@@ -36,9 +36,9 @@ class Total:
 
     @property
     def interval(self) -> list[float]:
-        """The 95 % interval; the lower end is not negative."""
-        reach = _SURE * self.sigma
-        return [max(self.expected - reach, 0.0), self.expected + reach]
+        """The 95 % interval of a positive quantity, whose logarithm is off to both sides alike."""
+        factor = float(np.exp(_SURE * np.sqrt(np.log1p((self.sigma / self.expected)**2))))
+        return [self.expected / factor, self.expected * factor]
 
 
 def total_length(skeleton: Skeleton, doubts: SearchDoubts = _NOTHING_OPEN) -> Total:

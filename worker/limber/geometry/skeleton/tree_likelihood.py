@@ -53,6 +53,7 @@ class PointLikelihood:
         volume: Where background may be [m^3].
         sight: Unit vectors from points to the sensor, shape [m, 3]; None: seen from all around.
         power: Of the radius, by which axes show points: 1 by their skin's area, 0 by their length.
+        twig_numbers: What a twig costs, in halves of the logarithm of the number of points.
     """
 
     points: np.ndarray
@@ -60,6 +61,7 @@ class PointLikelihood:
     volume: float
     sight: np.ndarray | None = None
     power: float = 1.0
+    twig_numbers: float = _TWIG_NUMBERS
 
     @classmethod
     def of(cls, points: np.ndarray) -> "PointLikelihood":
@@ -136,7 +138,7 @@ class PointLikelihood:
     @property
     def twig_cost(self) -> float:
         """By how much a twig must raise the logarithm of the likelihood."""
-        return _TWIG_NUMBERS / 2 * float(np.log(len(self.points)))
+        return self.twig_numbers / 2 * float(np.log(len(self.points)))
 
     def score(self, skeleton: Skeleton, match: Match | None = None) -> float:
         """The logarithm of the likelihood of the points given a tree, less the cost of its twigs

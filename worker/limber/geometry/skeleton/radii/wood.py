@@ -330,8 +330,7 @@ def _information(skeleton: Skeleton, evidence: ShapeEvidence, local: np.ndarray,
     block[~measured] = 0.0
     block[~measured, :3, :3] = np.eye(3) / radius[~measured, None, None]**2
     along = skeleton.axes()
-    block[:, :3, :3] += along[:, :, None] * along[:, None, :] / (
-        _ALONG * radius[:, None, None])**2
+    block[:, :3, :3] += along[:, :, None] * along[:, None, :] / (_ALONG * radius[:, None, None])**2
     return sparse.bsr_matrix((block, np.arange(count), np.arange(count + 1)))
 
 
