@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
-from benchmarks.worlds.sources import bare_case
-from limber.geometry.skeleton.likeliest_tree import _falling, fitted, likeliest_tree
+from benchmarks.worlds.sources import NEW, bare_case, sparse_case
+from limber.geometry.skeleton.likeliest_tree import _falling, fitted, likeliest_tree, rival_tree
 from limber.geometry.skeleton.likelihood_kernels import densities
 from limber.geometry.skeleton.repair import PointSpacing
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -93,8 +93,7 @@ def thin_scan(source: str = "monopodial") -> tuple[np.ndarray, Skeleton]:
     """700 points of a plant with 2 mm of noise and some far off [m], and its true axes."""
     case = bare_case(9102, source, "round")
     rng = np.random.default_rng(3)
-    points = case.points[rng.choice(len(case.points), 700, replace=False)]
-    points = points + rng.normal(0, 0.002, points.shape)
+    points = rng.choice(case.points, 700, replace=False) + rng.normal(0, 0.002, (700, 3))
     points[:15] += rng.normal(0, 0.02, (15, 3))
     return points, case.truth
 
@@ -120,19 +119,26 @@ def test_a_thin_scan_shows_its_axes_and_hardly_changes_without_two_points():
 @pytest.mark.slow
 def test_a_twig_that_no_point_shows_is_left_out():
     points = skin(0.004, 0.0005)
-    whole = rod()
-    twig = np.array([[0.15, 0.0, 0.02], [0.15, 0.0, 0.05]])
-    first = Skeleton.from_edges(np.vstack([whole.nodes, twig]), np.concatenate(
-        [whole.parent, [10, 20]]), np.full(22, 0.004))
+    nodes = np.vstack([rod().nodes, [[0.15, 0.0, 0.02], [0.15, 0.0, 0.05]]])
+    first = Skeleton.from_edges(nodes, [*rod().parent, 10, 20], np.full(22, 0.004))
     found, count = likeliest_tree(first, PointLikelihood.of(points), PointSpacing.of(points))
     assert found.branch_count == count == 1
 
 
 @pytest.mark.slow
-def test_points_that_nothing_explains_become_a_twig():
+@pytest.mark.parametrize(("count", "is_sure"), [(60, True), (20, False)])
+def test_points_that_nothing_explains_become_a_twig(count, is_sure):
+    """Whether a faint one is a twig hangs on what a twig must explain: the length is less sure."""
     rng = np.random.default_rng(1)
-    twig = np.column_stack([np.full(60, 0.15), np.zeros(60), rng.uniform(0.005, 0.08, 60)])
+    twig = np.column_stack([np.full(count, 0.15), np.zeros(count), rng.uniform(0.005, 0.08, count)])
     points = np.vstack([skin(0.004, 0.0005), twig + rng.normal(0, 0.001, twig.shape)])
-    found, _ = likeliest_tree(rod(), PointLikelihood.of(points), PointSpacing.of(points))
-    assert found.branch_count == 2
-    assert found.length == pytest.approx(0.38, rel=0.05)
+    found, _, _, spread = rival_tree(rod(), rod(), points)
+    assert found.branch_count == 2 and (spread < 0.09) is is_sure
+    assert found.length == pytest.approx(0.38 if is_sure else 0.35, rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_thin_scan_of_many_twigs_is_not_taken_for_leaves():
+    """Half of its axes were missing: leaves were likelier than the fit, not than the search."""
+    case = sparse_case(7309002, NEW, "round")
+    assert not skeletonise(case.points[~case.leaf], up=np.array(case.settings["up"])).leafy
