@@ -233,17 +233,33 @@ def test_a_point_that_is_off_along_the_branch_is_told_as_that(small, small_bench
 
 
 def test_a_frame_is_put_right_by_its_fitted_turn(small_pull):
-    """About the middle of the points, as it was fitted."""
+    """About the middle of the points at rest, as it was fitted."""
     turn, shift = np.array([0.2, -0.1, 0.15]), np.array([0.03, -0.02, 0.01])
     seen = small_pull.observations.positions
-    middle = seen.mean(axis=(0, 1))
+    middle = seen[0].mean(axis=0)
     wrong = middle + shift + rotated(turn, (seen - middle).reshape(-1, 3)).reshape(seen.shape)
     off = replace(small_pull, observations=replace(small_pull.observations, positions=wrong))
     errors = [{"name": f"camera {what} {axis}", "value": float(value)}
               for what, values in (("position", shift), ("rotation about", turn))
               for axis, value in zip("xyz", values, strict=True)]
-    right = put_right(off, *fitted_frame(errors)).observations.positions
+    right = put_right(off, *fitted_frame(errors), middle).observations.positions
     assert right == pytest.approx(seen, abs=1e-9)
+
+
+def test_pulls_of_one_cell_turn_about_one_point(small_bench, small_pull):
+    """Each about the middle of its own points, one turn would be two frames."""
+    turn = np.array([2e-3, -1e-3, 1.5e-3])
+    known = EXACT.model_copy(update={"camera_sigma_rad": 1e-3})
+    seen = small_pull.observations
+    pulls = [replace(small_pull, name=name, entry=small_pull.entry.model_copy(
+        update={"calibration": known}), observations=replace(seen, positions=places))
+        for name, places in (("a", seen.positions), ("b", 2 * seen.positions[:1] - seen.positions))]
+    objective = small_bench.objective(pulls, SETTINGS)
+    for number, pull in enumerate(pulls):
+        places = objective.forwards[number].frames.positions
+        found = objective.cell_errors.slopes(number, places, np.zeros((len(places), 3))).points @ (turn / 1e-3)
+        wanted = np.cross(turn, places - objective.forwards[0].rest_points.mean(axis=0))
+        assert found == pytest.approx(wanted, abs=1e-9), pull.name
 
 
 def test_an_untared_zero_is_free(small_bench, small, small_pull):
@@ -419,7 +435,7 @@ def test_a_point_aside_of_the_axis_turns_with_the_branch():
     angle = np.linspace(0.0, 1.2, 5)
     directions = np.stack([0 * angle, np.sin(angle), np.cos(angle)], axis=1)[:, None]
     directions = np.concatenate([directions, directions[:, :, [1, 0, 2]]], axis=1)
-    pull = _Pull(None, None, np.zeros(3), None, directions, np.zeros((5, 2, 3)), None)
+    pull = _Pull(None, None, np.zeros(3), np.zeros(3), None, directions, np.zeros((5, 2, 3)), None)
     arms = _across(pull)["points"].reshape(5, 2, 3, 2, 2)
     assert not arms[:, 0, :, 1].any() and not arms[:, 1, :, 0].any()
     for point in range(2):

@@ -194,7 +194,9 @@ class _Strategy:
             shift, turn = fitted_frame(found.cell_errors)
             if found.stopped or np.linalg.norm(turn) < SMALL_RAD:
                 break
-            step = replace(step, pulls=[put_right(pull, shift, turn) for pull in step.pulls])
+            middle = found.objective.forwards[0].rest_points.mean(axis=0)
+            step = replace(step, pulls=[put_right(pull, shift, turn, middle)
+                                        for pull in step.pulls])
             found = step._placed(EvaluationLog(None, ""))
         try:
             other = self._with(also=tuple(part for part in self.settings.also if part != "frame")

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from limber.recordings.recording import CalibrationEntry
 
+HELD_FRACTION = 0.92
+"""Where a virtual pull holds the branch, as a fraction of the main path."""
 _QUICK = {"key_frames": 4, "hold_out": False, "mesh_check": False, "shapes": 0}
 
 
@@ -183,11 +185,12 @@ class VirtualPullSettings(Settings):
     camera: bool = Field(
         False, description="Record depth images of a simulated D455 instead of points.")
     cell_errors: str = Field(
-        "none", description="Errors of the cell that stay during the recording, drawn from the "
-        "seed: none, realistic, or a TOML file whose table [calibration] has their standard "
+        "none", description="Errors of the cell that stay during the recording, drawn at random: "
+        "none, realistic, or a TOML file whose table [calibration] has their standard "
         "deviations, as pull.toml has. realistic: those of a cell that was set up with care and "
         "not measured since (gripper 1 mm and 1 degree, force gain 2 %, zero and drift 1 N, "
-        "camera 1 mm, points 5 mm along the branch). The pull states them as its calibration.")
+        "camera 1 mm, points 5 mm along the branch). The pull states them as its calibration. "
+        "Frames and gain are those of one cell: the same in all pulls with one calibration.")
     seed: int = Field(0, ge=0, description="Seed of all random numbers.")
 
     @property
@@ -215,8 +218,10 @@ class PullSpec(VirtualPullSettings):
     duration: float | None = Field(
         None, gt=0, description="Duration of the recording [s]. Default: 6, or 1.5 for a dynamic "
         "pull.")
+    shared_seed: int = Field(0, ge=0, description="Seed of what all pulls of a branch share: its "
+                             "likely shape, and frames and gain of the cell.")
     grasp_fraction: float = Field(
-        0.92, gt=0, le=1, description="Position of the grasp as a fraction of the main path. It "
+        HELD_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the main path. It "
         "must be beyond the last control point: the branch does not bend beyond the grasp, so its "
         "modulus there cannot be estimated.")
     mode: GraspMode = Field(
@@ -238,7 +243,7 @@ class PullSpec(VirtualPullSettings):
         "for `limber import-pull --own-weight`.")
     shape: Literal["likely", "fitted"] = Field(
         "likely", description="Branch that is pulled if only a scan is known. likely: a posterior "
-        "sample of the shape given the scan, drawn from the seed. fitted: the reconstructed "
+        "sample of the shape given the scan, the same in all pulls. fitted: the reconstructed "
         "shape.")
     weight: float | None = Field(
         None, gt=0, description="Instead of pulling sideways, hang a weight on the grasp that "

@@ -458,11 +458,11 @@ def fitted_frame(cell_errors: Sequence[dict]) -> tuple[np.ndarray, np.ndarray]:
     return vector("camera position"), vector("camera rotation")
 
 
-def put_right(pull: Pull, shift: np.ndarray, turn: np.ndarray) -> Pull:
-    """Return the pull with its points in the branch's frame, turned back about their middle."""
+def put_right(pull: Pull, shift: np.ndarray, turn: np.ndarray, middle: np.ndarray) -> Pull:
+    """Return the pull with its points in the branch's frame, turned back about ``middle`` [3], that
+    of the first pull's points at rest: all pulls have one observer."""
     seen = present(pull.observations, "observed points")
     points = seen.positions - shift
-    middle = np.nanmean(points, axis=(0, 1))
     back = rotated(-turn, (points - middle).reshape(-1, 3)).reshape(points.shape)
     return replace(pull, observations=replace(seen, positions=middle + back))
 

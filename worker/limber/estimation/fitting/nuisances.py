@@ -137,11 +137,13 @@ def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.nd
 
 @dataclass(frozen=True)
 class _Pull:
-    """The data of a pull that its errors depend on."""
+    """The data of a pull that its errors depend on. All pulls of a cell turn about its first pull's
+    grasp, ``pivot``, and about the ``middle`` of that one's points."""
 
     entry: PullEntry
     frames: Frames
     pivot: np.ndarray
+    middle: np.ndarray
     tangent: np.ndarray | None
     directions: np.ndarray | None
     positions: np.ndarray
@@ -168,10 +170,12 @@ class CellErrors:
         self._places: list[list[tuple[Unknown, float, np.ndarray]]] = []
         self._forwards = forwards
         known: dict[tuple[object, ...], int] = {}
-        self._pivots: dict[CalibrationEntry, np.ndarray] = {}
+        self._pivots: dict[CalibrationEntry, tuple[np.ndarray, np.ndarray]] = {}
         for forward in forwards:
             calibration, indexed = calibration_of(forward.entry), []
-            self._pivots.setdefault(calibration, np.array(forward.entry.grasp.point_m))
+            self._pivots.setdefault(calibration, (
+                np.array(forward.entry.grasp.point_m), forward.rest_points.mean(axis=0)
+                if len(forward.rest_points) else np.zeros(3)))
             for unknown in UNKNOWNS:
                 sigma, names = unknown.sigma(calibration), unknown.names(forward)
                 if not names or not sigma > 0:
@@ -207,7 +211,7 @@ class CellErrors:
         total = {"points": np.zeros((*positions.shape, count)),
                  **{kind: np.zeros((len(frames), 3, count))
                     for kind in ("forces", "torques", "grasps")}}
-        pull = _Pull(forward.entry, frames, self._pivots[calibration_of(forward.entry)],
+        pull = _Pull(forward.entry, frames, *self._pivots[calibration_of(forward.entry)],
                      forward.grasp_tangent, forward.point_directions, positions, forces,
                      forward.creep_time)
         for unknown, sigma, used in self._places[index]:
@@ -227,8 +231,7 @@ def _rotations(arms: np.ndarray) -> np.ndarray:
 
 
 def _turned(pull: _Pull) -> dict[str, np.ndarray]:
-    middle = pull.positions.mean(axis=(0, 1))
-    return {"points": _rotations(pull.positions - middle)}
+    return {"points": _rotations(pull.positions - pull.middle)}
 
 
 def _along(pull: _Pull) -> dict[str, np.ndarray]:
