@@ -89,7 +89,7 @@ def _graphs(branch: Branch) -> list[_Graph]:
 def _fitted(graph: _Graph, found: Estimate, branch: Branch, pulls: Sequence[Pull],
             settings: FitSpec, progress: Progress) -> Estimate:
     """The same pulls on another skeleton."""
-    from limber.estimation.estimated_branch import subject_of
+    from limber.estimation.estimated_branch import lumped, subject_of
     from limber.estimation.fit import fit_branch
     from limber.estimation.fit_assessment import require_result
     from limber.estimation.fitting.objective import EvaluationLog
@@ -108,7 +108,7 @@ def _fitted(graph: _Graph, found: Estimate, branch: Branch, pulls: Sequence[Pull
         [*meshed.masses, *leaves], load_targets(branch)), branch.gravity, settings)
     if found.is_weightless:
         subject = subject.without_weight()
-    other = fit_branch(list(pulls), subject, settings, log=EvaluationLog(None, ""), quick=True,
+    other = fit_branch(list(pulls), lumped(subject, pulls, settings), settings, log=EvaluationLog(None, ""), quick=True,
                        near=replace(found.values, form=()),
                        progress=progress.keeping([], silently=True))
     require_result(other, skeleton)
