@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,14 +12,24 @@ from limber.cli.main import call
 from limber.core.errors import Cancelled, InputError
 from limber.core.progress import SILENT, Progress
 from limber.estimation import fit
+from limber.estimation.estimated_branch import forwards_of, parameter_space
+from limber.estimation.fitting.nuisances import advice_on
+from limber.estimation.fitting.objective import Objective
 from limber.estimation.parameters import Values
-from limber.estimation.settings import FitSpec
+from limber.estimation.settings import EstimateSettings, FitSpec
+from limber.estimation.uncertainty.covariance import variance_parts
+from limber.geometry.settings import ReconstructSettings
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.recordings.recording import read_pull
 from limber.results.report.estimate_figures import report_figures
 from limber.stages.moduli.estimate import EVALUATIONS, EstimateYoung, follow
 from limber.store import Branch
-from limber.store.loading import load_estimated_subject, stiffness_deviation
+from limber.store.loading import (
+    fit_spec,
+    load_estimated_subject,
+    load_subject,
+    stiffness_deviation,
+)
 
 QUICK = FitSpec(key_frames=6, mesh_check=False, shapes=0)
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
@@ -38,6 +49,29 @@ def test_virtual_pull_is_a_recording_with_its_truth(branch_folder):
     assert again["frame_count"] == 12
     same = read_pull(branch_folder / "pulls" / "again")
     assert np.allclose(same.wrenches[:, :3], pull.wrenches[:, :3], atol=1e-6)
+
+
+def test_a_ratio_that_was_given_counts_as_measured(branch_folder):
+    """Its advice is then not to give it; the interval is narrower for it."""
+    subjects = {}
+    for value in (0.35, 0.41):
+        branch = Branch.open(branch_folder)
+        with branch.stage("reconstruct", ReconstructSettings(poisson=value)) as stage:
+            stage.path("mesh.vtu")
+        settings = fit_spec(branch, EstimateSettings(quick=True)).model_copy(
+            update={"fractions": ()})
+        subject = load_subject(branch, settings)
+        forwards = forwards_of([read_pull(branch_folder / "pulls" / "pull-1")], subject, settings)
+        space = parameter_space(subject, forwards, settings)
+        objective = Objective(forwards, space)
+        evaluation = objective.evaluate(space.pack(replace(subject.start, young=TRUTH)),
+                                        jacobian=True)
+        subjects[value] = settings.poisson_sigma, variance_parts(evaluation, objective)
+    usual, given = subjects.values()
+    assert (usual[0], given[0]) == (0.05, 0.02)
+    assert "give it" in advice_on("Poisson's ratio")
+    assert "Poisson's ratio" not in given[1] and "give" not in advice_on(
+        next(cause for cause in given[1] if "as given" in cause))
 
 
 @pytest.mark.slow

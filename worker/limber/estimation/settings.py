@@ -15,7 +15,7 @@ from limber.core.settings import (
     possible_young,
     within,
 )
-from limber.geometry.settings import DENSITY_SIGMA
+from limber.geometry.settings import DENSITY_SIGMA, POISSON_SIGMA
 
 if TYPE_CHECKING:
     import numpy as np
@@ -126,7 +126,7 @@ class FitSpec(EstimateSettings):
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
     poisson_sigma: float = Field(
-        0.05, ge=0, description="Standard deviation of Poisson's ratio if it is not fitted.")
+        POISSON_SIGMA, ge=0, description="Standard deviation of Poisson's ratio if it is not fitted.")
     density_sigma: float = Field(
         DENSITY_SIGMA, ge=0, description="Relative standard deviation of the density, if weight or "
         "inertia acts.")

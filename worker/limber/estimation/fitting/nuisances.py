@@ -386,6 +386,7 @@ OTHER_CAUSES = {
                   "another point"),
     "poisson": Cause("Poisson's ratio", Text("give it (", Option("poisson"), " of reconstruct); "
                                              "pulls do not determine it")),
+    "given": Cause("Poisson's ratio as given", "measure it on a straight piece, by twist and bend"),
     "density": Cause("density", Text("weigh a piece of the branch (", Option("density"), ", ",
                                      Option("density_sigma"), " of reconstruct)")),
     "link": Cause("moduli that the pulls do not determine", "pull at a point farther out"),
