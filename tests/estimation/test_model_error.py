@@ -12,15 +12,8 @@ from limber.estimation.fitting.objective import Objective
 from limber.estimation.parameters import Values
 from limber.estimation.settings import FitSpec, PullSpec
 from limber.estimation.simulated_pull import TrueBranch, simulate_pull
+from limber.estimation.uncertainty import model_error
 from limber.estimation.uncertainty.covariance import repeated
-from limber.estimation.uncertainty.model_error import (
-    ModelError,
-    SmallLoad,
-    geometry_error,
-    mesh_error,
-    refined,
-    total_interval,
-)
 from limber.estimation.uncertainty.shape_error import grip_error
 from limber.geometry.io.skeletons import write_cylinders
 from limber.geometry.skeleton.skeleton import control_points
@@ -38,17 +31,17 @@ def test_radii_that_are_unsure_make_moduli_four_times_as_unsure(tmp_path, small,
     skeleton = small.skeleton
     path = tmp_path / "skeleton.csv"
     write_cylinders(skeleton, path)
-    assert geometry_error(path, small_bench.mesh, small_bench.weights) is None
+    assert model_error.geometry_error(path, small_bench.mesh, small_bench.weights) is None
     share = np.linspace(0.02, 0.05, skeleton.node_count)
     write_cylinders(replace(skeleton, radius_sigma=share * skeleton.radius), path)
-    found = geometry_error(path, small_bench.mesh, small_bench.weights)
+    found = model_error.geometry_error(path, small_bench.mesh, small_bench.weights)
     assert np.all(np.diff(found) > 0) and found[0] > 0.08 and found[-1] < 0.20
 
 
 def test_a_refined_mesh_is_the_same_body(small_bench):
     """Eight times the tetrahedra, the same volume, the old nodes first, the base still fixed."""
     mesh = small_bench.mesh
-    fine = refined(mesh)
+    fine = model_error.refined(mesh)
     assert fine.tet_count == 8 * mesh.tet_count and fine.is_quadratic
     assert np.allclose(fine.nodes[:mesh.node_count], mesh.nodes)
     assert fine.volumes.min() > 0
@@ -64,9 +57,9 @@ def test_the_mesh_error_foretells_how_a_much_finer_mesh_differs(small):
     grasp = grasp_on(bench.mesh, GraspEntry(
         point_m=tuple(small.skeleton.point_at(0.9)), radius_m=0.012, mode="point"))
     operator = point_operator(bench.mesh, bench.points)
-    found = mesh_error(bench.model, grasp, operator, bench.weights, YOUNG)
+    found = model_error.mesh_error(bench.model, grasp, operator, bench.weights, YOUNG)
     model = bench.model.with_parameters(young=bench.weights @ YOUNG)
-    much = refined(refined(bench.mesh))
+    much = model_error.refined(model_error.refined(bench.mesh))
     finest = BranchModel(much, young=np.repeat(bench.weights @ YOUNG, 64), poisson=0.35,
                          density=900.0, gravity=None)
     moved = [operator @ solve_static(each, grasp=grasp, grasp_force=(1e-6, 0.0, 0.0)).require(
@@ -78,12 +71,13 @@ def test_the_mesh_error_foretells_how_a_much_finer_mesh_differs(small):
 
 def test_parts_add_up_in_squares():
     """3 % by sensors, 4 % by radii and none by the mesh: 5 %, and the interval is 1.96 of that."""
-    error = ModelError({"geometry": np.array([0.04])}, np.array([0.0]))
+    error = model_error.ModelError({"geometry": np.array([0.04])}, np.array([0.0]))
     assert error.total(np.array([0.03])) == pytest.approx([0.05])
     sensor = 1e7 * np.exp([[-1.96 * 0.03, 1.96 * 0.03]])
-    interval = total_interval(np.array([1e7]), sensor, error)
+    interval = model_error.total_interval(np.array([1e7]), sensor, error)
     assert np.log(interval / 1e7) == pytest.approx(np.array([[-0.098, 0.098]]))
-    assert total_interval(np.array([1e7]), sensor, ModelError()) == pytest.approx(sensor)
+    assert model_error.total_interval(
+        np.array([1e7]), sensor, model_error.ModelError()) == pytest.approx(sensor)
 
 
 def test_errors_that_last_count_as_fewer_frames():
@@ -107,7 +101,7 @@ def test_one_recording_gives_one_modulus_on_any_mesh(gravity):
 
     Looked at in the middle of the beam instead, the correction overshoots by 3 %.
     """
-    load = SmallLoad(np.array([0.0, 0.0, -0.5]), np.array([0.0, 0.0, -gravity]))
+    load = model_error.SmallLoad(np.array([0.0, 0.0, -0.5]), np.array([0.0, 0.0, -gravity]))
     found = []
     for cells in ((6, 2, 2), (9, 3, 3)):
         mesh = box_mesh(cells)
@@ -115,8 +109,8 @@ def test_one_recording_gives_one_modulus_on_any_mesh(gravity):
         grasp = grasp_on(mesh, GraspEntry(point_m=tuple(LOAD_POINT_M), radius_m=0.012,
                                           mode="point"))
         tips = point_operator(mesh, NOMINAL_M[TIPS])
-        stiff = mesh_error(model, grasp, tips, np.ones((mesh.tet_count, 1)), np.array([3e5]),
-                           [load])
+        stiff = model_error.mesh_error(model, grasp, tips, np.ones((mesh.tet_count, 1)),
+                                       np.array([3e5]), [load])
         forces = model.mass_load[:, None] * load.gravity
         forces[grasp.nodes] += grasp.weights[:, None] * load.force
         moved = model.equations().tangent(model, np.zeros_like(forces)).solve(forces)

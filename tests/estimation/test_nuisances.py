@@ -12,15 +12,8 @@ from limber.core.errors import WorkError
 from limber.core.numerics.rigid import rotated
 from limber.estimation.estimated_branch import Subject, forwards_of, observes_path
 from limber.estimation.fit import fit_branch, fit_pulls
+from limber.estimation.fitting import nuisances
 from limber.estimation.fitting.initial_modulus import far_points, fitted_frame, put_right
-from limber.estimation.fitting.nuisances import (
-    _across,
-    _Pull,
-    eliminated,
-    in_words,
-    nuisance_records,
-    unlikely,
-)
 from limber.estimation.fitting.objective import EvaluationLog, Objective
 from limber.estimation.forward import solved_pull
 from limber.estimation.forward.forward_model import PointDirections
@@ -30,15 +23,7 @@ from limber.estimation.settings import FitSpec, PullSpec
 from limber.estimation.simulated_pull import CellErrors, marked_points, simulate_pull
 from limber.estimation.uncertainty.covariance import largest, variance_parts
 from limber.estimation.uncertainty.model_error import path_error, path_prescribed
-from limber.recordings.recording import (
-    EXACT,
-    CalibrationEntry,
-    Observations,
-    PullEntry,
-    calibration_of,
-    read_entry,
-    write_entry,
-)
+from limber.recordings import recording
 from limber.recordings.synchronisation import frames_of
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
@@ -53,7 +38,7 @@ def bad_cell(small_pull):
     a millimetre off."""
     pull = measured(small_pull, 3, points=5e-4, force=0.01)
     peak = float(np.linalg.norm(small_pull.wrenches[:, :3], axis=1).max())
-    calibration = CalibrationEntry(force_bias_sigma_n=peak, force_drift_sigma_n=peak,
+    calibration = recording.CalibrationEntry(force_bias_sigma_n=peak, force_drift_sigma_n=peak,
                                    repeat_sigma=0.0)
     point = np.array(pull.entry.grasp.point_m)
     poses, wrenches = pull.poses.copy(), pull.wrenches.copy()
@@ -62,7 +47,7 @@ def bad_cell(small_pull):
     seen = pull.observations
     return replace(pull, poses=poses, wrenches=wrenches,
                    entry=pull.entry.model_copy(update={"calibration": calibration}),
-                   observations=Observations(seen.times, seen.positions + [1e-3, 0.0, -1e-3]))
+                   observations=replace(seen, positions=seen.positions + [1e-3, 0.0, -1e-3]))
 
 
 def subject_of(bench, branch):
@@ -161,7 +146,7 @@ def test_elimination_is_the_joint_least_squares_problem():
     rng = np.random.default_rng(0)
     jacobian, columns = rng.standard_normal((40, 3)), rng.standard_normal((40, 5))
     residual = rng.standard_normal(40)
-    left, slopes, errors = eliminated(residual, jacobian, columns)
+    left, slopes, errors = nuisances.eliminated(residual, jacobian, columns)
     joint = np.vstack([np.hstack([jacobian, columns]), np.hstack([np.zeros((5, 3)), np.eye(5)])])
     step = -np.linalg.lstsq(joint, np.r_[residual, np.zeros(5)], rcond=None)[0]
     ours = -np.linalg.lstsq(slopes, left, rcond=None)[0]
@@ -178,9 +163,9 @@ def test_a_known_part_of_an_error_is_in_its_value_and_its_prior():
     rng = np.random.default_rng(1)
     jacobian, columns = rng.standard_normal((40, 3)), rng.standard_normal((40, 5))
     residual, known = rng.standard_normal(40), rng.standard_normal(5)
-    left, slopes, errors = eliminated(residual, jacobian, columns)
-    with_part, its_slopes, its_errors = eliminated(residual + columns @ known, jacobian, columns,
-                                                   known)
+    left, slopes, errors = nuisances.eliminated(residual, jacobian, columns)
+    with_part, its_slopes, its_errors = nuisances.eliminated(
+        residual + columns @ known, jacobian, columns, known)
     assert its_errors.values == pytest.approx(errors.values)
     assert its_slopes == pytest.approx(slopes)
     assert with_part @ with_part == pytest.approx(left @ left)
@@ -215,11 +200,11 @@ def test_a_point_that_is_off_along_the_branch_is_told_as_that(small, small_bench
     places = np.array(small_pull.entry.rest_points_m)
     off = marked_points(small.skeleton, FRACTIONS, np.array([0.0, 0.0, 8e-3, 0.0]))
     entry = pull.entry.model_copy(update={
-        "calibration": CalibrationEntry(force_bias_sigma_n=0.0, force_drift_sigma_n=0.0),
+        "calibration": recording.CalibrationEntry(force_bias_sigma_n=0.0, force_drift_sigma_n=0.0),
         "rest_points_m": tuple(map(tuple, (2 * places - off).tolist()))})
     objective = objective_of(small_bench, replace(pull, entry=entry))
     evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)), jacobian=True)
-    listed = {each["name"]: each for each in nuisance_records(
+    listed = {each["name"]: each for each in nuisances.nuisance_records(
         objective.cell_errors.nuisances, evaluation.errors, np.zeros((4, 4)))}
     point = listed["position of point 3 along the branch"]
     assert point["value"] == pytest.approx(8e-3, abs=1.5e-3) and point["explains_misfit"]
@@ -246,28 +231,13 @@ def test_a_frame_is_put_right_by_its_fitted_turn(small_pull):
     assert right == pytest.approx(seen, abs=1e-9)
 
 
-def test_pulls_of_one_cell_turn_about_one_point(small_bench, small_pull):
-    """Each about the middle of its own points, one turn would be two frames."""
-    turn = np.array([2e-3, -1e-3, 1.5e-3])
-    known = EXACT.model_copy(update={"camera_sigma_rad": 1e-3})
-    seen = small_pull.observations
-    pulls = [replace(small_pull, name=name, entry=small_pull.entry.model_copy(
-        update={"calibration": known}), observations=replace(seen, positions=places))
-        for name, places in (("a", seen.positions), ("b", 2 * seen.positions[:1] - seen.positions))]
-    objective = small_bench.objective(pulls, SETTINGS)
-    for number, pull in enumerate(pulls):
-        places = objective.forwards[number].frames.positions
-        found = objective.cell_errors.slopes(number, places, np.zeros((len(places), 3))).points @ (turn / 1e-3)
-        wanted = np.cross(turn, places - objective.forwards[0].rest_points.mean(axis=0))
-        assert found == pytest.approx(wanted, abs=1e-9), pull.name
-
-
 def test_an_untared_zero_is_free(small_bench, small, small_pull):
     """Stated as not tared, a zero of twice the force is found; otherwise it is an odd error."""
     peak = float(np.linalg.norm(small_pull.wrenches[:, :3], axis=1).max())
     wrenches = small_pull.wrenches.copy()
     wrenches[:, 0] += 2 * peak
-    calibration = CalibrationEntry(force_bias_sigma_n=0.01 * peak, force_drift_sigma_n=0.0)
+    calibration = recording.CalibrationEntry(force_bias_sigma_n=0.01 * peak,
+                                             force_drift_sigma_n=0.0)
     sigmas = []
     for is_tared in (True, False):
         entry = small_pull.entry.model_copy(update={
@@ -275,7 +245,7 @@ def test_an_untared_zero_is_free(small_bench, small, small_pull):
             "sensor": small_pull.entry.sensor.model_copy(update={"tared": is_tared})})
         forward = forwards_of([replace(small_pull, entry=entry, wrenches=wrenches)],
                               subject_of(small_bench, small), SETTINGS)[0]
-        sigmas.append(calibration_of(forward.entry).force_bias_sigma_n)
+        sigmas.append(recording.calibration_of(forward.entry).force_bias_sigma_n)
     assert sigmas[0] == 0.01 * peak and sigmas[1] >= 2 * peak
 
 
@@ -286,7 +256,7 @@ def test_a_free_frame_is_put_right_though_it_is_turned_far(small_bench, small, s
     seen = small_pull.observations.positions
     middle = seen.mean(axis=(0, 1))
     wrong = middle + shift + rotated(turn, (seen - middle).reshape(-1, 3)).reshape(seen.shape)
-    entry = small_pull.entry.model_copy(update={"calibration": EXACT.model_copy(
+    entry = small_pull.entry.model_copy(update={"calibration": recording.EXACT.model_copy(
         update={"camera_sigma_m": 1e-3, "camera_sigma_rad": 1e-3})})
     pull = replace(small_pull, entry=entry,
                    observations=replace(small_pull.observations, positions=wrong))
@@ -324,9 +294,9 @@ def test_what_is_off_is_found_and_named(found):
     held = [each["interval"][0] - 2e-3 < value < each["interval"][1] + 2e-3
             for name, value in true.items() if (each := errors[name])]
     assert sum(held) >= 2
-    sentence = in_words(found.cell_errors)
+    sentence = nuisances.in_words(found.cell_errors)
     assert re.search(r"force zero x [+-][\d.e+-]+ N \(± ", sentence)
-    assert in_words([]) is None
+    assert nuisances.in_words([]) is None
 
 
 def test_causes_add_up_to_the_variance(found):
@@ -346,7 +316,7 @@ def test_a_path_is_watched_where_its_frame_may_be_off(small_pull):
     """Not where it is known exactly, the force was not measured, or the user says what drives."""
     frames = frames_of(small_pull)
     entry = small_pull.entry
-    assert entry.calibration == EXACT and not observes_path(entry, frames, SETTINGS)
+    assert entry.calibration == recording.EXACT and not observes_path(entry, frames, SETTINGS)
     entry = entry.model_copy(update={"calibration": None})
     assert observes_path(entry, frames, SETTINGS)
     assert not observes_path(entry, frames, SETTINGS.model_copy(update={"drive": "pose"}))
@@ -364,10 +334,10 @@ def test_a_force_that_leads_nowhere_says_how_well_it_is_known(small_bench, small
 
 
 def test_calibration_survives_a_pull_file(tmp_path, small_pull):
-    entry: PullEntry = small_pull.entry.model_copy(
-        update={"calibration": CalibrationEntry(pose_sigma_m=2e-4)})
-    write_entry(tmp_path / "pull.toml", entry)
-    assert read_entry(tmp_path / "pull.toml").calibration == entry.calibration
+    entry: recording.PullEntry = small_pull.entry.model_copy(
+        update={"calibration": recording.CalibrationEntry(pose_sigma_m=2e-4)})
+    recording.write_entry(tmp_path / "pull.toml", entry)
+    assert recording.read_entry(tmp_path / "pull.toml").calibration == entry.calibration
 
 
 @pytest.mark.slow
@@ -376,7 +346,7 @@ def test_a_path_that_leads_says_so_and_widens_the_interval(small_bench, small_pu
     interval, ten times less of it ten times less, and where it is known exactly there is no word.
     """
     def found(**known):
-        calibration = EXACT.model_copy(update=known)
+        calibration = recording.EXACT.model_copy(update=known)
         pull = measured(small_pull, 3)
         pull = replace(pull, entry=pull.entry.model_copy(update={"calibration": calibration}))
         objective = small_bench.objective([pull], SETTINGS)
@@ -398,8 +368,8 @@ def test_an_error_far_beyond_what_the_cell_states_gives_no_result():
     place = {"name": "gripper position x", "unit": "m", "pull": "", "value": 3e-3,
              "prior_sigma": 1e-3}
     assert ("force gain would have an error of -70 %. That is 35 times the standard deviation"
-            in unlikely([place, gain]))
-    assert unlikely([place]) is None and unlikely([]) is None
+            in nuisances.unlikely([place, gain]))
+    assert nuisances.unlikely([place]) is None and nuisances.unlikely([]) is None
 
 
 @pytest.mark.slow
@@ -415,7 +385,7 @@ def test_points_aside_of_the_scanned_axis_move_no_modulus(small_bench, small):
                         position_noise=0.0, force_noise=0.0, phase=0.3)
     pull = measured(simulate_pull(replace(truth, control_points=truth.control_points + sides),
                                   "pull-1", settings)[0], 3, points=5e-4, force=0.01)
-    calibration = CalibrationEntry(force_bias_sigma_n=0.02, force_drift_sigma_n=0.02)
+    calibration = recording.CalibrationEntry(force_bias_sigma_n=0.02, force_drift_sigma_n=0.02)
     off = {}
     for name, places in (("stated", tuple(map(tuple, small_bench.points))), ("open", None)):
         entry = pull.entry.model_copy(update={"calibration": calibration, "rest_points_m": places})
@@ -435,8 +405,9 @@ def test_a_point_aside_of_the_axis_turns_with_the_branch():
     angle = np.linspace(0.0, 1.2, 5)
     directions = np.stack([0 * angle, np.sin(angle), np.cos(angle)], axis=1)[:, None]
     directions = np.concatenate([directions, directions[:, :, [1, 0, 2]]], axis=1)
-    pull = _Pull(None, None, np.zeros(3), np.zeros(3), None, directions, np.zeros((5, 2, 3)), None)
-    arms = _across(pull)["points"].reshape(5, 2, 3, 2, 2)
+    pull = nuisances._Pull(None, None, np.zeros(3), np.zeros(3), None, directions,
+                           np.zeros((5, 2, 3)), None)
+    arms = nuisances._across(pull)["points"].reshape(5, 2, 3, 2, 2)
     assert not arms[:, 0, :, 1].any() and not arms[:, 1, :, 0].any()
     for point in range(2):
         own = arms[:, point, :, point]
@@ -452,7 +423,7 @@ def test_a_zero_larger_than_the_force_ends_soon_with_a_wide_interval(small_bench
     """Readings up to nine times the force: few simulations, the truth inside, the zero named."""
     pull = measured(small_pull, 3)
     peak = float(np.linalg.norm(small_pull.wrenches[:, :3], axis=1).max())
-    known = CalibrationEntry(force_bias_sigma_n=3 * peak, force_drift_sigma_n=3 * peak)
+    known = recording.CalibrationEntry(force_bias_sigma_n=3 * peak, force_drift_sigma_n=3 * peak)
     rng = np.random.default_rng(7)
     seen = CellErrors.drawn(known, rng).recorded(pull, rng)
     assert np.linalg.norm(seen.wrenches[:, :3], axis=1).max() > 9 * peak
@@ -462,4 +433,4 @@ def test_a_zero_larger_than_the_force_ends_soon_with_a_wide_interval(small_bench
     low, high = found.uncertainty.young_interval.T
     assert found.is_bad is None and found.objective.forward_count < 60
     assert np.all((low < TRUTH) & (TRUTH < high)) and np.log(high / low).max() > 0.5
-    assert "force zero" in in_words(found.cell_errors)
+    assert "force zero" in nuisances.in_words(found.cell_errors)

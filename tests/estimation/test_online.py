@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.paper_branches import Bench, measured
-from limber.estimation.online.filter import (
-    FRAME_ITERATIONS,
-    FullBranch,
-    Here,
-    OnlineEstimator,
-    OnlineFrame,
-)
+from limber.estimation.online import filter
 from limber.estimation.settings import FitSpec
 from limber.recordings.synchronisation import frames_of
 from limber.reduced.model_cache import build_reduced
@@ -45,12 +39,12 @@ def batch(bench, pull):
 
 @pytest.fixture(scope="module")
 def full(bench, pull):
-    return FullBranch(bench.mesh, bench.weights, pull.entry.grasp, bench.points, 0.35, 900.0,
+    return filter.FullBranch(bench.mesh, bench.weights, pull.entry.grasp, bench.points, 0.35, 900.0,
                       (0.0, 0.0, 0.0))
 
 
 def reduced_around(full, young, spread):
-    here = Here(full)._solver
+    here = filter.Here(full)._solver
     model = full.model(young)
     training = TrainingSettings(grasp_count=20, young_spread=spread)
     return build_reduced(model, here.grasp, full.weights, young,
@@ -58,14 +52,14 @@ def reduced_around(full, young, spread):
 
 
 def followed(reduced, full, pull, exact, repeat=1):
-    estimator = OnlineEstimator(
+    estimator = filter.OnlineEstimator(
         reduced, pull.entry.grasp, full.mesh, full.rest_points,
         position_sigma=pull.entry.sensor.position_sigma_m,
         force_sigma=pull.entry.sensor.force_sigma_n, prior_deviation=0.8, exact=exact)
     frames, states = frames_of(pull), []
     for turn in range(repeat):
         for index in range(len(frames)):
-            states.append(estimator.update(OnlineFrame(
+            states.append(estimator.update(filter.OnlineFrame(
                 frames.times[index] + 10.0 * turn, frames.poses[index],
                 frames.wrenches[index, :3], frames.positions[index])))
     return estimator, states
@@ -79,7 +73,7 @@ def test_it_ends_where_all_frames_together_do(bench, pull, batch, full):
     reduced = reduced_around(full, 1.2 * TRUTH, 1.5)
     alone, _ = followed(reduced, full, pull, None)
     alone.settle()
-    estimator, states = followed(reduced, full, pull, Here(full))
+    estimator, states = followed(reduced, full, pull, filter.Here(full))
     end = estimator.settle()
     deviation = np.sqrt(np.diag(estimator.covariance))
     off, off_alone = (np.abs(np.log(found / batch)) for found in (end.young, alone.young))
@@ -92,7 +86,7 @@ def test_it_ends_where_all_frames_together_do(bench, pull, batch, full):
 @pytest.mark.slow
 def test_a_basis_for_other_moduli_is_made_on_the_way(bench, pull, batch, full):
     """Begun a factor of three too stiff, outside of what the training sampled."""
-    estimator, _ = followed(reduced_around(full, 3 * TRUTH, 1.3), full, pull, Here(full))
+    estimator, _ = followed(reduced_around(full, 3 * TRUTH, 1.3), full, pull, filter.Here(full))
     estimator.settle()
     assert estimator.refresh_count >= 1
     deviation = np.sqrt(np.diag(estimator.covariance))
@@ -105,7 +99,7 @@ def test_more_of_the_same_is_called_idle_and_little_noise_enough(bench, pull, fu
     known to 2 %, which another pull could not improve by more than that.
     """
     reduced = reduced_around(full, TRUTH, 1.5)
-    _, states = followed(reduced, full, pull, Here(full))
+    _, states = followed(reduced, full, pull, filter.Here(full))
     assert not states[-1].enough and not any(state.idle for state in states)
     quiet = pull.entry.model_copy(update={"sensor": pull.entry.sensor.model_copy(update={
         "position_sigma_m": 2e-5, "force_sigma_n": 1e-4 * pull.entry.sensor.force_sigma_n})})
@@ -113,7 +107,7 @@ def test_more_of_the_same_is_called_idle_and_little_noise_enough(bench, pull, fu
     assert states[-1].enough
     assert np.sqrt(np.diag(estimator.covariance)).max() < 0.02
     frames = frames_of(pull)
-    rest = OnlineFrame(99.0, frames.poses[0], np.full(3, np.nan), np.full((4, 3), np.nan))
+    rest = filter.OnlineFrame(99.0, frames.poses[0], np.full(3, np.nan), np.full((4, 3), np.nan))
     for step in range(30):
         state = estimator.update(replace(rest, time=99.0 + step))
     assert state.idle
@@ -135,7 +129,7 @@ def test_no_frame_takes_longer_than_a_frame_may(pull, full, monkeypatch):
     reduced = reduced_around(full, 2 * TRUTH, 1.3)
     told.clear()
     _, states = followed(reduced, full, pull, None)
-    assert FRAME_ITERATIONS / 2 < max(told) <= FRAME_ITERATIONS
+    assert filter.FRAME_ITERATIONS / 2 < max(told) <= filter.FRAME_ITERATIONS
     assert len(told) > 1.5 * len(states)
     monkeypatch.setattr("limber.estimation.online.filter.BUDGET_SECONDS", 0.0)
     told.clear()

@@ -7,14 +7,6 @@ import pytest
 
 from limber.estimation.fitting import optimise
 from limber.estimation.fitting.objective import Evaluation, EvaluationLog
-from limber.estimation.fitting.optimise import (
-    SETTLED_FALL,
-    WANDERING_STEP,
-    FitStatus,
-    _Settling,
-    gauss_newton,
-    nelder_mead,
-)
 from limber.estimation.parameters import ParameterSpace, Values
 
 FORM = 0.4
@@ -49,7 +41,7 @@ def test_it_begins_again_where_a_simplex_ended_too_early(monkeypatch):
 
     monkeypatch.setattr(optimise, "_simplex_search", collapsing)
     valley = _Valley()
-    fit = nelder_mead(valley, valley.space.pack(valley.space.base), evaluation_limit=1500)
+    fit = optimise.nelder_mead(valley, valley.space.pack(valley.space.base), evaluation_limit=1500)
     assert fit.converged and ends[0] > ends[-1] + 0.5
     assert fit.evaluation.free[:2] == pytest.approx([16.0, 16.0], abs=0.1)
 
@@ -57,25 +49,25 @@ def test_it_begins_again_where_a_simplex_ended_too_early(monkeypatch):
 def test_what_is_known_by_its_prior_alone_is_not_searched():
     """A fourth corner would take twice the simulations and say nothing."""
     valley = _Valley()
-    nelder_mead(valley, valley.space.pack(valley.space.base), evaluation_limit=60)
+    optimise.nelder_mead(valley, valley.space.pack(valley.space.base), evaluation_limit=60)
     assert {float(free[2]) for free in valley.asked} == {FORM}
 
 
 @pytest.mark.parametrize(("delta", "status", "reason"), [
-    (2.7, FitStatus.converged, "fell below 2.7 m2"),
-    (1.0, FitStatus.misfit, "settled above the requested 1 m2 (--delta-m2)")])
+    (2.7, optimise.FitStatus.converged, "fell below 2.7 m2"),
+    (1.0, optimise.FitStatus.misfit, "settled above the requested 1 m2 (--delta-m2)")])
 def test_it_ends_below_the_papers_delta(delta, status, reason):
     """The form of the field alone leaves 2.56 here."""
     valley = _Valley()
     start = valley.space.pack(valley.space.base)
-    fit = nelder_mead(valley, start, evaluation_limit=1500, delta_m2=delta)
+    fit = optimise.nelder_mead(valley, start, evaluation_limit=1500, delta_m2=delta)
     assert fit.status is status and reason in fit.reason
-    assert (fit.evaluation.loss < delta) == (status is FitStatus.converged)
+    assert (fit.evaluation.loss < delta) == (status is optimise.FitStatus.converged)
 
 
 def test_no_more_simulations_than_allowed():
     valley = _Valley()
-    fit = nelder_mead(valley, valley.space.pack(valley.space.base), evaluation_limit=30)
+    fit = optimise.nelder_mead(valley, valley.space.pack(valley.space.base), evaluation_limit=30)
     assert not fit.converged and "30 simulations were not enough" in fit.reason
     assert "It would take more than" in fit.reason or "would settle after about" in fit.reason
     assert len(valley.asked) <= 32
@@ -83,7 +75,7 @@ def test_no_more_simulations_than_allowed():
 
 def test_it_says_after_how_many_simulations_it_would_settle():
     """A fall that shrinks by half every 20 iterations of 2 simulations each."""
-    rule = _Settling(_Valley())
+    rule = optimise._Settling(_Valley())
     for number in range(40):
         rule.count += 2
         rule.seen(100 * 0.5**(number / 20) + 50, 1.0)
@@ -91,7 +83,7 @@ def test_it_says_after_how_many_simulations_it_would_settle():
     reason = rule.verdict(False, 80)[1]
     about = float(reason.split("about ")[1].split(".")[0])
     # 25 are left to fall; a hundredth after 11 halvings, of 40 simulations each.
-    assert about == pytest.approx(80 + 40 * np.log2(25 / SETTLED_FALL), rel=0.15)
+    assert about == pytest.approx(80 + 40 * np.log2(25 / optimise.SETTLED_FALL), rel=0.15)
 
 
 # A fit ends where nothing that matters is left to gain, however finely simulations repeat.
@@ -126,16 +118,17 @@ def test_a_fit_does_not_wander_in_what_simulations_do_not_repeat():
     """Few simulations, and next to where the fit on exact ones ends."""
     exact, rough = RoughObjective(0.0), RoughObjective(0.1)
     start = TRUTH + [-0.7, 0.7]
-    best = gauss_newton(exact, start, tolerance=1e-12).evaluation
-    found = gauss_newton(rough, start)
+    best = optimise.gauss_newton(exact, start, tolerance=1e-12).evaluation
+    found = optimise.gauss_newton(rough, start)
     assert found.converged
     # Until its steps are too short for any, 22.
     assert rough.count <= 18
     left = best.jacobian @ (found.evaluation.free - best.free)
-    assert np.linalg.norm(left) < 2 * WANDERING_STEP
+    assert np.linalg.norm(left) < 2 * optimise.WANDERING_STEP
 
 
 def test_a_settled_fit_has_converged_at_its_limit_too():
     """The last simulation that is allowed leads to the end: no other has to tell so."""
-    fit = gauss_newton(RoughObjective(0.0), TRUTH + [-0.7, 0.7], robust=False, evaluation_limit=3)
+    fit = optimise.gauss_newton(RoughObjective(0.0), TRUTH + [-0.7, 0.7], robust=False,
+                                evaluation_limit=3)
     assert fit.converged and "standard deviations" in fit.reason

@@ -10,14 +10,7 @@ from tests.subjects.forced_pulls import SETTINGS, TRUTH, with_force
 from limber.core.errors import WorkError
 from limber.core.progress import Progress
 from limber.estimation.estimated_branch import forwards_of, lumped, subject_of
-from limber.estimation.fitting.initial_modulus import (
-    SECTIONS,
-    Beam,
-    beam_start,
-    beams_of,
-    scaled_start,
-    standing_start,
-)
+from limber.estimation.fitting import initial_modulus
 from limber.estimation.fitting.objective import Evaluation, EvaluationLog, Objective
 from limber.estimation.fitting.optimise import LONGEST_STEP, gauss_newton
 from limber.estimation.forward.observed_path import force_for_travel
@@ -35,8 +28,8 @@ from limber.store.loading import load_subject
 
 @pytest.mark.parametrize("young", [1e3, 6e5, 1e8, 1e11])
 def test_a_measured_force_gives_the_start_whatever_the_modulus_was(objective, young):
-    start = scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
-    expected = scaled_start(objective, Values(np.full(4, 1e7), 0.36, 900.0))
+    start = initial_modulus.scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
+    expected = initial_modulus.scaled_start(objective, Values(np.full(4, 1e7), 0.36, 900.0))
     assert start.young == pytest.approx(expected.young, rel=1e-6)
     assert 0.3 * TRUTH.min() < start.young[0] < 3 * TRUTH.max()
 
@@ -48,7 +41,7 @@ def test_a_start_carries_the_weight(small_bench, pull, young):
     objective = small_bench.objective([weak], SETTINGS)
     forward = objective.forwards[0]
     forward._model = forward._model.with_parameters(gravity=(0.0, 0.0, -9.81)).as_scanned()
-    start = scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
+    start = initial_modulus.scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
     assert forward.stands(start)
     assert not forward.stands(replace(start, young=0.25 * start.young))
 
@@ -56,7 +49,7 @@ def test_a_start_carries_the_weight(small_bench, pull, young):
 def test_a_beam_bends_as_the_branch_does(objective, small_bench, pull):
     """Its sections' places from base to grasp, far bent, against the tetrahedra at the truth."""
     forward, values = objective.forwards[0], Values(TRUTH, 0.36, 900.0)
-    beam = Beam(forward)
+    beam = initial_modulus.Beam(forward)
     moved, turns = beam.bent([values])
     seen = beam.seen[:, -1] - beam.seen[0, -1]
     off = moved[0, :, -1] - moved[0, 0, -1] - seen
@@ -69,11 +62,11 @@ def test_a_beam_bends_as_the_branch_does(objective, small_bench, pull):
 
 def test_a_beam_under_a_small_force_is_bernoullis(objective):
     """F L^3 / 3 E I of its sections' radii, where it hardly bends."""
-    beam = Beam(objective.forwards[0])
-    along = np.linspace(0.0, 0.5, SECTIONS + 1)
+    beam = initial_modulus.Beam(objective.forwards[0])
+    along = np.linspace(0.0, 0.5, initial_modulus.SECTIONS + 1)
     beam.axis = np.column_stack([0 * along, 0 * along, along])
-    beam._second = np.full(SECTIONS, 1e-9)
-    beam.rest, beam._at = beam.axis[[-1]], np.array([SECTIONS])
+    beam._second = np.full(initial_modulus.SECTIONS, 1e-9)
+    beam.rest, beam._at = beam.axis[[-1]], np.array([initial_modulus.SECTIONS])
     beam.force, beam.torque = np.array([[1e-3, 0.0, 0.0]]), np.zeros((1, 3))
     beam.place = beam.axis[[-1]]
     moved, _ = beam.bent([Values(np.full(4, 1e7), 0.36, 900.0)])
@@ -83,19 +76,20 @@ def test_a_beam_under_a_small_force_is_bernoullis(objective):
 @pytest.mark.parametrize("factor", [0.1, 1.0, 1e3])
 def test_a_beam_scales_with_the_force(objective, factor):
     """A force so many times as large gives moduli so many times as large, within their bounds."""
-    begun = beam_start(beams_of(objective.forwards), Values(np.full(4, 1e7), 0.36, 900.0))
+    begun = initial_modulus.beam_start(initial_modulus.beams_of(objective.forwards),
+                                       Values(np.full(4, 1e7), 0.36, 900.0))
     assert begun.explained > 0.9
-    beams = beams_of(objective.forwards)
+    beams = initial_modulus.beams_of(objective.forwards)
     beams[0].force = factor * beams[0].force
-    found = beam_start(beams, Values(np.full(4, 1e7), 0.36, 900.0)).values
+    found = initial_modulus.beam_start(beams, Values(np.full(4, 1e7), 0.36, 900.0)).values
     assert found.young == pytest.approx(np.clip(factor * begun.values.young, 1e4, 1e11), rel=0.05)
 
 
 def test_a_force_that_cannot_have_moved_the_branch_explains_nothing(objective):
     """Turned by 180 degrees no modulus answers it; of its frame the user is told."""
-    beams = beams_of(objective.forwards)
+    beams = initial_modulus.beams_of(objective.forwards)
     beams[0].force = -beams[0].force
-    assert beam_start(beams, Values(np.full(4, 1e7), 0.36, 900.0)).explained < 0.3
+    assert initial_modulus.beam_start(beams, Values(np.full(4, 1e7), 0.36, 900.0)).explained < 0.3
 
 
 def test_a_start_without_equilibrium_is_stiffened(objective, monkeypatch):
@@ -107,7 +101,7 @@ def test_a_start_without_equilibrium_is_stiffened(objective, monkeypatch):
         return evaluate(self, free, **options) if len(tried) > 2 else None
 
     monkeypatch.setattr(Objective, "evaluate", refusing)
-    found, _ = standing_start(objective, Values(TRUTH, 0.36, 900.0))
+    found, _ = initial_modulus.standing_start(objective, Values(TRUTH, 0.36, 900.0))
     assert np.diff(tried) == pytest.approx(LONGEST_STEP)
     assert found.young == pytest.approx(TRUTH * np.exp(2 * LONGEST_STEP))
 
@@ -122,7 +116,7 @@ def test_decades_without_equilibrium_are_no_minimum(objective, monkeypatch):
     monkeypatch.setattr(Objective, "evaluate", evaluate)
     monkeypatch.setattr(objective.forwards[0], "skeleton", None)
     for young in (1e4, 1e8, 1e10):
-        start = scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
+        start = initial_modulus.scaled_start(objective, Values(np.full(4, young), 0.36, 900.0))
         assert start.young == pytest.approx(1e8, rel=0.3)
 
 

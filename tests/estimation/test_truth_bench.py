@@ -5,15 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.drawn_branches import (
-    FIRST_PULL,
-    FIRST_TURN,
-    SETTINGS,
-    bounds,
-    drawn_truth,
-    exact_pull,
-    fitting_subject,
-)
+from benchmarks import drawn_branches
 from benchmarks.mechanics_reduced import trained
 from benchmarks.paper_branches import measured
 from benchmarks.scan_loops import bending_row, width_row
@@ -39,12 +31,13 @@ def test_moduli_that_err_together_count_as_one():
 @pytest.mark.slow
 def test_a_known_form_leaves_less_open():
     """Of one drawn branch and pull; less of each modulus and of any mixture of them."""
-    truth = drawn_truth(np.random.default_rng(3))
-    subject = fitting_subject(truth)
-    pull = measured(exact_pull(truth, 0, FIRST_PULL, FIRST_TURN), 4)
-    forwards = forwards_of([pull], subject, SETTINGS)
-    objective = Objective(forwards, parameter_space(subject, forwards, SETTINGS))
-    as_fitted, of_known_form = bounds(truth, objective, subject)
+    truth = drawn_branches.drawn_truth(np.random.default_rng(3))
+    subject = drawn_branches.fitting_subject(truth)
+    pull = measured(drawn_branches.exact_pull(
+        truth, 0, drawn_branches.FIRST_PULL, drawn_branches.FIRST_TURN), 4)
+    forwards = forwards_of([pull], subject, drawn_branches.SETTINGS)
+    objective = Objective(forwards, parameter_space(subject, forwards, drawn_branches.SETTINGS))
+    as_fitted, of_known_form = drawn_branches.bounds(truth, objective, subject)
     assert np.all(np.linalg.eigvalsh(as_fitted - of_known_form) > -1e-9)
     assert np.all(np.diag(of_known_form) < 0.8 * np.diag(as_fitted))
 

@@ -157,11 +157,9 @@ def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0,
                 Observations(times, positions))
 
 
-def recorded(pull: Pull, cell: CellErrors, rng: np.random.Generator,
-             pivot: np.ndarray | None = None) -> Pull:
-    """The cell's recording of a pull: its own errors, the sensor's drifting zero, and noise. The
-    gripper's frame turns about ``pivot``, the first pull's grasp (None: this one's)."""
-    seen = cell.recorded(pull, rng, pivot)
+def recorded(pull: Pull, cell: CellErrors, rng: np.random.Generator) -> Pull:
+    """The cell's recording of a pull: its own errors, the sensor's drifting zero, and noise."""
+    seen = cell.recorded(pull, rng)
     peak = float(np.linalg.norm(pull.wrenches[:, :3], axis=1).max())
     wrenches, positions = seen.wrenches.copy(), seen.observations.positions
     wrenches[:, :3] += FORCE_NOISE * peak * rng.standard_normal((len(wrenches), 3))
@@ -193,8 +191,7 @@ def cell_trial(task: tuple[int, int, int], calibration: CalibrationEntry, pull_c
     found = _estimated(pulls, subject)
     while len(pulls) < pull_count:
         choice = _suggested(found, pulls, subject)
-        pulls.append(recorded(exact_pull(truth, len(pulls), choice, shifts=off()), cell, rng,
-                              np.array(pulls[0].entry.grasp.point_m)))
+        pulls.append(recorded(exact_pull(truth, len(pulls), choice, shifts=off()), cell, rng))
         found = _estimated(pulls, subject)
     log_truth = np.log(truth.young)
     low, high = np.log(total_interval(found.values.young, found.uncertainty.young_interval,

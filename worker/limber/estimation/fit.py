@@ -195,8 +195,7 @@ class _Strategy:
             if found.stopped or np.linalg.norm(turn) < SMALL_RAD:
                 break
             middle = found.objective.forwards[0].rest_points.mean(axis=0)
-            step = replace(step, pulls=[put_right(pull, shift, turn, middle)
-                                        for pull in step.pulls])
+            step = replace(step, pulls=[put_right(one, shift, turn, middle) for one in step.pulls])
             found = step._placed(EvaluationLog(None, ""))
         try:
             other = self._with(also=tuple(part for part in self.settings.also if part != "frame")

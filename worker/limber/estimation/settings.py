@@ -15,15 +15,13 @@ from limber.core.settings import (
     possible_young,
     within,
 )
-from limber.geometry.settings import DENSITY_SIGMA, POISSON_SIGMA
+from limber.geometry.settings import DENSITY_SIGMA
 
 if TYPE_CHECKING:
     import numpy as np
 
     from limber.recordings.recording import CalibrationEntry
 
-HELD_FRACTION = 0.92
-"""Where a virtual pull holds the branch, as a fraction of the main path."""
 _QUICK = {"key_frames": 4, "hold_out": False, "mesh_check": False, "shapes": 0}
 
 
@@ -126,7 +124,7 @@ class FitSpec(EstimateSettings):
     gravity: bool = Field(
         True, description="The branch carries its own weight, as when it was scanned.")
     poisson_sigma: float = Field(
-        POISSON_SIGMA, ge=0, description="Standard deviation of Poisson's ratio if it is not fitted.")
+        0.05, ge=0, description="Standard deviation of Poisson's ratio if it is not fitted.")
     density_sigma: float = Field(
         DENSITY_SIGMA, ge=0, description="Relative standard deviation of the density, if weight or "
         "inertia acts.")
@@ -185,12 +183,11 @@ class VirtualPullSettings(Settings):
     camera: bool = Field(
         False, description="Record depth images of a simulated D455 instead of points.")
     cell_errors: str = Field(
-        "none", description="Errors of the cell that stay during the recording, drawn at random: "
-        "none, realistic, or a TOML file whose table [calibration] has their standard "
-        "deviations, as pull.toml has. realistic: those of a cell that was set up with care and "
-        "not measured since (gripper 1 mm and 1 degree, force gain 2 %, zero and drift 1 N, "
-        "camera 1 mm, points 5 mm along the branch). The pull states them as its calibration. "
-        "Frames and gain are those of one cell: the same in all pulls with one calibration.")
+        "none", description="Errors of the cell that stay during the recording, those of frames "
+        "and gain the same in all pulls: none, realistic, or a TOML file whose table [calibration] "
+        "has their standard deviations, as pull.toml has. realistic: those of a cell that was set "
+        "up with care and not measured since (gripper 1 mm and 1 degree, force gain 2 %, zero and "
+        "drift 1 N, camera 1 mm, points 5 mm along the branch). The pull states them.")
     seed: int = Field(0, ge=0, description="Seed of all random numbers.")
 
     @property
@@ -218,10 +215,8 @@ class PullSpec(VirtualPullSettings):
     duration: float | None = Field(
         None, gt=0, description="Duration of the recording [s]. Default: 6, or 1.5 for a dynamic "
         "pull.")
-    shared_seed: int = Field(0, ge=0, description="Seed of what all pulls of a branch share: its "
-                             "likely shape, and frames and gain of the cell.")
     grasp_fraction: float = Field(
-        HELD_FRACTION, gt=0, le=1, description="Position of the grasp as a fraction of the main path. It "
+        0.92, gt=0, le=1, description="Position of the grasp as a fraction of the main path. It "
         "must be beyond the last control point: the branch does not bend beyond the grasp, so its "
         "modulus there cannot be estimated.")
     mode: GraspMode = Field(

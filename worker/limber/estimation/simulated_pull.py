@@ -20,7 +20,7 @@ from limber.core.numerics.rigid import composed, rotated
 from limber.core.progress import SILENT, Progress
 from limber.estimation.forward.observed_path import MotionMade, MotionWanted, moved
 from limber.estimation.rod import Rod, RodMotion
-from limber.estimation.settings import HELD_FRACTION, PullSpec
+from limber.estimation.settings import PullSpec
 from limber.estimation.uncertainty.model_error import refined
 from limber.geometry.cloud.camera import D455, Camera, write_camera
 from limber.geometry.shape_samples import reshaped, sample_skeletons
@@ -47,7 +47,7 @@ from limber.recordings.recording import (
 # Simulated errors of a cell: drawn once, then applied to its recordings.
 
 
-@dataclass(frozen=True)
+@dataclass
 class CellErrors:
     """Errors of one cell that all recordings share: gripper's and camera's frame [m, rad] [3], a
     factor on force; ``calibration`` has their deviations."""
@@ -58,6 +58,7 @@ class CellErrors:
     force_gain: float
     camera_offset: np.ndarray
     camera_turn: np.ndarray
+    pivot: np.ndarray | None = None
 
     @classmethod
     def drawn(cls, calibration: CalibrationEntry, rng: np.random.Generator) -> "CellErrors":
@@ -76,28 +77,25 @@ class CellErrors:
                 "camera_place_m": self.camera_offset.tolist(),
                 "camera_turn_rad": self.camera_turn.tolist()}
 
-    def recorded(self, pull: Pull, rng: np.random.Generator,
-                 pivot: np.ndarray | None = None) -> Pull:
+    def recorded(self, pull: Pull, rng: np.random.Generator) -> Pull:
         """Record an exact pull with this cell and a zero and drift of its own, without noise. The
-        gripper's frame turns about ``pivot`` [3] (None: the grasp), which pulls of one cell share,
-        the observer's about the centre of the points at rest."""
+        gripper's frame turns about ``pivot`` [3], if none is set the first pull's grasp, the
+        observer's about the centre of the points at rest."""
         known, times = self.calibration, pull.times
         wrenches = pull.wrenches.copy()
         wrenches[:, :3] = self.force_gain * wrenches[:, :3] + self._zero(times, rng)
         wrenches[:, 3:] += known.torque_bias_sigma_nm * rng.standard_normal(3)
-        point = np.array(pull.entry.grasp.point_m) if pivot is None else pivot
+        at = self.pivot = np.array(pull.entry.grasp.point_m if self.pivot is None else self.pivot)
         poses = pull.poses.copy()
-        moved = rotated(self.gripper_turn, poses[:, :3] - point)
-        poses[:, :3] = (point + self.gripper_offset + moved
+        moved = rotated(self.gripper_turn, poses[:, :3] - at)
+        poses[:, :3] = (at + self.gripper_offset + moved
                         + known.pose_noise_m * rng.standard_normal((len(times), 3)))
         poses[:, 3:] = composed(self.gripper_turn, poses[:, 3:])
         late = known.clock_sigma_s * rng.standard_normal()
         observations = pull.observations
         if observations is not None:
-            seen = observations.positions
-            rest = seen[0] if pull.entry.rest_points_m is None else pull.entry.rest_points_m
             observations = replace(observations, positions=self._seen(
-                times, seen, late, np.mean(rest, axis=0)))
+                times, observations.positions, late))
         return replace(pull, entry=pull.entry.model_copy(update={"calibration": known}),
                        poses=poses, wrenches=wrenches, observations=observations)
 
@@ -109,8 +107,8 @@ class CellErrors:
         return (self.calibration.force_bias_sigma_n * rng.standard_normal(3)
                 + self.calibration.force_drift_sigma_n * rng.standard_normal(3) * course[:, None])
 
-    def _seen(self, times: np.ndarray, positions: np.ndarray, late: float,
-              middle: np.ndarray) -> np.ndarray:
+    def _seen(self, times: np.ndarray, positions: np.ndarray, late: float) -> np.ndarray:
+        middle = positions[0].mean(axis=0)
         spline = scipy.interpolate.CubicSpline(times, positions)
         at = spline(np.clip(times + late, times[0], times[-1]))
         turned = rotated(self.camera_turn, (at - middle).reshape(-1, 3)).reshape(at.shape)
@@ -186,8 +184,7 @@ def true_branch(skeleton: Skeleton, settings: PullSpec, *,
         mesh = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_spacing=1.3)
                            ).mesh
     if scan is not None and body is None:
-        skeleton, mesh = _another(skeleton, mesh, scan, np.random.default_rng(
-            [settings.shared_seed, 2]))
+        skeleton, mesh = _another(skeleton, mesh, scan, np.random.default_rng([0, 2]))
     mesh = mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
     return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions,
                       np.array(young, float), gravity, is_meshed=body is not None)
@@ -231,13 +228,11 @@ def simulate_pull(truth: TrueBranch, name: str, settings: PullSpec, *,
                               for displacement in displacements])
     sizes = [float(np.linalg.norm(made.wrenches[:, part], axis=1).max())
              for part in (slice(0, 3), slice(3, 6))]
-    wrenches = made.wrenches.copy()
-    count, poses = len(wrenches), made.poses
+    wrenches, count, poses = made.wrenches.copy(), len(made.wrenches), made.poses
     if settings.calibration != EXACT:
         exact = Pull(name, entry, settings.times, poses, wrenches,
                      Observations(settings.times, positions))
-        entry, poses, wrenches, positions = _misread(
-            exact, shifts, settings, truth.skeleton.point_at(HELD_FRACTION))
+        entry, poses, wrenches, positions = _misread(exact, shifts, settings, truth)
     wrenches[:, :3] += settings.force_noise * sizes[0] * rng.standard_normal((count, 3))
     positions = positions + settings.position_noise * rng.standard_normal(positions.shape)
     stray = rng.random(positions.shape[:2]) < settings.outliers
@@ -249,8 +244,7 @@ def simulate_pull(truth: TrueBranch, name: str, settings: PullSpec, *,
         force_sigma_n=max(settings.force_noise, 2e-3) * sizes[0],
         torque_sigma_nm=torque_sigma if settings.mode == "rigid" and torque_sigma > 0 else None)})
     observations = None if settings.camera else Observations(settings.times, positions)
-    pull = Pull(name, entry, settings.times, poses, wrenches, observations)
-    return pull, displacements
+    return Pull(name, entry, settings.times, poses, wrenches, observations), displacements
 
 
 def _requested(truth: TrueBranch, settings: PullSpec, entry: PullEntry,
@@ -290,7 +284,7 @@ def _marked(truth: TrueBranch, settings: PullSpec) -> tuple[np.ndarray, np.ndarr
     return shifts, points
 
 
-def _misread(exact: Pull, shifts: np.ndarray, settings: PullSpec, pivot: np.ndarray,
+def _misread(exact: Pull, shifts: np.ndarray, settings: PullSpec, truth: TrueBranch,
              ) -> tuple[PullEntry, np.ndarray, np.ndarray, np.ndarray]:
     """Return entry, poses, wrenches and positions as a cell with errors records them."""
     if settings.camera:
@@ -298,9 +292,9 @@ def _misread(exact: Pull, shifts: np.ndarray, settings: PullSpec, pivot: np.ndar
                          "Depth images are rendered by a camera whose position is known.",
                          "Omit ", Option("camera"), ", or the errors of the cell.")
     # All pulls of a branch are recorded in one cell, as the fit takes it.
-    errors = CellErrors.drawn(settings.calibration, np.random.default_rng(
-        [settings.shared_seed, 3]))
-    seen = errors.recorded(exact, np.random.default_rng([settings.seed, 5]), pivot)
+    errors = CellErrors.drawn(settings.calibration, np.random.default_rng([0, 3]))
+    errors.pivot = truth.skeleton.point_at(PullSpec().grasp_fraction)
+    seen = errors.recorded(exact, np.random.default_rng([settings.seed, 5]))
     observed = present(seen.observations, "observed points")
     entry = seen.entry.model_copy(update={
         "truth": {**(exact.entry.truth or {}), "cell_errors": errors.truth | {

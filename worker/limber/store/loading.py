@@ -22,12 +22,7 @@ from limber.estimation.estimate_file import read_estimate
 from limber.estimation.estimated_branch import Subject, observed, subject_of
 from limber.estimation.settings import EstimateSettings, FitSpec
 from limber.geometry.io.skeletons import read_cylinders, read_skeleton, read_swc
-from limber.geometry.settings import (
-    DENSITY_SIGMA,
-    GIVEN_POISSON_SIGMA,
-    POISSON_SIGMA,
-    ReconstructSettings,
-)
+from limber.geometry.settings import DENSITY_SIGMA, GIVEN_POISSON_SIGMA, POISSON
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added_masses import HungTwig, PointMass
@@ -245,23 +240,16 @@ def density_sigma(branch: Branch) -> float:
 
 def density_digest(branch: Branch) -> dict[str, str]:
     """Return what a result depends on besides, where that deviation is another than usual."""
-    sigma = density_sigma(branch)
-    return {} if sigma == DENSITY_SIGMA else {"density_sigma": repr(sigma)}
-
-
-def poisson_sigma(branch: Branch) -> float:
-    """Return the standard deviation of Poisson's ratio; one that the user gave was measured."""
-    usual = ReconstructSettings.model_fields["poisson"].default
-    given = branch.made is not None and branch.made.settings.get("poisson", usual) != usual
-    return GIVEN_POISSON_SIGMA if given else POISSON_SIGMA
+    return {"density_sigma": repr(own)} if (own := density_sigma(branch)) != DENSITY_SIGMA else {}
 
 
 def fit_spec(branch: Branch, settings: EstimateSettings) -> FitSpec:
     """Return what an estimate of the branch does; what Python gives whole stays as it is. It begins
     as the first one did: what that found is in the mesh, and no knowledge from before the pulls."""
     spec = FitSpec.of(settings)
-    update: dict[str, float] = {} if isinstance(settings, FitSpec) else {
-        "density_sigma": density_sigma(branch), "poisson_sigma": poisson_sigma(branch)}
+    update = {} if isinstance(settings, FitSpec) else {"density_sigma": density_sigma(branch)}
+    if update and branch.made and branch.made.settings.get("poisson", POISSON) != POISSON:
+        update["poisson_sigma"] = GIVEN_POISSON_SIGMA
     if branch.has("mesh.vtu") and branch.manifest.files["mesh.vtu"].stage == "estimate":
         before = read_estimate(branch.path("estimate.json")).get("initial", {})
         update |= {name: value for name, value in before.items() if getattr(spec, name) is None}

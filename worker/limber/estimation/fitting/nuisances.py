@@ -138,12 +138,12 @@ def eliminated(residual: np.ndarray, jacobian: np.ndarray | None, columns: np.nd
 @dataclass(frozen=True)
 class _Pull:
     """The data of a pull that its errors depend on. All pulls of a cell turn about its first pull's
-    grasp, ``pivot``, and about the ``middle`` of that one's points."""
+    grasp, ``pivot``, and about the middle of that one's points at rest, ``rest``."""
 
     entry: PullEntry
     frames: Frames
     pivot: np.ndarray
-    middle: np.ndarray
+    rest: np.ndarray
     tangent: np.ndarray | None
     directions: np.ndarray | None
     positions: np.ndarray
@@ -170,12 +170,10 @@ class CellErrors:
         self._places: list[list[tuple[Unknown, float, np.ndarray]]] = []
         self._forwards = forwards
         known: dict[tuple[object, ...], int] = {}
-        self._pivots: dict[CalibrationEntry, tuple[np.ndarray, np.ndarray]] = {}
+        self._first: dict[CalibrationEntry, Forward] = {}
         for forward in forwards:
             calibration, indexed = calibration_of(forward.entry), []
-            self._pivots.setdefault(calibration, (
-                np.array(forward.entry.grasp.point_m), forward.rest_points.mean(axis=0)
-                if len(forward.rest_points) else np.zeros(3)))
+            self._first.setdefault(calibration, forward)
             for unknown in UNKNOWNS:
                 sigma, names = unknown.sigma(calibration), unknown.names(forward)
                 if not names or not sigma > 0:
@@ -211,7 +209,8 @@ class CellErrors:
         total = {"points": np.zeros((*positions.shape, count)),
                  **{kind: np.zeros((len(frames), 3, count))
                     for kind in ("forces", "torques", "grasps")}}
-        pull = _Pull(forward.entry, frames, *self._pivots[calibration_of(forward.entry)],
+        first = self._first[calibration_of(forward.entry)]
+        pull = _Pull(forward.entry, frames, np.array(first.entry.grasp.point_m), first.rest_points,
                      forward.grasp_tangent, forward.point_directions, positions, forces,
                      forward.creep_time)
         for unknown, sigma, used in self._places[index]:
@@ -231,7 +230,7 @@ def _rotations(arms: np.ndarray) -> np.ndarray:
 
 
 def _turned(pull: _Pull) -> dict[str, np.ndarray]:
-    return {"points": _rotations(pull.positions - pull.middle)}
+    return {"points": _rotations(pull.positions - pull.rest.mean(axis=0))}
 
 
 def _along(pull: _Pull) -> dict[str, np.ndarray]:
@@ -384,9 +383,8 @@ UNKNOWNS = [
 OTHER_CAUSES = {
     "form": Cause("modulus between the control points", "add markers along the branch, or pull at "
                   "another point"),
-    "poisson": Cause("Poisson's ratio", Text("give it (", Option("poisson"), " of reconstruct); "
-                                             "pulls do not determine it")),
-    "given": Cause("Poisson's ratio as given", "measure it on a straight piece, by twist and bend"),
+    "poisson": Cause("Poisson's ratio", Text("measure it, and state it (", Option("poisson"),
+                                             " of reconstruct); pulls do not determine it")),
     "density": Cause("density", Text("weigh a piece of the branch (", Option("density"), ", ",
                                      Option("density_sigma"), " of reconstruct)")),
     "link": Cause("moduli that the pulls do not determine", "pull at a point farther out"),

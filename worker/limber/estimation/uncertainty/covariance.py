@@ -13,7 +13,6 @@ from limber.estimation.fitting.optimise import OUTLYING, Fit
 from limber.estimation.forward.solved_pull import DynamicForward, QuasiStaticForward
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, YoungField
 from limber.estimation.uncertainty.drift import scale_steps
-from limber.geometry.settings import GIVEN_POISSON_SIGMA
 from limber.recordings.recording import calibration_of
 
 OUTLIER = 4.5
@@ -294,11 +293,9 @@ def information_rows(evaluation: Evaluation, objective: Objective, scale: float,
         rows.append(InformationRows(nuisance.unknown.cause.name, row, nuisance.name))
     own, _ = space.own_rows()
     names = [name for name, _, _ in space.priors] + [""] * len(space.links)
-    is_given = ("poisson", GIVEN_POISSON_SIGMA) in [(name, sigma) for name, _, sigma in space.priors]
     for name, row in zip(names, own, strict=True):
         # The field's form has several unknowns.
-        cause = OTHER_CAUSES["form" if name.startswith("form") else "given"
-                             if name == "poisson" and is_given else name or "link"]
+        cause = OTHER_CAUSES["form" if name.startswith("form") else name or "link"]
         wide = np.r_[row, np.zeros(width - space.size)][None]
         rows.append(InformationRows(cause.name, wide, name))
     return rows

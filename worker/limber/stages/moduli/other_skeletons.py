@@ -108,8 +108,8 @@ def _fitted(graph: _Graph, found: Estimate, branch: Branch, pulls: Sequence[Pull
         [*meshed.masses, *leaves], load_targets(branch)), branch.gravity, settings)
     if found.is_weightless:
         subject = subject.without_weight()
-    other = fit_branch(list(pulls), lumped(subject, pulls, settings), settings, log=EvaluationLog(None, ""), quick=True,
-                       near=replace(found.values, form=()),
+    other = fit_branch(list(pulls), lumped(subject, list(pulls), settings), settings, quick=True,
+                       log=EvaluationLog(None, ""), near=replace(found.values, form=()),
                        progress=progress.keeping([], silently=True))
     require_result(other, skeleton)
     return other
