@@ -334,7 +334,6 @@ def test_the_guard_listens_to_the_stated_sensor(stepped_ros):
     (with_sensor(PAPER, kind="controller"), "A CB3 estimates it from motor currents"),
     (with_sensor(PAPER, kind="controller", topic="/ft300/wrench"), "A CB3 estimates it"),
     (with_sensor(PAPER, kind="none"), "names no force sensor"),
-    (with_sensor(CELL, kind="replay", file="forces.csv"), "replays forces"),
     (with_sensor(CELL, kind="ft300"), "states no sensor.topic"),
     (with_sensor(CELL, kind="ft300", topic=Topics().wrench), "or sensor.kind to controller")])
 def test_a_sensor_that_is_not_heard_in_ros_is_refused(cell, told):

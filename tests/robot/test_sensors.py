@@ -1,4 +1,4 @@
-"""Force sensors: frames, tare, weight, saturation, torn messages, replay."""
+"""Force sensors: frames, tare, weight, saturation, torn messages."""
 
 import socket
 import threading
@@ -15,7 +15,6 @@ from limber.robot.driver.force_samples import (
     ControllerSensor,
     Ft300Sensor,
     Reading,
-    ReplayedSensor,
     WrenchChain,
     open_sensor,
     parsed_message,
@@ -150,31 +149,6 @@ def test_ft300_messages_in_any_pieces(own_address):
         with pytest.raises(ConnectionError):
             sensor.read(sample)
         sensor.close()
-
-
-def test_a_replayed_file_runs_with_the_robots_clock(tmp_path):
-    path = tmp_path / "wrench.csv"
-    path.write_text("t_s,fx,fy,fz,tx,ty,tz\n10.0,1,0,0,0,0,0\n10.5,2,0,0,0,0,0\n")
-    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6})
-    sensor = ReplayedSensor(cell, path)
-    assert sensor.read(sample_at(np.zeros(6), clock=100.0)).wrench[0] == 1
-    later = sensor.read(sample_at(np.zeros(6), clock=100.52))
-    assert later.wrench[0] == 2 and later.age == pytest.approx(0.02)
-    assert sensor.read(sample_at(np.zeros(6), clock=103.0)).age > 2
-
-
-def test_a_replay_is_for_the_virtual_robot_alone(tmp_path):
-    path = tmp_path / "ft.csv"
-    path.write_text("t_s,fx,fy,fz,tx,ty,tz\n0,1,0,0,0,0,0\n0.5,2,0,0,0,0,0\n")
-    cell = cell_with(kind="replay", file=str(path))
-    assert isinstance(open_sensor(cell), ReplayedSensor)
-    real = cell.model_copy(update={"robot": cell.robot.model_copy(
-        update={"address": "192.168.0.10"})})
-    with pytest.raises(InputError, match="would not feel the real branch"):
-        open_sensor(real)
-    for wrong in ({"kind": "replay"}, {"kind": "ft300", "file": "ft.csv"}):
-        with pytest.raises(ValueError, match="allowed only with it"):
-            cell_with(**wrong)
 
 
 def test_without_a_sensor_nothing_is_moved():

@@ -137,13 +137,10 @@ class ApproachEntry(_Entry):
 class SensorEntry(_Entry):
     """The force-torque sensor that the guard and recordings use."""
 
-    kind: Literal["controller", "ft300", "ft300_usb", "replay", "none"] = Field(
+    kind: Literal["controller", "ft300", "ft300_usb", "none"] = Field(
         "controller", description="ft300: by its URCap's stream (port 63351 of the robot's "
-        "address). ft300_usb: by Modbus on device. replay reads a file and works only with the "
-        "virtual robot.")
+        "address). ft300_usb: by Modbus on device.")
     device: str | None = Field(None, description="Serial line of kind = \"ft300_usb\".")
-    file: str | None = Field(None, description="CSV of a replay: t_s and six columns, in the "
-                             "sensor's frame.")
     topic: str | None = Field(None, min_length=1, description="Topic of its wrench in ROS "
                               "(geometry_msgs/msg/WrenchStamped). `limber ros` takes that of the "
                               "UR driver only for the own sensor of an e-Series arm.")
@@ -155,9 +152,7 @@ class SensorEntry(_Entry):
     drift_n_per_minute: float = Field(0.8, ge=0)
 
     @model_validator(mode="after")
-    def _has_its_file(self) -> "SensorEntry":
-        if (self.kind == "replay") != (self.file is not None):
-            raise ValueError("file is the CSV of kind = \"replay\", and is allowed only with it")
+    def _has_its_line(self) -> "SensorEntry":
         if self.kind == "ft300_usb" and self.device is None:
             raise ValueError("device, the serial line of kind = \"ft300_usb\", is missing")
         return self

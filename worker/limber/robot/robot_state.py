@@ -33,7 +33,6 @@ _ALIKE = 0.8  # cosine of the angle between measured and expected change
 _UNITS = {0.1019: "kilograms-force", 0.2248: "pounds-force", 0.001: "kilonewtons",
           1000.0: "millinewtons"}
 _NEAR = 0.15  # relative
-_FEEL_NO_WEIGHT = ("none", "replay")
 _LOOPBACK = "127."
 
 
@@ -59,7 +58,7 @@ def unweighed(cell: Cell) -> str | None:
     whose gripper is another at each start."""
     stated, last = cell.tool.mass_kg or 0.0, _last_weighing(cell)
     is_bare = not stated and (last is None or cell.robot.address.startswith(_LOOPBACK))
-    if is_bare or cell.sensor.kind in _FEEL_NO_WEIGHT:
+    if is_bare or cell.sensor.kind == "none":
         return None
     if last is None:
         return (f"The gripper of {stated:g} kg was never weighed with this sensor, so a wrong "

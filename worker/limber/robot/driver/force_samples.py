@@ -6,14 +6,12 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, SafetyStop, WorkError
-from limber.core.not_none import present
 from limber.core.numerics.rigid_kernels import (
     frame_of,
     inverse_of,
@@ -185,7 +183,7 @@ class UnderWay:
 # Force-torque sensors: from a reading to the wrench of the gripper on the branch.
 #
 # The frames: the controller reports the wrench of the surroundings on the tool, in the base's axes,
-# about the tool's centre. An FT300 and a replayed file report the same in the sensor's own frame.
+# about the tool's centre. An FT300 reports the same in its own frame.
 # The guard and recordings need the opposite: the wrench of the gripper on the branch, about the
 # grasp's centre, in the branch's frame. A tare removes bias and weight at its orientation. The
 # change of the gripper's weight with rotation is removed by computation.
@@ -309,36 +307,6 @@ class Ft300UsbSensor:
         self._line.close()
 
 
-class ReplayedSensor:
-    """Readings from a CSV file from the first sample on: ``t_s`` and six columns, in the sensor's
-    frame."""
-
-    connections: tuple[socket.socket, ...] = ()
-
-    def __init__(self, cell: Cell, path: Path):
-        from limber.recordings.time_series import read_stream
-
-        stream = read_stream(path)
-        if stream.values.shape[1] < 6:
-            raise InputError(f"{path} has {stream.values.shape[1]} columns besides time.",
-                             "A wrench has six.", "Give fx, fy, fz, tx, ty, tz.")
-        self._frame = frame_of(np.array(cell.sensor.pose))
-        self._times, self._values = stream.times - stream.times[0], stream.values[:, :6]
-        self._begin: float | None = None
-
-    def read(self, sample: Sample) -> Reading:
-        if self._begin is None:
-            self._begin = sample.clock
-        time_now = sample.clock - self._begin
-        row = max(int(np.searchsorted(self._times, time_now, side="right")) - 1, 0)
-        age = max(time_now - self._times[row], 0.0)
-        frame, wrench = self._frame, self._values[row]
-        return Reading(turned_wrench(frame[:3, :3], wrench, frame[:3, 3]), age, wrench)
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-
 def require_sensor(cell: Cell) -> None:
     """Refuse a cell without a force sensor that the guard can rely on: InputError if it names none,
     or a CB3's own estimate."""
@@ -354,17 +322,9 @@ def require_sensor(cell: Cell) -> None:
 
 
 def open_sensor(cell: Cell) -> ForceTorqueSensor:
-    """Return the cell's sensor. InputError as :func:`require_sensor`, or if the cell names a replay
-    for a real robot; WorkError if it does not answer."""
+    """Return the cell's sensor. InputError as :func:`require_sensor`; WorkError if it does not
+    answer."""
     require_sensor(cell)
-    if cell.sensor.kind == "replay":
-        if not cell.robot.address.startswith("127."):
-            raise InputError(f"The cell file replays forces from {cell.sensor.file}, but the "
-                             "robot is at "
-                             f"{cell.robot.address}.", "The guard would not feel the real "
-                             "branch.", "Replay only with the virtual robot (127.0.0.x), or name "
-                             "the mounted sensor.")
-        return ReplayedSensor(cell, Path(present(cell.sensor.file, "the file of a replay")))
     if cell.sensor.kind == "ft300_usb":
         return Ft300UsbSensor(cell)
     if cell.sensor.kind == "ft300":

@@ -219,10 +219,6 @@ def wrench_topic(cell: Cell, own: str = _USUAL.wrench) -> str:
     names none that is heard in ROS, or a CB3's own estimate."""
     require_sensor(cell)
     sensor = cell.sensor
-    if sensor.kind == "replay":
-        raise InputError(f"The cell file replays forces from {sensor.file}.",
-                         "The guard would not feel the branch of the robot in ROS.",
-                         "Name the mounted sensor in the cell file.")
     if sensor.kind == "controller":
         return sensor.topic or own
     if sensor.topic is None:
