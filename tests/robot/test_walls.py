@@ -130,3 +130,28 @@ def test_from_a_pause_at_something_stiff_it_goes_back_until_no_force_is_left():
         assert event["event"] == "reached", event
     assert wall.peak > CELL.limits.soft_force_n and wall.now == 0.0
     assert robot.controller.pose[:3] == pytest.approx(path.poses[0, :3], abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("again", ["the same driver", "another driver"])
+def test_a_sensor_zeroed_against_a_wall_is_known_on_the_way_back(again):
+    """An e-Series zeroes its sensor as the program starts anew: the force falls, not rises."""
+    robot, wall, path = facing_a_wall(0.05, 2e4, predicted=False)
+    rows = []
+    with robot.here(), RobotLink(CELL) as first:
+        first.wait_for_samples()
+        first.tare(0.3)
+        assert first.follow(path)["event"] == "paused"
+        robot.controller.stop_program("pendant")
+        robot.rest(0.2)
+        pressed = wall.now
+        if again == "another driver":
+            first.close()
+        with RobotLink(CELL, rows.append) if first.process.poll() is not None else first as link:
+            event = link.retreat()
+            robot.rest(0.2)
+        assert event["event"] == "reached", event
+    assert pressed > 8.0 and wall.now == 0.0
+    if rows:
+        forces = np.linalg.norm(np.concatenate(rows)[:, 13:16], axis=1)
+        assert forces[101:110].mean() == pytest.approx(pressed, rel=0.1) and forces[-1] < 0.5

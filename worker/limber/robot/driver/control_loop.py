@@ -14,19 +14,21 @@ import numpy as np
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
-from limber.core.numerics.rigid_kernels import frame_of, pose_of, turn_between
 from limber.robot.controller_settings import require_tool
 from limber.robot.driver.controls import control_of
 from limber.robot.driver.force_samples import (
+    LEVEL_READINGS,
     Following,
     ForceTorqueSensor,
     HoldUps,
     Senses,
     UnderWay,
     WrenchChain,
+    guard_of,
     open_sensor,
+    rehearse,
 )
-from limber.robot.driver.guard import Guard, GuardSettings, State
+from limber.robot.driver.guard import State
 from limber.robot.driver.real_time import (
     CONNECT_SECONDS,
     RenewedDeadline,
@@ -59,8 +61,8 @@ class Driver:
         self.cell, self.tell = cell, words.tell
         self._control = control_of(cell)
         sensor = open_sensor(cell)
-        self.guard = _guard_of(cell, self._control)
-        _warm_up(cell, self._control, sensor)
+        self.guard = guard_of(cell)
+        level = _warm_up(cell, self._control, sensor)
         # Now: if it has just compiled, this takes longer than the watchdog would wait.
         self.facts = self._control.facts | {
             "real_time": claim_real_time(), "kept_in_memory": spare_what_is_loaded(),
@@ -75,7 +77,7 @@ class Driver:
         self._hold_ups = HoldUps(self._quiet, self.tell)
         self._under_way = UnderWay(self._control, self.guard, self.tell)
         self._senses = Senses(cell, self._control, sensor, self.guard, self._under_way,
-                              self._hold_ups, self.tell)
+                              self._hold_ups, self.tell, level)
         self._command = np.zeros(6)
         self._last: Sample | None = None
         self._heard = time.monotonic()
@@ -217,24 +219,30 @@ class Driver:
         if sample.slider <= 0.0:
             raise SafetyStop("The speed slider is at 0.", "The robot would not move.",
                              "Raise it on the pendant.")
-        if not self._control.program_runs():
-            self._start_program()
-
-    def _start_program(self) -> None:
-        """Start the control program once more, and check that it runs."""
-        started = self._control.start_program()
-        self._deadline.renew()
         deadline = time.monotonic() + _PROGRAM_SECONDS
-        while not (self._control.program_runs()
-                   and self._require_sample().program_runs):
-            if not started or time.monotonic() > deadline:
-                raise WorkError("The control program is not running.", "", "See the pendant.")
-            self._deadline.renew()
-            for sample in self._control.read(1.0 / self._control.rate):
-                self._senses.look(sample)
-                self._last = sample
+        if not self._control.program_runs():
+            self._start_program(deadline)
+        while not self._senses.knows_zero:
+            self._control.keep_alive()
+            self._look_on(deadline)
+
+    def _start_program(self, deadline: float) -> None:
+        """Start the control program once more, and check that it runs."""
+        level = self._senses.level
+        started = self._control.start_program()
+        while not (self._control.program_runs() and self._require_sample().program_runs):
+            self._look_on(deadline if started else -np.inf)
+        self._senses.program_started(level)
         # Each program begins without a watchdog.
         self._control.watch()
+
+    def _look_on(self, deadline: float) -> None:
+        if time.monotonic() > deadline:
+            raise WorkError("The control program is not running.", "", "See the pendant.")
+        self._deadline.renew()
+        for sample in self._control.read(1.0 / self._control.rate):
+            self._senses.look(sample)
+            self._last = sample
 
     def _move(self, step: float) -> None:
         """Send the next target, ``step`` [s] of the controller's time after the last one."""
@@ -308,30 +316,18 @@ def _ordered(order: dict[str, Any]) -> Trajectory:
         None if joints is None else np.array(joints, float), by_joints=joints is not None)
 
 
-def _guard_of(cell: Cell, control: ArmControl) -> Guard:
-    return Guard(cell.arm, GuardSettings.of_cell(cell, control.rate), control.rate)
-
-
-def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> None:
-    """Run the loop's functions once: compiling during a motion would starve the watchdog."""
+def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> np.ndarray | None:
+    """Run the loop's functions once: compiling during a motion would starve the watchdog. Return
+    the level of the controller's own sensor, as :meth:`.WrenchChain.level`."""
     samples: list[Sample] = []
-    while len(samples) < 3:
+    while len(samples) < LEVEL_READINGS:
         samples += control.read(1.0)
-    guard, chain = _guard_of(cell, control), WrenchChain(cell)
-    base = frame_of(np.array(cell.base.pose))
-    guard.tared(np.zeros((3, 3)))
-    guard.hold(np.zeros(3))
-    guard.begin()
-    for sample in samples:
-        reading = sensor.read(sample)
-        now, _ = chain.wrench(sample, reading)
-        guard.look(sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]),
-                   expected=now, uncertainty=np.eye(6), grasp=sample.pose[:3])
-        turn_between(sample.pose, sample.pose)
-        guard.state = State.MOVING
-        guard.permit(sample.pose, sample.pose + 1e-3, 0.002)
-        pose_of(base @ frame_of(sample.pose))
+    readings = [sensor.read(sample) for sample in samples]
+    for sample, reading in zip(samples, readings, strict=True):
+        rehearse(cell, sample, reading)
     _walk_back(samples[0], RetreatPath(cell.arm.joint_names))
+    return None if cell.sensor.kind != "controller" else np.mean(list(map(
+        WrenchChain(cell).level, samples, readings)), axis=0)
 
 
 def _walk_back(sample: Sample, retreat: RetreatPath) -> None:

@@ -20,7 +20,7 @@ from limber.core.numerics.rigid_kernels import (
     turned_wrench,
     weight_wrench,
 )
-from limber.robot.driver.guard import Decision, Guard, Verdict
+from limber.robot.driver.guard import Decision, Guard, GuardSettings, State, Verdict
 from limber.robot.interface import ArmControl, Sample
 from limber.robot.motion.retreat import FollowedPathFile, RetreatPath, read_followed_path
 from limber.robot.motion.trajectory import Trajectory
@@ -357,6 +357,18 @@ class WrenchChain:
         """Return the delay of the smoothed wrench [s]."""
         return 0.5 * (self.count - 1) / rate
 
+    def level(self, sample: Sample, reading: Reading) -> np.ndarray:
+        """Return what only load and zero of the controller's own sensor change of a reading, shape
+        [6]: without the payload that it computes away."""
+        rotation = (frame_of(sample.pose) @ self._from_tool)[:3, :3]
+        centre = np.zeros(3) if sample.payload_centre is None else sample.payload_centre
+        return reading.wrench + weight_wrench(sample.payload or 0.0, centre, rotation)
+
+    def zeroed(self, change: np.ndarray) -> None:
+        """The sensor's zero has changed every reading by ``change`` [6]."""
+        self.bias = self.bias + change
+        self._recent.clear()
+
     def start_tare(self) -> None:
         """Collect readings of the empty, resting gripper."""
         self._taring = []
@@ -417,6 +429,26 @@ class WrenchChain:
         return weight_wrench(tool.mass_kg or 0.0, np.array(tool.centre_of_mass_m), flange[:3, :3])
 
 
+def guard_of(cell: Cell, **others: float) -> Guard:
+    """Return the guard of a cell, with other settings than usual."""
+    return Guard(cell.arm, GuardSettings.of_cell(cell, cell.arm.rate, **others), cell.arm.rate)
+
+
+def rehearse(cell: Cell, sample: Sample, reading: Reading) -> None:
+    """Judge a sample once: compiling or loading must not delay a motion."""
+    guard = guard_of(cell)
+    guard.tared(np.zeros((3, 3)))
+    guard.hold(np.zeros(3))
+    guard.begin()
+    now, _ = WrenchChain(cell).wrench(sample, reading)
+    guard.look(sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=now,
+               uncertainty=np.eye(6), grasp=sample.pose[:3], sent=sample.pose[:3])
+    turn_between(sample.pose, sample.pose)
+    guard.state = State.MOVING
+    guard.permit(sample.pose, sample.pose + 1e-3, 0.002)
+    pose_of(frame_of(np.array(cell.base.pose)) @ frame_of(sample.pose))
+
+
 def parsed_message(message: str) -> np.ndarray | None:
     """Return the six numbers of one FT300 message (no brackets), or None if it is incomplete."""
     parts = message.split(",")
@@ -431,6 +463,9 @@ def parsed_message(message: str) -> np.ndarray | None:
 _BATCH_SECONDS = 0.02
 _OLDEST_READING_SECONDS = 0.05
 _STANDING_SECONDS = 0.1  # over which the force of a resting branch is averaged
+LEVEL_READINGS = 25
+"""Readings before and after a program's start that tell how the sensor's zero has changed."""
+_SETTLING = 75  # readings in between, which may not know of it yet
 _NOTHING = np.full(6, np.nan)
 _UPPER = np.triu_indices(3)
 
@@ -440,7 +475,10 @@ class Senses:
     wrench, branch frame [N, N m], shape [6]; ``retreat_path``: the arm's path so far."""
 
     def __init__(self, cell: Cell, control: ArmControl, sensor: ForceTorqueSensor, guard: Guard,
-                 under_way: UnderWay, hold_ups: HoldUps, tell: Callable[..., None]):
+                 under_way: UnderWay, hold_ups: HoldUps, tell: Callable[..., None],
+                 level: np.ndarray | None):
+        """``level`` [6] of readings before the program's start, as :meth:`WrenchChain.level`, if it
+        zeroes the sensor."""
         self._base = frame_of(np.array(cell.base.pose))
         self._rate, self._lookahead = control.rate, control.lookahead
         self._sensor, self._guard = sensor, guard
@@ -453,6 +491,9 @@ class Senses:
         if followed is not None and followed.bias is not None:
             # The tare of an earlier program: a retreat is judged by it.
             self._chain.bias = followed.bias
+        self._levels = deque[np.ndarray](maxlen=_SETTLING + LEVEL_READINGS)
+        self._level = level if self._recalls_tare else None
+        self._is_zeroed = level is not None
         self.smooth = _NOTHING
         self._held_for: np.ndarray | None = None
         self._held_at = np.zeros(6)
@@ -490,6 +531,8 @@ class Senses:
         except ConnectionError as error:
             self._under_way.judge(self._guard.event(str(error)))
             return
+        if self._is_zeroed:
+            self._find_zero(sample, reading)
         now, self.smooth = self._chain.wrench(sample, reading)
         # First the part that must not wait for the rest.
         self._under_way.judge(self._guard.feel(now), sample)
@@ -533,8 +576,7 @@ class Senses:
             self._sensor.connections = ()
             self._under_way.judge(self._guard.event(str(error)))
             return
-        self._under_way.judge(self._guard.feel(self._chain.between(sample, reading)),
-                              at_once=True)
+        self._under_way.judge(self._guard.feel(self._chain.between(sample, reading)), at_once=True)
 
     def _expected(self, trajectory: Trajectory, time: float, planned: np.ndarray,
                   pose: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -548,6 +590,32 @@ class Senses:
                               turn_between(planned, pose) - turn_between(rest, self._held_at)))
         turn = self._base[:3, :3]
         return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), covariance
+
+    @property
+    def level(self) -> np.ndarray | None:
+        """Level of the last readings, to be taken before a program starts; None if that changes
+        none."""
+        return np.mean([*self._levels][-LEVEL_READINGS:], axis=0) if self._levels else None
+
+    def program_started(self, level: np.ndarray | None) -> None:
+        """A program was started under load, where readings had this :attr:`level`."""
+        self._level = level
+        self._levels.clear()
+
+    @property
+    def knows_zero(self) -> bool:
+        """Whether the tare is right for the readings of this program."""
+        return self._level is None
+
+    def _find_zero(self, sample: Sample, reading: Reading) -> None:
+        """An e-Series zeroes its sensor at each program's start, under load as well: what was
+        nothing at the tare is another reading from now on."""
+        self._levels.append(self._chain.level(sample, reading))
+        if self._level is not None and len(self._levels) == self._levels.maxlen:
+            self._chain.zeroed(self.level - self._level)
+            self._level = None
+            self._standing = self._chain.wrench(sample, reading)[0][:3]
+            self.followed_file.tared(self._chain.bias)
 
     def begin_tare(self, sample: Sample, seconds: float) -> None:
         """Tare the force over the next ``seconds`` [s]; SafetyStop if the robot moves."""
@@ -572,7 +640,7 @@ class Senses:
             self._tell(event="refused", order="tare", reason=str(error))
             return
         self._guard.tared(self._chain.at_rest)
-        self._is_tared, self._standing = True, np.zeros(3)
+        self._is_tared, self._standing, self._level = True, np.zeros(3), None
         self.followed_file.tared(self._chain.bias)
         self._tell(event="tared", bias=self._chain.bias.tolist(), sigma=sigma.tolist(),
                    delay_s=self._chain.delay(self._rate), noise_n=self._guard.noise)

@@ -276,8 +276,7 @@ class LiveForce:
     def take(self, samples: np.ndarray) -> None:
         """Take a batch of samples [n, 37], as in :data:`limber.robot.driver.link.COLUMNS`."""
         forces = np.linalg.norm(samples[:, _SMOOTH], axis=1)
-        forces = np.where(np.isfinite(forces), forces,
-                          np.linalg.norm(samples[:, _FORCE], axis=1))
+        forces = np.where(np.isfinite(forces), forces, np.linalg.norm(samples[:, _FORCE], axis=1))
         if np.isfinite(forces).any():
             self._peak = max(self._peak, float(np.nanmax(forces)))
         self._force = float(forces[-1])

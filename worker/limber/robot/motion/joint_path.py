@@ -132,8 +132,7 @@ def _turned_near(path: JointPath, start: np.ndarray, limits: np.ndarray) -> Join
     # An arm a full turn away from the limits' middle may stay there if it fits.
     fits = inside | (_margins(moved, limits).min(axis=0) > 0.05)
     joints = path.joints + np.where(fits, turns, 0.0)
-    return JointPath(path.branch, joints, path.singularity,
-                     float(_margins(joints, limits).min()))
+    return JointPath(path.branch, joints, path.singularity, float(_margins(joints, limits).min()))
 
 
 def _margins(joints: np.ndarray, limits: np.ndarray) -> np.ndarray:

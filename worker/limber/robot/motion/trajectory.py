@@ -88,8 +88,7 @@ class ExpectedWrench:
     def nothing(cls, poses: np.ndarray) -> "ExpectedWrench":
         """Return the wrenches of an empty gripper that passes through ``poses`` [n, 6]."""
         count = len(poses)
-        return cls(np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6)),
-                   poses[0])
+        return cls(np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6)), poses[0])
 
     def reversed(self) -> "ExpectedWrench":
         """Return the same in reverse order."""

@@ -19,8 +19,14 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import SafetyStop, WorkError
 from limber.core.numerics.rigid import pose_vectors
 from limber.core.numerics.rigid_kernels import frame_of, turn_between, turned_wrench
-from limber.robot.driver.force_samples import HoldUps, Reading, WrenchChain
-from limber.robot.driver.guard import GO, SAFETY_MODES, Decision, Guard, GuardSettings, Verdict
+from limber.robot.driver.force_samples import (
+    HoldUps,
+    Reading,
+    WrenchChain,
+    guard_of,
+    rehearse,
+)
+from limber.robot.driver.guard import GO, SAFETY_MODES, Decision, Verdict
 from limber.robot.driver.real_time import spare_what_is_loaded
 from limber.robot.interface import Sample
 from limber.robot.motion.retreat import (
@@ -70,8 +76,7 @@ class RosRobot:
                  on_sample: Callable[[float, np.ndarray, np.ndarray], None] | None = None):
         self._cell, self._bridge, self._topics = cell, bridge, topics
         self._on_sample = on_sample
-        self.guard = Guard(cell.arm, GuardSettings.of_cell(cell, cell.arm.rate,
-                                                           off_path=_OFF_PATH_M), cell.arm.rate)
+        self.guard = guard_of(cell, off_path=_OFF_PATH_M)
         self._chain = WrenchChain(cell)
         self._sensor = frame_of(np.array(cell.sensor.pose))
         self._base = frame_of(np.array(cell.base.pose))
@@ -176,7 +181,8 @@ class RosRobot:
                              "Follow the approach first, then close the gripper.")
         self._chain.bias = followed.bias
         self._kept.tared(followed.bias)
-        self._warm_up()
+        assert self.last is not None and self._reading is not None
+        rehearse(self._cell, self.last, self._reading)
         self.guard.tared()
 
     def tare(self, seconds: float = 0.5) -> np.ndarray:
@@ -189,24 +195,12 @@ class RosRobot:
                 assert self._reading is not None
                 self._chain.wrench(sample, self._reading)
         sigma = self._chain.end_tare()
-        self._warm_up()
+        assert self.last is not None and self._reading is not None
+        rehearse(self._cell, self.last, self._reading)
         self.guard.tared(self._chain.at_rest)
         self._kept.begin()
         self._kept.tared(self._chain.bias)
         return sigma
-
-    def _warm_up(self) -> None:
-        """Judge the present samples once: compiling or loading must not delay a motion."""
-        assert self.last is not None and self._reading is not None
-        guard = Guard(self._cell.arm, GuardSettings.of_cell(self._cell, self._cell.arm.rate),
-                      self._cell.arm.rate)
-        guard.tared(np.zeros((3, 3)))
-        guard.hold(np.zeros(3))
-        guard.begin()
-        now, _ = self._chain.wrench(self.last, self._reading)
-        guard.look(self.last, wrench=now, raw=np.stack([self._reading.raw] * 2), expected=now,
-                   uncertainty=np.eye(6), grasp=self.last.pose[:3], sent=self.last.pose[:3])
-        turn_between(self.last.pose, self.last.pose)
 
     def follow(self, trajectory: Trajectory, *, goes_on: bool = False,
                check: PullPlausibility | None = None) -> dict[str, Any]:

@@ -60,7 +60,8 @@ class UrControl(SampleStream):
         model = ask("get robot model")
         facts = {"address": self.address, "version": version, "model": model,
                  "serial": ask("get serial number"),
-                 "remote": _yes_or_no(ask("is in remote control")),
+                 # None if it does not know the question, as a CB3.
+                 "remote": {"true": True, "false": False}.get(ask("is in remote control")),
                  "rate_hz": self.rate}
         known = model.lower()
         if known.startswith("ur") and known != arm.name.rstrip("e"):
@@ -144,8 +145,7 @@ class UrControl(SampleStream):
         if self._outputs is None:
             raise InputError("Limber does not drive the cell's gripper.",
                              f"tool.gripper is {tool.gripper}.", "Close and open it by hand.")
-        _require(self._outputs.setStandardDigitalOut(tool.close_output, close),
-                 "drive its gripper")
+        _require(self._outputs.setStandardDigitalOut(tool.close_output, close), "drive its gripper")
 
     def put_back(self) -> str | None:
         """Restore tool and payload; returns in words what failed."""
@@ -173,11 +173,6 @@ class UrControl(SampleStream):
             self._gripper.close()
         super().close()
         self._dashboard.close()
-
-
-def _yes_or_no(answer: str) -> bool | None:
-    """Whether a controller says yes; None if it does not know the question, as a CB3."""
-    return {"true": True, "false": False}.get(answer)
 
 
 def _first_sample(stream: SampleStream) -> Sample:

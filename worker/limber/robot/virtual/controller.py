@@ -328,6 +328,7 @@ class Controller:
         self.outputs_double = [0.0] * 48
         self.digital_outputs, self.gripper_output = 0, 0
         self.log: deque[str] = deque(maxlen=200)
+        self._zeroes = False
         self._reading = np.zeros(6)
         self._update_tool()
 
@@ -376,6 +377,9 @@ class Controller:
         weight = weight_wrench(self.mass, self.centre, rotation)
         supposed = weight_wrench(self.payload, self.payload_centre, rotation)
         fault = self.fault
+        if self._zeroes:
+            self._zeroes = False
+            self.sensor.zero(held + weight - supposed)
         if not fault.frozen:
             reading = self.sensor.read(held + weight - supposed, self.seconds) + fault.added
             # Reported in the base's axes, the torque about the tool's centre.
@@ -476,7 +480,9 @@ class Controller:
                 and self.robot_mode == RobotMode.RUNNING)
 
     def load_script(self, text: str) -> None:
-        """Run an uploaded script, ending the running one; refused in local control."""
+        """Run an uploaded script, ending the running one; refused in local control. An e-Series
+        then zeroes its own sensor, whatever it carries ("it is zeroed every time you start a
+        program": Universal_Robots_ROS_Driver, issue 512, by the maker)."""
         if not self.remote:
             self.say("script refused: not in remote control")
             return
@@ -487,6 +493,7 @@ class Controller:
         self.watchdog = None
         self.outputs_int = [0] * 48
         self.program, self.paused = ControlProgram(text), False
+        self._zeroes = self.arm.measures_force
 
     def stop_program(self, reason: str) -> None:
         """End the program and brake the arm."""

@@ -60,6 +60,10 @@ class ForceSensor:
         self._sigma = np.r_[np.full(3, traits.force_sigma), np.full(3, traits.torque_sigma)]
         self.gain = 1.0 + traits.gain_sigma * float(rng.standard_normal())
 
+    def zero(self, wrench: np.ndarray) -> None:
+        """Read nothing at this wrench [6] from here on, but noise and drift."""
+        self._bias, self._drift = -self.gain * wrench, 0.0
+
     def read(self, wrench: np.ndarray, seconds: float) -> np.ndarray:
         """Return a reading, ``seconds`` after the last one, shape [6] in N and N m."""
         self._drift += self.traits.drift_n_per_minute / 60.0 * seconds
@@ -121,8 +125,7 @@ class RobotiqRegisters:
 
     def __init__(self, drive: Callable[[bool], None], load_state: Callable[[], str]):
         self._drive, self._load_state = drive, load_state
-        self.values = {"ACT": 1, "GTO": 0, "POS": 0, "SPE": 0, "FOR": 0, "STA": ACTIVATED,
-                       "FLT": 0}
+        self.values = {"ACT": 1, "GTO": 0, "POS": 0, "SPE": 0, "FOR": 0, "STA": ACTIVATED, "FLT": 0}
         self._is_closed = False
 
     def answer(self, line: str) -> bytes:

@@ -169,8 +169,7 @@ class Server:
         Raises:
             WorkError: a port is in use.
         """
-        ports: dict[int, Callable[[Any, Any], Awaitable[None]]] = {
-            SCRIPT_PORT: self._serve_scripts}
+        ports: dict[int, Callable[[Any, Any], Awaitable[None]]] = {SCRIPT_PORT: self._serve_scripts}
         if self.controller.calibration is not None:
             ports[PRIMARY_PORT] = self._serve_primary
         if self.controller.robotiq is not None:
