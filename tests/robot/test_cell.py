@@ -9,6 +9,7 @@ import tomlkit
 from tests.subjects.commands import answer
 
 from limber.cell.cell_file import Cell, read_cell, write_cell
+from limber.cli.commands.robot.new_cell import NewCell
 from limber.cli.main import call
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
@@ -218,6 +219,17 @@ def test_a_new_cell_says_what_is_to_be_filled_in_instead_of_zero(tmp_path, capfd
     path.write_text(text.replace("# grasp_pose =", "grasp_pose =", 1).replace(
         "# mass_kg =", "mass_kg ="), encoding="utf-8")
     assert read_cell(path).tool.mass_kg == 0.9
+
+
+def test_a_new_cell_asks_at_a_terminal_for_sensor_grasp_and_base(tmp_path, monkeypatch):
+    typed = {"Model": "ur10", "Force": "ft300", "How": "robotiq", "Mass": "1.1",
+             "Distance": "0.2", "Pose": "0.5, 0.2 0 0 0 1.5"}
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda asked: typed.get(asked.split()[0], ""))
+    NewCell(cell_file=tmp_path / "new.toml").run()
+    cell = read_cell(tmp_path / "new.toml")
+    assert (cell.sensor.kind, cell.sensor.force_range_n, cell.tool.mass_kg) == ("ft300", 300, 1.1)
+    assert cell.base.pose == (0.5, 0.2, 0, 0, 0, 1.5) and cell.tool.grasp_pose[2] == 0.2
 
 
 @pytest.mark.parametrize("options, rated", [

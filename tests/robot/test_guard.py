@@ -127,8 +127,7 @@ def test_before_the_tare_the_bias_is_no_force_and_nothing_moves():
     guard = Guard(ARM, GuardSettings(LIMITS, ARM.joint_limits, BOX), 500.0)
     bench = Bench()
     bias = np.array([30.0, 0, 0, 0, 0, 0])
-    assert guard.look(bench.sample(), wrench=bias, raw=np.stack([bias, bias])
-                      ).verdict == Verdict.GO
+    assert guard.look(bench.sample(), wrench=bias, raw=np.stack([bias, bias])).verdict == Verdict.GO
     with pytest.raises(SafetyStop, match="not tared"):
         guard.begin()
     guard.tared()

@@ -61,8 +61,7 @@ class BugReport(Tool):
         try:
             with replacing(output) as stream, zipfile.ZipFile(
                     stream, "w", zipfile.ZIP_DEFLATED) as archive:
-                archive.writestr("report.json",
-                                 json.dumps(plain(told), indent=1, default=str))
+                archive.writestr("report.json", json.dumps(plain(told), indent=1, default=str))
                 for path, name in names.items():
                     if path not in kept and (name == MANIFEST or (
                             self.data and path.resolve() != output.resolve())):

@@ -115,8 +115,7 @@ class RosScan(_RosTool):
             raise InputError(f"The clouds on {self.topic} have no point within camera.range_m.",
                              "", "Check the camera and [camera] in the cell file.")
         Cloud(points, {}).write_ply(self.output)
-        return {"cloud": str(self.output), "point_count": len(points),
-                "view_count": self.views}
+        return {"cloud": str(self.output), "point_count": len(points), "view_count": self.views}
 
 
 class RosFollow(_RosTool, ArmedTool):
@@ -276,8 +275,7 @@ class RosGripper(_RosTool):
         from limber.robot.ros.bridge import SECONDS, Bridge, drive
 
         cell = self.cell()
-        result: dict[str, Any] = {"armed": self.arm, "action": self.action,
-                                  "wanted": self.position}
+        result: dict[str, Any] = {"armed": self.arm, "action": self.action, "wanted": self.position}
         if not self.arm:
             return result
         require_word("gripper", self.confirm, "A bent branch springs back where it opens.",

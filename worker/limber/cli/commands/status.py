@@ -17,8 +17,7 @@ def _states(values: Mapping[str, Any]) -> str:
 
 
 def _next(values: Mapping[str, Any]) -> str:
-    return f"next  limber batch {shlex.quote(str(values['job_file']))}" if values[
-        "waiting"] else ""
+    return f"next  limber batch {shlex.quote(str(values['job_file']))}" if values["waiting"] else ""
 
 
 class Status(Tool):

@@ -128,8 +128,7 @@ def _pictures_of(asked: Calibrate, cell: Cell, images_file: Path, progress: Prog
                          Option("squares"), " and ", Option("dictionary"), " against what was "
                          "printed.")
     robot = poses[[view is not None for view in found]]
-    fit, pixels = fit_pictures(robot, views, cell.camera, asked.camera_on,
-                               asked.largest_residual)
+    fit, pixels = fit_pictures(robot, views, cell.camera, asked.camera_on, asked.largest_residual)
     return fit, {"residual_px": float(np.sqrt(np.mean(pixels**2))), "pictures": [
         {"name": view.name, "residual_px": float(off), "corners": len(view.corners)}
         for view, off in zip(views, pixels, strict=True)]}

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from limber.cell.cell_file import Cell, SensorEntry, ToolEntry, cell_template, not_stated, slips
 from limber.cell.known_arms import arm_named
@@ -15,8 +15,9 @@ from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.stages.stage import About, Tool, argument, given
 
-_ASKED = ("model", "address", "sensor", "gripper", "mass_kg", "grasp_distance")
-_USUAL = {"model": "ur5e", "address": "127.0.0.1", "gripper": "by_hand"}
+_ASKED = ("model", "address", "sensor", "gripper", "mass_kg", "grasp_distance", "base")
+_USUAL: dict[str, Any] = {"model": "ur5e", "address": "127.0.0.1", "gripper": "by_hand",
+                          "base": (0.6, 0.1, 0.0, 0.0, 0.0, 1.2)}
 _RATED = {"ft300": (300.0, 30.0), "ur3e": (30.0, 10.0), "ur5e": (50.0, 10.0),
           "ur10e": (100.0, 10.0), "ur16e": (160.0, 10.0)}
 """Ranges [N, N m] by the makers' data sheets; other arms have the usual ones of a cell file."""
@@ -42,6 +43,9 @@ class NewCell(Tool):
     mass_kg: float | None = given("Mass of the gripper with the sensor [kg].")
     grasp_distance: float | None = given("Distance from the flange to the middle of the fingers "
                                          "[m].")
+    base: tuple[float, float, float, float, float, float] | None = Field(
+        None, description="Pose of the robot's base in the branch's frame [m, rad], until `limber "
+        "robot calibrate` finds it.", json_schema_extra={"metavar": "X Y Z RX RY RZ"})
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         if self.cell_file.exists():
@@ -58,7 +62,7 @@ class NewCell(Tool):
         kind = told.sensor or ("controller" if arm.measures_force else "ft300")
         force, torque = _RATED.get(arm.name if kind == "controller" else kind[:5], (100.0, 10.0))
         cell = Cell(robot={"model": told.model, "address": told.address},
-                    base={"pose": (0.6, 0.1, 0.0, 0.0, 0.0, 1.2)}, sensor=SensorEntry(
+                    base={"pose": told.base}, sensor=SensorEntry(
                         kind=kind, force_range_n=force, torque_range_nm=torque,
                         device="/dev/ttyUSB0" if kind == "ft300_usb" else None))
         # Not validated together before it is complete.
@@ -81,4 +85,5 @@ class NewCell(Tool):
         if value is not None or not sys.stdin.isatty():
             return usual if value is None else value
         about = (type(self).model_fields[name].description or name).rstrip(".")
-        return input(f"{about} [{usual or 'not known yet'}]: ").strip() or usual
+        typed = input(f"{about} [{usual or 'not known yet'}]: ").strip()
+        return (typed.replace(",", " ").split() if name == "base" else typed) or usual
