@@ -281,7 +281,7 @@ def test_a_missing_folder_is_refused(tmp_path):
 def test_settings_are_listed():
     """All of a verb's and no more; required ones are marked; a verb goes by its command's name."""
     known = limber.settings("energy_field")
-    assert set(known) == {"samples", "field_error", "deflection", "seed", "forward", "force"}
+    assert set(known) == {"samples", "field_error", "deflection", "seed", "force"}
     assert known["samples"].default == 225 and "  samples = 225: Number" in repr(known)
     assert known._repr_html_().count("<tr>") == len(known) + 1
     assert limber.settings("add_pull")["source"].default == "required"

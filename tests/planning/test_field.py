@@ -192,16 +192,18 @@ def test_saved_field_is_the_same(tmp_path, ridge_field):
 @pytest.mark.parametrize(("name", "change"), [
     ("chart_layers", lambda values: values[:1]),
     ("chart_layers", lambda values: np.repeat(values, 2, axis=0)),
-    ("energy_fit_value_weights", lambda values: values * 1e300)])
+    ("chart_layers", lambda values: -values),
+    ("shape_fit_kernel", lambda _: np.array("cubist")),
+    ("energies_j", lambda values: values * 1e300)])
 def test_a_field_of_odd_numbers_is_refused(tmp_path, ridge_field, name, change):
-    """One chart too many or too few, weights whose sums are not finite."""
+    """One chart too many or too few, no chart, no kernel, energies whose sums are not finite."""
     path = tmp_path / "energy.npz"
     ridge_field.write(path)
     with np.load(path, allow_pickle=False) as file:
         arrays = {key: file[key] for key in file.files}
     arrays[name] = change(arrays[name])
     np.savez(path, **arrays)
-    with pytest.raises(InputError, match=r"is not an energy field|energy_fit_value_weights has"):
+    with pytest.raises(InputError, match=r"is not an energy field|energies_j has"):
         EnergyField.read(path)
 
 

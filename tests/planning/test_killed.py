@@ -78,7 +78,7 @@ def assert_clean(folder: Path) -> None:
 def test_a_killed_energy_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
     """Earlier results stand; the next run sweeps what was left, and finds what it always finds."""
     before = (folder / "energy.npz").read_bytes()
-    code = killed_at_work(command("energy", folder, "--samples", 400), kind)
+    code = killed_at_work(command("energy", folder, "--samples", 2200), kind)
     assert code == (130 if kind == signal.SIGTERM else -kind)
     assert (folder / "energy.npz").read_bytes() == before
     run("energy", folder, "--samples", "60", "--force")

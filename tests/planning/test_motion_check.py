@@ -158,7 +158,10 @@ def test_a_plan_to_a_region_ends_less_deep_once_the_field_knows_its_end(to_regio
     deep, cancelled = ends_with(NoPathError), ends_with(Cancelled)
     assert len(deep.summary["rounds"]) == 1
     assert again.summary["certificate"]["upper_bound"] < (
-        0.99 * deep.summary["certificate"]["upper_bound"])
+        0.995 * deep.summary["certificate"]["upper_bound"])
+    middle = again.summary["goal"]["position_m"]
+    off = [np.linalg.norm(found.plan.solved.tips[-1] - middle) for found in (again, deep)]
+    assert off[0] > off[1] + 1e-3
     assert cancelled.summary["stopped"] and not deep.summary["stopped"]
     np.testing.assert_array_equal(cancelled.plan.solved.poses, deep.plan.solved.poses)
     for found in (again, deep, cancelled):

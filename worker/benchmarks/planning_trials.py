@@ -32,7 +32,7 @@ from limber.planning.cost import CostWeights, arc_lengths, resample
 from limber.planning.field.energy_field import EnergyField, limited
 from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.planning.field.radial import LocalError
-from limber.planning.field.sampling import SolverPool, solve_branch
+from limber.planning.field.sampling import solve_branch
 from limber.planning.field.stored_states import samples_of
 from limber.planning.goals.goal import CellPlace, GoalRequest
 from limber.planning.goals.goal_kinds import GraspGoal, default_goal, goal_of, near
@@ -58,7 +58,7 @@ class Subject:
 
 def arcs() -> list[Subject]:
     """Return the paper's branches with its moduli, too soft to bear their own weight."""
-    return [_arc(branch) for branch in BRANCHES]
+    return [arc_of(branch=branch) for branch in BRANCHES]
 
 
 def forked(seed: int, count: int, progress: Progress = SILENT) -> list[Subject]:
@@ -78,10 +78,11 @@ def forked(seed: int, count: int, progress: Progress = SILENT) -> list[Subject]:
     return found
 
 
-def _arc(branch: PaperBranch) -> Subject:
-    skeleton = branch.skeleton
-    return _subject(branch.name, branch.mesh(slice_length=2.0, sides=6), skeleton,
-                    np.array(branch.young), branch.poisson, None)
+def arc_of(slice_length: float = 2.0, sides: int = 6, branch: PaperBranch = BRANCHES[1],
+           ) -> Subject:
+    """Return one of the paper's branches, in slices of that many radii."""
+    return _subject(branch.name, branch.mesh(slice_length=slice_length, sides=sides),
+                    branch.skeleton, np.array(branch.young), branch.poisson, None)
 
 
 def _subject(name: str, mesh: TetMesh, skeleton: Skeleton, young: np.ndarray, poisson: float,
@@ -445,8 +446,7 @@ def coverage(model: GraspModel, known: EnergyField, count: int, seed: int,
     overestimate is within its stated 95 % error, and the number of poses.
     """
     places = known.region.draw(count, np.random.default_rng(seed))
-    with SolverPool(model, 1) as solvers:
-        good, _ = solve_branch(solvers, places, progress=SILENT)
+    good, _ = solve_branch(model, places, workers=1)
     fresh = samples_of(good[1:], np.empty((0, 3)))
     chart, inner = known.region.chart.plain, ~known.region.is_face()
     values, limits = sampled_sizes(fresh), Limits(**dict.fromkeys(LIMITED, 1e9))

@@ -28,7 +28,6 @@ _PLACES = {
     "fit_field": "field.energy_field",
     "grasp_model_of": "field.grasp_model",
     "plan_motion": "make_plan",
-    "sample_branch": "field.sampling",
     "sample_field": "field.sampling",
     "sample_positions": "field.sampling",
 }

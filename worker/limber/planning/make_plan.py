@@ -31,7 +31,7 @@ from limber.planning.constraints.motion_check import (
 from limber.planning.cost import STEP, arc_lengths, resample
 from limber.planning.field.energy_field import UNITS, EnergyField, limited, refit
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.field.sampling import SolverPool, solve_branch
+from limber.planning.field.sampling import solve_branch
 from limber.planning.field.stored_states import GraspSamples, Solved, samples_of
 from limber.planning.goals.goal import CellPlace, Goal, GoalRequest
 from limber.planning.goals.goal_kinds import TargetGoal, goal_of, near
@@ -84,8 +84,7 @@ def checked_wall(field: EnergyField, grasp_model: GraspModel, limits: Limits, no
     points = np.concatenate([wall, _chosen(none.nearest)])
     if not len(points):
         return WallCheck(0, True)
-    with SolverPool(grasp_model, workers) as solvers:
-        good, _ = solve_branch(solvers, points, progress=progress)
+    good, _ = solve_branch(grasp_model, points, workers=workers, progress=progress)
     states = good[1:]
     if not states:
         return WallCheck(0, False)

@@ -10,7 +10,8 @@ from limber.core.progress import SILENT, Progress
 from limber.mechanics import StaticResult
 from limber.planning.cost import PathMeasures, measure_path, resample
 from limber.planning.field.grasp_model import GraspModel, refusal
-from limber.planning.field.stored_states import LOADS, straight_on
+from limber.planning.field.rod import RodState
+from limber.planning.field.stored_states import LOADS
 
 _APPROACH_STEP = 0.02  # [m] between poses on the path from rest to the start
 _MOST_UNSOLVED = 0.1  # fraction of a path's poses
@@ -121,13 +122,15 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
     """Solve the branch along ``path`` [n, 3], coming from rest along ``approach`` [k, 3]."""
     before, unsolved, reasons = [grasp_model.rest], [], []
     good: list[bool] = []
-    last: np.ndarray | None = None
+    rod_state: RodState | None = grasp_model.rod.rest
     state = grasp_model.rest.displacement
     ahead = resample(approach, _APPROACH_STEP)[1:-1]
     is_whole = True
     for number, point in enumerate(np.concatenate([ahead, path])):
         progress(number / (len(ahead) + len(path)), "path on the full model")
-        guess = None if last is None else straight_on(grasp_model, last, state, point)
+        # Beyond a fold of the rod the branch may be in another shape than it.
+        rod_state = rod_state and grasp_model.rod.followed(rod_state, point)[0]
+        guess = None if rod_state is None else grasp_model.rod.lifted(rod_state)
         result = grasp_model.follow(point[None], state, guess)[0]
         if reason := refusal(result):
             unsolved.append(point)
@@ -138,7 +141,7 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
                 break
             continue
         (before if number < len(ahead) else good).append(result)
-        last, state = state, result.displacement
+        state = result.displacement
     return ResolvedPath(
         SolvedPoses.of(grasp_model, good or before[-1:]), SolvedPoses.of(grasp_model, before),
         np.array(unsolved).reshape(-1, 3), tuple(reasons), is_whole)

@@ -21,7 +21,6 @@ class EnergySettings(Settings):
 
     groups: ClassVar[Groups] = {
         "samples": ("samples", "field_error", "deflection", "seed"),
-        "solver": ("forward",),
     }
     common: ClassVar[tuple[str, ...]] = ("samples", "field_error")
 
@@ -30,15 +29,11 @@ class EnergySettings(Settings):
         "where neighbouring solutions disagree."))
     field_error: float | None = Field(None, gt=0, description=(
         "Largest error of the energy [%] at samples excluded from the fit (root mean square). "
-        "Poses are added where the error is largest, up to four times --samples."))
+        "The number of poses is doubled, at most to four times --samples."))
     deflection: float = Field(0.4, gt=0, le=1.0, description=(
         "Largest distance from the rest position, as a fraction of the branch's length up to the "
         "grasp."))
     seed: int = Field(0, ge=0, description="Seed of the sampled positions.")
-    forward: Literal["full", "reduced"] = Field("full", description=(
-        "full: solve every pose on the full model. reduced: use the reduced model of `limber "
-        "session --mode point`, and train it first if there is none. The full model corrects "
-        "each state once and solves uncertain ones."))
 
 
 class EnergySpec(EnergySettings):

@@ -32,11 +32,11 @@ from limber.mechanics.model import BranchModel
 from limber.reduced.basis import Basis, make_basis
 from limber.reduced.reduced_model import ReducedModel, ReducedSettings
 from limber.reduced.strain_polynomial import StrainPolynomial, make_polynomial, reduced_mass
-from limber.reduced.training import Snapshots, Trainer, TrainingSettings, sample_poses, sample_young
+from limber.reduced.training import Snapshots, Trainer, sample_poses, sample_young
 
 # A reduced model as a file of plain arrays.
 
-FORMAT = 4
+FORMAT = 5
 
 
 def write_model(model: ReducedModel, path: Path,
@@ -55,8 +55,6 @@ def write_model(model: ReducedModel, path: Path,
         "training_young": model.training_young, "energies": model.energies,
         "young_spread": model.young_spread, "extent": model.extent,
         "error_names": list(model.error), "error_values": list(model.error.values())}
-    if model.strain_fields is not None:
-        arrays["strain_fields"] = model.strain_fields
     with open(path, "wb") as stream:
         np.savez(stream, **arrays, **(beside or {}))
 
@@ -82,8 +80,7 @@ def read_model(path: Path) -> ReducedModel:
         grasp, arrays["rest"], basis, polynomial, arrays["load"], arrays["weight_stiffness"],
         arrays["mass"], RayleighDamping(*arrays["damping"]), arrays["control_young"],
         arrays["poses"], arrays["training_young"], arrays["energies"],
-        float(arrays["young_spread"]), float(arrays["extent"]), error,
-        strain_fields=arrays.get("strain_fields"))
+        float(arrays["young_spread"]), float(arrays["extent"]), error)
 
 
 # Construction of a reduced model: full solutions at training grasps, and their span.
@@ -108,24 +105,22 @@ def build_reduced(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                              vibration_count=training.vibration_count,
                              progress=progress.part(0.0, 0.9))
     progress(0.9, "reducing", snapshots=len(snapshots))
-    reduced = reduce_snapshots(model, grasp, weights, control_young, snapshots, settings,
-                               keeps_strain=True)
+    reduced = reduce_snapshots(model, grasp, weights, control_young, snapshots, settings)
     progress(1.0, "reduced model ready", size=reduced.size)
     return reduced, snapshots
 
 
 def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                      control_young: np.ndarray, snapshots: Snapshots,
-                     settings: ReducedSettings, *, keeps_strain: bool = False) -> ReducedModel:
-    """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`. With
-    ``keeps_strain`` it has :meth:`ReducedModel.strains` and twice the size."""
+                     settings: ReducedSettings) -> ReducedModel:
+    """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`."""
     control_young = np.asarray(control_young, float)
     if not settings.vibration_count:
         snapshots = snapshots.without_vibrations()
     basis = make_basis(model, grasp, snapshots, settings.size,
                        settings.vibration_count if len(snapshots.vibrations) else 0)
-    polynomial, fields = make_polynomial(model, basis, weights, control_young, snapshots,
-                                         settings.field_count, keeps_fields=keeps_strain)
+    polynomial = make_polynomial(model, basis, weights, control_young, snapshots,
+                                 settings.field_count)
     flat = basis.columns.reshape(basis.size, -1)
     spread = float(np.exp(np.abs(np.log(snapshots.young / control_young)).max()))
     weight = model.weight_stiffness
@@ -134,7 +129,7 @@ def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
     return ReducedModel(
         grasp, model.mesh.nodes, basis, polynomial, flat @ model.weight_force.ravel(), carried,
         reduced_mass(model, basis), model.damping, control_young, snapshots.poses,
-        snapshots.young, snapshots.energy, max(spread, 1.0), model.extent, strain_fields=fields)
+        snapshots.young, snapshots.energy, max(spread, 1.0), model.extent)
 
 
 def as_control_points(model: BranchModel) -> tuple[np.ndarray, np.ndarray]:
@@ -156,9 +151,6 @@ def as_control_points(model: BranchModel) -> tuple[np.ndarray, np.ndarray]:
 
 LIMIT_BYTES = 2 << 30
 """Largest size of all models of a folder: a dozen for a branch of some thousand tetrahedra."""
-SHARED = ReducedSettings(size=80, vibration_count=1, field_count=130, training=TrainingSettings(
-    grasp_count=160, young_spread=1.0))
-"""Default training of a branch whose moduli are known."""
 SNAPSHOT_PREFIX = "snapshot_"
 _LEFT_OVER_SECONDS = 24 * 3600.0
 _WAIT_SECONDS = 0.5

@@ -138,7 +138,6 @@ class FoundState:
     novelty: float
     iterations: int
     potential: float
-    steady: bool = False  # every tangent along the path was positive definite
 
     def agrees(self, other: "FoundState") -> bool:
         """Whether both are the same equilibrium."""
@@ -152,10 +151,6 @@ class FoundState:
 
 _STATIC = ReducedStaticSettings()
 _NO_INCREMENT = np.empty(0)
-_LOST = 0.25
-"""Fraction of the potential's change in a step beyond its work above which the step counts as a
-jump, as for the full model (limber.mechanics.statics.equilibrium_path).
-"""
 _LEADING = 20
 """Modes that decide whether a state is like those of the training. Chosen, not measured."""
 
@@ -177,8 +172,6 @@ class ReducedModel:
         extent: Diagonal of the branch's bounding box [m].
         error: Held-out errors measured when it was built (limber.reduced.refresh).
         poisson: Poisson's ratio, if it differs from the training's.
-        strain_fields: What strain is made of, shape [tet_count, q, 6, m]; None where it was not
-            kept, and :meth:`strains` is not to be had.
     """
 
     grasp: Grasp
@@ -197,7 +190,6 @@ class ReducedModel:
     extent: float
     error: dict[str, float] = field(default_factory=dict)
     poisson: float | None = None
-    strain_fields: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.held = GraspCoordinates(self.grasp)
@@ -276,14 +268,6 @@ class ReducedModel:
         """Return that energy with the carried weight's [J]."""
         return self.strain_energy(q) + 0.5 * float(q @ self.weight_stiffness @ q)
 
-    def strains(self, q: np.ndarray) -> np.ndarray:
-        """Return the strain at the quadrature points as the model assumes it, [tet_count, q, 6] (00
-        11 22 01 02 12). Its error is a tenth of that of the displacement's strain."""
-        self.strain_energy(q)
-        shares = np.linalg.solve(self.root.T, self._work.strain).astype(np.float32)
-        fields = present(self.strain_fields, "strain field of the reduced model")
-        return (fields @ shares).astype(float)
-
     def displacement_of(self, q: np.ndarray) -> np.ndarray:
         """Return the displacement of all nodes [m], shape [node_count, 3]."""
         return np.tensordot(q, self.basis.columns, 1)
@@ -320,37 +304,6 @@ class ReducedModel:
                     or iterations >= settings.iteration_limit):
                 break
         return self._state(present(best, "start"), pose, load, iterations, began, settings)
-
-    def followed(self, start: np.ndarray, pose: np.ndarray,
-                 settings: ReducedStaticSettings = _STATIC) -> ReducedState:
-        """Return the equilibrium that a pinned grasp comes to from coordinates ``start`` [size]. It
-        seeks no other state; where even short steps jump, it has not converged."""
-        began, pose = time.perf_counter(), check_pose(pose)
-        at_pose = np.concatenate([self.grasp.centre + start[:self.basis.lift_count], pose[3:]])
-        found = self._follow(at_pose, start, pose, self.load, settings, settings.iteration_limit,
-                             steadily=True)
-        return self._state(found, pose, self.load, found.iterations, began, settings)
-
-    def pulled(self, start: np.ndarray, force: np.ndarray,
-               settings: ReducedStaticSettings = _STATIC) -> ReducedState | None:
-        """Return the equilibrium under a force [3] [N] on a pinned grasp, from the coordinates
-        ``start`` [size]; None if the path ends before, as at a snap."""
-        count = self.basis.lift_count
-        begin = (self.energy_force(start)[1] - self.load)[:count]
-        q, reached, step = start, 0.0, 1.0
-        while reached < 1.0:
-            part = min(1.0, reached + step)
-            load = self.load.copy()
-            load[:count] += begin + part * (force - begin)
-            found = self._newton(q, None, load, settings, settings.max_iterations)
-            if found.converged and self._came_from(q, found):
-                q, reached = found.q, part
-                continue
-            step /= 2
-            if step < 0.5**settings.max_halvings:
-                return None
-        position = self.grasp.centre + q[:count]
-        return self.followed(q, np.concatenate([position, np.zeros(3)]), settings)
 
     def sensitivities(self, state: ReducedState) -> ReducedSensitivities:
         """Differentiate a converged state to log Young's modulus at each control point."""
@@ -397,10 +350,8 @@ class ReducedModel:
         return [own, *near] if far[0] <= 2 * far[1] else [near[0], own, *near[1:]]
 
     def _follow(self, at_pose: np.ndarray, q: np.ndarray, pose: np.ndarray, load: np.ndarray,
-                settings: ReducedStaticSettings, most: int, *, steadily: bool = False,
-                ) -> "FoundState":
-        """Newton to the pose in ``most`` iterations; if that fails, the step is halved, with
-        ``steadily`` also if the branch may have jumped."""
+                settings: ReducedStaticSettings, most: int) -> "FoundState":
+        """Newton to the pose in ``most`` iterations; if that fails, the step is halved."""
         iterations, reached, step = 0, 0.0, 1.0
         while True:
             part = min(1.0, reached + step)
@@ -408,8 +359,7 @@ class ReducedModel:
             found = self._newton(q, self.held.at(goal), load, settings,
                                  min(settings.max_iterations, most - iterations))
             iterations += found.iterations
-            sound = (found.converged and found.novelty < 4 * settings.novelty_limit
-                     and not (steadily and not self._came_from(q, found)))
+            sound = found.converged and found.novelty < 4 * settings.novelty_limit
             if sound and part == 1.0:
                 return replace(found, iterations=iterations)
             if iterations >= most:
@@ -421,32 +371,18 @@ class ReducedModel:
             if step < 0.5**settings.max_halvings:
                 return replace(found, converged=False, iterations=iterations)
 
-    def _came_from(self, q: np.ndarray, found: "FoundState") -> bool:
-        """Whether an equilibrium continues the one at ``q``: every tangent along the path was
-        positive definite, or the potential changed by the work of the gripper."""
-        if found.steady:
-            return True
-        count, energies, forces = self.basis.lift_count, [], []
-        for end in (q, found.q):
-            energy, force = self.energy_force(end)
-            energies.append(energy - float(self.load @ end))
-            forces.append((force - self.load)[:count])
-        change = energies[1] - energies[0]
-        work = 0.5 * float((forces[0] + forces[1]) @ (found.q - q)[:count])
-        return work - change <= _LOST * (abs(work) + abs(change))
-
-    def _newton(self, q: np.ndarray, held: np.ndarray | None, load: np.ndarray,
+    def _newton(self, q: np.ndarray, held: np.ndarray, load: np.ndarray,
                 settings: ReducedStaticSettings, most: int) -> "FoundState":
-        """Iterate with the grasp's coordinates ``held``, or free where they are not."""
-        count, q = 0 if held is None else self.basis.lift_count, q.copy()
-        move, increment, steady = None if held is None else held - q[:count], None, True
+        """Iterate with the grasp's coordinates ``held``."""
+        count, q = self.basis.lift_count, q.copy()
+        move: np.ndarray | None = held - q[:count]
+        increment = None
         for iteration in range(most):
             energy, force, tangent = self.tangent(q, increment)
             right = load[count:] - force[count:]
             if move is not None:
                 right = right - tangent[count:, :count] @ move
             step, stable = solved_raised(tangent[count:, count:], right)
-            steady = steady and stable
             increment = np.concatenate([np.zeros(count) if move is None else move, step])
             q = q + increment
             gain = 0.5 * abs(right @ step)
@@ -455,7 +391,7 @@ class ReducedModel:
             if move is None and gain <= settings.tolerance * max(energy, 1e-12):
                 novelty = float((np.abs(q[self._known]) / self._largest[self._known]).max())
                 return FoundState(q, stable, novelty, iteration + 1,
-                                  self.energy(q) - float(load @ q), steady)
+                                  self.energy(q) - float(load @ q))
             move = None
         return FoundState(q, False, np.inf, most, np.inf)
 

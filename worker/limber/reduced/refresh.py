@@ -12,8 +12,7 @@ import numpy as np
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
-from limber.mechanics.statics.equilibrium_path import StaticProblem, make_result
-from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, Status
+from limber.mechanics.statics.result import StaticResult
 from limber.reduced.model_cache import reduce_snapshots
 from limber.reduced.reduced_model import ReducedModel, ReducedSettings, ReducedState
 from limber.reduced.training import Snapshots, Trainer
@@ -86,39 +85,6 @@ def estimate_error(model: BranchModel, weights: np.ndarray, reduced: ReducedMode
                          bool(certain and np.isfinite(off + energy)), u)
 
 
-def corrected_once(model: BranchModel, reduced: ReducedModel, state: ReducedState,
-                   ) -> tuple[StaticResult, np.ndarray] | None:
-    """Return a pinned state after one Newton step of the full model with the state's Young's
-    modulus, and its change [3, node_count, 3] with the grasp's position. None where it is off by
-    more than a state may be unsaid, or not stable. ``reduced`` keeps its strain."""
-    # The step's tangent has the stress of the strain that the reduced model assumes, without the
-    # noise that its displacement has. So one step does what takes `estimate_error` four: of 40
-    # states on a forked branch, the energy was then off by 5e-5 at most, the force by 0.13 %, nodes
-    # by 0.006 mm.
-    problem = StaticProblem(model, reduced.grasp, True, DEFAULT_SETTINGS)
-    equations, start = problem.equations, reduced.displacement(state)
-    try:
-        tangent = equations.tangent(model, start, strain=reduced.strains(state.coordinates))
-    except NotPositiveDefiniteError:
-        return None
-    if not tangent.is_positive_definite:
-        return None
-    load, nothing = model.weight_force, np.zeros_like(start)
-    out = equations.free_part(load - model.internal(start).force)
-    step, *tangents = tangent.solve_all([out, nothing, nothing, nothing], np.eye(3, 4, 1))
-    displacement = start + step
-    now = model.internal(displacement)
-    off = float(np.linalg.norm(step, axis=1).max()) / model.extent
-    energy = state.strain_energy / max(now.strain_energy, 1e-12) - 1
-    # Neither is a number where something went wrong.
-    if not (off <= _POSITION and abs(energy) <= _ENERGY and now.min_det_f > 0):
-        return None
-    result = make_result(
-        problem, displacement, now, load, status=Status.converged, iterations=1,
-        residual_history=[], seconds=state.seconds)
-    return result, np.array(tangents)
-
-
 class RefreshingModel:
     """A reduced model and its full one, with arguments as for ``build_reduced``, and the full
     ``snapshots`` it was made from. After ``refresh_every`` new ones the basis is made again."""
@@ -158,7 +124,6 @@ class RefreshingModel:
         self.snapshots = self.snapshots.joined(added)
         self.reduced = reduce_snapshots(self.model, self.grasp, self.weights,
                                         self.reduced.control_young, self.snapshots,
-                                        self.settings,
-                                        keeps_strain=self.reduced.strain_fields is not None)
+                                        self.settings)
         self._new = []
         self.refresh_count += 1

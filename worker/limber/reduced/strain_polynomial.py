@@ -163,11 +163,9 @@ def compile_kernels() -> None:
 
 def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
                     control_young: np.ndarray, snapshots: Snapshots | None,
-                    field_count: int | None, *, keeps_fields: bool = False,
-                    ) -> tuple[StrainPolynomial, np.ndarray | None]:
-    """Return the strain polynomial; with ``keeps_fields`` also the fields, [tet_count, q, 6, m] (00
-    11 22 01 02 12), whose sum by e is the strain. ``field_count`` None: no projection.
-    ``control_young`` [Pa] weighs its product. InputError unless St. Venant-Kirchhoff."""
+                    field_count: int | None) -> StrainPolynomial:
+    """Return the strain polynomial. ``field_count`` None: no projection. ``control_young`` [Pa]
+    weighs its product. InputError unless St. Venant-Kirchhoff."""
     if not model.material.has_cubic_force:
         raise InputError(f"A reduced model of the material {model.material.name} is requested.",
                          "Only the force of St. Venant-Kirchhoff is a cubic polynomial.",
@@ -179,7 +177,7 @@ def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
     else:
         sources = _strain_sources(model, present(snapshots, "snapshot"))
         transform = _leading_fields(points, sources, field_count)
-    return _projected(points, basis, sources, transform, keeps_fields)
+    return _projected(points, basis, sources, transform)
 
 
 def reduced_mass(model: BranchModel, basis: Basis) -> np.ndarray:
@@ -330,20 +328,16 @@ def _all_fields(points: _Points, basis: Basis) -> np.ndarray:
 
 
 def _projected(points: _Points, basis: Basis, sources: _Sources | None,
-               transform: np.ndarray, keeps_fields: bool,
-               ) -> tuple[StrainPolynomial, np.ndarray | None]:
+               transform: np.ndarray) -> StrainPolynomial:
     count, regions = transform.shape[1], points.weights.shape[1]
     coupling = np.zeros((count, 1))
     own = np.zeros((count, count))
     by_lambda = np.zeros((regions, count, count))
     by_mu = np.zeros((regions, count, count))
-    kept = []
     for chunk in points.chunks():
         terms = _terms(points, basis, chunk)
         strain = terms if sources is None else sources.strains(points, chunk)
         fields = strain @ transform
-        if keeps_fields:
-            kept.append((fields / _SHEAR[:, None]).astype(np.float32))
         flat = fields.reshape(-1, count)
         stress = points.stress(fields, chunk).reshape(flat.shape)
         coupling = coupling + stress.T @ terms.reshape(len(flat), -1)
@@ -358,13 +352,9 @@ def _projected(points: _Points, basis: Basis, sources: _Sources | None,
     inverse = _orthonormal(own)
     coupling = inverse @ coupling
     size = basis.size
-    polynomial = StrainPolynomial(
+    return StrainPolynomial(
         np.ascontiguousarray(coupling[:, :size]), np.ascontiguousarray(coupling[:, size:]),
         inverse @ by_lambda @ inverse.T, inverse @ by_mu @ inverse.T, points.poisson)
-    if not keeps_fields:
-        return polynomial, None
-    fields = np.concatenate(kept) @ inverse.T.astype(np.float32)
-    return polynomial, fields.reshape(*points.model.weights.shape, 6, len(inverse))
 
 
 def _orthonormal(own: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from limber.core.numerics.compiled import compiled
 from limber.core.progress import SILENT, Progress
 from limber.planning.field.chart import Chart, mapped, pulled_back_size
 from limber.planning.field.radial import (
+    KERNELS,
     LocalError,
     RadialInterpolant,
     Slack,
@@ -30,7 +31,7 @@ from limber.planning.field.radial import (
     slack_of,
     value_at,
 )
-from limber.planning.field.stored_states import LOADS, GraspSamples
+from limber.planning.field.stored_states import GraspSamples
 from limber.planning.field.valid_region import TrustRegion, trusted_at
 
 # The kernel and the charts of a field's fit, chosen by cross-validation.
@@ -193,24 +194,17 @@ def _rms(values: np.ndarray) -> float:
 
 _OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
-             "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n", "reduced": "reduced"}
+             "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n"}
 _WHAT = Text("an energy field (", Command("energy", Option("force", True)), " creates one)")
 _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
-           "min_det_f": ("m",), "rejected_poses": ("q", 6)}
+           "min_det_f": ("m",), "rejected_poses": ("q", 6), "chart_pivot_m": (3,),
+           "chart_radius_m": ()}
 _OPTIONAL_SHAPES = {
     "strains": ("m",), "targets_m": ("m", "t", 3), "torques_nm": ("m", 3),
     "strain_places_m": ("m", 3), "stresses_pa": ("m",), "shape_slopes": ("m", 3, "s"),
-    "axial_forces_n": ("m",), "reduced": ("m",), "left_out_place_errors_m": ("m", "places"),
-    "rest_pose": (6,), "chart_pivot_m": (3,), "chart_radius_m": (), "energy_error": (),
-    "force_error": (),
-    **{f"{fit}_{name}": shape for fit in ("energy_fit", "shape_fit", "load_fit")
-       for name, shape in {
-           "shape": (), "smoothing": (), "scale": (), "shift": (3,), "centres": (f"{fit} m", 3),
-           "value_weights": (f"{fit} m", f"{fit} c"),
-           "gradient_weights": (f"{fit} g", 3, f"{fit} c"),
-           "polynomial": (f"{fit} p", f"{fit} c"), "powers": (f"{fit} p", 3)}.items()}}
+    "axial_forces_n": ("m",), "rest_pose": (6,)}
 """Shapes of the arrays in a file; equal letters are equal lengths."""
-"""In any unit here: with larger numbers, sums would not be finite."""
+_CHOSEN = ("energy_fit", "shape_fit")  # whose kernels and charts are in it
 
 
 class FieldArrays(NamedTuple):
@@ -362,30 +356,25 @@ class EnergyField:
                            slack or slack_of(("energy", "force", *self.load_names), {}, 0.0))
 
     def write(self, path: Path, extra: dict[str, Any] | None = None) -> None:
-        """Write ``energy.npz``: samples, weights, errors and ``extra`` arrays; without pickling."""
+        """Write ``energy.npz``: samples, kernels, charts and ``extra`` arrays; without pickling."""
         samples = self.samples
         arrays = {
             "poses": samples.poses, "energies_j": samples.energies,
             "forces_n": samples.forces, "tips_m": samples.tips, "min_det_f": samples.min_det_f,
             "rejected_poses": samples.rejected_poses,
-            "left_out_errors": self.missed, "left_out_place_errors_m": self.misplaced,
             "chart_pivot_m": self.chart.pivot, "chart_radius_m": np.array(self.chart.radius),
             "chart_layers": np.array([[chart.stretch, chart.depth]
-                                      for chart in (self.chart, self.shape_chart)]),
-            "error_names": np.array(list(self.errors)),
-            "error_values": np.array(list(self.errors.values())),
-            "energy_error": np.array(self.errors["energy_error"]),
-            "force_error": np.array(self.errors["force_error"]),
-        }
+                                      for chart in (self.chart, self.shape_chart)])}
+        for name in _CHOSEN:
+            fit = getattr(self, name)
+            arrays |= {f"{name}_kernel": np.array(fit.kernel), f"{name}_shape": np.array(fit.shape)}
         arrays |= {stored: getattr(samples, name) for name, stored in _OPTIONAL.items()
                    if getattr(samples, name) is not None}
-        for name in ("energy_fit", "shape_fit", "load_fit"):
-            arrays |= getattr(self, name).to_arrays(f"{name}_")
         np.savez_compressed(path, **arrays, **(extra or {}))
 
     @classmethod
     def read(cls, path: Path) -> "EnergyField":
-        """Read a file that :meth:`write` wrote; nothing is fitted again.
+        """Read a file that :meth:`write` wrote; the samples are fitted again as they were.
 
         Raises:
             InputError: the file is not an energy field.
@@ -393,31 +382,26 @@ class EnergyField:
         try:
             arrays = read_arrays(path, _WHAT)
             require_shapes(path, arrays, _SHAPES | {
-                name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays},
-                           _WHAT, flags=("reduced",))
+                name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays}, _WHAT)
             stored: dict[str, Any] = {name: arrays.get(key) for name, key in _OPTIONAL.items()}
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
-                arrays["min_det_f"], arrays["rejected_poses"],
-                **stored)
-            energy, shape, loads = (RadialInterpolant.from_arrays(arrays, f"{name}_")
-                                    for name in ("energy_fit", "shape_fit", "load_fit"))
-            region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3],
-                                    arrays["chart_pivot_m"], float(arrays["chart_radius_m"]))
-            if arrays["chart_layers"].shape != (2, 2):
-                raise ValueError("two charts are needed")
-            chart, shape_chart = (replace(region.chart, stretch=float(stretch), depth=float(depth))
-                                  for stretch, depth in arrays["chart_layers"])
-            missed, misplaced = _errors_in(arrays, samples)
-            errors = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
-                              strict=True))
+                arrays["min_det_f"], arrays["rejected_poses"], **stored)
+            radius = float(arrays["chart_radius_m"])
+            energy, shape = (FitChoice(
+                str(arrays[f"{name}_kernel"]), float(arrays[f"{name}_shape"]), stretch,
+                depth / (radius or 1.0)) for name, (stretch, depth) in zip(
+                    _CHOSEN, arrays["chart_layers"].tolist(), strict=True))
+            if not all(one.kernel in KERNELS and one.shape > 0.0 and one.stretch > 0.0
+                       and one.depth > 0.0 for one in (energy, shape)):
+                raise ValueError("unknown kernels or charts")
+            return _fitted(samples, energy, shape, TrustRegion.of(
+                samples.positions, samples.rejected_poses[:, :3], arrays["chart_pivot_m"], radius))
         except (KeyError, ValueError, OSError, TypeError) as error:
             raise InputError(f"{path} is not an energy field ({error}).",
                              Text("It was not written by ", Command("energy"), ", or is damaged."),
                              "Run ", Command("energy"), " again with ", Option("force", True),
                              ".") from error
-        return cls(samples, chart, shape_chart, energy, shape, loads, region, errors, missed,
-                   misplaced)
 
 
 def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: float | None = None,
@@ -444,22 +428,6 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
     region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3], base, radius)
     charts = CHARTS_TRIED if base is not None else CHARTS_TRIED[:1]
     return _fitted(samples, *chosen_fits(samples, region, charts, progress), region)
-
-
-def _errors_in(arrays: dict[str, np.ndarray], samples: GraspSamples,
-               ) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``missed`` and ``misplaced`` from a file; nan if it does not contain them."""
-    column_count = 1 + (0 if samples.targets is None else samples.targets.shape[1])
-    found = []
-    for name, columns in (("left_out_errors", 4 + len(LOADS)),
-                          ("left_out_place_errors_m", column_count)):
-        whole = np.full((len(samples.poses), columns), np.nan)
-        known = arrays.get(name, np.empty((len(whole), 0)))
-        if known.ndim != 2 or len(known) != len(whole) or known.shape[1] > columns:
-            raise ValueError(f"{name} does not match the poses")
-        whole[:, :known.shape[1]] = known
-        found.append(whole)
-    return found[0], found[1]
 
 
 def refit(field: EnergyField, added: GraspSamples) -> EnergyField:

@@ -122,31 +122,6 @@ class RadialInterpolant:
                 np.ascontiguousarray(self.gradient_weights.transpose(2, 1, 0)), self.polynomial,
                 self.powers)
 
-    def to_arrays(self, prefix: str) -> dict[str, np.ndarray]:
-        """Return plain arrays for an ``npz`` file, names starting with ``prefix``."""
-        names = ("shape", "smoothing", "shift", "scale", "centres", "value_weights",
-                 "gradient_weights", "polynomial", "powers")
-        return {f"{prefix}kernel": np.array(self.kernel)} | {
-            prefix + name: np.asarray(getattr(self, name)) for name in names}
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, np.ndarray], prefix: str) -> "RadialInterpolant":
-        """Undo :meth:`to_arrays`."""
-        part = {name.removeprefix(prefix): value for name, value in arrays.items()
-                if name.startswith(prefix)}
-        plain = {"kernel": str(part.pop("kernel")), "shape": float(part.pop("shape")),
-                 "smoothing": float(part.pop("smoothing")), "scale": float(part.pop("scale"))}
-        powers = np.ascontiguousarray(part.pop("powers"), np.int64)
-        found = cls(**plain, powers=powers, **{
-            name: np.ascontiguousarray(value, float) for name, value in part.items()})
-        if found.kernel not in KERNELS or not (found.scale > 0 and found.shape > 0):
-            raise ValueError(f"unknown kernel {found.kernel} of shape {found.shape}")
-        if len(found.gradient_weights) not in (0, len(found.centres)) or not (
-                (powers >= 0) & (powers <= 8)).all() or len(found.value_weights) != len(
-                found.centres):
-            raise ValueError("weights that do not match their samples")
-        return found
-
 
 def _frame(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Return shift and scale that bring points within a box of half edge 1."""

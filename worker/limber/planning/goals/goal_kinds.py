@@ -10,7 +10,7 @@ import numpy as np
 from limber.core.errors import Command, InputError, NoPathError, Option, Text
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.field.sampling import SolverPool, solve_branch
+from limber.planning.field.sampling import solve_branch
 from limber.planning.field.valid_region import nearest_of
 from limber.planning.goals.goal import (
     NEARER,
@@ -419,8 +419,7 @@ class CellGoal(TargetGoal):
         """Return the goal with the results at poses of the field. NoPathError if the target is in
         the region at some of them, and valid at none."""
         if self.cell_place.of_surface:
-            with SolverPool(self.grasp_model, 1) as solvers:
-                found = self._of_states(field, solvers)
+            found = self._of_states(field)
         else:
             points = np.concatenate([field.rest[None], field.region.draw(
                 _PLACES_DRAWN, np.random.default_rng(0))])
@@ -452,7 +451,7 @@ class CellGoal(TargetGoal):
                        refused=np.concatenate([self.refused, wrong]),
                        causes=(*self.causes, *causes))
 
-    def _of_states(self, field: EnergyField, solvers: SolverPool) -> Self:
+    def _of_states(self, field: EnergyField) -> Self:
         """Test states of the branch model at samples of the field in the region, far apart, and
         between them."""
         samples = field.samples
@@ -462,14 +461,14 @@ class CellGoal(TargetGoal):
         if not len(inside):
             return self
         chosen = inside[_far_apart(samples.positions[inside], _SOLVED)]
-        states = solve_branch(solvers, samples.positions[chosen])[0][1:]
+        states = solve_branch(self.grasp_model, samples.positions[chosen], workers=1)[0][1:]
         which = [chosen[one.target] for one in states]
         found = self._asked(samples.positions[which], positions[which],
                             np.array([one.displacement for one in states]))
 
         def causes_at(middle: np.ndarray) -> list[str]:
             causes = ["the branch has no equilibrium there"] * len(middle)
-            for one in solve_branch(solvers, middle, states)[0][1 + len(states):]:
+            for one in solve_branch(self.grasp_model, middle, workers=1)[0][1:]:
                 place = one.tip if self.target is None else one.targets[self.target]
                 causes[one.target] = self._cause(place, one.displacement)
             return causes

@@ -5,7 +5,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from limber.core.errors import Option
-from limber.core.not_none import present
 from limber.core.progress import SILENT, Progress
 from limber.planning.settings import EnergySettings, EnergySpec
 from limber.stages.result import FORCE, Picture, Result, frozen, of_files, shown
@@ -79,8 +78,7 @@ class SampleEnergy(EnergySettings, Repeatable, BranchStage):
             WorkError: too few poses could be solved.
         """
         from limber.planning.field.energy_field import fit_field
-        from limber.planning.field.grasp_model import LearntGraspModel
-        from limber.planning.field.sampling import energy_inputs, refined, sample_field
+        from limber.planning.field.sampling import energy_inputs, sample_field
         from limber.store.loading import load_grasp_model
 
         branch = Branch.open(self.branch_folder)
@@ -90,29 +88,22 @@ class SampleEnergy(EnergySettings, Repeatable, BranchStage):
         if self.is_kept(branch, digests=digests):
             return branch.manifest.stages["energy"].result
         with branch.stage("energy", self, digests=digests) as stage:
-            if self.forward == "reduced":
-                grasp_model = LearntGraspModel.learnt(grasp_model,
-                                                      progress=progress.part(0.0, 0.02))
-            progress(0.0, "rest state")
-            sampled = sample_field(grasp_model, self,
-                                   progress=progress.part(0.02, 0.7))
-            field = fit_field(
-                sampled.samples,
-                sampled.energy_surface.pivot,
-                sampled.energy_surface.radius,
-                progress=progress.part(0.7, 0.8),
-            )
-            if self.field_error is not None:
-                sampled, field = refined(grasp_model, sampled, field, self.field_error / 100.0,
-                                         _MOST_TIMES * self.samples,
-                                         progress=progress.part(0.8, 1.0))
-                off = 100.0 * field.errors["energy_error"]
-                if off > self.field_error:
-                    progress.warn(
-                        f"The error of the energy field is {off:.2g} % with "
-                        f"{len(field.samples.poses)} poses, more than the {self.field_error:g} % "
-                        "of ", Option("field_error"), ". Increase ", Option("samples"),
-                        ", or reduce ", Option("deflection"), ".")
+            count = self.samples
+            while True:
+                sampled = sample_field(grasp_model, self.model_copy(update={"samples": count}),
+                                       progress=progress.part(0.0, 0.8))
+                field = fit_field(sampled.samples, sampled.energy_surface.pivot,
+                                  sampled.energy_surface.radius, progress=progress.part(0.8, 1.0))
+                off, asked = 100.0 * field.errors["energy_error"], self.field_error or np.inf
+                if off <= asked or count >= _MOST_TIMES * self.samples:
+                    break
+                count *= 2
+            if off > asked:
+                progress.warn(
+                    f"The error of the energy field is {off:.2g} % with "
+                    f"{len(field.samples.poses)} poses, more than the {asked:g} % of ",
+                    Option("field_error"), ". Increase ", Option("samples"), ", or reduce ",
+                    Option("deflection"), ".")
             samples, reasons = sampled.samples, sampled.reasons
             rejected = len(samples.rejected_poses)
             if rejected > 0.2 * self.samples:
@@ -126,8 +117,6 @@ class SampleEnergy(EnergySettings, Repeatable, BranchStage):
                 sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
                 taut_count=sampled.taut_count,
                 energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
-                forward=self.forward,
-                reduced_count=int(present(samples.reduced, "mark of reduced samples").sum()),
                 errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
                 chart_stretch=field.chart.stretch,
                 chart_depth_m=field.chart.depth if np.isfinite(field.chart.depth) else None,
