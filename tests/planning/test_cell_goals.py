@@ -162,6 +162,10 @@ def test_states_of_a_plan_refine_the_border(field, small_model):
     right = replace(states, tips=states.tips - [0, 0.03, 0])
     assert len(goal.drawn_in(wrong).refused) == len(goal.refused) + 1
     assert len(goal.drawn_in(right).taken) == len(goal.taken) + 1
+    points = field.region.draw(1000, np.random.default_rng(5))
+    closer = goal.drawn_in(wrong).distance(field, points) <= goal.tolerance
+    known = replace(goal.drawn_in(wrong), caution=1.0).distance(field, points) <= goal.tolerance
+    assert 0 < closer.sum() < known.sum() and (known | ~closer).all(), "ends nearer to what does"
     assert goal.drawn_in(wrong).distance(field, wrong.poses[:, :3])[0] > goal.tolerance
     with pytest.raises(NoPathError, match=r"Nobody takes the tip at the end of the path: a wall"):
         goal.require_end(small_model, wrong)

@@ -10,12 +10,15 @@ from tests.stages.specified import Planned
 import limber.planning.make_plan as plan_module
 from limber.cell.obstacles import Box
 from limber.core.errors import Cancelled, NoPathError
+from limber.core.progress import SILENT
 from limber.mechanics import simulate_dynamics
 from limber.mechanics.dynamics.motion import EnergyMomentumSettings
 from limber.planning import make_plan as planning
 from limber.planning.constraints.limits import Limits, Obstacles
 from limber.planning.constraints.motion_check import MotionCheck, check_motion, learnt
 from limber.planning.field.energy_field import EnergyField, refit
+from limber.planning.goals.goal import Ball
+from limber.planning.goals.goal_kinds import TargetGoal
 from limber.planning.path_on_full_model import resolve_path
 from limber.planning.plan_file import read_plan
 from limber.planning.settings import PlanSpec
@@ -168,3 +171,19 @@ def test_a_plan_to_a_region_ends_less_deep_once_the_field_knows_its_end(to_regio
         centre = np.array(found.summary["goal"]["position_m"])
         assert np.linalg.norm(found.plan.solved.tips[-1] - centre) <= 0.02
         assert found.baseline.is_whole and found.summary["certificate"]["lower_bound"] > 0.0
+
+
+def test_a_goal_that_a_miss_made_too_small_is_planned_to_without_its_margins(monkeypatch):
+    """Less deep by the field's error, then also by what an earlier plan missed."""
+    tried = []
+
+    def fails(_field, _start, aim, *_, **__):
+        tried.append((aim.margin, aim.inset))
+        if any(tried[-1]):
+            raise NoPathError("No path.", "", "")
+        return "paths"
+    monkeypatch.setattr(planning, "plan_within", fails)
+    aim = TargetGoal(Ball((0.0, 0.0, 0.3), 0.05), margin=0.5, inset=0.02)
+    rounds = planning._Rounds(*[None] * 8, aim, *[None] * 2, SILENT)
+    assert rounds._within_goal(SILENT) == "paths"
+    assert tried == [(0.5, 0.02), (0.0, 0.02), (0.0, 0.0)]

@@ -417,28 +417,30 @@ class _Rounds:
         return pair
 
     def _within_goal(self, ahead: Progress) -> PathPair:
-        """Return paths on the field that end as deep in the goal as the field's error asks for; if
-        none is found, paths that end anywhere in it. NoPathError if neither was found."""
+        """Return paths on the field that end as deep in the goal as the field's error and earlier
+        plans ask for; if none is found, less deep ones. NoPathError if none ends in it."""
         # Probably the first plan to a region ends too deep in it, and a later one is refused.
         is_deep = isinstance(self.aim, TargetGoal) and self.aim.margin > 0.0
         is_bounded = self.holding is not None or (self.pair is None and not is_deep)
 
-        def paths(aim: Goal, ahead: Progress) -> PathPair:
-            return plan_within(self.field, self.start, aim, self.settings, self.planned_limits,
-                               asked=self.limits, asked_goal=self.goal, before=self.pair,
-                               is_bounded=is_bounded, progress=ahead)
         try:
-            return paths(self.aim, ahead.part(0.0, 0.5))
+            return plan_within(self.field, self.start, self.aim, self.settings,
+                               self.planned_limits, asked=self.limits, asked_goal=self.goal,
+                               before=self.pair, is_bounded=is_bounded,
+                               progress=ahead.part(0.0, 0.5))
         except NoPathError as none:
-            proven = isinstance(none, BlockedError) and none.is_proven
-            if proven or not (isinstance(self.aim, TargetGoal) and self.aim.margin):
+            aim, proven = self.aim, isinstance(none, BlockedError) and none.is_proven
+            if proven or not (isinstance(aim, TargetGoal) and (aim.margin or aim.inset)):
                 raise
-            self.progress.warn(
-                f"No path was found that ends deeper in the goal than the energy field's error of "
-                f"{self.aim.what}'s position. The path is planned without this margin. The full "
-                "model decides whether its end is in the goal.")
-            self.aim = replace(self.aim, margin=0.0)
-            return paths(self.aim, ahead.part(0.5, 1.0))
+            if aim.margin:
+                self.progress.warn(
+                    f"No path was found that ends deeper in the goal than the energy field's error "
+                    f"of {aim.what}'s position. The path is planned without this margin. The full "
+                    "model decides whether its end is in the goal.")
+            # Less what an earlier plan missed it by, the goal may be too small; that plan's states
+            # are samples by now.
+            self.aim = replace(aim, margin=0.0, inset=aim.inset if aim.margin else 0.0)
+            return self._within_goal(ahead.part(0.5, 1.0))
 
     def _closed(self, none: BlockedError, is_last: bool, ahead: Progress) -> None:
         """Pass on that there is no path, or learn evidence against it. BlockedError if no evidence

@@ -375,19 +375,22 @@ _ASKED = 150  # most of these, where only the target's position counts
 _PAIRS, _PAIR_HALVINGS = 40, 5  # pairs between which the border is searched; halvings
 _SOLVED = 16  # most states of the branch model, where its surface counts as well
 _SOLVED_PAIRS, _SOLVED_HALVINGS = 4, 3  # the same with states of the branch model
+_WARIER = 3.0  # factor on the caution after each end that is not valid
 _NOWHERE = np.empty((0, 3))
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellGoal(TargetGoal):
     """A target at a valid position in a region of the cell. ``taken`` and ``refused`` are grasp
-    positions [m] in it where it is valid or not, and ``causes`` why not, as clauses."""
+    positions [m] in it where it is valid or not, and ``causes`` why not, as clauses. ``caution`` is
+    how many times nearer to a valid one than to an invalid one a plan ends."""
 
     cell_place: CellPlace
     grasp_model: GraspModel
     taken: np.ndarray = field(default_factory=_NOWHERE.copy)
     refused: np.ndarray = field(default_factory=_NOWHERE.copy)
     causes: tuple[str, ...] = ()
+    caution: float = 1.0
 
     @property
     def where(self) -> str:
@@ -398,8 +401,9 @@ class CellGoal(TargetGoal):
         if not len(self.refused) or not len(self.taken):
             return within
         points = np.ascontiguousarray(points, float).reshape(-1, 3)
-        nearer = nearest_of(points, self.taken)[0] - nearest_of(points, self.refused)[0]
-        return np.maximum(within, self.tolerance + 0.5 * nearer)
+        nearer = (self.caution * nearest_of(points, self.taken)[0]
+                  - nearest_of(points, self.refused)[0])
+        return np.maximum(within, self.tolerance + nearer / (1.0 + self.caution))
 
     def uncertainty(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
         # Between invalid poses there may be a valid one: then nothing is proven.
@@ -409,7 +413,10 @@ class CellGoal(TargetGoal):
 
     def drawn_in(self, states: SolvedPoses) -> Self:
         positions = states.tips if self.target is None else states.targets[:, self.target]
-        return super().drawn_in(states)._asked(states.poses[:, :3], positions, states.displacements)
+        found = super().drawn_in(states)._asked(states.poses[:, :3], positions,
+                                                states.displacements)
+        ends = bool(self._cause(positions[-1], states.displacements[-1]))
+        return replace(found, caution=found.caution * (_WARIER if ends else 1.0))
 
     def require_end(self, grasp_model: GraspModel, states: SolvedPoses) -> None:
         self.cell_place.require(self.what, self.target_position(states),
