@@ -355,10 +355,12 @@ def _gradients(points, channels, kernel, shape, scale, shift, centres, value_wei
 # that fall with the distance in the chart. The accuracy of this prediction is known as well, from
 # each sample and the others: the mean is multiplied by the factor that covers the requested
 # fraction of them (split conformal prediction: Vovk et al. 2005; with a local scale: Lei et al.
-# 2018). States of the full model along plans join the samples, and with them these errors.
+# 2018; with weights: Tibshirani et al. 2019). States of the full model along plans join the
+# samples, and with them these errors.
 
 _LEAST = 0.2  # fraction of the median error that is stated even where the nearest samples are exact
 _FEWEST = 8  # fewest samples with a known error
+_ROOM = 3  # which neighbour of a sample is at the border of the room about it
 
 
 @dataclass(frozen=True)
@@ -384,12 +386,15 @@ class LocalError:
             return cls(points, sizes**2, 1.0, np.inf, most)
         floor = _LEAST * float(np.median(sizes))
         squares = sizes**2 + floor**2
-        near = max(_spacing(points)**2, 1e-18)
+        near = max(float(np.median(_away(points, 1)))**2, 1e-18)
         predicted = np.sqrt(_means(points, points, squares, near, True))
-        shares = np.sort(np.maximum(above, 0.0) / np.maximum(predicted, 1e-300))
-        # One more than there are: the queried position counts as one more sample.
-        rank = min(int(np.ceil(covered * (len(shares) + 1))), len(shares)) - 1
-        return cls(points, squares, near, float(shares[rank]), most)
+        shares = np.maximum(above, 0.0) / np.maximum(predicted, 1e-300)
+        order, room = np.argsort(shares, kind="stable"), _away(points, _ROOM)**3 + 1e-30
+        # One more than there are: the queried position counts as one more sample. Samples lie
+        # closer where neighbours disagree, positions do not: each counts by the room about it.
+        parts = np.cumsum(room[order]) / room.sum() * len(shares) / (len(shares) + 1)
+        rank = min(int(np.searchsorted(parts, covered)), len(shares) - 1)
+        return cls(points, squares, near, float(shares[order[rank]]), most)
 
     def at(self, points: np.ndarray) -> np.ndarray:
         """Return the error at ``points`` [n, 3] of the chart, shape [n]."""
@@ -485,11 +490,11 @@ def slack_slopes(points: np.ndarray, row: int, slack: Slack) -> np.ndarray:
     return out
 
 
-def _spacing(points: np.ndarray) -> float:
-    """Return the median distance of a sample from the nearest other [m]."""
+def _away(points: np.ndarray, count: int) -> np.ndarray:
+    """Return the distance of each sample from the ``count``-th nearest other [m], shape [m]."""
     from scipy.spatial import cKDTree
 
-    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
+    return cKDTree(points).query(points, k=count + 1)[0][:, count]
 
 
 @compiled
