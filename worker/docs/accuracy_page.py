@@ -72,7 +72,9 @@ def accuracy_page() -> str:
         "a run had no time for is not listed. The page is written from `worker/docs/data` by "
         "`scripts/docs`, and a test holds it to that.\n"), (
         "`scripts/bench NAME` measures anew, with fresh seeds. `--seed` repeats a run. Times are "
-        "those of two shared cores.\n")]
+        "those of two shared cores. `scripts/worlds FOLDER` writes the scans of the other kinds, "
+        "with their truth, as plain files. The score that lies beside them takes any program's "
+        "skeletons.\n")]
     for bench, (title, about) in CHAPTERS.items():
         if (DATA / f"{bench}.json").is_file():
             parts.extend(_chapter(bench, title, about))
