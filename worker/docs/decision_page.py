@@ -20,7 +20,8 @@ SCANS = (
     ("300 to 1,500 points, bare",
      "{sparse} of the axes found / own; {sparse length} of the lengths within 10 %",
      "mostly unknown", "{sparse volume} scans state none",
-     "Use the axes. The length's interval holds {sparse held} of the time: too narrow."),
+     "Use the axes. The length's interval holds {sparse held} of the time. Real scans came out up "
+     "to a third too long."),
     ("in leaf", "{in leaf} of the wood's length; {right in leaf} of what is found is wood",
      "not measured alone", "not measured alone",
      "Scan in winter, or check the skeleton by eye and correct it."),
