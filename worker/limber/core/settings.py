@@ -238,8 +238,10 @@ def _refusal(model: type[BaseModel], values: dict[str, Any], error: ValidationEr
     if not first["loc"]:
         # It concerns several values, and names them.
         return InputError(Text(message, "."), "", "See the options' help.")
-    return InputError(Text(Option(str(first["loc"][0])), f" {first.get('input')!r}: ", message,
-                           "."), "The stage cannot use this value.",
+    given = first.get("input")
+    typed = shlex.quote(given) if isinstance(given, str) else repr(given)
+    return InputError(Text(Option(str(first["loc"][0])), f" {typed}: ", message, "."),
+                      "The stage cannot use this value.",
                       "See the option's help for its range.")
 
 
