@@ -231,6 +231,22 @@ def test_a_frame_is_put_right_by_its_fitted_turn(small_pull):
     assert right == pytest.approx(seen, abs=1e-9)
 
 
+def test_pulls_of_one_cell_turn_about_one_point(small_bench, small_pull):
+    """Each about the middle of its own points, one turn would be two frames."""
+    turn = np.array([2e-3, -1e-3, 1.5e-3])
+    known = recording.EXACT.model_copy(update={"camera_sigma_rad": 1e-3})
+    seen = small_pull.observations
+    pulls = [replace(small_pull, name=name, entry=small_pull.entry.model_copy(
+        update={"calibration": known}), observations=replace(seen, positions=places))
+        for name, places in (("a", seen.positions), ("b", 2 * seen.positions[:1] - seen.positions))]
+    objective = small_bench.objective(pulls, SETTINGS)
+    for number, pull in enumerate(pulls):
+        places = objective.forwards[number].frames.positions
+        slopes = objective.cell_errors.slopes(number, places, np.zeros((len(places), 3)))
+        wanted = np.cross(turn, places - objective.forwards[0].rest_points.mean(axis=0))
+        assert slopes.points @ (turn / 1e-3) == pytest.approx(wanted, abs=1e-9), pull.name
+
+
 def test_an_untared_zero_is_free(small_bench, small, small_pull):
     """Stated as not tared, a zero of twice the force is found; otherwise it is an odd error."""
     peak = float(np.linalg.norm(small_pull.wrenches[:, :3], axis=1).max())

@@ -18,7 +18,8 @@ from limber.recordings.recording import (
     PullEntry,
     read_pull,
 )
-from limber.stages.pulls.virtual_pull import VirtualPull
+from limber.stages.pulls.virtual_pull import VirtualPull, load_truth
+from limber.store import Branch
 
 POINT = (0.0, 0.0, 0.3)
 
@@ -83,6 +84,19 @@ def test_a_virtual_pull_states_what_was_drawn(branch_folder):
     assert abs(known["force_gain"] - 1) < 0.1 and np.linalg.norm(known["gripper_place_m"]) > 1e-4
     other = read_pull(branch_folder / "pulls" / "pull-1").entry
     assert other.calibration == EXACT and "cell_errors" not in other.truth
+
+
+def test_virtual_pulls_of_a_branch_share_shape_and_cell(branch_folder):
+    """A joint fit takes them as pulls of one branch in one cell; zero and points are each's own."""
+    truths, lengths = [], []
+    for seed in (3, 4):
+        settings = PullSpec(frames=4, cell_errors="realistic", seed=seed)
+        lengths.append(load_truth(Branch.open(branch_folder), settings).skeleton.nodes)
+        SpecifiedPull.of(settings, branch_folder=branch_folder, name=f"of-{seed}").run()
+        truths.append(read_pull(branch_folder / "pulls" / f"of-{seed}").entry.truth["cell_errors"])
+    assert np.array_equal(*lengths)
+    first, second = truths
+    assert first.pop("point_shifts_m") != second.pop("point_shifts_m") and first == second
 
 
 def test_depth_images_have_no_such_errors(branch_folder):
