@@ -42,7 +42,7 @@ def test_virtual_pull_is_a_recording_with_its_truth(branch_folder):
 
 
 def test_a_ratio_that_was_given_counts_as_measured(branch_folder):
-    for value, sigma in ((0.35, 0.05), (0.41, 0.02)):
+    for value, sigma in ((0.35, 0.05), (0.41, 0.03)):
         with Branch.open(branch_folder).stage("reconstruct", ReconstructSettings(poisson=value)):
             pass
         assert fit_spec(Branch.open(branch_folder), EstimateSettings()).poisson_sigma == sigma

@@ -239,7 +239,8 @@ def _refusal(model: type[BaseModel], values: dict[str, Any], error: ValidationEr
         # It concerns several values, and names them.
         return InputError(Text(message, "."), "", "See the options' help.")
     given = first.get("input")
-    typed = shlex.quote(given) if isinstance(given, str) else repr(given)
+    # A number is a text where it was typed, but not to who typed it.
+    typed = given if isinstance(given, str) and re.fullmatch(r"[-+.\d]\S*", given) else repr(given)
     return InputError(Text(Option(str(first["loc"][0])), f" {typed}: ", message, "."),
                       "The stage cannot use this value.",
                       "See the option's help for its range.")

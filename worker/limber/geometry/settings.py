@@ -23,7 +23,7 @@ OPEN = 0.8
 """Probability below which a decision is an open question."""
 GRASP_FRACTION = 2.0 / 3.0
 """Position along the main path at which a branch is held by default."""
-DENSITY_SIGMA, POISSON, GIVEN_POISSON_SIGMA = 0.1, 0.35, 0.02
+DENSITY_SIGMA, POISSON, GIVEN_POISSON_SIGMA = 0.1, 0.35, 0.03
 """Relative standard deviation of the density of wood that nobody weighed; Poisson's ratio where
 none was given, and the standard deviation of one that was."""
 
@@ -141,7 +141,7 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
         0.0, ge=0, description="Leave twigs thinner than this [m] out of the mesh, and keep "
             "their mass.")
     young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
-    poisson: float = Field(POISSON, ge=0, lt=0.5, description="Poisson's ratio; if given, to 0.02.")
+    poisson: float = Field(POISSON, ge=0, lt=0.5, description="Poisson's ratio; if given, to 0.03.")
     density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
     density_sigma: float = Field(
         DENSITY_SIGMA, ge=0, le=1, description="Relative standard deviation of the density: 0.02 "
@@ -172,7 +172,7 @@ class MeshSurfaceSettings(Settings):
         "thicker end.")
     upright: bool = Field(True, description="Turn the long axis to z, and gravity with it.")
     young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
-    poisson: float = Field(POISSON, ge=0, lt=0.5, description="Poisson's ratio; if given, to 0.02.")
+    poisson: float = Field(POISSON, ge=0, lt=0.5, description="Poisson's ratio; if given, to 0.03.")
     density: float = Field(900.0, gt=0, description="Density [kg/m^3].")
     density_sigma: float = Field(
         DENSITY_SIGMA, ge=0, le=1, description="Relative standard deviation of the density.")
