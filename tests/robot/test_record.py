@@ -31,6 +31,7 @@ from limber.core.progress import SILENT
 from limber.geometry.cloud.camera import D455
 from limber.perception.observe import observe
 from limber.recordings.recording import read_pull
+from limber.robot.motion.trajectory import Trajectory
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
 from limber.robot.virtual.launch import VirtualCamera
 from limber.stages.pulls.record import RecordPull, _remove_empty
@@ -166,6 +167,25 @@ def after_a_way(robot, way: float, action: str, **values):
             robot.ask(action, **values)
     robot.each_step = watch
     yield
+
+
+@pytest.mark.slow
+def test_a_pull_is_predicted_at_a_gripper_that_yields(branch_folder):
+    """Fingers and branch are springs in a row: along its axis the branch is the stiffer one."""
+    cell = cell_at(branch_folder, "127.0.0.1")
+    point, branch = np.array([0.0, 0.0, 0.2]), Branch.open(branch_folder)
+    forces = {}
+    for compliance in (0.0, 1e-4):
+        cell = cell.model_copy(update={"tool": cell.tool.model_copy(
+            update={"compliance_m_per_n": compliance})})
+        model = PullModel.of_branch(branch, cell, point, SILENT)
+        poses = np.zeros((2, 6))
+        poses[1, :3] = 1e-3 * matrices(np.array(cell.base.pose))[2, :3]
+        forces[compliance] = model.predicted(Trajectory(np.array([0.0, 1.0]), poses)).forces[-1]
+    stiffness = model.stiffness
+    wanted = np.linalg.solve(np.eye(3) + 1e-4 * stiffness, forces[0.0])
+    assert forces[1e-4] == pytest.approx(wanted, rel=0.05, abs=0.02)
+    assert np.linalg.norm(forces[1e-4]) < 0.7 * np.linalg.norm(forces[0.0])
 
 
 @pytest.mark.slow

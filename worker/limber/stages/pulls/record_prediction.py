@@ -14,7 +14,7 @@ from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.cell.cell_file import Cell
-    from limber.mechanics import BranchModel
+    from limber.mechanics import BranchModel, StaticResult
     from limber.robot.motion.trajectory import Trajectory
 
 _SHARES = (0.35, 0.7, 1.0)  # of the travel in which a wrong sensor is noticed
@@ -39,6 +39,7 @@ class PullModel:
         self._grasp = Grasp.gripping(model.mesh, point, GRASP_RADIUS_M)
         self._model = model.gripped(self._grasp)
         self._base = matrices(np.array(cell.base.pose))
+        self._compliance = cell.tool.compliance_m_per_n
         self._rest = np.eye(4)
         self._rest[:3, 3] = point
         self.stiffness = self._stiffness()
@@ -72,14 +73,21 @@ class PullModel:
         chosen, away = _prediction_rows(frames[:, :3, 3])
         poses = pose_vectors(frames[chosen] @ inverted(frames[0]) @ self._rest)
         results = follow_poses(self._model, self._grasp, poses)
-        forces = [result.require().reaction_force for result in results[:len(_SHARES)]]
+        forces = [self._felt(result.require()) for result in results[:len(_SHARES)]]
         for result in results[len(_SHARES):]:
             if not result.converged:
                 break
-            forces.append(result.reaction_force)
+            forces.append(self._felt(result))
         way = frames[chosen[len(_SHARES) - 1], :3, 3] - frames[0, :3, 3]
         return PredictedPull(np.r_[0.0, away[:len(forces)]], np.vstack([np.zeros(3), *forces]),
                              self._factor, certain_directions(self.stiffness, way))
+
+    def _felt(self, result: StaticResult) -> np.ndarray:
+        """Force of a gripper that yields itself [N], shape [3], as :meth:`.Predicted.felt`."""
+        from limber.mechanics.sensitivities import grasp_slopes
+
+        slopes = grasp_slopes(self._model, self._grasp, result.displacement).wrench[:3, :3]
+        return np.linalg.solve(np.eye(3) + self._compliance * slopes, result.reaction_force)
 
 
 def _prediction_rows(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
