@@ -183,7 +183,7 @@ def read(capfd, *arguments):
     (b"\x93NUMPY\x01\0", "stdin")])
 def test_standard_input_is_a_file(content, name, capfd, monkeypatch):
     """It is read to its end, and recognised as a file would be."""
-    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO(content + 9000 * b"\n")))
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content + 9000 * b"\n")))
     [(path, held)], code, _ = read(capfd, "-")
     assert code == 0 and path.name == name and held.strip() == content.strip()
     assert len(held) == len(content) + 9000 and not path.exists()

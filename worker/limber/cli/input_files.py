@@ -5,7 +5,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,8 @@ import click
 
 from limber.core.errors import Command, InputError
 
-_BINARY = (b"\0", b"ply", b"# .PCD", b"LASF", b"ASTM-E57", b"glTF", b"solid", b"VERSION")
-"""Content that is recognised without a suffix begins so, or has the first of these."""
+_MARKS = (b"ply", b"# .PCD", b"LASF", b"ASTM-E57", b"glTF", b"solid", b"VERSION")
+"""Content that is recognised without a suffix begins so, or has zero bytes."""
 
 
 @contextmanager
@@ -23,10 +23,11 @@ def input_files(arguments: list[click.Parameter], typed: Mapping[str, Any],
     """Return what was typed, with a file that holds standard input for ``-``, and for a pattern the
     file that matches it. InputError if several match."""
     found = dict(typed)
-    with tempfile.TemporaryDirectory(prefix="limber-stdin-") as folder:
+    with ExitStack() as held:
         for name in (each.name for each in arguments if isinstance(each, click.Argument)):
             path = found.get(name)
-            if path == Path("-"):
+            if path == Path("-") and not sys.stdin.isatty():
+                folder = held.enter_context(tempfile.TemporaryDirectory(prefix="limber-stdin-"))
                 found[name] = _held(sys.stdin.buffer, Path(folder))
             elif isinstance(path, Path) and glob.has_magic(str(path)) and not path.exists():
                 found[name] = _match(path)
@@ -35,8 +36,7 @@ def input_files(arguments: list[click.Parameter], typed: Mapping[str, Any],
 
 def _held(stream: Any, folder: Path) -> Path:
     head = stream.read(1 << 12)
-    is_named_by_content = _BINARY[0] in head or head.startswith(_BINARY[1:])
-    path = folder / ("stdin" if is_named_by_content else "stdin.txt")
+    path = folder / ("stdin" if b"\0" in head or head.startswith(_MARKS) else "stdin.txt")
     with open(path, "wb") as file:
         file.write(head)
         shutil.copyfileobj(stream, file)
