@@ -7,7 +7,7 @@ import sys
 import bpy
 
 from . import compat, preferences
-from .worker import WorkerNotFound, worker_environment
+from .jobs.worker import WorkerNotFound, worker_environment
 
 _handles = []
 

@@ -7,7 +7,8 @@ import time
 
 import bpy
 
-from . import compat, worker
+from . import compat
+from .jobs import worker
 
 KEY = __package__
 """The add-on's name among Blender's."""

@@ -6,9 +6,10 @@ from typing import Any
 import bpy
 import numpy as np
 
-from . import branch_folder, branches, compat
-from .overlays import graph as viewport_graph
-from .stages import Field, SettingError, Stage, rows_of, stages
+from . import compat
+from .branch import branch_folder, branches
+from .jobs.stages import Field, SettingError, Stage, rows_of, stages
+from .show import graph as viewport_graph
 
 OPEN = "use_"
 """Prefix of the property that states whether an optional field is given."""

@@ -11,7 +11,7 @@ import bmesh
 import bpy
 import numpy as np
 
-from ..skeleton_edits import Mark, Nodes, Skeleton, SkeletonEditError, edits_of
+from ..skeleton.skeleton_edits import Mark, Nodes, Skeleton, SkeletonEditError, edits_of
 from . import meshes
 
 NODES_KEY = "limber_skeleton_m"

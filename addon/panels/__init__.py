@@ -1,1 +1,1 @@
-"""The sidebar tab "Limber": one file per step of the work."""
+"""The sidebar tab "Limber", and the guide's pages."""

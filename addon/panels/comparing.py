@@ -5,10 +5,9 @@ from typing import Any
 
 import bpy
 
-from .. import branch_folder, branches
-from ..branch_folder import BranchRecord
-from ..lines import draw_text, room, width
-from ..operators import several
+from ..branch import branch_folder, branches, several
+from ..branch.branch_folder import BranchRecord
+from .lines import draw_text, room, width
 
 _PATH_ROWS = (("Length", "length_m", 1e3, "mm"), ("Energy, summed", "energy_sum_nmm", 1.0, "N mm"),
               ("Peak energy", "peak_energy_j", 1e3, "mJ"), ("Peak force", "peak_force_n", 1.0, "N"),

@@ -2,9 +2,10 @@
 
 import bpy
 
-from .. import guide, jobs
-from ..lines import draw_text
-from ..plain_words import error_texts
+from ..jobs import jobs
+from ..jobs.plain_words import error_texts
+from . import guide
+from .lines import draw_text
 from .sidebar import SidebarPanel
 
 _LOG_LINES = 12

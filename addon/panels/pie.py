@@ -2,7 +2,8 @@
 
 import bpy
 
-from .. import branches, properties
+from .. import properties
+from ..branch import branches
 from .steps import next_stage
 
 _KEY = {"type": "L", "value": "PRESS", "shift": True, "alt": True}

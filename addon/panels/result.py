@@ -2,11 +2,16 @@
 
 import bpy
 
-from .. import branches, compat, energy_field, guide, preferences, properties, warming
-from ..lines import draw_text
-from ..operators import live_loads, seeing
-from ..overlays import graph as viewport_graph
+from .. import compat, preferences, properties
+from ..bend import live_loads
+from ..branch import branches
+from ..jobs import warming
+from ..plan import energy_field
+from ..show import graph as viewport_graph
+from ..show import seeing
+from . import guide
 from .comparing import draw_branches
+from .lines import draw_text
 from .sidebar import SidebarPanel
 from .steps import next_stage
 

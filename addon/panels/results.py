@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-from ..lines import draw_pair
+from .lines import draw_pair
 
 _UNITS = {"m": "m", "m2": "m²", "m3": "m³", "mm": "mm", "pa": "Pa", "j": "J", "n": "N", "s": "s",
           "percent": "%", "mb": "MB", "hz": "Hz", "kg": "kg", "rad": "rad"}

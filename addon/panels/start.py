@@ -2,8 +2,9 @@
 
 import bpy
 
-from .. import branches, guide
-from ..lines import draw_text
+from ..branch import branches
+from . import guide
+from .lines import draw_text
 from .sidebar import SidebarPanel
 
 

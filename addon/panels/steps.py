@@ -5,13 +5,15 @@ from typing import Any
 
 import bpy
 
-from .. import branch_folder, branches, guide, jobs, preferences, properties, trouble_mark
-from ..branch_folder import BranchRecord, StageRecord
-from ..lines import draw_text, has_room_beside
-from ..operators.presets import sensor_menu
-from ..plain_words import choice_title, error_texts, warning_text
-from ..stages import Field, Stage, stages
-from ..steps import (
+from .. import preferences, properties
+from ..bend.replay import draw_pulls
+from ..branch import branch_folder, branches
+from ..branch.branch_folder import BranchRecord, StageRecord
+from ..jobs import jobs, trouble_mark
+from ..jobs.plain_words import choice_title, error_texts, warning_text
+from ..jobs.presets import sensor_menu
+from ..jobs.stages import Field, Stage, stages
+from ..jobs.steps import (
     FIRST,
     PLACES,
     REGIONS,
@@ -22,13 +24,14 @@ from ..steps import (
     Step,
     StepState,
 )
-from ..steps import next_step as step_after
+from ..jobs.steps import next_step as step_after
+from ..plan.robot import draw_robot
+from ..skeleton.panel_parts import draw_skeleton
+from . import guide
 from .comparing import draw_moduli, draw_paths
-from .pulls import draw_pulls
+from .lines import draw_text, has_room_beside
 from .results import draw_results
-from .robot import draw_robot
 from .sidebar import SidebarPanel
-from .skeleton import draw_skeleton
 
 _FIRST_ORDER = 3
 _GRAPHS = {"estimate": "young", "plan": "energy"}

@@ -166,7 +166,7 @@ def whole_texts(registered, monkeypatch):
 
     Every module is loaded before: one that took the replaced function would keep it.
     """
-    lines = importlib.import_module("limber_addon.lines")
+    lines = importlib.import_module("limber_addon.panels.lines")
     monkeypatch.setattr(lines, "wrapped", lambda text, _space: (text,) if text else ())
 
 
@@ -188,7 +188,7 @@ def worker_here(registered, monkeypatch):
     For tests of what is asked of the worker and what is done with its answer. Those of operators
     and jobs start it as the process that it is.
     """
-    jobs = importlib.import_module("limber_addon.jobs")
+    jobs = importlib.import_module("limber_addon.jobs.jobs")
     launch = jobs.Job.launch
 
     def launch_here(job) -> None:

@@ -54,7 +54,7 @@ def is_imported():
 
 def is_made():
     """The worker has made a branch folder of the scan, and its result was opened by itself."""
-    if "scan" not in bpy.data.collections or part("jobs").is_running() or not waited(1.0):
+    if "scan" not in bpy.data.collections or part("jobs.jobs").is_running() or not waited(1.0):
         return False
     cloud, surface = bpy.data.objects["scan scan"], bpy.data.collections["scan"].objects["scan"]
     seen["points"] = len(cloud.data.vertices)
@@ -76,7 +76,7 @@ def point_at_grasp():
 
 
 def goal():
-    return part("goal_ball").of(bpy.data.collections["scan"])
+    return part("plan.goal_ball").of(bpy.data.collections["scan"])
 
 
 def drag():
@@ -84,7 +84,7 @@ def drag():
     mouse.event("MOUSEMOVE")
     if goal() is None:
         return False
-    grasp = part("branches").find_surface(bpy.context.scene)["limber_grasp_m"][:3]
+    grasp = part("branch.branches").find_surface(bpy.context.scene)["limber_grasp_m"][:3]
     seen["goal_from_grasp_m"] = sum(
         (a - b) ** 2 for a, b in zip(goal().location, grasp, strict=True)) ** 0.5
     return seen["goal_from_grasp_m"] > 0.03
@@ -97,7 +97,7 @@ def is_goal_set():
 
 
 def is_planned():
-    jobs = part("jobs")
+    jobs = part("jobs.jobs")
     if jobs.is_running() or not waited(1.0):
         return False
     if error := jobs.current().error:

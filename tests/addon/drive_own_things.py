@@ -21,7 +21,7 @@ def thing_of(name):
 
 def is_idle():
     """Done for a while: a stage's job is followed by that which shows its result."""
-    if part("jobs").is_running() or part("jobs").waiting():
+    if part("jobs.jobs").is_running() or part("jobs.jobs").waiting():
         idle["since"] = time.monotonic()
     return time.monotonic() - max(idle["since"], started["step"]) > 0.5
 
@@ -55,7 +55,7 @@ def put_things():
     bpy.data.scenes.new("other").collection.children.link(bpy.data.collections["beam"])
     scene.frame_start, scene.frame_end = 2, 90
     scene.frame_set(4)
-    part("branches").activate(scene, thing_of("Cube"))
+    part("branch.branches").activate(scene, thing_of("Cube"))
     area = view()[1]
     area.spaces.active.shading.color_type = "MATERIAL"
     area.spaces.active.region_3d.view_distance = 1.5

@@ -110,7 +110,7 @@ def open_example():
 
 
 def is_open():
-    return "bending_branch" in bpy.data.collections and not part("jobs").is_running() and (
+    return "bending_branch" in bpy.data.collections and not part("jobs.jobs").is_running() and (
         waited(1.0))
 
 
@@ -130,7 +130,7 @@ def all_settings():
 
 def fail():
     """A job that ended with an error and said much."""
-    jobs = part("jobs")
+    jobs = part("jobs.jobs")
     job = jobs.start("Sample the Energy", [sys.executable, "-c", (
         "import sys; print('A line of the log that is longer than the sidebar is wide, with a '"
         "'path: /data/somebody/branches/an-apple-tree/the-scan-of-a-branch.ply',"
@@ -144,7 +144,7 @@ def errors():
     told = json.loads((FOLDER / "errors.json").read_text())
 
     def draw(layout, context):
-        steps, stages = part("panels.steps"), part("stages").stages()
+        steps, stages = part("panels.steps"), part("jobs.stages").stages()
         # As the panels of the steps have it.
         layout.use_property_split, layout.use_property_decorate = True, False
         for number, (stage, parts) in enumerate(told[:DRAWN_ERRORS]):
@@ -157,9 +157,9 @@ def errors():
 
 def measure_errors():
     """Write down the errors of which a line is wider than there is room for in the sidebar."""
-    lines, words = part("lines"), part("plain_words")
+    lines, words = part("panels.lines"), part("jobs.plain_words")
     told = json.loads((FOLDER / "errors.json").read_text())
-    stages = part("stages").stages()
+    stages = part("jobs.stages").stages()
     window, area, region = view("UI")
     seen["sidebar"] = [region.x, region.y, region.width, region.height]
     with bpy.context.temp_override(window=window, area=area, region=region):

@@ -54,7 +54,7 @@ def test_what_is_wrong_is_said_and_the_next_one_works(bpy, use, kind):
     with pytest.raises(RuntimeError, match=words):
         bpy.ops.limber.report()
     assert steps.state_of(scene, "report")[0] is steps.StepState.FAILED
-    assert words in part("jobs").current().error
+    assert words in part("jobs.jobs").current().error
     use(GOOD)
     assert bpy.ops.limber.report() == {"FINISHED"}
     assert steps.state_of(scene, "report")[0] is not steps.StepState.FAILED
@@ -75,7 +75,7 @@ def test_a_worker_that_hangs(bpy, use, monkeypatch):
     """It says nothing and does not end when asked: that is told, and it is ended all the same."""
     from tests.addon.test_panels import _draw
 
-    jobs, panel = part("jobs"), part("panels.job").LIMBER_PT_job
+    jobs, panel = part("jobs.jobs"), part("panels.job").LIMBER_PT_job
     monkeypatch.setattr(jobs, "_SILENT_SECONDS", 0.3)
     monkeypatch.setattr(jobs, "_GRACE_SECONDS", 0.3)
     job = jobs.start("Trying", [sys.executable, "-c", (
@@ -126,20 +126,20 @@ def test_a_running_job_redraws_the_sidebar_alone(bpy, registered):
     area = SimpleNamespace(type="VIEW_3D", regions=[region("WINDOW"), region("UI")],
                            tag_redraw=lambda: drawn.append("all of it"))
     window = SimpleNamespace(screen=SimpleNamespace(areas=[area]))
-    part("operators.worker_operator").redraw_sidebars(
+    part("jobs.worker_operator").redraw_sidebars(
         SimpleNamespace(window_manager=SimpleNamespace(windows=[window])))
     assert drawn == ["UI"]
 
 
 def test_what_is_opened_is_what_the_job_filled(bpy, use, monkeypatch, tmp_path):
     """Whatever folder the scene names by the time it ends."""
-    run_stage, opened = part("operators.run_stage"), []
+    run_stage, opened = part("jobs.run_stage"), []
     in_a_window = SimpleNamespace(
         app=SimpleNamespace(background=False), ops=SimpleNamespace(limber=SimpleNamespace(
             open_result=lambda _, directory: opened.append(directory))))
     operator = SimpleNamespace(
         report=lambda *_: None, title="Plan Path", stage_name="plan", _name="p",
-        _folder=tmp_path / "a.branch", stage=part("stages").stages()["plan"],
+        _folder=tmp_path / "a.branch", stage=part("jobs.stages").stages()["plan"],
         _show_what_was_made=lambda _: None)
     bpy.context.scene.limber.branch_folder = str(tmp_path / "another.branch")
     with monkeypatch.context() as patch:

@@ -10,7 +10,7 @@ pytestmark = pytest.mark.usefixtures("worker_here")
 @pytest.mark.parametrize("scalar", ["young", "strain_energy"])
 def test_it_colours_as_the_worker_does(bpy, registered, beam, scalar):
     """By the attribute of the surface, on a logarithmic or an even scale: the worker's colours."""
-    from limber_addon.branches import find_surface, info_of
+    from limber_addon.branch.branches import find_surface, info_of
     from limber_addon.bridge import colour_nodes, meshes
 
     bpy.ops.limber.open_result(directory=str(beam.folder))

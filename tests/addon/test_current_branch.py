@@ -34,7 +34,7 @@ def two(bpy, registered, bare_beam):
     folders = (bare_beam.folder, other)
     for folder in folders:
         assert bpy.ops.limber.open_result(directory=str(folder)) == {"FINISHED"}
-    return folders, part("branches").branches(bpy.context.scene)
+    return folders, part("branch.branches").branches(bpy.context.scene)
 
 
 def _mark(bpy, parent):
@@ -50,7 +50,7 @@ def _mark(bpy, parent):
 def test_a_step_works_on_the_branch_of_the_active_object(bpy, two, chosen):
     """a opened, then b, then a made active: the target goes into a, and all else says a too."""
     folders, (first, _) = two
-    scene, branches = bpy.context.scene, part("branches")
+    scene, branches = bpy.context.scene, part("branch.branches")
     surface = branches.surface_of(first)
     active = {"surface": surface, "what hangs on it": _mark(bpy, surface),
               "another part": next(thing for thing in first.objects if thing != surface)}[chosen]
@@ -59,14 +59,14 @@ def test_a_step_works_on_the_branch_of_the_active_object(bpy, two, chosen):
     assert Path(scene.limber.branch_folder) == folders[0], "as the panel shows it"
     assert bpy.ops.limber.target(name="flower", at=(0.0, 0.0, 0.3)) == {"FINISHED"}
     assert [_targets(folder) for folder in folders] == [["flower"], []]
-    assert part("panels.steps").state_of(scene, "target")[0] is part("steps").StepState.DONE
+    assert part("panels.steps").state_of(scene, "target")[0] is part("jobs.steps").StepState.DONE
 
 
 @pytest.mark.slow
 def test_the_branch_used_last_stays(bpy, two):
     """A lamp is chosen after a: still a. The one opened last is the current one before."""
     folders, (first, second) = two
-    scene, branches = bpy.context.scene, part("branches")
+    scene, branches = bpy.context.scene, part("branch.branches")
     assert branches.current_folder(scene) == folders[1]
     assert bpy.context.view_layer.objects.active == branches.surface_of(second)
     layer = bpy.context.view_layer
@@ -86,7 +86,7 @@ def test_a_folder_that_was_chosen_is_the_current_one(bpy, two, tmp_path):
     """Entered in the panel or given by a script: its branch becomes active; one that is not shown
     leaves none active."""
     folders, (first, _) = two
-    scene, branches, layer = bpy.context.scene, part("branches"), bpy.context.view_layer
+    scene, branches, layer = bpy.context.scene, part("branch.branches"), bpy.context.view_layer
     scene.limber.branch_folder = f"{folders[0]}/"
     assert layer.objects.active == branches.surface_of(first)
     assert bpy.ops.limber.target(branch_folder=str(folders[1]), name="fruit",
@@ -108,7 +108,7 @@ def test_a_folder_that_was_chosen_is_the_current_one(bpy, two, tmp_path):
 def test_a_button_means_the_branch_that_it_was_drawn_for(bpy, two):
     """Drawn for a; b becomes the current one; pressed: into a. The list says which is current."""
     folders, shown = two
-    scene, branches = bpy.context.scene, part("branches")
+    scene, branches = bpy.context.scene, part("branch.branches")
     for branch, uuid in zip(shown, ("uuid-a", "uuid-b"), strict=True):
         branch[branches.UUID_KEY] = uuid
         path = Path(branch[branches.FOLDER_KEY]) / "branch.json"
@@ -128,7 +128,7 @@ def test_a_button_means_the_branch_that_it_was_drawn_for(bpy, two):
 def test_a_folder_that_has_another_branch_by_now_is_shown_before_it_is_written(bpy, two):
     """Replaced on the disk: steps refuse, Open Result shows what is there, and then they work."""
     folders, (_, shown) = two
-    shown[part("branches").UUID_KEY] = "another"
+    shown[part("branch.branches").UUID_KEY] = "another"
     with pytest.raises(RuntimeError, match=r"another branch now.*Open Result"):
         bpy.ops.limber.target(name="flower", at=(0.0, 0.0, 0.3))
     assert bpy.ops.limber.open_result() == {"FINISHED"}
@@ -142,14 +142,14 @@ def test_a_refused_folder_leaves_the_current_one(bpy, two, tmp_path):
     folders, _ = two
     with pytest.raises(RuntimeError, match=r"branch\.json"):
         bpy.ops.limber.open_result(directory=str(tmp_path))
-    assert part("branches").current_folder(bpy.context.scene) == folders[1]
+    assert part("branch.branches").current_folder(bpy.context.scene) == folders[1]
 
 
 @pytest.mark.slow
 def test_a_scan_stands_for_its_own_folder(bpy, two, tmp_path):
     """Imported beside a branch, then chosen again: a branch is made in the scan's folder."""
     folders, (first, _) = two
-    scene, branches = bpy.context.scene, part("branches")
+    scene, branches = bpy.context.scene, part("branch.branches")
     (tmp_path / "twig.xyz").write_text("0 0 0\n0 0 0.1\n0 0 0.2\n")
     bpy.ops.limber.import_cloud(filepath=str(tmp_path / "twig.xyz"))
     assert branches.current_folder(scene) == tmp_path / "twig.branch"
@@ -167,7 +167,7 @@ def test_a_shipped_scene_has_its_folder(bpy, registered, name):
     bpy.ops.wm.open_mainfile(filepath=str(BLEND_FILES / f"{name}.blend"))
     scene = bpy.context.scene
     assert scene.limber.branch_folder == f"//{name}"
-    assert part("branches").current_folder(scene).resolve() == BLEND_FILES / name
+    assert part("branch.branches").current_folder(scene).resolve() == BLEND_FILES / name
     assert part("panels.steps").state_of(scene, "estimate")[1] is not None
 
 

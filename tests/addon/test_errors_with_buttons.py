@@ -50,8 +50,8 @@ def test_a_choice_is_a_button_that_runs_the_step_again(bpy, failing):
     """Refused; its sentence, its mark and its button are there; pressed, the step is done."""
     with pytest.raises(RuntimeError, match=r"two plants.*Plants: largest"):
         bpy.ops.limber.reconstruct()
-    scene, stage = bpy.context.scene, part("stages").stages()["reconstruct"]
-    mark = part("trouble_mark").of(scene, stage)
+    scene, stage = bpy.context.scene, part("jobs.stages").stages()["reconstruct"]
+    mark = part("jobs.trouble_mark").of(scene, stage)
     bpy.context.view_layer.update()
     cloud = next(thing for thing in scene.objects if "limber_scan_sha256" in thing)
     local = [1200.0, 2000.0, 300.0]
@@ -69,7 +69,7 @@ def test_a_choice_is_a_button_that_runs_the_step_again(bpy, failing):
     result = bpy.ops.limber.take_choice(stage="reconstruct", option="plants", value='"largest"')
     assert result == {"FINISHED"}
     assert "--plants" in json.loads(failing.read_text().splitlines()[-1])
-    assert part("trouble_mark").of(scene, stage) is None
+    assert part("jobs.trouble_mark").of(scene, stage) is None
     assert "Why, and what to do" not in _draw_step(bpy, "skeleton").names("label")
 
 
@@ -83,9 +83,10 @@ def test_a_choice_is_a_button_that_runs_the_step_again(bpy, failing):
     ("energy", Option("such_a_thing", 3), "--such-a-thing 3")])
 def test_options_are_told_by_their_titles(addon, stage, named, wanted):
     """As the panels call them; what no panel has stays as it is. In warnings too."""
-    text, words = Text("Or (", named, ")."), part("plain_words")
+    text, words = Text("Or (", named, ")."), part("jobs.plain_words")
     outcome = {"warning_parts": [{"text": text, "parts": json.loads(json.dumps(text.as_json()))}]}
-    assert words.warning_text(outcome, text, part("stages").stages()[stage]) == f"Or ({wanted})."
+    described = part("jobs.stages").stages()[stage]
+    assert words.warning_text(outcome, text, described) == f"Or ({wanted})."
     assert words.warning_text(outcome, "Another.") == "Another."
     assert words.error_texts({"error": "No result."}) == ["No result."]
 
@@ -93,7 +94,7 @@ def test_options_are_told_by_their_titles(addon, stage, named, wanted):
 def test_settings_without_a_value_are_shown(bpy, registered, whole_texts):
     """Each once, in the text's order: not those with a value, switches, or what no panel keeps."""
     layout, steps = Layout(), part("panels.steps")
-    stage = part("stages").stages()["reconstruct"]
+    stage = part("jobs.stages").stages()["reconstruct"]
     error = InputError("Two plants.", "", *map(Option, (
         "crop", "camera_at", "root", "crop", "force", "output", "such_a_thing")),
                        Option("plants", "joined"))
@@ -107,7 +108,7 @@ def test_a_step_that_an_error_names_is_a_button(bpy, registered, whole_texts):
     layout, steps = Layout(), part("panels.steps")
     error = InputError("There is no field.", "", *map(Command, (
         "energy", "reconstruct", "execute", "doctor")), Command("energy", Option("samples")))
-    steps.draw_error(layout, bpy.context, part("stages").stages()["plan"], error.as_json())
+    steps.draw_error(layout, bpy.context, part("jobs.stages").stages()["plan"], error.as_json())
     assert layout.names("operator") == ["limber.energy"]
 
 
@@ -115,7 +116,7 @@ def test_a_step_that_an_error_names_is_a_button(bpy, registered, whole_texts):
 def test_every_error_of_a_stage_is_told_without_the_command_line(addon):
     """Each text that the worker raises, as far as a step of the tab can meet it. Slow: reads all of
     the worker's source."""
-    words, stages = part("plain_words"), part("stages").stages()
+    words, stages = part("jobs.plain_words"), part("jobs.stages").stages()
     known = {"`limber cache --clear`": "no panel has the cache",
              "`limber scene`": "what runs Blender by itself",
              "`limber 0.1234 0.1234`": "what makes a file that is missing",
@@ -128,7 +129,7 @@ def test_every_error_of_a_stage_is_told_without_the_command_line(addon):
 
 def test_the_root_that_an_error_asks_for_is_set_by_a_button_or_the_cursor(bpy, failing):
     """The button sets the place, or the word; the cursor gives the file's coordinates."""
-    stages, properties = part("stages").stages(), part("properties")
+    stages, properties = part("jobs.stages").stages(), part("properties")
     stage = stages["reconstruct"]
     group = properties.group_of(bpy.context.scene, stage)
 

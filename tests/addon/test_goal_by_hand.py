@@ -23,8 +23,8 @@ def part(name):
 def ball(bpy, registered, beam):
     """An opened branch with a plan, and the ball of its goal."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
-    surface = part("branches").find_surface(bpy.context.scene)
-    return part("goal_ball").of(part("branches").branch_of(surface))
+    surface = part("branch.branches").find_surface(bpy.context.scene)
+    return part("plan.goal_ball").of(part("branch.branches").branch_of(surface))
 
 
 @pytest.mark.slow
@@ -41,7 +41,7 @@ def test_moving_the_ball_moves_the_plans_goal(bpy, ball, monkeypatch):
     bpy.context.view_layer.update()
     assert plan.use_goal and not plan.use_goal_seed
     assert list(plan.goal) == pytest.approx([0.1, 0.2, 0.3])
-    stage = part("stages").stages()["plan"]
+    stage = part("jobs.stages").stages()["plan"]
     assert part("properties").differs(plan, stage, {"goal": [0.1, 0.2, 0.31]})
     assert not part("properties").differs(plan, stage, {"goal": [0.1, 0.2, 0.3]})
 
@@ -50,7 +50,7 @@ def test_moving_the_ball_moves_the_plans_goal(bpy, ball, monkeypatch):
 def test_dragging_the_handle_moves_the_plans_goal(bpy, ball):
     """By a displacement in the world, also where the branch was put aside and turned."""
     scene, before = bpy.context.scene, list(ball.location)
-    surface = part("branches").find_surface(scene)
+    surface = part("branch.branches").find_surface(scene)
     surface.delta_rotation_euler = (0.0, 0.0, math.pi / 2)
     bpy.context.view_layer.update()
     assert bpy.ops.limber.drag_goal(move=(0.0, 0.1, 0.0)) == {"FINISHED"}
@@ -68,7 +68,7 @@ def test_the_ball_is_an_active_object_that_gives_the_goal(bpy, ball):
     """From Active Object takes its place; the tolerance is not the size of what is seen."""
     plan = bpy.context.scene.limber.plan
     tolerance = plan.goal_tolerance
-    part("branches").activate(bpy.context.scene, ball)
+    part("branch.branches").activate(bpy.context.scene, ball)
     assert bpy.ops.limber.from_object(region="goal") == {"FINISHED"}
     assert list(plan.goal) == pytest.approx(list(ball.location))
     assert plan.use_goal and plan.goal_tolerance == tolerance
@@ -112,7 +112,7 @@ def test_a_branch_without_a_plan_gets_a_ball(bpy, registered, bare_beam):
 def test_a_plan_samples_the_energy_that_it_lacks(bpy, registered, bare_beam, monkeypatch):
     """Once, before it; nothing is sampled where it is there. Where it fails, no plan is begun."""
     bpy.ops.limber.open_result(directory=str(bare_beam.folder))
-    jobs = part("jobs")
+    jobs = part("jobs.jobs")
     ran, code, launch = [], [0], jobs.Job.launch
 
     def launch_here(job):
@@ -150,9 +150,9 @@ def test_a_plan_samples_the_energy_that_it_lacks(bpy, registered, bare_beam, mon
 def test_the_grasp_is_dragged_to_a_goal(bpy, registered, bare_beam):
     """Without a plan: a ball is made there, and is the plan's goal. Put back, there is neither."""
     bpy.ops.limber.open_result(directory=str(bare_beam.folder))
-    scene, goal_ball = bpy.context.scene, part("goal_ball")
-    surface = part("branches").find_surface(scene)
-    branch = part("branches").branch_of(surface)
+    scene, goal_ball = bpy.context.scene, part("plan.goal_ball")
+    surface = part("branch.branches").find_surface(scene)
+    branch = part("branch.branches").branch_of(surface)
     bpy.context.view_layer.update()
     before = goal_ball.Before.of(scene, branch)
     assert bpy.ops.limber.drag_goal(mark="Grasp 1", move=(0.05, 0.0, -0.01)) == {"FINISHED"}
@@ -174,11 +174,11 @@ def test_a_target_is_dragged_to_a_goal(bpy, ball, beam):
     bpy.ops.limber.open_result(directory=str(beam.folder))
     bpy.context.view_layer.update()
     scene, plan = bpy.context.scene, bpy.context.scene.limber.plan
-    branch = part("branches").branch_of(part("branches").find_surface(scene))
+    branch = part("branch.branches").branch_of(part("branch.branches").find_surface(scene))
     mark = branch.objects["Target bud"]
     plan.use_goal = True
-    before = part("goal_ball").Before.of(scene, branch)
-    place = part("goal_ball").of(branch).location.copy()
+    before = part("plan.goal_ball").Before.of(scene, branch)
+    place = part("plan.goal_ball").of(branch).location.copy()
     assert bpy.ops.limber.drag_goal(mark=mark.name, move=(0.0, 0.1, 0.0)) == {"FINISHED"}
     assert (plan.use_tip_goal, plan.use_goal, plan.target) == (True, False, "bud")
     wanted = [mark.delta_location.x, mark.delta_location.y + 0.1, mark.delta_location.z]
@@ -186,7 +186,7 @@ def test_a_target_is_dragged_to_a_goal(bpy, ball, beam):
     before.put_back(scene, branch)
     bpy.context.view_layer.update()
     assert (plan.use_tip_goal, plan.use_goal, plan.target) == (False, True, "")
-    assert list(part("goal_ball").of(branch).location) == list(place)
+    assert list(part("plan.goal_ball").of(branch).location) == list(place)
 
 
 @pytest.mark.slow
@@ -199,33 +199,33 @@ def test_the_slice_shows_the_energy_field(bpy, registered, tmp_path):
     shutil.copytree(ROOT / "blend_files" / "bending_branch", folder)
     bpy.ops.limber.open_result(directory=str(folder))
     scene = bpy.context.scene
-    surface = part("branches").find_surface(scene)
-    branch = part("branches").branch_of(surface)
+    surface = part("branch.branches").find_surface(scene)
+    branch = part("branch.branches").branch_of(surface)
     for thing in branch.objects:
         thing.delta_location = (2.0, 0.0, 0.0)
     bpy.context.view_layer.update()
-    thing, field = part("energy_field").of(branch), EnergyField.read(folder / "energy.npz")
+    thing, field = part("plan.energy_field").of(branch), EnergyField.read(folder / "energy.npz")
     assert thing.hide_render and not thing.visible_get()
     # The field's own numbers, at the points of the grid.
     meshes = part("bridge.meshes")
     points = meshes.positions(thing.data).astype(float)
-    colours = part("energy_field").colours_at(thing, points)
+    colours = part("plan.energy_field").colours_at(thing, points)
     assert len(points) > 100 and (colours[:, 3] > 0.99).mean() > 0.99
     np.testing.assert_allclose(meshes.scalars(thing.data, "energy_j"), field.energy(points),
                                rtol=2e-2, atol=1e-5)
     np.testing.assert_allclose(colours, meshes.colors(thing.data, "color"), atol=0.02)
     aside = points + [0.0, 0.0, 0.5]
-    assert (part("energy_field").colours_at(thing, aside)[:, 3] == 0).all()
+    assert (part("plan.energy_field").colours_at(thing, aside)[:, 3] == 0).all()
     place = Vector(field.rest) + Vector((2.0, 0.0, 0.0))
     across, up = Vector((1.0, 0.0, 0.0)), Vector((0.0, 0.0, 1.0))
-    at, seen, triangles = part("overlays.energy_slice").net(thing, surface, place, across, up)
+    at, seen, triangles = part("plan.energy_slice").net(thing, surface, place, across, up)
     np.testing.assert_allclose(at[:, 1], place.y)
     assert len(triangles) > 50 and (seen[triangles, 3] > 0).any(axis=1).all()
     nearest = np.argmin(np.linalg.norm(at - np.array(place), axis=1))
-    rest = part("energy_field").colours_at(thing, np.array([field.rest]))[0, :3].sum()
+    rest = part("plan.energy_field").colours_at(thing, np.array([field.rest]))[0, :3].sum()
     assert seen[nearest, 3] > 0
     assert rest < np.quantile(colours[:, :3].sum(axis=1), 0.25), "the least energy is dark"
-    assert not scene.limber.show_energy_slice and not part("energy_field").is_sliced(scene)
+    assert not scene.limber.show_energy_slice and not part("plan.energy_field").is_sliced(scene)
     scene.limber.show_energy_slice = True
-    scales = part("overlays.legend").shown_scales(surface)
+    scales = part("show.legend").shown_scales(surface)
     assert any("with the grasp there" in scale["title"] for scale in scales)

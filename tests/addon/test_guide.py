@@ -34,8 +34,8 @@ def pages(tmp_path_factory):
 
 def test_every_panel_has_a_page(bpy, registered, pages):
     """The button in each panel's header opens a page that the checkout and the zip have."""
-    guide = importlib.import_module("limber_addon.guide")
-    steps = importlib.import_module("limber_addon.steps").STEPS
+    guide = importlib.import_module("limber_addon.panels.guide")
+    steps = importlib.import_module("limber_addon.jobs.steps").STEPS
     names = {*guide._PAGES.values(), *(step.page for step in steps), "index"}
     assert len(names) > 8
     for name in names:

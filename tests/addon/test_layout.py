@@ -36,16 +36,26 @@ def test_imports_of_its_own_are_relative():
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and node.level == 0:
                 first = (node.module or "").split(".")[0]
-                if first in {"addon", "limber", "bridge", "operators", "panels"}:
+                if first in {"addon", "limber"} | {path.name for path in ADDON.iterdir()
+                                                      if path.is_dir()}:
                     wrong.append(f"{path.name}: {node.module}")
     assert not wrong
 
 
 def test_only_the_scene_script_is_a_program():
     """Jobs and the search for the worker stay free of bpy: threads live there."""
-    for name in ("jobs.py", "worker.py", "worker_process.py", "plain_words.py", "clouds.py",
-                 "scans.py", "scene_data.py", "session.py"):
-        assert "import bpy" not in (ADDON / name).read_text()
+    for name in ("jobs/jobs", "jobs/worker", "jobs/worker_process", "jobs/plain_words",
+                 "scan/clouds", "scan/scans", "show/scene_data", "bend/session"):
+        assert "import bpy" not in (ADDON / f"{name}.py").read_text()
+
+
+def test_a_folder_is_one_action_of_the_user():
+    """At most 16 files in a folder, and at the top only what Blender and the build ask for."""
+    folders = {path.parent for path in FILES}
+    assert len(folders) >= 10
+    counts = {folder.name: len(list(folder.glob("*.py"))) for folder in folders}
+    assert not {name: count for name, count in counts.items() if count > 16}
+    assert counts["addon"] <= 6
 
 
 def test_every_icon_exists(bpy):
@@ -55,6 +65,6 @@ def test_every_icon_exists(bpy):
             for call in re.findall(r"icon=([^)\n]+)", path.read_text())
             for icon in re.findall(r'"([A-Z_0-9]+)"', call)}
     assert "FILE_FOLDER" in used
-    used |= set(re.findall(r'= \("[^"]+", "([A-Z_]+)"\)', (ADDON / "steps.py").read_text()))
+    used |= set(re.findall(r'= \("[^"]+", "([A-Z_]+)"\)', (ADDON / "jobs/steps.py").read_text()))
     assert "RADIOBUT_OFF" in used
     assert used <= known

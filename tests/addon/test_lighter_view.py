@@ -7,7 +7,7 @@ import pytest
 
 @pytest.fixture()
 def view(bpy, addon):
-    module = importlib.import_module("limber_addon.operators.lighter_view")
+    module = importlib.import_module("limber_addon.bend.lighter_view")
     bpy.context.preferences.system.viewport_aa = "8"
     bpy.context.preferences.is_dirty = False
     return module.LighterView(bpy.context.preferences)

@@ -9,7 +9,7 @@ import pytest
 
 @pytest.fixture()
 def limits(worker_here):
-    return importlib.import_module("limber_addon.operators.limits")
+    return importlib.import_module("limber_addon.bend.limits")
 
 
 def test_only_limits_that_are_set_count(bpy, limits):
@@ -38,7 +38,8 @@ def test_colours_go_from_green_to_red(limits):
 def test_the_branch_is_red_beyond_a_limit_and_gets_its_colours_back(bpy, limits, beam):
     """Whatever it was coloured by; turning it on or off twice is nothing."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
-    surface = importlib.import_module("limber_addon.branches").find_surface(bpy.context.scene)
+    branches = importlib.import_module("limber_addon.branch.branches")
+    surface = branches.find_surface(bpy.context.scene)
     bpy.ops.limber.color_by(scalar="strain_energy")
     tint, attributes = limits.Tint(surface), surface.data.color_attributes
     for _ in range(2):
@@ -55,7 +56,7 @@ def test_the_branch_is_red_beyond_a_limit_and_gets_its_colours_back(bpy, limits,
 
 def test_the_frame_rate_is_that_of_the_last_second(addon):
     """Thirty in a second; none a second later."""
-    rate = importlib.import_module("limber_addon.frame_rate").FrameRate()
+    rate = importlib.import_module("limber_addon.bend.frame_rate").FrameRate()
     for number in range(60):
         rate.tick(10.0 + number / 30)
     assert rate.per_second(10.0 + 59 / 30) == 30

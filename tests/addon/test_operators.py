@@ -67,7 +67,7 @@ def test_columns_are_read_as_the_worker_reads_them(bpy, registered, tmp_path, te
     """Coordinates by the header's names, in whatever order; no other column, no unit guessed."""
     path = tmp_path / "scan.csv"
     path.write_text(text, encoding="utf-8")
-    points, *_ = importlib.import_module("limber_addon.clouds").read_points(path)
+    points, *_ = importlib.import_module("limber_addon.scan.clouds").read_points(path)
     np.testing.assert_allclose(points, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
     np.testing.assert_allclose(points, read_cloud(path).points)
     bpy.ops.limber.import_cloud(filepath=str(path))
@@ -83,7 +83,7 @@ def test_the_units_and_files_of_other_programs(bpy, registered, tmp_path, name, 
     """A unit that the file states is set, and the points are the worker's."""
     path = tmp_path / name
     path.write_text(text)
-    points, *_ = importlib.import_module("limber_addon.clouds").read_points(path)
+    points, *_ = importlib.import_module("limber_addon.scan.clouds").read_points(path)
     np.testing.assert_allclose(points * {"m": 1.0, "mm": 1e-3}[unit], read_cloud(path).points)
     bpy.ops.limber.import_cloud(filepath=str(path))
     assert bpy.context.scene.limber.reconstruct.unit == unit
@@ -92,7 +92,7 @@ def test_the_units_and_files_of_other_programs(bpy, registered, tmp_path, name, 
 @pytest.mark.parametrize("name", ["realsense_ascii_normals.ply", "metashape.txt", "polycam.ply"])
 def test_a_scan_has_the_workers_colours(bpy, registered, name):
     path = Path(__file__).parents[1] / "data" / "tour" / name
-    points, _, colours = importlib.import_module("limber_addon.clouds").read_points(path)
+    points, _, colours = importlib.import_module("limber_addon.scan.clouds").read_points(path)
     read = read_cloud(path)
     np.testing.assert_allclose(points, read.points, atol=1e-9)
     np.testing.assert_array_equal(colours, read.attributes["color"])
@@ -140,7 +140,7 @@ def test_reconstruct_wants_a_scan(bpy, registered):
 
 def test_reconstruct_hands_the_worker_what_the_user_chose(bpy, registered, tmp_path, monkeypatch):
     """The worker gets file, folder and unit; its error reaches the user as it is."""
-    jobs = importlib.import_module("limber_addon.jobs")
+    jobs = importlib.import_module("limber_addon.jobs.jobs")
     seen = []
     start = jobs.start
     monkeypatch.setattr(jobs, "start", lambda title, command, _: seen.append(command) or start(
@@ -206,7 +206,7 @@ def test_color_by_refuses_unknown(bpy, worker_here, beam):
 def test_check_worker(bpy, registered):
     """The worker that is found answers."""
     assert bpy.ops.limber.check_worker() == {"FINISHED"}
-    jobs = importlib.import_module("limber_addon.jobs")
+    jobs = importlib.import_module("limber_addon.jobs.jobs")
     assert jobs.current().result["command"] == "doctor"
 
 
@@ -255,7 +255,7 @@ def test_a_folder_belongs_to_its_scan(bpy, registered, tmp_path):
 
 def test_replacing_a_branch_has_to_be_said(bpy, registered, tmp_path, monkeypatch):
     """Reconstructing into the folder of another scan is refused unless it is asked for."""
-    jobs = importlib.import_module("limber_addon.jobs")
+    jobs = importlib.import_module("limber_addon.jobs.jobs")
     started = []
     monkeypatch.setattr(jobs, "start", lambda title, command, _: started.append(command) or 1 / 0)
     one, two = _scan(tmp_path / "a.xyz", 1), _scan(tmp_path / "b.xyz", 2)
@@ -271,9 +271,9 @@ def test_replacing_a_branch_has_to_be_said(bpy, registered, tmp_path, monkeypatc
 
 def test_keywords_are_the_scenes_settings(bpy, registered, beam, monkeypatch):
     """What a script gives a stage is what the panels show, and what the worker gets."""
-    jobs = importlib.import_module("limber_addon.jobs")
+    jobs = importlib.import_module("limber_addon.jobs.jobs")
     # The branch has no energy field: here it is not sampled first.
-    monkeypatch.delitem(importlib.import_module("limber_addon.steps").FIRST, "plan")
+    monkeypatch.delitem(importlib.import_module("limber_addon.jobs.steps").FIRST, "plan")
     started = []
     monkeypatch.setattr(jobs, "start", lambda title, command, _: started.append(command) or 1 / 0)
     with pytest.raises(RuntimeError, match="division"):
@@ -318,14 +318,14 @@ def test_places_come_from_the_cursor(bpy, registered):
 def test_import_stands_in_the_file_menu(bpy, registered):
     """File > Import has the scan, so that F3 finds it; and it goes with the add-on."""
     menu = bpy.types.TOPBAR_MT_file_import
-    imports = importlib.import_module("limber_addon.operators.import_cloud")
+    imports = importlib.import_module("limber_addon.scan.import_cloud")
     assert imports._draw_menu in menu._dyn_ui_initialize()
     assert bpy.types.LIMBER_FH_cloud.bl_import_operator == "limber.import_cloud"
 
 
 def test_a_scan_of_more_units_than_a_plant_has_metres_is_in_millimetres(bpy, registered, tmp_path):
     """From the worker's limit on: guessed and asked, unless the user has set the unit."""
-    limit = importlib.import_module("limber_addon.stages").longest_m()
+    limit = importlib.import_module("limber_addon.jobs.stages").longest_m()
     assert limit == LONGEST
     np.savetxt(tmp_path / "a.xyz", POINTS * 1.1 * limit / np.ptp(POINTS, axis=0).max())
     settings = bpy.context.scene.limber.reconstruct
@@ -338,7 +338,7 @@ def test_a_scan_of_more_units_than_a_plant_has_metres_is_in_millimetres(bpy, reg
         assert settings.unit == unit
     # The worker would ask for it again.
     stages, properties = (importlib.import_module(f"limber_addon.{name}") for name in (
-        "stages", "properties"))
+        "jobs.stages", "properties"))
     settings.output = "a.branch"
     typed = properties.arguments_of(bpy.context.scene, stages.stages()["reconstruct"], "a.branch")
     assert typed[typed.index("--unit") + 1] == "m"
@@ -347,12 +347,12 @@ def test_a_scan_of_more_units_than_a_plant_has_metres_is_in_millimetres(bpy, reg
 def test_map_coordinates_keep_their_digits(bpy, registered, tmp_path):
     """A scan in a map's coordinates: a millimetre is still there, and it comes to its branch."""
     meshes = importlib.import_module("limber_addon.bridge.meshes")
-    scene = importlib.import_module("limber_addon.scene")
+    scene = importlib.import_module("limber_addon.show.scene")
     points = np.array([[432100.001, 5412300.002, 512.003], [432100.501, 5412300.102, 513.0]])
     (tmp_path / "map.xyz").write_text("".join(f"{x} {y} {z}\n" for x, y, z in points))
     bpy.ops.limber.import_cloud(filepath=str(tmp_path / "map.xyz"))
     cloud = bpy.data.objects["map scan"]
-    branches = importlib.import_module("limber_addon.branches")
+    branches = importlib.import_module("limber_addon.branch.branches")
     offset = np.array(cloud[branches.OFFSET_KEY])
     np.testing.assert_allclose(meshes.positions(cloud.data) + offset, points, rtol=0, atol=1e-6)
     alignment = np.eye(4)
@@ -367,7 +367,7 @@ def test_map_coordinates_keep_their_digits(bpy, registered, tmp_path):
 
 def test_a_count_that_the_file_has_no_room_for(bpy, registered, tmp_path):
     """No memory is taken for what a header only claims."""
-    clouds = importlib.import_module("limber_addon.clouds")
+    clouds = importlib.import_module("limber_addon.scan.clouds")
     path = tmp_path / "huge.ply"
     path.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 900000000000\n"
                      b"property float x\nproperty float y\nproperty float z\nend_header\n1234")
@@ -377,8 +377,8 @@ def test_a_count_that_the_file_has_no_room_for(bpy, registered, tmp_path):
 
 def test_a_job_that_blender_ends_is_no_failure(bpy, registered, tmp_path):
     """File > New while the worker works: the panel of the new file shows no failure."""
-    jobs = importlib.import_module("limber_addon.jobs")
-    operators = importlib.import_module("limber_addon.operators.worker_operator")
+    jobs = importlib.import_module("limber_addon.jobs.jobs")
+    operators = importlib.import_module("limber_addon.jobs.worker_operator")
     job = jobs.start("Working", [sys.executable, "-c", "import time; time.sleep(60)"])
     operators._beside.append(operators._Beside("limber.energy", job, {}, {}))
     bpy.ops.wm.read_homefile()

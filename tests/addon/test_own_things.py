@@ -35,7 +35,7 @@ def shown(bpy, beam):
     """A function that shows the folder's present result; shown once."""
     def show(folder=beam.folder):
         assert bpy.ops.limber.open_result(directory=str(folder)) == {"FINISHED"}
-        return part("branches").find_surface(bpy.context.scene)
+        return part("branch.branches").find_surface(bpy.context.scene)
     show()
     return show
 
@@ -245,7 +245,7 @@ def _timing(bpy):
 def _selection(bpy):
     lamp = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "POINT"))
     bpy.context.scene.collection.objects.link(lamp)
-    part("branches").activate(bpy.context.scene, lamp)
+    part("branch.branches").activate(bpy.context.scene, lamp)
     return lambda: (bpy.context.view_layer.objects.active.name,
                     [thing.name for thing in bpy.context.selected_objects])
 
@@ -259,7 +259,7 @@ def _copied(bpy):
     # It sorts before the original.
     points = part("bridge.meshes").positions
     return lambda: (points(things(bpy)["a copy"].data).tolist(),
-                    things(bpy)["beam"] == part("branches").find_surface(bpy.context.scene))
+                    things(bpy)["beam"] == part("branch.branches").find_surface(bpy.context.scene))
 
 
 def _edit_mode(bpy):
@@ -280,7 +280,7 @@ THINGS = (_own_object, _own_object_with_keys, _moved, _renamed, _keyed, _coloure
 @pytest.mark.parametrize("thing", THINGS, ids=lambda thing: thing.__name__.strip("_"))
 def test_a_thing_of_the_users_stays(bpy, shown, beam, write_pc2, thing):
     """After Open Result, a simulation, and a plan again. The objects are the same ones."""
-    surface = part("branches").find_surface(bpy.context.scene)
+    surface = part("branch.branches").find_surface(bpy.context.scene)
     seen = thing(bpy)
     before, count = seen(), len(bpy.data.objects)
     shown()
@@ -294,7 +294,7 @@ def test_a_thing_of_the_users_stays(bpy, shown, beam, write_pc2, thing):
     bpy.context.scene.limber.scene.motion = ""
     shown()
     assert seen() == before
-    assert part("branches").find_surface(bpy.context.scene) == surface
+    assert part("branch.branches").find_surface(bpy.context.scene) == surface
 
 
 @pytest.mark.slow
@@ -303,7 +303,7 @@ def test_another_mesh_comes_into_the_same_object(bpy, shown, beam):
     motion, which belonged to the other mesh, is gone, with all that belonged to the plan."""
     from limber.geometry.tets.tree_sweep import straight_beam
 
-    surface = part("branches").find_surface(bpy.context.scene)
+    surface = part("branch.branches").find_surface(bpy.context.scene)
     mesh, mine = surface.data, bpy.data.materials.new("mine")
     surface.modifiers.new("Subsurf", "SUBSURF")
     surface.data.materials[0] = mine
@@ -355,7 +355,7 @@ def test_the_motion_goes_before_a_subdivision(bpy, worker_here, bare_beam, beam)
     """Put around a branch that has no motion yet: the motion moves the vertices below it."""
     show = bpy.ops.limber.open_result
     show(directory=str(bare_beam.folder))
-    surface = part("branches").find_surface(bpy.context.scene)
+    surface = part("branch.branches").find_surface(bpy.context.scene)
     surface.modifiers.new("Subsurf", "SUBSURF")
     shutil.copytree(beam.folder, bare_beam.folder, dirs_exist_ok=True)
     show(directory=str(bare_beam.folder))
@@ -376,7 +376,7 @@ def test_what_the_user_deleted_comes_back_once(bpy, shown):
     names = set(things(bpy).keys())
     shown()
     assert set(things(bpy).keys()) - names == {"Control point 2"}
-    surface = part("branches").find_surface(bpy.context.scene)
+    surface = part("branch.branches").find_surface(bpy.context.scene)
     for thing in list(bpy.data.collections["beam"].objects):
         bpy.context.scene.collection.objects.link(thing)
     bpy.data.collections.remove(bpy.data.collections["beam"])
@@ -389,7 +389,7 @@ def test_what_the_user_deleted_comes_back_once(bpy, shown):
 def test_a_copied_collection_is_the_users(bpy, shown, beam):
     """A copy in the scene does not change; a copy with its scene is a branch of that scene."""
     branch = bpy.data.collections["beam"]
-    surface = part("branches").find_surface(bpy.context.scene)
+    surface = part("branch.branches").find_surface(bpy.context.scene)
     copy = branch.copy()
     for thing in list(copy.objects):
         copy.objects.unlink(thing)
@@ -398,7 +398,7 @@ def test_a_copied_collection_is_the_users(bpy, shown, beam):
         copy.objects.link(twin)
     bpy.context.scene.collection.children.link(copy)
     assert shown() == surface
-    assert part("branches").branches(bpy.context.scene) == [branch]
+    assert part("branch.branches").branches(bpy.context.scene) == [branch]
     bpy.ops.scene.new(type="FULL_COPY")
     twin = shown()
     assert twin != surface
@@ -410,7 +410,7 @@ def test_a_copied_collection_is_the_users(bpy, shown, beam):
 def test_a_copy_is_told_apart_after_saving(bpy, shown, tmp_path):
     """Saved and opened again, even under a name that sorts first: the original is changed."""
     _copied(bpy)
-    surface = part("branches").find_surface(bpy.context.scene)
+    surface = part("branch.branches").find_surface(bpy.context.scene)
     surface.name = "z original"
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "mine.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "mine.blend"))
@@ -440,7 +440,7 @@ def test_an_appended_branch_is_changed_in_place_and_a_linked_one_is_left(bpy, sh
 @pytest.mark.slow
 def test_two_branches_do_not_touch_each_other(bpy, shown, beam, tmp_path):
     """Copies of one folder, with one identity: each has its own objects."""
-    first = part("branches").find_surface(bpy.context.scene)
+    first = part("branch.branches").find_surface(bpy.context.scene)
     shutil.copytree(beam.folder, tmp_path / "twin.branch")
     second = shown(tmp_path / "twin.branch")
     assert second != first
@@ -470,11 +470,11 @@ def test_a_goal_moved_by_hand_waits_for_its_plan(bpy, shown, beam):
 def test_a_bad_motion_costs_nothing(bpy, shown, beam, write_pc2):
     """Of another mesh: refused with the reason, and all is there as before."""
     scene_data(Branch.open(beam.folder)).write(beam.folder / "data.npz")
-    data = part("scene_data").read_scene_data(beam.folder / "data.npz")
+    data = part("show.scene_data").read_scene_data(beam.folder / "data.npz")
     write_pc2(beam.folder / "frames/to-goal.pc2", beam.frames[:, :-1])
     names = set(things(bpy).keys())
     with pytest.raises(ValueError, match="belongs to another mesh"):
-        part("scene").show_branch(bpy.context.scene, data)
+        part("show.scene").show_branch(bpy.context.scene, data)
     assert set(things(bpy).keys()) == names
 
 
@@ -499,11 +499,11 @@ def test_it_is_undone_and_redone(bpy, shown, beam, write_pc2):
 def test_a_scan_is_put_to_its_branch_once(bpy, beam, tmp_path):
     """Where the user moves it then, it stays, until a result lies elsewhere."""
     scene_data(Branch.open(beam.folder)).write(tmp_path / "data.npz")
-    data = part("scene_data").read_scene_data(tmp_path / "data.npz")
+    data = part("show.scene_data").read_scene_data(tmp_path / "data.npz")
     scan = bpy.data.objects.new("scan", None)
     scan["limber_scan_sha256"] = data.info["source"]["sha256"] = "abc"
     bpy.context.scene.collection.objects.link(scan)
-    place = part("scene").place_scans
+    place = part("show.scene").place_scans
     assert place(bpy.context.scene, data) == 1
     scan.location.x = 5.0
     assert place(bpy.context.scene, data) == 0 and scan.location.x == 5.0

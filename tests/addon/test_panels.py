@@ -96,7 +96,8 @@ def _draw(panel, context):
 @pytest.fixture()
 def panels(worker_here):
     def panel(name):
-        module = importlib.import_module(f"limber_addon.panels.{name}")
+        module = importlib.import_module(
+            "limber_addon.plan.play_panel" if name == "play" else f"limber_addon.panels.{name}")
         return getattr(module, f"LIMBER_PT_{name}")
     return panel
 
@@ -133,7 +134,7 @@ def test_every_panel_is_in_the_tab(bpy, panels):
     ("report", "limber.report", ("limber.open_report",))])
 def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, first, more):
     """Its stages' buttons in order, and every setting of the schema; the common ones at once."""
-    stages = importlib.import_module("limber_addon.stages").stages()
+    stages = importlib.import_module("limber_addon.jobs.stages").stages()
     drawn = _draw_step(bpy, name)
     shown = [call for call in drawn.names("operator") if call not in (
         "limber.from_cursor", "limber.from_object")]
@@ -186,7 +187,7 @@ def test_a_step_says_how_far_it_is(bpy, panels, branch_folder, small):
             (branch_folder / "skeleton.swc").read_text() + "# edited\n")
     assert state("virtual-pull") is module.StepState.STALE
     properties = importlib.import_module("limber_addon.properties")
-    stages = importlib.import_module("limber_addon.stages").stages()
+    stages = importlib.import_module("limber_addon.jobs.stages").stages()
     properties.keep_outcome(scene, stages["virtual-pull"], str(branch_folder),
                             {"status": "failed", "error": "It broke.", "warnings": ["It bent."]})
     assert state("virtual-pull") is module.StepState.FAILED
@@ -275,7 +276,7 @@ def test_without_a_client_for_robots_there_is_no_robot(bpy, panels, whole_texts,
             for text in _draw_step(bpy, name).names("label")]
     is_there, before = shown()
     assert is_there and "Record a Pull" in before and not any("ur-rtde" in text for text in before)
-    worker = importlib.import_module("limber_addon.worker")
+    worker = importlib.import_module("limber_addon.jobs.worker")
     monkeypatch.setattr(preferences, "worker_command", worker.bundled_command)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, found=importlib.util.find_spec: (
         None if name == "rtde_control" else found(name)))
@@ -301,7 +302,7 @@ def test_where_to_start(bpy, panels, beam):
 
 def test_jobs_that_wait_are_listed(bpy, panels):
     """What runs with its time and numbers, then what waits, each with its own cross."""
-    jobs = importlib.import_module("limber_addon.jobs")
+    jobs = importlib.import_module("limber_addon.jobs.jobs")
     job = jobs.add("Estimating", [sys.executable, "-c", "import time; time.sleep(30)"])
     jobs.add("Planning", [sys.executable, "-c", ""])
     jobs.add("Reporting", [sys.executable, "-c", ""])
@@ -321,7 +322,7 @@ def test_jobs_that_wait_are_listed(bpy, panels):
 
 def test_a_running_and_a_failed_job(bpy, panels):
     """While the worker works: a bar and a cancel button; after a failure: why."""
-    jobs = importlib.import_module("limber_addon.jobs")
+    jobs = importlib.import_module("limber_addon.jobs.jobs")
     job = jobs.start("Reconstructing", [sys.executable, "-c", (
         "import sys, time; print('{\"progress\": 0.25, \"message\": \"radii\"}', flush=True); "
         "time.sleep(30)")])
@@ -356,7 +357,7 @@ def test_no_worker_is_said_in_the_panel(bpy, panels, monkeypatch):
 def test_names_are_chosen_from_what_the_branch_has(bpy, panels, tmp_path):
     """Plans, motions and pulls are listed; all of them while one is chosen, else what fits."""
     properties = importlib.import_module("limber_addon.properties")
-    stages = importlib.import_module("limber_addon.stages").stages()
+    stages = importlib.import_module("limber_addon.jobs.stages").stages()
     scene = bpy.context.scene
     scene.limber.branch_folder = str(EXAMPLE)
 
@@ -378,7 +379,7 @@ def test_names_are_chosen_from_what_the_branch_has(bpy, panels, tmp_path):
 
 def test_every_choice_has_a_tooltip(bpy, panels):
     """Of every setting of every stage."""
-    stages = importlib.import_module("limber_addon.stages").stages()
+    stages = importlib.import_module("limber_addon.jobs.stages").stages()
     for stage in stages.values():
         group = getattr(bpy.context.scene.limber, stage.name.replace("-", "_"))
         for field in stage.fields.values():
@@ -402,11 +403,12 @@ def _change(content, scene, *, without=(), rewritten="", ended=(), queued="", fo
         setattr(group, f"use_{name}", True)
         setattr(group, name, value)
     if ended:
-        stage, status = importlib.import_module("limber_addon.stages").stages()[ended[0]], ended[1]
+        name, status = ended
+        stage = importlib.import_module("limber_addon.jobs.stages").stages()[name]
         importlib.import_module("limber_addon.properties").keep_outcome(
             scene, stage, scene.limber.branch_folder, {"status": status, "error": "It broke."})
     if queued:
-        jobs = importlib.import_module("limber_addon.jobs")
+        jobs = importlib.import_module("limber_addon.jobs.jobs")
         jobs._waiting.append(jobs.Job(queued, [], folder or scene.limber.branch_folder))
 
 
@@ -426,7 +428,7 @@ def test_the_next_step_is_a_button_in_thirty_states(bpy, panels, tmp_path):
         found.append(next((name.removeprefix("limber.") for kind, name, *title in
                            _draw(panels("result"), bpy.context).calls
                            if kind == "operator" and str(title[:1]).startswith("['Next: ")), None))
-        importlib.import_module("limber_addon.jobs")._waiting.clear()
+        importlib.import_module("limber_addon.jobs.jobs")._waiting.clear()
         for group in ("estimate", "plan"):
             getattr(bpy.context.scene.limber, group).outcome = ""
     assert list(enumerate(found)) == list(enumerate(name for _, name in table))

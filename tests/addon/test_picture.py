@@ -23,7 +23,7 @@ def example(bpy, registered, tmp_path):
     bpy.ops.wm.read_factory_settings()
     shutil.copytree(EXAMPLE, tmp_path / "example")
     bpy.ops.limber.open_result(directory=str(tmp_path / "example"))
-    return part("branches").find_surface(bpy.context.scene)
+    return part("branch.branches").find_surface(bpy.context.scene)
 
 
 @pytest.mark.slow
@@ -67,20 +67,20 @@ def test_a_plan_over_the_strength_is_not_ticked(bpy, example):
     steps, scene = part("panels.steps"), bpy.context.scene
     step = bpy.types.LIMBER_PT_plan.step
     assert steps.stress_share(scene) == pytest.approx(1.8, abs=0.05)
-    assert steps.step_state(scene, step) is part("steps").StepState.OVER_STRENGTH
+    assert steps.step_state(scene, step) is part("jobs.steps").StepState.OVER_STRENGTH
     drawn = _draw_step(bpy, "plan")
     assert any(text.startswith("May break: stress 1.8") for text in drawn.names("label"))
     assert "The stress exceeds the strength of the wood" in drawn.names("label")
     scene.limber.scene.use_strength, scene.limber.scene.strength = True, 500e6
     bpy.ops.limber.open_result()
-    assert steps.step_state(scene, step) is part("steps").StepState.DONE
+    assert steps.step_state(scene, step) is part("jobs.steps").StepState.DONE
     assert "The stress exceeds the strength of the wood" not in _draw_step(
         bpy, "plan").names("label")
 
 
 def test_the_scale_bar_has_a_round_length(addon):
     """A quarter of the branch at most, in the unit that suits."""
-    scale_bar = part("scale_bar")
+    scale_bar = part("show.scale_bar")
     assert [scale_bar.length_for(size) for size in (0.01, 0.3, 4.1, 30.0)] == pytest.approx(
         [0.002, 0.05, 1.0, 5.0])
     assert [scale_bar.words_for(length) for length in (0.002, 0.05, 0.5, 1.0, 20.0)] == [

@@ -36,7 +36,7 @@ def test_with_a_branch_it_goes_on(bpy, worker_here, bare_beam):
 
 def test_a_choice_has_a_tooltip_of_its_own(bpy, registered):
     """What the description says of it, where it says so choice by choice."""
-    stages = importlib.import_module("limber_addon.stages").stages()
+    stages = importlib.import_module("limber_addon.jobs.stages").stages()
     leaves = stages["reconstruct"].fields["leaves"]
     told = {choice: leaves.about(choice) for choice in leaves.choices}
     assert told["keep"] == "treat all points as wood."

@@ -51,7 +51,7 @@ def test_a_force_sensor(bpy, registered):
 
 def test_menus_offer_the_sensors_of_their_stage(bpy, registered):
     """Every sensor in one menu, its title as text, its values and source as tooltip."""
-    presets = importlib.import_module("limber_addon.operators.presets")
+    presets = importlib.import_module("limber_addon.jobs.presets")
     offered = {}
     for stage in presets.SENSED:
         class Layout:

@@ -49,10 +49,10 @@ def pulled(beam):
 def opened(bpy, worker_here, pulled, tmp_path):
     """The pull's motion in a scene of 24 frames a second: twelve to each frame of it."""
     scene_data(Branch.open(pulled.folder), motion="p").write(tmp_path / "scene.npz")
-    data = part("scene_data").read_scene_data(tmp_path / "scene.npz")
+    data = part("show.scene_data").read_scene_data(tmp_path / "scene.npz")
     bpy.context.scene.limber.branch_folder = str(pulled.folder)
-    shown = part("scene").show_branch(bpy.context.scene, data)
-    assert not part("frame_colours").keep(data)
+    shown = part("show.scene").show_branch(bpy.context.scene, data)
+    assert not part("show.frame_colours").keep(data)
     return shown.surface
 
 
@@ -90,13 +90,13 @@ def test_it_is_hidden_and_gone_with_its_pull(bpy, opened, pulled, tmp_path):
     bpy.context.scene.limber.scene.motion = ""
     bpy.ops.limber.open_result(directory=str(pulled.folder))
     assert "Measured point 1" not in bpy.data.objects
-    assert part("branches").info_of(part("branches").find_surface(bpy.context.scene))[
+    assert part("branch.branches").info_of(part("branch.branches").find_surface(bpy.context.scene))[
         "observation"]["is_shown"] is False
 
 
 def test_force_and_distance_follow_too(bpy, opened):
     """The graph's cursor stands at the frame in sight; so does the colour of the distance."""
-    graph, scene = part("overlays.graph"), bpy.context.scene
+    graph, scene = part("show.graph"), bpy.context.scene
     places = [graph.cursor_of("force", opened, scene) for frame in (1, 31, 61)
               if not scene.frame_set(frame)]
     assert places == pytest.approx([0.0, 0.5, 1.0], abs=0.11) and places == sorted(places)
@@ -129,7 +129,7 @@ def test_a_pull_of_the_example_is_replayed(bpy, worker_here, tmp_path):
     scene = bpy.context.scene
     scene.limber.branch_folder = str(tmp_path / "twig.branch")
     assert bpy.ops.limber.replay_pull(pull="pull-1") == {"FINISHED"}
-    info = part("branches").info_of(part("branches").find_surface(scene))
+    info = part("branch.branches").info_of(part("branch.branches").find_surface(scene))
     assert info["observation"] == {"pull": "pull-1", "is_shown": True}
     assert "residual" in info["frame_scalars"] and scene.limber.scene.motion == "pull-1"
     points = [thing for thing in scene.objects if thing.name.startswith("Measured point")]

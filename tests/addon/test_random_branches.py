@@ -43,8 +43,8 @@ class Run:
         self.bpy.ops.limber.open_result(directory=str(folder))
 
     def shown(self):
-        return [one for one in part("branches").branches(self.bpy.context.scene)
-                if part("branches").surface_of(one) is not None]
+        return [one for one in part("branch.branches").branches(self.bpy.context.scene)
+                if part("branch.branches").surface_of(one) is not None]
 
     def switch(self):
         """Click any object of the scene, or none."""
@@ -74,7 +74,7 @@ class Run:
             return
         branch = self.chance.choice(self.shown())
         if self.chance.random() < 0.5:
-            self.bpy.data.objects.remove(part("branches").surface_of(branch))
+            self.bpy.data.objects.remove(part("branch.branches").surface_of(branch))
         else:
             self.bpy.data.collections.remove(branch)
 
@@ -97,7 +97,7 @@ class Run:
     def write(self, operator, *, late=False, **given):
         """Press a button as it was drawn; ``late``: after another branch became current."""
         scene = self.bpy.context.scene
-        named = part("branches").current_uuid(scene)
+        named = part("branch.branches").current_uuid(scene)
         if not named:
             return
         if late:
@@ -147,7 +147,7 @@ def three(bpy, registered, tmp_path, bare_beam, monkeypatch):
 def quick_worker(worker_here, monkeypatch):
     """``target`` and ``plan`` write their name into the folder that they are given, ``energy``
     writes nothing; all else is the real worker."""
-    jobs = importlib.import_module("limber_addon.jobs")
+    jobs = importlib.import_module("limber_addon.jobs.jobs")
     launch = jobs.Job.launch
 
     def launch_here(job):

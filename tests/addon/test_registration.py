@@ -27,7 +27,7 @@ def test_registers_twice(bpy, addon):
 
 def test_failed_registration_leaves_nothing(bpy, addon, monkeypatch):
     """If one module cannot register, those before it are taken back and the error is seen."""
-    panel = importlib.import_module("limber_addon.panels.play")
+    panel = importlib.import_module("limber_addon.plan.play_panel")
 
     def refuse():
         raise RuntimeError("no")

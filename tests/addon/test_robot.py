@@ -67,7 +67,7 @@ def test_the_plan_in_sight_is_what_a_robot_would_follow(bpy, worker_here, beam):
 def test_not_without_a_dry_run_of_the_same(bpy, checked, tmp_path):
     """Other settings, a plan made anew, another folder: it has to be checked again."""
     folder, _ = checked
-    arming = part("operators.arming")
+    arming = part("plan.robot")
     given = part("properties").OPEN + "speed"  # left open, it is the plan's own
     bpy.context.scene.limber.execute.speed = 0.01
     setattr(bpy.context.scene.limber.execute, given, True)
@@ -84,9 +84,9 @@ def test_not_without_a_dry_run_of_the_same(bpy, checked, tmp_path):
 
 def test_a_robot_never_waits_for_its_turn(bpy, checked):
     """Queued, it would move when nobody is there any more."""
-    jobs = part("jobs")
+    jobs = part("jobs.jobs")
     jobs.start("Estimating", [sys.executable, "-c", "import time; time.sleep(30)"])
-    operator = part("operators.arming").LIMBER_OT_arm
+    operator = part("plan.robot").LIMBER_OT_arm
     moves = type("Moves", (), {"trouble": lambda *_: "", "confirm": "to-goal"})()
     with pytest.raises(ValueError, match="immediately or not at all"):
         operator.arguments(moves, bpy.context)
@@ -121,7 +121,7 @@ def test_the_live_force_is_in_the_panel(bpy, checked):
     assert ("progress", 0.325, "3.25 N of 10 N") in drawn.calls
     assert {"Following to-goal: path", "Peak 4.50 N, expected 3.00 N"} <= set(drawn.names("label"))
     assert "limber.arm" in drawn.names("operator")
-    live_force = part("live_force")
+    live_force = part("plan.live_force")
     assert live_force.read(folder, now=time.time() + 60) is None
     for changed in ({"force_n": None, "expected_n": None}, {"limit_n": 0.0}, {"format": 2},
                     {"peak_n": "many"}):
@@ -136,8 +136,8 @@ def test_while_it_moves_there_is_a_stop(bpy, checked, tmp_path):
     """One large button, and that it is no emergency stop; its force, whichever branch is chosen."""
     from tests.addon.test_panels import _draw_step
 
-    jobs, (folder, _) = part("jobs"), checked
-    jobs.start(part("operators.arming").LIMBER_OT_arm.title,
+    jobs, (folder, _) = part("jobs.jobs"), checked
+    jobs.start(part("plan.robot").LIMBER_OT_arm.title,
                [sys.executable, "-c", "import time; time.sleep(30)"], str(folder))
     _write_live(folder)
     bpy.context.scene.limber.branch_folder = str(tmp_path / "another.branch")
@@ -153,5 +153,5 @@ def test_the_file_is_the_workers(addon):
     """Reader and writer speak of the same file in the same way."""
     from limber.robot.driver import link as live_force
 
-    ours = part("live_force")
+    ours = part("plan.live_force")
     assert (ours.FILE, ours.FORMAT) == (live_force.FILE, live_force.FORMAT)

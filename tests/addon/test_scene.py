@@ -35,8 +35,8 @@ def _scene_in_process(addon, branch, path, bpy, motion=None):
     from limber.results.scene.animation import scene_data
     from limber.store import Branch
 
-    scenes = importlib.import_module("limber_addon.scene")
-    reader = importlib.import_module("limber_addon.scene_data")
+    scenes = importlib.import_module("limber_addon.show.scene")
+    reader = importlib.import_module("limber_addon.show.scene_data")
     data_path = path.parent / "scene.npz"
     scene_data(Branch.open(branch), motion=motion).write(data_path)
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
@@ -161,8 +161,8 @@ def test_targets_go_with_the_branch(bpy, addon, beam, tmp_path):
     from limber.results.scene.animation import scene_data
     from limber.store import Branch
 
-    scenes = importlib.import_module("limber_addon.scene")
-    reader = importlib.import_module("limber_addon.scene_data")
+    scenes = importlib.import_module("limber_addon.show.scene")
+    reader = importlib.import_module("limber_addon.show.scene_data")
     flower = NamedTarget("flower", (0.0, 0.0, 0.5))
     scene_data(Branch.open(beam.folder), targets=[flower]).write(tmp_path / "data.npz")
     shown = scenes.show_branch(bpy.context.scene, reader.read_scene_data(tmp_path / "data.npz"))
@@ -223,7 +223,7 @@ def test_path_becomes_relative_when_saved_later(bpy, worker_here, beam, position
 def test_strain_energy_along_the_path(bpy, addon, beam, tmp_path):
     """The surface carries the largest strain energy density of any frame, in J/m3."""
     meshes = importlib.import_module("limber_addon.bridge.meshes")
-    scenes = importlib.import_module("limber_addon.scene")
+    scenes = importlib.import_module("limber_addon.show.scene")
     shown = _scene_in_process(addon, beam.folder, tmp_path / "scene.blend", bpy)
     mesh = shown.surface.data
     np.testing.assert_allclose(meshes.scalars(mesh, "strain_energy"),
@@ -316,7 +316,7 @@ def test_scene_script_reports_its_failure(bpy, beam, write_pc2, tmp_path):
     scene_data(Branch.open(beam.folder)).write(tmp_path / "data.npz")
     write_pc2(beam.folder / "frames" / "to-goal.pc2", beam.frames[:, 1:])
     done = subprocess.run(
-        [sys.executable, ADDON / "make_scene.py", "--", "--data", tmp_path / "data.npz",
+        [sys.executable, ADDON / "show/make_scene.py", "--", "--data", tmp_path / "data.npz",
          "--scene", tmp_path / "scene.blend"], check=False, capture_output=True, text=True)
     assert done.returncode == 3
     assert "another mesh" in json.loads(done.stdout.splitlines()[-1])["error"]
@@ -360,8 +360,8 @@ def test_the_robots_links_go_with_the_frames(bpy, addon, beam, tmp_path):
                           "robot_radii": np.full(7, 0.03)}
     shown_data.info["robot"] = {"name": "ur5e", "gripper_rods": 3}
     shown_data.write(tmp_path / "data.npz")
-    scenes = importlib.import_module("limber_addon.scene")
-    reader = importlib.import_module("limber_addon.scene_data")
+    scenes = importlib.import_module("limber_addon.show.scene")
+    reader = importlib.import_module("limber_addon.show.scene_data")
     shown = scenes.show_branch(bpy.context.scene, reader.read_scene_data(tmp_path / "data.npz"))
     rods = shown.objects["robot"]
     assert len(rods) == 6
@@ -388,8 +388,8 @@ def test_a_cell_is_shown_where_its_file_says(bpy, addon, beam, tmp_path):
     cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.6, 0, 0, 0, 0, 0)})
     add_cell(cell_data, cell, [table])
     cell_data.write(tmp_path / "data.npz")
-    scenes = importlib.import_module("limber_addon.scene")
-    reader = importlib.import_module("limber_addon.scene_data")
+    scenes = importlib.import_module("limber_addon.show.scene")
+    reader = importlib.import_module("limber_addon.show.scene_data")
     for _ in range(2):
         shown = scenes.show_branch(bpy.context.scene, reader.read_scene_data(tmp_path / "data.npz"))
     kinds = {kind for kind in shown.objects if kind.startswith("cell:")}
@@ -416,13 +416,13 @@ def test_a_long_legend_keeps_to_its_margin_and_height(bpy, addon, beam, tmp_path
     shown_data = data_of(Branch.open(beam.folder))
     shown_data.info["notes"] = ["one of many words that go on and on beyond the margin"] * 12
     shown_data.write(tmp_path / "data.npz")
-    modules = {name: importlib.import_module(f"limber_addon.{name}")
-               for name in ("scene", "scene_data", "studio", "legend")}
+    modules = {name: importlib.import_module(f"limber_addon.show.{name}")
+               for name in ("scene", "scene_data", "studio", "picture_legend")}
     data = modules["scene_data"].read_scene_data(tmp_path / "data.npz")
     scene = bpy.context.scene
     shown = modules["scene"].show_branch(scene, data)
     camera = modules["studio"].set_up_studio(scene, data)
-    legend = modules["legend"].add_legend(scene, camera, data, shown)
+    legend = modules["picture_legend"].add_legend(scene, camera, data, shown)
     bpy.context.view_layer.update()
     frame = camera.data.view_frame(scene=scene)
     depth = 2.0 * camera.data.clip_start

@@ -16,7 +16,7 @@ from limber.store import Branch
 
 @pytest.fixture()
 def reader(addon):
-    return importlib.import_module("limber_addon.scene_data")
+    return importlib.import_module("limber_addon.show.scene_data")
 
 
 @pytest.fixture()
@@ -122,8 +122,8 @@ def test_damaged_files_are_refused(reader, data, tmp_path):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
 def test_a_pipe_in_a_branch_folder_is_not_waited_for(addon, tmp_path):
     """Nobody writes to it: Blender would stand still at the next redraw."""
-    for module, name, function in (("branch_folder", "branch.json", "read_record"),
-                                   ("live_force", None, "read")):
+    for module, name, function in (("branch.branch_folder", "branch.json", "read_record"),
+                                   ("plan.live_force", None, "read")):
         part = importlib.import_module(f"limber_addon.{module}")
         os.mkfifo(tmp_path / (name or part.FILE))
         assert getattr(part, function)(tmp_path) is None

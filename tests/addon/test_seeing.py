@@ -21,10 +21,10 @@ def show(bpy, registered, tmp_path):
     """A function that shows a branch folder as `limber.open_result` does, without its process."""
     def show(folder):
         scene_data(Branch.open(folder)).write(tmp_path / "scene.npz")
-        data = part("scene_data").read_scene_data(tmp_path / "scene.npz")
-        shown = part("scene").show_branch(bpy.context.scene, data)
+        data = part("show.scene_data").read_scene_data(tmp_path / "scene.npz")
+        shown = part("show.scene").show_branch(bpy.context.scene, data)
         bpy.context.scene.limber.branch_folder = str(folder)
-        assert not part("frame_colours").keep(data)
+        assert not part("show.frame_colours").keep(data)
         return shown.surface
     return show
 
@@ -101,7 +101,7 @@ def test_colours_of_each_frame_survive_closing_and_moving(bpy, opened, beam, tmp
 
 def test_a_motion_of_another_size_is_not_shown(addon, tmp_path):
     """Values of fewer frames, or of fewer vertices, are no values of this motion."""
-    frame_values = part("frame_values")
+    frame_values = part("show.frame_values")
     shape = (3, 4)
     values = frame_values.FrameValues({"strain": np.ones(shape, np.float32)},
                                       {"strain": np.ones(shape, np.uint8)},
@@ -122,7 +122,7 @@ def test_a_motion_of_another_size_is_not_shown(addon, tmp_path):
 
 def test_values_of_a_motion_stay_in_their_folder(addon, tmp_path):
     """A name that leads out of it, or a link in the place of its folder, is refused."""
-    frame_values = part("frame_values")
+    frame_values = part("show.frame_values")
     values = frame_values.FrameValues({}, {}, {})
     branch, elsewhere = tmp_path / "a.branch", tmp_path / "elsewhere"
     branch.mkdir()
@@ -139,7 +139,7 @@ def test_values_of_a_motion_stay_in_their_folder(addon, tmp_path):
 
 def test_what_can_be_shown_and_hidden(bpy, opened):
     """Trees are hidden at first, paths are not; what is not there is said."""
-    seeing, branch = part("operators.seeing"), part("branches").branch_of(opened)
+    seeing, branch = part("show.seeing"), part("branch.branches").branch_of(opened)
 
     def hidden(group):
         return {thing.hide_viewport for thing in seeing.things_of(branch, group)}
@@ -153,7 +153,7 @@ def test_what_can_be_shown_and_hidden(bpy, opened):
 
 def test_paths_by_energy_have_a_legend_and_a_graph(bpy, opened):
     """Rods in the colours of the energy; their scale joins the legend once they are in sight."""
-    legend, graph = part("overlays.legend"), part("overlays.graph")
+    legend, graph = part("show.legend"), part("show.graph")
     rods = bpy.data.objects["gentle path by energy"]
     assert rods.hide_viewport and len(legend.shown_scales(opened)) == 1
     bpy.ops.limber.show(group="energy")
@@ -174,7 +174,7 @@ def test_several_branches(bpy, show, beam, tmp_path):
     copied = tmp_path / "second.branch"
     shutil.copytree(beam.folder, copied)
     first, second = show(beam.folder), show(copied)
-    find, scene = part("branches").find_surface, bpy.context.scene
+    find, scene = part("branch.branches").find_surface, bpy.context.scene
     assert find(scene) == second
     bpy.ops.limber.choose_branch(branch=first.users_collection[0].name)
     assert find(scene) == first
@@ -196,8 +196,8 @@ def test_several_branches(bpy, show, beam, tmp_path):
 
 def test_a_folder_is_found_again(bpy, opened, beam, tmp_path):
     """Renamed beside the file: by its number. Elsewhere: where the user says; never another's."""
-    several, scene = part("operators.several"), bpy.context.scene
-    branch = part("branches").branch_of(opened)
+    several, scene = part("branch.several"), bpy.context.scene
+    branch = part("branch.branches").branch_of(opened)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     shutil.copytree(beam.folder, tmp_path / "other.branch")
     manifest = tmp_path / "other.branch" / "branch.json"
@@ -224,10 +224,10 @@ def test_a_folder_is_found_again(bpy, opened, beam, tmp_path):
 def test_the_example_opens(bpy, worker_here, tmp_path):
     """The branch that comes along, in a copy: with all its results."""
     assert bpy.ops.limber.open_example(directory=str(tmp_path / "mine")) == {"FINISHED"}
-    surface = part("branches").find_surface(bpy.context.scene)
+    surface = part("branch.branches").find_surface(bpy.context.scene)
     assert surface.name == "bending_branch"
     assert (tmp_path / "mine" / "bending_branch.blend").is_file()
-    info = part("branches").info_of(surface)
+    info = part("branch.branches").info_of(surface)
     assert {"young", "energy", "force"} <= set(info["graphs"])
     assert {"young", "strain_energy", "stress_over_strength", "residual"} <= set(info["scalars"])
 

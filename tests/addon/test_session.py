@@ -19,7 +19,7 @@ sys.stdin.read()
 
 @pytest.fixture
 def session_module(addon):
-    return importlib.import_module("limber_addon.session")
+    return importlib.import_module("limber_addon.bend.session")
 
 
 @pytest.fixture

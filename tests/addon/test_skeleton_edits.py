@@ -8,7 +8,7 @@ import pytest
 
 @pytest.fixture()
 def edits(addon):
-    return importlib.import_module("limber_addon.skeleton_edits")
+    return importlib.import_module("limber_addon.skeleton.skeleton_edits")
 
 
 @pytest.fixture()

@@ -23,7 +23,7 @@ def opened(bpy, registered, tmp_path):
     folder = tmp_path / "twig.branch"
     shutil.copytree(EXAMPLE, folder)
     bpy.ops.limber.open_result(directory=str(folder))
-    scene = importlib.import_module("limber_addon.branches")
+    scene = importlib.import_module("limber_addon.branch.branches")
     return folder, lambda: scene.find_skeleton(bpy.context.scene)
 
 
@@ -55,7 +55,7 @@ def test_edits_reach_the_mesh_and_are_marked(bpy, opened):
     assert bpy.ops.limber.edit_node(action="RADIUS", node=3, radius=0.012) == {"FINISHED"}
     bpy.ops.object.mode_set(mode="OBJECT")
     _move(skeleton(), 4, [0.001, 0.0, 0.0])
-    overlay = importlib.import_module("limber_addon.overlays.skeleton")
+    overlay = importlib.import_module("limber_addon.skeleton.node_marks")
     skeletons = importlib.import_module("limber_addon.bridge.skeletons")
     marks = overlay.marks_of(skeletons.nodes_of(skeleton()), skeleton().data)
     assert (marks.edit_count, marks.trouble) == (3, "")
@@ -88,7 +88,7 @@ def test_edits_not_applied_outlive_opening_and_a_saved_file(bpy, opened, tmp_pat
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "kept.blend"))
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "kept.blend"))
     skeletons = importlib.import_module("limber_addon.bridge.skeletons")
-    edits = importlib.import_module("limber_addon.skeleton_edits")
+    edits = importlib.import_module("limber_addon.skeleton.skeleton_edits")
     done = edits.edits_of(skeletons.as_given(skeleton().data), skeletons.nodes_of(skeleton()))
     assert [edit["do"] for edit in done] == ["move", "confirm"]
     assert bpy.ops.limber.discard_skeleton() == {"FINISHED"}
@@ -110,7 +110,7 @@ def test_an_alternative_has_a_button(bpy, opened):
                             {"probability": 0.25, "length_m": 0.4,
                              "edits": [{"do": "delete", "at": tip}]}]
     path.write_text(json.dumps(content))
-    panel = importlib.import_module("limber_addon.panels.skeleton")
+    panel = importlib.import_module("limber_addon.skeleton.panel_parts")
     assert panel.alternative_text(*made["alternatives"]) == (
         "0.5 times as likely, 400 mm: 1 branch less")
     drawn = Layout()
@@ -163,7 +163,7 @@ def test_loads_and_exports_have_a_button(bpy, opened, tmp_path):
     assert bpy.ops.limber.load() == {"FINISHED"}
     assert steps.state_of(bpy.context.scene, "load")[0] is steps.StepState.DONE
     properties = importlib.import_module("limber_addon.properties")
-    stages = importlib.import_module("limber_addon.stages").stages()
+    stages = importlib.import_module("limber_addon.jobs.stages").stages()
 
     def told(name):
         # The branch folder knows nothing of it: what was said stays with the button.

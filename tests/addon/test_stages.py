@@ -13,7 +13,7 @@ from limber.stages.registry import all_schemas
 
 @pytest.fixture()
 def stages(addon):
-    return importlib.import_module("limber_addon.stages").stages()
+    return importlib.import_module("limber_addon.jobs.stages").stages()
 
 
 def test_the_shipped_schema_is_the_workers():
@@ -25,7 +25,7 @@ def test_the_shipped_schema_is_the_workers():
 def test_every_stage_has_its_place_in_the_add_on(stages):
     """A new stage stands in a step, with a label; `generate` makes no branch, and `scene` draws
     what `limber.open_result` does."""
-    steps = {step.name for step in importlib.import_module("limber_addon.steps").STEPS}
+    steps = {step.name for step in importlib.import_module("limber_addon.jobs.steps").STEPS}
     assert {stage.name for stage in stages.values() if not stage.step} == {"generate", "scene"}
     assert {stage.step for stage in stages.values()} <= {*steps, ""}
     assert all(bool(stage.label) == bool(stage.step) for stage in stages.values())

@@ -12,7 +12,7 @@ from tests.addon.test_panels import Layout
 @pytest.fixture()
 def warming(bpy, registered, tmp_path, monkeypatch):
     """The module, its worker a script that writes down how it was called."""
-    module = importlib.import_module("limber_addon.warming")
+    module = importlib.import_module("limber_addon.jobs.warming")
     script = tmp_path / "worker.py"
     script.write_text(
         "import json, sys\n"
@@ -53,4 +53,5 @@ def test_it_compiles_once(warming, tmp_path):
     assert not warming.begin() and warming.current() is None
     calls = [json.loads(line) for line in (tmp_path / "calls").read_text().splitlines()]
     assert calls == [["doctor", "--warm", "--json", "--progress", "json"]] * 2
-    assert not importlib.import_module("limber_addon.jobs").is_running(), "nothing waits for it"
+    jobs = importlib.import_module("limber_addon.jobs.jobs")
+    assert not jobs.is_running(), "nothing waits for it"

@@ -26,7 +26,7 @@ class Kernel:
 
 @pytest.fixture()
 def process(addon):
-    return importlib.import_module("limber_addon.worker_process")
+    return importlib.import_module("limber_addon.jobs.worker_process")
 
 
 def test_the_job_object_ends_with_blender(process):

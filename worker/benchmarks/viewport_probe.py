@@ -78,13 +78,13 @@ def frame_write(count: int, repeats: int) -> None:
 def import_points(path: Path) -> None:
     """A scan as a user's import has it: read by a thread, then shown at once."""
     longest, started = 0.0, time.perf_counter()
-    reading, last = part("scans").Reading(path), started
+    reading, last = part("scan.scans").Reading(path), started
     while not reading.is_done:
         time.sleep(0.005)
         longest, last = max(longest, time.perf_counter() - last), time.perf_counter()
     scan = reading.scan()
     mesh = part("bridge.meshes").new_mesh("cloud", scan.points)
-    cloud = part("branches").add_object(bpy.context.scene.collection, "cloud", mesh)
+    cloud = part("branch.branches").add_object(bpy.context.scene.collection, "cloud", mesh)
     bpy.context.view_layer.update()
     now = time.perf_counter()
     say("import", seconds=now - started, reading_ms=1e3 * longest, shown_ms=1e3 * (now - last),
@@ -94,7 +94,8 @@ def import_points(path: Path) -> None:
 
 def grab_loop(branch: Path, count: int) -> None:
     """Poses streamed to a session at 60 Hz, and Blender's handling of each answer."""
-    sessions, meshes, branches = part("session"), part("bridge.meshes"), part("branches")
+    sessions, meshes = part("bend.session"), part("bridge.meshes")
+    branches = part("branch.branches")
     bpy.ops.limber.open_result(directory=str(branch))
     surface = branches.find_surface(bpy.context.scene)
     command = [*part("preferences").worker_command(), "session", "--no-grasp", str(branch)]
@@ -169,7 +170,7 @@ def _streamed(held, surface, meshes, number, start, count):
 
 def job_memory(count: int) -> None:
     """Jobs that print a little and end, one after the other."""
-    jobs = part("jobs")
+    jobs = part("jobs.jobs")
     program = "import json; print(json.dumps({'progress': 0.5})); print(json.dumps({'status': 1}))"
     before = _memory_mb()
     for number in range(count):
@@ -217,12 +218,12 @@ def undo_sequences(branch: Path, cloud: Path, count: int, seed: int, seconds: fl
 
 
 def _act(name: str, branch: Path, cloud: Path, rng: np.random.Generator) -> None:
-    limber, branches = bpy.ops.limber, part("branches")
+    limber, branches = bpy.ops.limber, part("branch.branches")
     skeleton = branches.find_skeleton(bpy.context.scene)
     surface = branches.find_surface(bpy.context.scene)
     if name == "open" and surface is None:
         # A file here replaces the worker's answer to each request.
-        part("scene").show_branch(bpy.context.scene, part("scene_data").read_scene_data(
+        part("show.scene").show_branch(bpy.context.scene, part("show.scene_data").read_scene_data(
             branch.with_suffix(".npz")))
     elif name == "colour" and surface is not None:
         scalars = list(json.loads(surface[branches.INFO_KEY])["scalars"])
@@ -248,8 +249,8 @@ def _state() -> str:
     limber = bpy.context.scene.limber
     things = sorted((thing.name, len(thing.data.vertices) if thing.type == "MESH" else 0)
                     for thing in bpy.context.scene.objects)
-    skeleton = part("branches").find_skeleton(bpy.context.scene)
-    surface = part("branches").find_surface(bpy.context.scene)
+    skeleton = part("branch.branches").find_skeleton(bpy.context.scene)
+    surface = part("branch.branches").find_surface(bpy.context.scene)
     radii = [] if skeleton is None else part("bridge.meshes").scalars(
         skeleton.data, "radius").round(6).tolist()
     colour = None if surface is None else surface.data.color_attributes.active_color.name

@@ -40,7 +40,7 @@ def event(kind, value="NOTHING", aside=(0.0, 0.0)):
 
 
 def held():
-    return part("session")._open[0]
+    return part("bend.session")._open[0]
 
 
 def begin(settings):
@@ -56,11 +56,11 @@ def is_loaded(_settings):
         raise RuntimeError(held().error)
     if not held().hello:
         return False
-    surface = part("branches").find_surface(bpy.context.scene)
+    surface = part("branch.branches").find_surface(bpy.context.scene)
     _, area, region = view()
     place = view3d_utils.location_3d_to_region_2d(
         region, area.spaces.active.region_3d, surface.matrix_world @ Vector(
-            surface[part("branches").GRASP_KEY][:3]))
+            surface[part("branch.branches").GRASP_KEY][:3]))
     state["x"], state["y"] = place
     move, frame = held().move, held().frame
 

@@ -429,9 +429,9 @@ FILE_READERS: dict[str, Reader] = {
     "wind CSV": Reader("text", partial(_decay, "wind.csv", "speed_m_s"), _wind),
     "MTG": Reader("text", partial(_cylinder_models, ".mtg"), partial(_read, SKELETONS)),
     "add-on clouds": Reader("binary", partial(_clouds, ".ply .xyz .csv"),
-                            partial(_addon_read, "clouds", "read_points")),
+                            partial(_addon_read, "scan.clouds", "read_points")),
     "add-on scene data": Reader("npz", _scene_file, partial(
-        _addon_read, "scene_data", "read_scene_data"), True),
+        _addon_read, "show.scene_data", "read_scene_data"), True),
     "SWC": Reader("text", partial(template_file, "skeleton.swc"), partial(_read, SKELETONS)),
     "surface PLY": Reader("binary", partial(template_file, "surface.ply"),
                           partial(_read, SURFACES)),

@@ -322,8 +322,8 @@ def _written(folder: Path) -> int:
     """Open, run a stage and append to a stream, as a Python program does, after the add-on has read
     the data of its panels.
     """
-    addon_module("branch_folder").read_record(folder)
-    addon_module("live_force").read(folder)
+    addon_module("branch.branch_folder").read_record(folder)
+    addon_module("plan.live_force").read(folder)
     try:
         branch = Branch.create(folder)
         with branch.stream("pulls/p/robot.csv") as stream:

@@ -501,7 +501,8 @@ def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away, mo
 
 def test_paths_have_the_same_colours_everywhere():
     """In report, scene and graphs the gentle path is red and the shortest one blue."""
-    tree = ast.parse((Path(__file__).parents[3] / "addon/scene.py").read_text(encoding="utf-8"))
+    scene = Path(__file__).parents[3] / "addon" / "show" / "scene.py"
+    tree = ast.parse(scene.read_text(encoding="utf-8"))
     colors = next(node.value for node in tree.body if isinstance(node, ast.Assign)
                   and getattr(node.targets[0], "id", "") == "COLORS")
     shown = dict(zip([key.value for key in colors.keys], colors.values, strict=True))

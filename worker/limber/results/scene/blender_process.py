@@ -96,7 +96,7 @@ def scene_script() -> Path:
     """Return the path of ``make_scene.py``, the wheel's own copy or the checkout's;
     MissingDependencyError if there is none."""
     here = Path(__file__).parent
-    candidates = [here / "addon" / "make_scene.py", here.parents[3] / "addon" / "make_scene.py"]
+    candidates = [folder / "addon" / "show" / "make_scene.py" for folder in (here, here.parents[3])]
     for path in candidates:
         if path.is_file():
             return path

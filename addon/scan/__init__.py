@@ -1,0 +1,1 @@
+"""Import a scan: read it, show its points, leave some out."""

@@ -1,0 +1,1 @@
+"""Show a branch: its scene, colours, legends, graphs and pictures."""

@@ -1,0 +1,108 @@
+"""The legend of the branch's colours in the 3D view: title, bar, values with their unit."""
+
+import json
+import textwrap
+
+import blf
+import bpy
+import gpu
+import numpy as np
+from gpu_extras.batch import batch_for_shader
+
+from ..branch import branches
+from ..plan import energy_field
+from . import frame_colours
+from .view_borders import covered_width
+
+_MARGIN, _WIDTH, _HEIGHT, _TEXT = 24, 16, 160, 12
+_BETWEEN, _LINE_LETTERS = 20, 20
+_GAP = 60  # above the lower edge: Blender's text there stays readable
+_handle: list = []
+
+
+def shown_scales(surface: bpy.types.Object) -> list[dict]:
+    """Return the scales of everything coloured now: the branch's, then those of its surroundings.
+    """
+    scales = [frame_colours.shown_scale(surface) or _scale_at_rest(surface)]
+    branch = branches.branch_of(surface)
+    for thing in branches.parts_of(branch).values():
+        is_seen = thing.visible_get() or (energy_field.is_sliced(bpy.context.scene)
+                                          and thing == energy_field.of(branch))
+        if branches.SCALE_KEY in thing and is_seen:
+            scales.append(json.loads(thing[branches.SCALE_KEY]))
+    told = {scale["title"]: scale for scale in scales if scale is not None}
+    return list(told.values())
+
+
+def _scale_at_rest(surface: bpy.types.Object) -> dict | None:
+    active = surface.data.color_attributes.active_color
+    scalars = branches.info_of(surface).get("scalars", {})
+    return scalars.get(active.name.removesuffix("_color")) if active is not None else None
+
+
+def bar(stops: list[list[float]], x: float, y: float, width: float, height: float,
+        ) -> tuple[list, list, list]:
+    """Return corners, their colours and triangles of a bar of rows ``[position, r, g, b]``."""
+    places, colours, triangles = [], [], []
+    for position, *colour in stops:
+        places += [(x, y + position * height), (x + width, y + position * height)]
+        colours += [(*display(np.array(colour)), 1.0)] * 2
+    for k in range(0, len(places) - 2, 2):
+        triangles += [(k, k + 1, k + 2), (k + 1, k + 3, k + 2)]
+    return places, colours, triangles
+
+
+def display(linear: np.ndarray) -> np.ndarray:
+    """Return linear components of colours as sRGB."""
+    return np.where(linear < 0.0031308, 12.92 * linear,
+                    1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def _draw() -> None:
+    context = bpy.context
+    surface = branches.find_surface(context.scene)
+    if (surface is None or not context.scene.limber.show_legend or not surface.visible_get()
+            or not context.space_data.overlay.show_overlays):
+        return
+    shading = context.space_data.shading
+    if shading.type == "WIREFRAME" or (shading.type == "SOLID" and shading.color_type != "VERTEX"):
+        return
+    size = context.preferences.system.ui_scale
+    x, y = covered_width(context, "TOOLS") + _MARGIN * size, _GAP * size
+    for scale in shown_scales(surface):
+        places, colours, triangles = bar(scale["stops"], x, y, _WIDTH * size, _HEIGHT * size)
+        shader = gpu.shader.from_builtin("SMOOTH_COLOR")
+        gpu.state.blend_set("ALPHA")
+        batch_for_shader(shader, "TRIS", {"pos": places, "color": colours},
+                         indices=triangles).draw(shader)
+        gpu.state.blend_set("NONE")
+        x += _write(scale, x, y, size) + _BETWEEN * size
+
+
+def _write(scale: dict, x: float, y: float, size: float) -> float:
+    """Write title and values of a scale; returns its width [pixels]."""
+    blf.size(0, _TEXT * size)
+    blf.color(0, 1.0, 1.0, 1.0, 1.0)
+    blf.enable(0, blf.SHADOW)
+    blf.shadow(0, 5, 0.0, 0.0, 0.0, 0.9)
+    ticks = scale["ticks"]
+    for number, tick in enumerate(ticks):
+        share = number / max(len(ticks) - 1, 1)
+        blf.position(0, x + (_WIDTH + 6) * size, y + (share * _HEIGHT - 4) * size, 0)
+        blf.draw(0, str(tick))
+    lines = textwrap.wrap(scale["title"] + (", log scale" if scale["log"] else ""), _LINE_LETTERS)
+    for number, line in enumerate(reversed(lines)):
+        blf.position(0, x, y + (_HEIGHT + 10 + 16 * number) * size, 0)
+        blf.draw(0, line)
+    blf.disable(0, blf.SHADOW)
+    return max(blf.dimensions(0, line)[0] for line in lines)
+
+
+def register() -> None:
+    if not bpy.app.background:
+        _handle.append(bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL"))
+
+
+def unregister() -> None:
+    while _handle:
+        bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
