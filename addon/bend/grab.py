@@ -109,6 +109,8 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         self._had_motion = motion is not None and motion.show_viewport
         if self._had_motion:
             motion.show_viewport = False
+        # The branch is at rest now, so are its marks; not only from the session's first frame on.
+        self._marks.show(self._rest)
         self._area, self._region = context.area, context.region
         if self._region.type != "WINDOW":
             # Pressed in the sidebar: it refers to the view beside it.

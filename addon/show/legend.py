@@ -1,4 +1,5 @@
-"""The legend of the branch's colours in the 3D view: title, bar, values with their unit."""
+"""The legend in the 3D view: the branch's colours with their values, and what balls and lines are.
+"""
 
 import json
 import textwrap
@@ -11,11 +12,12 @@ from gpu_extras.batch import batch_for_shader
 
 from ..branch import branches
 from ..plan import energy_field
-from . import frame_colours
+from . import frame_colours, scene
 from .view_borders import covered_width
 
 _MARGIN, _WIDTH, _HEIGHT, _TEXT = 24, 16, 160, 12
 _BETWEEN, _LINE_LETTERS = 20, 20
+_KEY_LINE, _KEY_SIZE = 18, 10
 _GAP = 60  # above the lower edge: Blender's text there stays readable
 _handle: list = []
 
@@ -32,6 +34,14 @@ def shown_scales(surface: bpy.types.Object) -> list[dict]:
             scales.append(json.loads(thing[branches.SCALE_KEY]))
     told = {scale["title"]: scale for scale in scales if scale is not None}
     return list(told.values())
+
+
+def shown_marks(surface: bpy.types.Object) -> list[str]:
+    """Return the kinds of balls, lines and rings of the branch in sight, as :data:`scene.NAMES`."""
+    seen = {thing[branches.SHOWS_KEY]
+            for thing in branches.parts_of(branches.branch_of(surface)).values()
+            if thing.visible_get()}
+    return [kind for kind in scene.NAMES if kind in seen]
 
 
 def _scale_at_rest(surface: bpy.types.Object) -> dict | None:
@@ -77,14 +87,35 @@ def _draw() -> None:
                          indices=triangles).draw(shader)
         gpu.state.blend_set("NONE")
         x += _write(scale, x, y, size) + _BETWEEN * size
+    for number, kind in enumerate(reversed(shown_marks(surface))):
+        _draw_key(kind, x, y + number * _KEY_LINE * size, size)
 
 
-def _write(scale: dict, x: float, y: float, size: float) -> float:
-    """Write title and values of a scale; returns its width [pixels]."""
+def _draw_key(kind: str, x: float, y: float, size: float) -> None:
+    """Draw the colour of a kind of mark, and its name."""
+    side = _KEY_SIZE * size
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    shader.uniform_float("color", (*display(np.array(scene.COLORS[kind])), 1.0))
+    batch_for_shader(shader, "TRIS", {"pos": [(x, y), (x + side, y), (x + side, y + side),
+                                              (x, y + side)]},
+                     indices=[(0, 1, 2), (0, 2, 3)]).draw(shader)
+    _in_white(size)
+    blf.position(0, x + side + 6 * size, y, 0)
+    blf.draw(0, scene.NAMES[kind])
+    blf.disable(0, blf.SHADOW)
+
+
+def _in_white(size: float) -> None:
+    """Set the font so that it is legible before any background."""
     blf.size(0, _TEXT * size)
     blf.color(0, 1.0, 1.0, 1.0, 1.0)
     blf.enable(0, blf.SHADOW)
     blf.shadow(0, 5, 0.0, 0.0, 0.0, 0.9)
+
+
+def _write(scale: dict, x: float, y: float, size: float) -> float:
+    """Write title and values of a scale; returns its width [pixels]."""
+    _in_white(size)
     ticks = scale["ticks"]
     for number, tick in enumerate(ticks):
         share = number / max(len(ticks) - 1, 1)

@@ -12,7 +12,7 @@ from mathutils import Vector
 from ..branch.branches import add_object
 from ..branch.parts import ShownBranch
 from ..bridge import materials, meshes
-from .scene import COLORS
+from .scene import COLORS, NAMES
 from .scene_data import SceneData
 from .studio import LEGEND_SHARE, PAPER
 
@@ -155,13 +155,10 @@ def _add_keys(sheet: _Sheet, data: SceneData, shown: ShownBranch) -> None:
     keys = [(f"path:{key}", f"{about['title']} path", about["note"], thin)
             for key, about in data.info["paths"].items()]
     keys += [("goal", _goal_words(data.info.get("goal") or {}), "", dot),
-             ("grasp", "grasp", "", dot),
              ("targets", ", ".join(data.info.get("targets") or ()), "", dot),
-             ("control_points", "control points", "", dot),
-             ("observed", "measured in the pull", "", dot),
-             ("robot", f"robot {(data.info.get('robot') or {}).get('name', '')}", "", dot),
-             ("rest", "rest shape", "", dot),
-             ("base", "fixed base", "", dot)]
+             ("robot", f"robot {(data.info.get('robot') or {}).get('name', '')}", "", dot)]
+    keys += [(name, NAMES[name], "", dot)
+             for name in ("grasp", "control_points", "observed", "rest", "base")]
     for name, words, note, (width, height) in keys:
         if name not in shown.objects:
             continue

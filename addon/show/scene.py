@@ -56,6 +56,11 @@ COLORS = {
     "robot": (0.32, 0.40, 0.48),
     "observed": annotations.MEASURED,
 }
+NAMES = {
+    "path:plan": "gentle path", "path:baseline": "shortest path", "goal": "goal", "grasp": "grasp",
+    "control_points": "control points", "targets": "targets", "base": "fixed base",
+    "rest": "rest shape", "robot": "robot", "observed": "measured in the pull"}
+"""What the objects of each colour are, in the keys of pictures and views."""
 
 
 def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = None,

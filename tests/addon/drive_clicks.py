@@ -15,7 +15,7 @@ from driving import KEY, drive, picture, processor_seconds, seen, started, view,
 
 def is_open():
     return "bending_branch" in bpy.data.objects and waited(1.0) and (
-        not sys.modules[f"{KEY}.jobs"].is_running())
+        not sys.modules[f"{KEY}.jobs.jobs"].is_running())
 
 
 def places():
@@ -27,7 +27,7 @@ def places():
 
 def is_held():
     """The session answers, and its first frame is drawn: then the branch can be pressed."""
-    sessions = sys.modules[f"{KEY}.session"]._open
+    sessions = sys.modules[f"{KEY}.bend.session"]._open
     if not (sessions and sessions[0].hello):
         return False
     mouse.at["before"] = places()
@@ -56,7 +56,7 @@ def drag():
     seen["clicks_to_bent"] = seen["clicks"]
     seen["bent_m"] = max(abs(a - b) for a, b in zip(places(), mouse.at["before"], strict=True))
     if seen["bent_m"] > 0.0 and "answer_s" not in seen:
-        seen["answer_s"] = processor_seconds(sys.modules[f"{KEY}.session"]._open[0].pid)
+        seen["answer_s"] = processor_seconds(sys.modules[f"{KEY}.bend.session"]._open[0].pid)
     return seen["bent_m"] > 0.01
 
 
@@ -72,7 +72,7 @@ def leave():
 
 def goal():
     branch = bpy.data.collections["bending_branch"]
-    return sys.modules[f"{KEY}.goal_ball"].of(branch)
+    return sys.modules[f"{KEY}.plan.goal_ball"].of(branch)
 
 
 def point_at_goal():

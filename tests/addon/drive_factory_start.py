@@ -22,7 +22,7 @@ def begin():
 def shown(name):
     """Return the step that waits for an object."""
     def step():
-        return name in bpy.data.objects and not sys.modules[f"{KEY}.jobs"].is_running()
+        return name in bpy.data.objects and not sys.modules[f"{KEY}.jobs.jobs"].is_running()
     step.__name__ = f"{name} shown"
     return step
 
@@ -39,6 +39,8 @@ def look(name):
         seen[name] = {
             "inside": sum(at is not None and 0 <= at[0] < region.width
                           and 0 <= at[1] < region.height for at in places) / len(places),
+            # The sidebar covers the view's right edge.
+            "beside": max(at[0] for at in places) < region.width - view("UI")[2].width,
             "height": max(at[1] for at in places if at is not None) / region.height
                       - min(at[1] for at in places if at is not None) / region.height,
             "cube": bpy.data.objects["Cube"].visible_get(),

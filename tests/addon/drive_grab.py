@@ -51,7 +51,7 @@ def event(kind, value="NOTHING", move=(0, 0)):
 
 
 def sessions():
-    return sys.modules[f"{KEY}.session"]._open
+    return sys.modules[f"{KEY}.bend.session"]._open
 
 
 def open_result():
@@ -168,7 +168,7 @@ def is_kept_as(name):
             return False
         plan = bpy.context.scene.limber.plan
         seen[name] = [getattr(plan, f"use_{name}"), list(getattr(plan, name))]
-        ball = sys.modules[f"{KEY}.goal_ball"].of(bpy.data.collections["beam"])
+        ball = sys.modules[f"{KEY}.plan.goal_ball"].of(bpy.data.collections["beam"])
         seen["ball"] = list(ball.location)
         return True
     return step
@@ -208,7 +208,7 @@ def blow():
 
 def is_loaded_down():
     """Cut at the top, with a fruit in the wind: it is bent, what is cut off is hidden."""
-    lines = sys.modules[f"{KEY}.operators.live_loads"].lines
+    lines = sys.modules[f"{KEY}.bend.live_loads"].lines
     if len(lines) < 3 or "Limber cut" not in surface().modifiers:
         return False
     bent = max((now - then).length for now, then in zip(tip()[1], state["before"], strict=True))

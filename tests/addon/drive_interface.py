@@ -14,7 +14,7 @@ from mouse import click, find
 
 
 def jobs():
-    return sys.modules[f"{KEY}.jobs"]
+    return sys.modules[f"{KEY}.jobs.jobs"]
 
 
 def open_sidebar():

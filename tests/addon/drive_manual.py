@@ -15,7 +15,7 @@ BENT, MOST_PULLED = 14, 73
 
 
 def jobs():
-    return sys.modules[f"{KEY}.jobs"]
+    return sys.modules[f"{KEY}.jobs.jobs"]
 
 
 def begin():

@@ -17,11 +17,11 @@ state = {}
 
 
 def skeleton():
-    return sys.modules[f"{KEY}.branches"].find_skeleton(bpy.context.scene)
+    return sys.modules[f"{KEY}.branch.branches"].find_skeleton(bpy.context.scene)
 
 
 def marks():
-    return sys.modules[f"{KEY}.overlays.skeleton"].marks_in_sight(skeleton())
+    return sys.modules[f"{KEY}.skeleton.node_marks"].marks_in_sight(skeleton())
 
 
 def open_result():
@@ -99,7 +99,7 @@ def apply():
 
 
 def applied():
-    if sys.modules[f"{KEY}.jobs"].is_running():
+    if sys.modules[f"{KEY}.jobs.jobs"].is_running():
         return False
     thing = skeleton()
     if thing is None or marks().edit_count or not len(marks().points["edited"]):

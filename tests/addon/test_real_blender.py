@@ -142,6 +142,7 @@ def test_the_first_view(shared_blender, tmp_path):
     for name in ("bending_branch", "scan scan"):
         found = seen[name]
         assert found["inside"] == 1.0 and found["height"] > 0.4, "framed"
+        assert found["beside"], "not behind the sidebar"
         assert not found["cube"] and not found["cube_in_picture"]
     assert seen["undone"] == [True, False, False]
     assert _coloured_count(tmp_path / "branch.png") > 1000
