@@ -20,24 +20,6 @@ from limber.core.processes.pool import Pool
 from limber.core.progress import report_damage_to
 from limber.stages.registry import stage_class
 
-KERNEL = """
-from limber.core.numerics.compiled import compiled
-from {place} import Pair
-
-@compiled
-def total(pair):
-    return pair.a + pair.b
-
-said = total(Pair(1.0, 2.0)), len(total._cache_hits)
-"""
-PAIR = """
-from typing import NamedTuple
-
-class Pair(NamedTuple):
-    a: float
-    b: float
-"""
-
 
 @pytest.fixture
 def imported(tmp_path, monkeypatch):
@@ -58,26 +40,6 @@ def imported(tmp_path, monkeypatch):
         return importlib.import_module(name).said
     yield said
     forget()
-
-
-@pytest.mark.slow
-def test_a_moved_type_is_compiled_anew(tmp_path, imported):
-    """A kernel kept with an argument's type that has since moved to another module still runs,
-    and is then kept again.
-    """
-    kernel = tmp_path / "kernel.py"
-
-    def run(place):
-        (tmp_path / f"{place}.py").write_text(PAIR)
-        if not kernel.exists() or place not in kernel.read_text():
-            kernel.write_text(KERNEL.format(place=place))
-        found = imported("kernel")
-        sys.modules.pop(place)
-        (tmp_path / f"{place}.py").unlink()
-        return found
-    assert run("before") == (3.0, 0)
-    assert run("after") == (3.0, 0)
-    assert run("after") == (3.0, 1)
 
 
 INNER = """

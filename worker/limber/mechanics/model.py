@@ -11,14 +11,13 @@ import scipy.sparse as sp
 
 from limber.core.constants import GRAVITY
 from limber.core.errors import InputError
-from limber.core.numerics.compiled import for_kernels
 from limber.core.numerics.sparse import NotPositiveDefiniteError
 from limber.geometry.tets.tet_mesh import TetMesh, check_mesh, fixed_mask
+from limber.kernels import for_kernels
 from limber.mechanics.added_masses import PointMass, Tied, mass_entries, nodal_masses, tied
 from limber.mechanics.elements import forces
 from limber.mechanics.elements import shape_functions as elements
 from limber.mechanics.elements.forces import ForceLayout, sparse_times
-from limber.mechanics.elements.stress_kernels import largest_principal_strains
 from limber.mechanics.grasp import Grasp, stiffening
 from limber.mechanics.linear.equations import Equations, Viscous
 from limber.mechanics.materials.laws import MaterialLaw, hooke_strain, hooke_stress, material_named
@@ -432,13 +431,13 @@ class BranchModel:
             lam, mu = self.lame_lambda, self.lame_mu
         det = forces.internal_force(
             for_kernels(displacement), layout.gradients, layout.weights, layout.per_element(lam),
-            layout.per_element(mu), layout.nodes, self.material.kernel, growth, memory, force,
-            energies)
+            layout.per_element(mu), layout.nodes, memory, force, energies, self.material.kernel,
+            growth)
         energies = energies if of_law is None else of_law
         if lame_pair is not None or self.weight_stiffness is None:
-            return InternalState(force, energies, float(det))
+            return InternalState(force, energies, det)
         lifted = product_with(self.weight_stiffness, displacement)
-        return InternalState(force + lifted, energies, float(det),
+        return InternalState(force + lifted, energies, det,
                              0.5 * float((lifted * displacement).sum()))
 
     def tangent_times(self, displacement: np.ndarray, direction: np.ndarray,
@@ -454,7 +453,7 @@ class BranchModel:
         forces.tangent_times(
             for_kernels(displacement), for_kernels(direction), layout.gradients, layout.weights,
             layout.per_element(self.lame_lambda), layout.per_element(self.lame_mu), layout.nodes,
-            self.material.kernel, growth, memory, self.mesh.tet_count, product)
+            memory, product, self.material.kernel, growth, self.mesh.tet_count)
         if of_change is not None:
             product += of_change
         weight = self.weight_stiffness
@@ -494,15 +493,16 @@ class BranchModel:
         data = self._data
         out = np.empty((*data.weights.shape, 6))
         forces.strains(for_kernels(displacement), data.layout.gradients, data.layout.nodes,
-                       self.material.kernel, out)
+                       out, self.material.kernel)
         return out
 
     def largest_stretch(self, displacement: np.ndarray) -> tuple[float, int]:
         """Return the largest principal stretch of an element's mean deformation, and which."""
         layout = self._data.layout
-        stretch, tet = forces.largest_stretch(for_kernels(displacement), layout.mean_gradients,
-                                              layout.nodes)
-        return float(stretch), min(int(tet), self.mesh.tet_count - 1)
+        stretch = np.empty(1)
+        tet = forces.largest_stretch(for_kernels(displacement), layout.mean_gradients,
+                                     layout.nodes, stretch)
+        return float(stretch[0]), min(tet, self.mesh.tet_count - 1)
 
     def largest_principal_strains(self, displacement: np.ndarray,
                                   carried: np.ndarray | None = None) -> np.ndarray:
@@ -512,9 +512,9 @@ class BranchModel:
         carries the weight (:func:`limber.mechanics.strain.carried_strain`), [tet_count, 6].
         """
         layout, out = self._data.layout, np.empty(self.mesh.tet_count)
-        largest_principal_strains(for_kernels(displacement), layout.mean_gradients, layout.nodes,
-                                  for_kernels(np.empty((0, 6)) if carried is None else carried),
-                                  out)
+        forces.largest_principal_strains(
+            for_kernels(displacement), layout.mean_gradients, layout.nodes,
+            for_kernels(np.empty((0, 6)) if carried is None else carried), out)
         return out
 
     def strain_changes(self, displacement: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -522,7 +522,7 @@ class BranchModel:
         data = self._data
         out = np.empty((*data.weights.shape, 6))
         forces.strain_changes(for_kernels(displacement), for_kernels(direction),
-                              data.layout.gradients, data.layout.nodes, self.material.kernel, out)
+                              data.layout.gradients, data.layout.nodes, out, self.material.kernel)
         return out
 
     @property

@@ -68,15 +68,13 @@ class Doctor(Tool):
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         if self.warm:
             from limber.geometry.warm_up import warm_up as warm_geometry
-            from limber.mechanics.warm_up import warm_up as warm_mechanics
             from limber.planning.warm_up import warm_up as warm_planning
             from limber.reduced.strain_polynomial import compile_kernels
 
             # First what a grab needs: someone may open the example and press on it.
-            warm_mechanics(progress.part(0.0, 0.4))
             compile_kernels()
-            warm_geometry(progress.part(0.4, 0.5))
-            warm_planning(progress.part(0.5, 1.0))
+            warm_geometry(progress.part(0.1, 0.3))
+            warm_planning(progress.part(0.3, 1.0))
         return report()
 
 

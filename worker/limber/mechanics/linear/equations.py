@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 
-from limber.core.numerics.compiled import for_kernels
 from limber.core.numerics.sparse import (
     CholmodFactor,
     NotPositiveDefiniteError,
@@ -17,6 +16,7 @@ from limber.core.numerics.sparse import (
     general_factor,
     little_fill,
 )
+from limber.kernels import for_kernels
 from limber.mechanics.elements.forces import lanes_last
 from limber.mechanics.elements.stiffness import LANES, moduli_stiffness, tangent_stiffness
 from limber.mechanics.grasp import Grasp
@@ -380,8 +380,8 @@ class Equations:
         if not law.is_compiled:
             growth, memory = self._add_moduli(model, displacement, viscous)
         tangent_stiffness(for_kernels(displacement), mixed, layout.gradients, layout.weights,
-                          lam, mu, layout.nodes, law.kernel, growth, memory,
-                          layout.slots, layout.lengths, self._values)
+                          lam, mu, layout.nodes, memory, layout.slots, layout.lengths, self._values,
+                          law.kernel, growth)
         self._add_pins()
         return self._values[:self.pattern.value_count]
 

@@ -1,0 +1,127 @@
+"""Native kernels: their library, and functions that check the arrays before each call.
+
+Their sources are in ``worker/kernels``, and the built libraries in this folder. A kernel is
+declared as its C++ function, arrays with their types and shapes:
+
+>>> sparse_times = Kernel(
+...     "sparse_times", "starts int32[starts]", "columns int32[entries]",
+...     "values float64[entries]", "field float64[columns, 3]", "out product float64[rows, 3]")
+
+Names in shapes are sizes: where a name returns, the size must too. The function gets all
+arguments, arrays first, then each such size in the order of first mention. An array without rows
+may have any other sizes. Calls do not hold the interpreter's lock, and may run at the same time.
+"""
+
+import ctypes
+import functools
+import os
+import platform
+import runpy
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.core.errors import MissingDependencyError
+
+FOLDER = Path(__file__).parent
+_SOURCES = FOLDER.parents[1] / "kernels"
+_SYSTEMS = {"linux": ("linux", "so"), "darwin": ("macos", "dylib"), "win32": ("windows", "dll")}
+_MACHINES = {"x86_64": "x64", "amd64": "x64", "arm64": "arm64", "aarch64": "arm64"}
+_PLAIN = {"int": ctypes.c_int64, "float": ctypes.c_double, "": None}
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """Return the library for this system and processor. In a checkout it is built if a source has
+    changed. With ``LIMBER_KERNELS=v2`` it is that for processors without AVX2."""
+    if FOLDER.parents[1].name == "worker" and (_SOURCES / "build.py").is_file():
+        runpy.run_path(str(_SOURCES / "build.py"))["build"](FOLDER)
+    system, ending = _SYSTEMS.get(sys.platform, (sys.platform, "so"))
+    machine = _MACHINES.get(platform.machine().lower(), platform.machine())
+    path = FOLDER / f"{system}-{machine}.{ending}"
+    try:
+        plain = ctypes.CDLL(str(path))
+        if plain.has_wide_vectors() and os.environ.get("LIMBER_KERNELS") != "v2":
+            return ctypes.CDLL(str(path.with_stem(f"{path.stem}-v3")))
+    except OSError as error:
+        raise MissingDependencyError(
+            f"Limber's compiled kernels do not load: {error}.",
+            "Install Limber from its wheel, or on a machine with a C++ compiler (g++, clang++, or "
+            "the package ziglang) from its sources.") from error
+    return plain
+
+
+class Kernel:
+    """A native function of a name; arguments as above, ``returns`` is int, float or nothing."""
+
+    def __init__(self, name: str, *arguments: str, returns: str = ""):
+        self.name, self._declared, self._returns = name, arguments, returns
+        shaped = [argument.rstrip("]").split("[") for argument in arguments if "[" in argument]
+        self._count = len(shaped)
+        self._dtypes = [np.dtype(head.split()[-1]) for head, _ in shaped]
+        self._axes = [tuple(shape.split(", ")) for _, shape in shaped]
+        self._written = [number for number, (head, _) in enumerate(shaped)
+                         if head.startswith("out ")]
+        self._plain: list[Any] = [_PLAIN[plain.split()[-1]] for plain in arguments[self._count:]]
+        self._known: dict[tuple, list[int]] = {}
+
+    @functools.cached_property
+    def _function(self) -> Callable:
+        function = library()[self.name]
+        sizes = {axis for axes in self._axes for axis in axes if not axis.isdecimal()}
+        function.argtypes = [*[ctypes.c_void_p] * self._count, *self._plain,
+                             *[ctypes.c_int64] * len(sizes)]
+        function.restype = _PLAIN[self._returns]
+        return function
+
+    def __call__(self, *values: Any) -> Any:
+        arrays = values[:self._count]
+        shapes = tuple([array.shape for array in arrays] + [array.strides for array in arrays])
+        sizes = self._known.get(shapes) or self._sizes(shapes, arrays)
+        if [array.dtype for array in arrays] != self._dtypes:
+            raise self._misfit(arrays)
+        for number in self._written:
+            if not arrays[number].flags.writeable:
+                raise self._misfit(arrays)
+        return self._function(*[_address(array) for array in arrays], *values[self._count:], *sizes)
+
+    def _sizes(self, shapes: tuple, arrays: tuple[np.ndarray, ...]) -> list[int]:
+        """Return the sizes that the axes' names have, and know them at the next call."""
+        sizes: dict[str, int] = {}
+        for axes, array in zip(self._axes, arrays, strict=True):
+            if len(axes) != array.ndim or not array.flags.c_contiguous:
+                raise self._misfit(arrays)
+            for axis, size in zip(axes, array.shape, strict=True):
+                known = int(axis) if axis.isdecimal() else sizes.setdefault(axis, size)
+                if known != size and len(array):
+                    raise self._misfit(arrays)
+        if len(self._known) > _MOST_KNOWN:
+            self._known.clear()
+        return self._known.setdefault(shapes, list(sizes.values()))
+
+    def _misfit(self, arrays: tuple[np.ndarray, ...]) -> TypeError:
+        seen = ", ".join(f"{array.dtype}{list(array.shape)}" + (
+            "" if array.flags.carray else " read-only or with gaps") for array in arrays)
+        return TypeError(f"The kernel {self.name} wants {', '.join(self._declared)}, in C order. "
+                         f"It was given {seen}.")
+
+
+_MOST_KNOWN = 64
+"""Most sets of shapes of which a kernel knows the sizes."""
+
+
+def _address(array: np.ndarray) -> int:
+    """Return where an array's numbers begin: the first word behind an object's head, by numpy's C
+    interface. ``array.ctypes.data`` takes ten times as long."""
+    return _word(id(array) + _HEAD).value
+
+
+_word, _HEAD = ctypes.c_size_t.from_address, object.__basicsize__
+
+
+def for_kernels(array: np.ndarray) -> np.ndarray:
+    """Return floats in C order, which kernels take."""
+    return np.require(array, float, "C")
