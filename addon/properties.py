@@ -109,7 +109,8 @@ class LimberSettings(bpy.types.PropertyGroup):
         name="Scan", default=True, update=_show_scan,
         description="Show imported scans over the branches made from them")
     show_legend: bpy.props.BoolProperty(
-        name="Legend", default=True, description="Explain the colours in the 3D view")
+        name="Legend", default=True,
+        description="Explain the colours, in the 3D view and in a picture")
     show_energy_slice: bpy.props.BoolProperty(
         name="Energy Slice", default=False,
         description="Show the energy with the grasp there, in the plane through the 3D cursor that "

@@ -1,4 +1,4 @@
-"""Materials: one colour, or a number on the vertices shown by a colour ramp."""
+"""Materials: one colour, a number on the vertices shown by a colour ramp, or wood."""
 
 import json
 import math
@@ -12,11 +12,16 @@ KEY = "limber_material"
 _SCALE_KEY = "limber_scale"
 _AXIS, _RANGE, _COLOURS = "Limber Axis", "Limber Range", "Limber Colours"
 """Names of the nodes that hold the scale of a scalar's material."""
+WOOD = "wood"
+_BARK = ([0.25, 0.035, 0.019, 0.010], [0.5, 0.16, 0.088, 0.043], [0.72, 0.33, 0.215, 0.125])
+WOOD_COLOUR = tuple(_BARK[1][1:])
+"""Linear colour of wood where no texture is drawn."""
 
 
 def plain_material(name: str, color: tuple[float, float, float], *, alpha: float = 1.0,
-                   roughness: float = 0.5) -> bpy.types.Material:
-    """Return the material of one linear colour; ``alpha`` below 1 is transparent."""
+                   roughness: float = 0.5, glow: float = 0.0) -> bpy.types.Material:
+    """Return the material of one linear colour; ``alpha`` below 1 is transparent, ``glow`` is the
+    strength of its own light."""
     key = f"{name} {tuple(color)} {alpha} {roughness}"
     if (known := _known(key)) is not None:
         return known
@@ -24,6 +29,8 @@ def plain_material(name: str, color: tuple[float, float, float], *, alpha: float
     shader.inputs["Base Color"].default_value = (*color, 1.0)
     shader.inputs["Roughness"].default_value = roughness
     shader.inputs["Alpha"].default_value = alpha
+    shader.inputs["Emission Color"].default_value = (*color, 1.0)
+    shader.inputs["Emission Strength"].default_value = glow
     material.diffuse_color = (*color, alpha)
     return material
 
@@ -39,6 +46,32 @@ def vertex_color_material(name: str, attribute: str) -> bpy.types.Material:
     color.attribute_name = attribute
     links.new(color.outputs["Color"], shader.inputs["Base Color"])
     shader.inputs["Roughness"].default_value = 0.5
+    return material
+
+
+def wood_material() -> bpy.types.Material:
+    """Return the material of bark: furrows along the height of the branch at rest."""
+    if (known := _known(WOOD)) is not None:
+        return known
+    material, shader = _new("Limber Wood", WOOD)
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    place, stretch, noise, ramp, bump = (nodes.new(f"ShaderNode{kind}") for kind in (
+        "TexCoord", "Mapping", "TexNoise", "ValToRGB", "Bump"))
+    stretch.inputs["Scale"].default_value = (90.0, 90.0, 12.0)
+    noise.inputs["Scale"].default_value, noise.inputs["Detail"].default_value = 1.0, 8.0
+    set_stops(ramp.color_ramp, _BARK)
+    bump.inputs["Strength"].default_value, bump.inputs["Distance"].default_value = 0.5, 0.001
+    # Of the shape at rest: the texture does not swim over a branch that bends.
+    for source, target in (
+            (place.outputs["Generated"], stretch.inputs["Vector"]),
+            (stretch.outputs["Vector"], noise.inputs["Vector"]),
+            (noise.outputs["Fac"], ramp.inputs["Fac"]),
+            (noise.outputs["Fac"], bump.inputs["Height"]),
+            (ramp.outputs["Color"], shader.inputs["Base Color"]),
+            (bump.outputs["Normal"], shader.inputs["Normal"])):
+        links.new(source, target)
+    shader.inputs["Roughness"].default_value = 0.85
+    material.diffuse_color = (*WOOD_COLOUR, 1.0)
     return material
 
 

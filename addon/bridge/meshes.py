@@ -144,9 +144,17 @@ def set_screen_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> No
     mesh.update_tag()
 
 
-def set_one_color(mesh: bpy.types.Mesh, color: tuple[float, float, float]) -> None:
+def shrink(mesh: bpy.types.Mesh, depth: float) -> None:
+    """Move all vertices inward by ``depth`` [m], against their normals."""
+    normals = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertex_normals.foreach_get("vector", normals)
+    set_positions(mesh, positions(mesh) - depth * normals.reshape(-1, 3))
+
+
+def set_one_color(mesh: bpy.types.Mesh, color: tuple[float, float, float],
+                  attribute: str = "color") -> None:
     """Give all vertices one linear colour: Solid mode then shows it beside coloured surfaces."""
-    set_colors(mesh, "color", np.tile((*color, 1.0), (len(mesh.vertices), 1)))
+    set_colors(mesh, attribute, np.tile((*color, 1.0), (len(mesh.vertices), 1)))
 
 
 def is_given(mesh: bpy.types.ID) -> bool:

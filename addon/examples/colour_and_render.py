@@ -2,7 +2,7 @@
 
     blender -b --python colour_and_render.py -- FOLDER.branch PICTURE.png --colour strain
 
-Quantities: young, strain_energy, strain, stress, stress_over_strength, det_f, residual.
+Quantities: young, strain_energy, strain, stress, stress_over_strength, det_f, residual; or wood.
 """
 
 import argparse
@@ -30,12 +30,10 @@ def main(arguments: list[str]) -> None:
     if given.frame is not None:
         scene.frame_set(given.frame)
     bpy.ops.limber.color_by(scalar=given.colour, each_frame=given.frame is not None)
-    # The opened branch is active. The picture has nothing else: no startup cube, no lamp, and not
-    # the grey rest shape, inside which an unbent branch is.
+    # The opened branch is active. The picture has nothing else: no startup cube and no lamp.
     branch = bpy.context.view_layer.objects.active.users_collection[0]
     for thing in scene.objects:
-        thing.hide_render |= thing.name not in branch.all_objects or (
-            thing.get("limber_shows") == "rest")
+        thing.hide_render |= thing.name not in branch.all_objects
     # A camera that shows the whole branch in a picture of this shape, and a sun.
     scene.render.resolution_x = scene.render.resolution_y = given.width
     bpy.ops.limber.turntable(frames=2)

@@ -5,6 +5,7 @@ import bpy
 from .. import compat, preferences, properties
 from ..bend import live_loads
 from ..branch import branches
+from ..bridge.materials import WOOD
 from ..jobs import warming
 from ..plan import energy_field
 from ..show import graph as viewport_graph
@@ -93,9 +94,9 @@ def _draw_colours(layout: bpy.types.UILayout, context: bpy.types.Context,
     if info.get("frame_scalars"):
         body.prop(settings, "each_frame")
     name = _shown_scalar(surface)
-    title, _, rest = _scale(info, settings, name)["title"].partition(" (") if name else ("", "", "")
+    title, _, rest = _title(info, settings, name).partition(" (")
     body.menu(LIMBER_MT_colours.bl_idname, text=_upper(title) or "Choose", icon="COLOR")
-    if name:
+    if name in info["scalars"]:
         draw_text(body, context, _span(info["scalars"][name], rest), "BLANK1")
     if "stress_over_strength" in info["scalars"]:
         row = body.row(heading="Strength [Pa]")
@@ -114,8 +115,8 @@ class LIMBER_MT_colours(bpy.types.Menu):
     def draw(self, context):
         surface, settings = branches.find_surface(context.scene), context.scene.limber
         info = branches.info_of(surface)
-        for name in info["scalars"]:
-            title = _scale(info, settings, name)["title"].partition(" (")[0]
+        for name in (*info["scalars"], WOOD):
+            title = _title(info, settings, name).partition(" (")[0]
             entry = self.layout.operator(
                 "limber.color_by", text=_upper(title),
                 icon="CHECKMARK" if name == _shown_scalar(surface) else "BLANK1")
@@ -128,7 +129,12 @@ def _shown_scalar(surface: bpy.types.Object) -> str:
         return shown
     active = surface.data.color_attributes.active_color
     name = "" if active is None else active.name.removesuffix("_color")
-    return name if name in branches.info_of(surface)["scalars"] else ""
+    return name if name in (*branches.info_of(surface)["scalars"], WOOD) else ""
+
+
+def _title(info: dict, settings, name: str) -> str:
+    """Return the title of what the branch is coloured by, with its remark; empty if by nothing."""
+    return _scale(info, settings, name)["title"] if name in info["scalars"] else name
 
 
 def _upper(title: str) -> str:

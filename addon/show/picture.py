@@ -16,15 +16,15 @@ from .scene_data import SceneData
 
 _KEY = "limber_picture"
 """Key of the collections that this operator made: pressed again, it makes them again."""
-_HIGH = studio.Picture(width=1440)
-"""1080 pixels high."""
+_WIDTH = 1440
+"""Of a picture 1080 pixels high."""
 _FRONT = (0.0, 1.0, -0.15)
 
 
 class LIMBER_OT_set_up_picture(NeedsBranchInObjectMode, bpy.types.Operator):
-    """Add a camera that sees the whole motion, lights, a ground, a legend and a scale, and render
-    colours as the legend has them. Other lights are left out of the picture. Press again after
-    changes"""
+    """Add a camera that sees the whole motion, lights, a ground, a legend and a scale (both only
+    where the legend is shown), and render colours as the legend has them. Other lights are left
+    out of the picture. Press again after changes"""
 
     bl_idname = "limber.set_up_picture"
     bl_label = "Set Up Picture"
@@ -39,13 +39,15 @@ class LIMBER_OT_set_up_picture(NeedsBranchInObjectMode, bpy.types.Operator):
         direction = Vector(surface.get(VIEW_KEY, _FRONT)).normalized()
         data = SceneData({"view_points": _seen(current, branch), "view_direction": np.array(
             direction)}, branches.info_of(surface))
-        camera = studio.set_up_studio(current, data, _HIGH)
+        has_legend = current.limber.show_legend
+        camera = studio.set_up_studio(current, data, studio.Picture(
+            _WIDTH, legend_share=studio.LEGEND_SHARE if has_legend else 0.0))
         info, points = data.info, data.arrays["view_points"]
         middle = (info.get("base") or {}).get("centre_m", points.mean(axis=0))
         foot = np.array([middle[0], middle[1], info["ground_m"]]) + surface.delta_location
-        scale_bar.add(camera.users_collection[0], camera, foot,
-                      info["size_m"])
-        legend.add_legend(current, camera, data, _shown(branch, surface))
+        if has_legend:
+            scale_bar.add(camera.users_collection[0], camera, foot, info["size_m"])
+            legend.add_legend(current, camera, data, _shown(branch, surface))
         made = set(bpy.data.collections) - before
         ours = {thing for collection in made for thing in collection.objects}
         for each in (*made, *ours):

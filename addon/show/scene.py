@@ -36,6 +36,8 @@ from .scene_data import SceneData
 _RANGE_KEY = "limber_range"
 """Key of a scene: the frame range that was set for a motion, until the user sets another."""
 _DEFAULT_RANGE = [1, 250]
+_REST_SHARE = 6e-4
+"""Of the branch's size: so much thinner is its rest shape, which else covers a branch at rest."""
 _CHOICE_KEY = "limber_colour"
 """Key of a surface: the scalar that was asked for, and the one that a result had instead."""
 _SPEED_KEY = "limber_own_speed"
@@ -135,18 +137,22 @@ def color_by(surface: bpy.types.Object, name: str, *, is_asked: bool = True) -> 
 
     Args:
         surface: The branch.
-        name: A scalar of its description.
+        name: A scalar of its description, or :data:`.materials.WOOD`.
         is_asked: Whether a material of the user is replaced.
 
     Raises:
         KeyError: the branch has no such scalar.
     """
-    scale = info_of(surface)["scalars"][name]
-    # Without a remark such as "(assumed)": it may not hold for the next result.
-    title = f"{surface.name} {scale['title'].partition(' (')[0]}"
-    materials.wear(surface, materials.scalar_material(
-        title, name, low=scale["low"], high=scale["high"], log=scale["log"], stops=scale["stops"],
-        owner=token_of(surface)), is_asked=is_asked)
+    if name == materials.WOOD:
+        material = materials.wood_material()
+    else:
+        scale = info_of(surface)["scalars"][name]
+        # Without a remark such as "(assumed)": it may not hold for the next result.
+        title = f"{surface.name} {scale['title'].partition(' (')[0]}"
+        material = materials.scalar_material(
+            title, name, low=scale["low"], high=scale["high"], log=scale["log"],
+            stops=scale["stops"], owner=token_of(surface))
+    materials.wear(surface, material, is_asked=is_asked)
     surface.pop(FRAME_SCALAR_KEY, None)
     surface[_CHOICE_KEY] = f"{name} {name}"
     surface.data.color_attributes.active_color = surface.data.color_attributes[f"{name}_color"]
@@ -156,7 +162,8 @@ def _colour(scene: bpy.types.Scene, shown: ShownBranch, scalar: str | None, *, i
             ) -> None:
     """Colour the surface as the user had it, else by its first scalar."""
     surface = shown.surface
-    scalars, each = info_of(surface)["scalars"], surface.get(FRAME_SCALAR_KEY)
+    scalars = [*info_of(surface)["scalars"], materials.WOOD]
+    each = surface.get(FRAME_SCALAR_KEY)
     if each is not None and each in frame_colours.changing(surface):
         frame_colours.show(surface, each, scene.frame_current_final, is_asked=is_asked)
         return
@@ -167,6 +174,9 @@ def _colour(scene: bpy.types.Scene, shown: ShownBranch, scalar: str | None, *, i
         # Chosen by the user among the attributes of the mesh.
         choice = before
     choice = scalar or choice
+    if before == materials.WOOD:
+        # Blender makes another attribute the active one where that is gone.
+        before = ""
     name = next((name for name in (choice, before, *scalars) if name in scalars), None)
     if name is not None and (scalar or each or not active or before in scalars
                             or active in surface.data[meshes.GIVEN_KEY]):
@@ -204,6 +214,7 @@ def _put_surface(shown: ShownBranch, data: SceneData) -> bool:
         colour_nodes.colour_group(scale["colours"], scale["stops"])
         meshes.set_scalars(mesh, key, data.arrays[f"scalar:{key}"])
         meshes.set_colors(mesh, f"{key}_color", data.arrays[f"color:{key}"])
+    meshes.set_one_color(mesh, materials.WOOD_COLOUR, f"{materials.WOOD}_color")
     surface, is_new = shown.put("surface", name, mesh)
     shown.surface = surface
     # Not the folder: it may move, and the file with it.
@@ -241,7 +252,7 @@ def _add_paths(shown: ShownBranch, data: SceneData) -> None:
         title = data.info["paths"][key]["title"]
         tube = curves.new_tube(title, data.arrays[name], share * data.info["size_m"])
         meshes.set_one_color(tube, COLORS[name])
-        material = materials.plain_material(title, COLORS[name], roughness=0.4)
+        material = materials.plain_material(title, COLORS[name], roughness=0.4, glow=0.6)
         shown.put(name, f"{title} path", tube, material)
 
 
@@ -383,6 +394,7 @@ def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> 
             shown.surface.modifiers.remove(before)
         return
     rest = meshes.new_mesh("Rest shape", data.arrays["vertices"], data.arrays["faces"])
+    meshes.shrink(rest, _REST_SHARE * data.info["size_m"])
     material = materials.plain_material("Rest shape", COLORS["rest"], alpha=0.25)
     ghost, is_new = shown.put("rest", "Rest shape", rest, material)
     if is_new:

@@ -6,6 +6,7 @@ import bpy
 
 from ..branch import branches
 from ..branch.needs_result import NeedsBranch
+from ..bridge.materials import WOOD
 from . import frame_colours, scene
 from . import graph as viewport_graph
 
@@ -67,7 +68,7 @@ class LIMBER_OT_color_by(NeedsBranch, bpy.types.Operator):
 
     scalar: bpy.props.StringProperty(
         name="Quantity", description="young, strain_energy, strain, stress, stress_over_strength, "
-                                     "det_f or residual, if the branch has it")
+                                     "det_f or residual, if the branch has it; or wood")
     each_frame: bpy.props.BoolProperty(
         name="In Each Frame", description="Show the values of the current frame; otherwise the "
                                           "worst value over all frames")
@@ -75,9 +76,9 @@ class LIMBER_OT_color_by(NeedsBranch, bpy.types.Operator):
     def execute(self, context):
         surface = branches.find_surface(context.scene)
         scalars = branches.info_of(surface).get("scalars", {})
-        if self.scalar not in scalars:
+        if self.scalar not in (*scalars, WOOD):
             self.report({"ERROR"}, f"The branch has no {self.scalar!r}. It has: "
-                                   f"{', '.join(scalars)}. Open the result again.")
+                                   f"{', '.join(scalars)}, {WOOD}. Open the result again.")
             return {"CANCELLED"}
         if not self.each_frame or self.scalar not in (
                 branches.info_of(surface).get("frame_scalars") or {}):

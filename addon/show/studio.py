@@ -21,10 +21,12 @@ PAPER = (0.779, 0.8075, 0.836)
 
 @dataclass(frozen=True)
 class Picture:
-    """Width of a rendered picture [pixels] and most samples per pixel."""
+    """A rendered picture: width [pixels], most samples per pixel, room for a legend."""
 
     width: int = 1120
     samples: int = 32
+    legend_share: float = LEGEND_SHARE
+    """Fraction of the width that is kept free on the left, for a legend; 0 without one."""
 
     @property
     def height(self) -> int:
@@ -40,7 +42,8 @@ def set_up_studio(scene: bpy.types.Scene, data: SceneData,
     _set_world(scene)
     rim = _add_ground(collection, data)
     _add_lights(collection, data)
-    return _add_camera(scene, collection, data, np.vstack([data.arrays["view_points"], rim]))
+    return _add_camera(scene, collection, data, np.vstack([data.arrays["view_points"], rim]),
+                       picture.legend_share)
 
 
 def _set_rendering(scene: bpy.types.Scene, picture: Picture) -> None:
@@ -108,7 +111,7 @@ def _add_lights(collection: bpy.types.Collection, data: SceneData) -> None:
 
 
 def _add_camera(scene: bpy.types.Scene, collection: bpy.types.Collection,
-                data: SceneData, seen: np.ndarray) -> bpy.types.Object:
+                data: SceneData, seen: np.ndarray, legend_share: float) -> bpy.types.Object:
     lens = bpy.data.cameras.new("Camera")
     camera = bpy.data.objects.new("Camera", lens)
     collection.objects.link(camera)
@@ -118,15 +121,16 @@ def _add_camera(scene: bpy.types.Scene, collection: bpy.types.Collection,
     lens.clip_start, lens.clip_end = 0.01 * data.info["size_m"], 100 * data.info["size_m"]
     camera.rotation_mode = "QUATERNION"
     camera.rotation_quaternion = Vector(data.arrays["view_direction"]).to_track_quat("-Z", "Y")
-    _fit(scene, camera, seen)
+    _fit(scene, camera, seen, legend_share)
     return camera
 
 
-def _fit(scene: bpy.types.Scene, camera: bpy.types.Object, points: np.ndarray) -> None:
+def _fit(scene: bpy.types.Scene, camera: bpy.types.Object, points: np.ndarray,
+         legend_share: float) -> None:
     """Move the camera back until all ``points`` [m] are visible, right of the legend."""
     render = scene.render
     width = render.resolution_x
-    render.resolution_x = round(width * (1 - LEGEND_SHARE) * 0.92)
+    render.resolution_x = round(width * (1 - legend_share) * 0.92)
     bpy.context.view_layer.update()
     place, _ = camera.camera_fit_coords(
         bpy.context.evaluated_depsgraph_get(), np.asarray(points, np.float32).ravel())
@@ -135,5 +139,5 @@ def _fit(scene: bpy.types.Scene, camera: bpy.types.Object, points: np.ndarray) -
     distance = (Vector(points.mean(axis=0)) - place).dot(towards)
     camera.location = place - 0.06 * distance * towards
     # The shift is in sensor heights (sensor_fit is VERTICAL).
-    camera.data.shift_x = -LEGEND_SHARE / 2 * width / render.resolution_y
+    camera.data.shift_x = -legend_share / 2 * width / render.resolution_y
     bpy.context.view_layer.update()

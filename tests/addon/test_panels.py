@@ -434,7 +434,7 @@ def test_the_next_step_is_a_button_in_thirty_states(bpy, panels, tmp_path):
     assert list(enumerate(found)) == list(enumerate(name for _, name in table))
     menu = Layout()
     bpy.types.LIMBER_MT_colours.draw(SimpleNamespace(layout=menu), bpy.context)
-    assert len(menu.names("operator")) == 7
+    assert len(menu.names("operator")) == 8
 
 
 @pytest.mark.slow

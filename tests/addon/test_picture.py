@@ -61,6 +61,34 @@ def test_the_picture_has_the_whole_motion_and_the_legends_colours(bpy, example):
 
 
 @pytest.mark.slow
+def test_wood_in_a_picture_without_legend(bpy, example, tmp_path):
+    """It stays when a result is shown again; the branch is in the middle then, and brown."""
+    materials, scene = part("bridge.materials"), bpy.context.scene
+    assert bpy.ops.limber.color_by(scalar="wood") == {"FINISHED"}
+    bpy.ops.limber.open_result()
+    assert example.material_slots[0].material[materials.KEY] == materials.WOOD
+    assert example.data.color_attributes.active_color_name == "wood_color"
+    assert not part("show.legend").shown_scales(example)
+    scene.limber.show_legend = False
+    bpy.ops.limber.set_up_picture()
+    assert scene.camera.data.shift_x == 0.0
+    assert not [each for each in bpy.data.collections if each.name.startswith("Legend")]
+    for group in ("marks", "control_points", "goal", "paths"):
+        bpy.ops.limber.show(group=group, hide=True)
+    scene.render.resolution_percentage, scene.cycles.samples = 15, 4
+    scene.render.filepath = str(tmp_path / "wood.png")
+    bpy.ops.render.render(write_still=True)
+    pixels = np.empty((162, 216, 4), np.float32)
+    bpy.data.images.load(scene.render.filepath).pixels.foreach_get(pixels.ravel())
+    red, blue = pixels[..., 0], pixels[..., 2]
+    is_wood = red > 1.3 * blue
+    assert 0.01 < is_wood.mean() < 0.2
+    assert np.ptp(red[is_wood]) > 0.2, "furrows, not one colour"
+    assert bpy.ops.limber.color_by(scalar="young") == {"FINISHED"}
+    assert example.material_slots[0].material[materials.KEY] != materials.WOOD
+
+
+@pytest.mark.slow
 def test_a_plan_over_the_strength_is_not_ticked(bpy, example):
     """1.8 times the assumed strength: said so, in the panel and its header; with stronger wood it
     is done."""

@@ -60,7 +60,7 @@ def test_frames_play_after_save_reopen_and_move(bpy, addon, beam, positions, tmp
     middle = (beam.frames[2] + beam.frames[3]) / 2
     np.testing.assert_allclose(positions("beam", 3, 0.5), middle, atol=1e-6)
     np.testing.assert_allclose(positions("beam", 99), beam.frames[-1], atol=1e-6)
-    np.testing.assert_allclose(positions("Rest shape", 4), beam.surface, atol=1e-6)
+    np.testing.assert_allclose(positions("Rest shape", 4), beam.surface, atol=4e-4)
     assert bpy.data.objects["Rest shape"].hide_viewport, "its lines would lie over the colours"
 
 
