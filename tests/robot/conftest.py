@@ -6,25 +6,22 @@ import shutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from types import SimpleNamespace
 
 import numpy as np
 import psutil
 import pytest
+from tests.robot.stepped_ros import SteppedRos
 
-from benchmarks import robot_rosbridge
 from benchmarks.machine_stalls import HELD_UP_SECONDS, Witness
 from benchmarks.robot_cells import cell_file, sideways
 from benchmarks.robot_faults import new_robot, restored
-from benchmarks.robot_rosbridge import RosBridge, SteppedBridge
+from benchmarks.robot_rosbridge import RosBridge
 from benchmarks.robot_stepped import SteppedRobot
 from limber.cell.cell_file import Cell
 from limber.core.numerics.rigid_kernels import pose_between
 from limber.mechanics.statics.result import Status
-from limber.robot.driver import force_samples
+from limber.robot.driver.link import RobotLink
 from limber.robot.driver.real_time import claim_real_time, may_use_two_processors
-from limber.robot.ros import guarded_robot
-from limber.robot.ros.guarded_robot import RosRobot, Topics
 from limber.robot.virtual.controller import Controller
 from limber.stages.paths.execute import ExecutePlan
 from limber.store import Branch
@@ -191,27 +188,25 @@ def stepped():
     yield from _stepped("ur5e")
 
 
-ROS_CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
+ROS_CELL = Cell(robot={"model": "ur5e", "address": "ws://stepped"}, base={"pose": (0,) * 6},
                 tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})
 
 
 @pytest.fixture
-def stepped_ros(monkeypatch):
-    """Make a server and a robot that follows as fast as it is watched, in the server's time.
-
-    ``plan(server, step)`` makes the faults.
-    """
-    def made(plan=None, cell: Cell = ROS_CELL, **settings) -> tuple[RosBridge, RosRobot]:
-        server = RosBridge(np.array(ROS_CELL.arm.home))
-        vars(server).update(settings)
-        bridge = SteppedBridge(server, None if plan is None else lambda step: plan(server, step))
-        clock = SimpleNamespace(monotonic=lambda: bridge.now)
-        for module in (guarded_robot, force_samples, robot_rosbridge):
-            monkeypatch.setattr(module, "time", clock)
-        robot = RosRobot(cell, bridge, Topics())
-        robot.tare()
-        return server, robot
-    return made
+def stepped_ros():
+    """Make a robot in ROS and a link to it, in the robot's time; ``plan(server, step)`` makes the
+    faults, settings are of the server."""
+    with ExitStack() as around:
+        def made(plan=None, cell: Cell = ROS_CELL, **settings) -> tuple[SteppedRos, RobotLink]:
+            server = RosBridge(np.array(ROS_CELL.arm.home))
+            vars(server).update(settings)
+            robot = around.enter_context(SteppedRos(
+                server, None if plan is None else lambda step: plan(robot, step)).here())
+            link = around.enter_context(RobotLink(cell))
+            link.wait_for_samples()
+            link.tare()
+            return robot, link
+        yield made
 
 
 @contextmanager

@@ -396,13 +396,18 @@ def test_a_sensor_that_the_nudge_finds_wrong_stops_before_the_path(planned_folde
 
 
 @pytest.mark.slow
-def test_a_force_unlike_the_predicted_one_stops_an_armed_run(planned_folder, armed):
-    """An allowance within the sensor's noise is passed: exit 4, a report, far below the limit."""
-    with pytest.raises(SafetyStop, match="stopped"):
-        armed(unexpected=0.2)
-    found = Branch.open(planned_folder).manifest.stages["execute:path"].result
-    assert not found["reached"] and found["stop_reason"]
-    assert found["peak_force_n"] is None or found["peak_force_n"] < 10
+def test_a_force_unlike_the_predicted_one_stops_an_armed_run(planned_folder, armed, monkeypatch):
+    """As predicted it is reached; by a model of three times the stiffness: exit 4, a report."""
+    assert armed(unexpected=3.0)["reached"]
+    predicted = execute_path.predicted_along
+
+    def stiffer(*given):
+        found = predicted(*given)
+        return replace(found, wrenches=3 * found.wrenches, stiffness=3 * found.stiffness)
+    monkeypatch.setattr(execute_path, "predicted_along", stiffer)
+    with pytest.raises(SafetyStop, match="predicted were"):
+        armed(unexpected=3.0)
+    assert not Branch.open(planned_folder).manifest.stages["execute:path"].result["reached"]
 
 
 def by_another_branch(joints: np.ndarray) -> np.ndarray:

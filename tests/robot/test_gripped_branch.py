@@ -13,6 +13,7 @@ import pytest
 from tests.subjects.meshes import box_mesh
 
 from limber.cell.cell_file import Cell
+from limber.cli.virtual_camera import scanned, views_around
 from limber.core.numerics.rigid import inverted, matrices
 from limber.geometry.cloud.camera import Camera, depth_to_cloud
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -21,7 +22,7 @@ from limber.mechanics.sensitivities import grasp_slopes
 from limber.robot.virtual.branch_solver import BranchSetting, BranchSolver
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.gripped_branch import HeldBranch
-from limber.robot.virtual.launch import VirtualRobot, scanned, views_around
+from limber.robot.virtual.launch import VirtualRobot
 
 TIP = np.array([0.0, 0.0, 0.3])
 

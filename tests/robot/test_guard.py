@@ -185,50 +185,28 @@ def test_a_frozen_sensor_is_seen_in_its_time(rate, row):
     assert "frozen" in bench.guard.reason
 
 
-def test_a_force_unlike_the_predicted_one_stops_long_before_the_limit():
+@pytest.mark.parametrize("force, told", [
+    ((6.5, 4, 0), "something else pushes"), ((0.1, 0.1, 0), "it slip"),
+    ((3.5, 0, 0), "it slip")])
+def test_a_force_that_changes_otherwise_than_predicted_stops_long_before_the_limit(force, told):
+    """At once, from one that was as predicted."""
     bench = Bench()
     bench.guard.begin()
-    assert bench.run(200, force=(6, 0, 0), expected=(6.5, 0.5, 0)).verdict == Verdict.GO
-    decision = bench.run(200, force=(6, 4, 0), expected=(6.5, 0.5, 0))
-    assert decision.verdict == Verdict.STOP and "differs from the predicted" in decision.reason
-
-
-@pytest.mark.parametrize("wanted, left, told", [
-    (5, 0.5, "dropped suddenly"), (8, 4.9, "dropped suddenly")])
-def test_slip_is_told_from_the_predicted_force(wanted, left, told):
-    bench = Bench()
-    bench.guard.begin()
-    bench.run(200, force=(wanted, 0, 0), expected=(wanted, 0, 0))
-    decision = bench.run(200, force=(left, 0, 0), expected=(wanted, 0, 0))
-    assert decision.verdict == Verdict.STOP
-    assert "slipped" in decision.reason and told in decision.reason
-
-
-@pytest.mark.parametrize("seconds, off, told", [
-    (0.01, (-2.1, 2.7), "dropped suddenly"), (3.0, (-2.1, 2.7), "differs from the predicted"),
-    (3.0, (-3.4, 0), "is softer")])
-def test_what_falls_at_once_is_a_slip_also_where_it_turns_aside(seconds, off, told):
-    """A branch that slides in the grip pulls askew, here by 52 degrees; as slowly as a path leads,
-    it is one whose moduli are others."""
-    bench = Bench()
-    bench.guard.begin()
-    bench.run(400, force=(8, 0, 0), expected=(8, 0, 0))
-    decisions = [bench.look(force=(8 + part * off[0], part * off[1], 0), expected=(8, 0, 0))
-                 for part in np.r_[np.linspace(0, 1, round(500 * seconds)), np.ones(50)]]
-    stop = next(each for each in decisions if each.verdict == Verdict.STOP)
-    assert told in stop.reason
+    assert bench.run(400, force=(6.2, 0, 0), expected=(6.5, 0, 0)).verdict == Verdict.GO
+    decision = bench.run(40, force=force, expected=(6.5, 0, 0))
+    assert decision.verdict == Verdict.STOP and told in decision.reason
+    assert "predicted were 6.5 N" in decision.reason
 
 
 @pytest.mark.parametrize("off, sigma, verdict", [
-    ((0, 0, 4.5), 2.0, Verdict.GO), ((0, 4.5, 0), 2.0, Verdict.STOP),
-    ((0, 0, 6.0), 2.0, Verdict.STOP), ((0, 0, 14.0), 50.0, Verdict.STOP)])
-def test_more_is_allowed_where_the_prediction_is_unsure_never_more_than_the_soft_limit(
-        off, sigma, verdict):
-    """3 N are allowed; along z, where the force is known to 2 N, 3 and 4 N in quadrature."""
+    ((0, 0, 3.0), 2.0, Verdict.GO), ((0, 3.0, 0), 2.0, Verdict.STOP),
+    ((0, 0, 7.0), 0.5, Verdict.STOP)])
+def test_more_is_allowed_where_the_prediction_is_unsure(off, sigma, verdict):
     bench = Bench()
     bench.guard.begin()
     uncertainty = np.diag([0, 0, sigma**2, 0, 0, 0])
-    assert bench.run(200, force=off, expected=(0, 0, 0), uncertainty=uncertainty).verdict == verdict
+    assert bench.run(200, force=np.array(off) + [6, 0, 0], expected=(6, 0, 0),
+                     uncertainty=uncertainty).verdict == verdict
 
 
 def test_slip_is_told_without_a_prediction_by_a_sudden_fall(bench):

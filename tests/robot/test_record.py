@@ -25,6 +25,7 @@ from benchmarks.robot_faults import restored
 from limber.cell.cell_file import CameraEntry, Cell
 from limber.cell.known_arms import arm_named
 from limber.cli.stage_command import StageCommand
+from limber.cli.virtual_camera import VirtualCamera
 from limber.core.errors import BranchFolderError, InputError, NoPathError, SafetyStop, WorkError
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import SILENT
@@ -33,7 +34,6 @@ from limber.perception.observe import observe
 from limber.recordings.recording import read_pull
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
-from limber.robot.virtual.launch import VirtualCamera
 from limber.stages.pulls.record import RecordPull, _remove_empty
 from limber.stages.pulls.record_path import arc_path, suggested_pull, there_and_back, waypoint_path
 from limber.stages.pulls.record_prediction import PullModel

@@ -102,7 +102,7 @@ def test_what_is_read_writes_nothing_and_what_is_set_is_put_back(stepped):
     told = "; ".join(map(str, seen.differences))
     assert "payload: 1.200 kg in the controller, 0.500 kg in the cell file (set for" in told
     assert "tool centre point: (0, 0, 50) mm" in told
-    assert not seen.implausible(cell) and not seen.program_runs
+    assert not seen.implausible(cell) and not seen.is_busy(cell)
     state = stepped.state
     assert state["program"] == "STOPPED"
     assert {name: state[name] for name in before} == before

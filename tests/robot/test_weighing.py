@@ -8,11 +8,11 @@ import pytest
 from limber.cell.cell_file import Cell
 from limber.cell.reach_and_collision import ArmSurroundings
 from limber.cli.commands.robot.moves import log_move
-from limber.cli.commands.robot.weigh import Weigh, weighed, weightless
+from limber.cli.commands.robot.weigh import Weigh, compared, tilted_joints, weighed, weightless
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
 from limber.robot.motion.joint_path import to_joints
-from limber.robot.robot_state import require_weighed, tilted_joints, unweighed, weigh, weighed_as
+from limber.robot.robot_state import require_weighed, unweighed, weighed_as
 
 MASS = 0.9
 SWAPPED = np.eye(3)[[1, 2, 0]]
@@ -40,22 +40,22 @@ def tilted(sensor: np.ndarray, *, mass: float = MASS, tilt: float = 0.23, seed: 
     (np.zeros((3, 3)), "does not notice")])
 def test_sign_axes_and_unit_are_named(sensor, told):
     for seed in range(5):
-        found = weigh(*tilted(sensor, seed=seed), MASS)
+        found = compared(*tilted(sensor, seed=seed), MASS)
         assert (told is None and not found.faults) or (told and told in found.faults[0])
     if told is None:
         assert abs(found.mass - MASS) < 4 * found.sigma < 0.05
 
 
 def test_a_mass_that_is_off_by_a_third_of_a_kilogram_is_named():
-    found = weigh(*tilted(np.eye(3), mass=MASS + 0.3), MASS)
+    found = compared(*tilted(np.eye(3), mass=MASS + 0.3), MASS)
     assert "tool.mass_kg" in found.faults[0] and found.mass == pytest.approx(1.2, abs=0.03)
 
 
 def test_one_axis_or_no_mass_tell_nothing():
     with pytest.raises(InputError, match="is not tilted about two axes"):
-        weigh(*tilted(np.eye(3), axes=((1, 0, 0), (1, 0, 0))), MASS)
+        compared(*tilted(np.eye(3), axes=((1, 0, 0), (1, 0, 0))), MASS)
     with pytest.raises(InputError, match=r"no tool\.mass_kg above 0"):
-        weigh(*tilted(np.eye(3)), 0.0)
+        compared(*tilted(np.eye(3)), 0.0)
 
 
 class Link:

@@ -17,11 +17,9 @@ from benchmarks.robot_branches import (
     FOLLOWED_ROWS,
     LEAST_STREAM_S,
     LOOP_ROWS,
-    LOST_ROW,
     STREAM_ROWS,
     closed_loops,
     followed_paths,
-    lost_branches,
     recorded_stream,
 )
 from benchmarks.robot_calibration import CALIBRATION_ROWS, calibrations
@@ -36,12 +34,12 @@ from benchmarks.robot_faults import (
     restored,
     straight,
 )
+from benchmarks.robot_guard import GUARD_ROWS, guarded_paths
 from benchmarks.robot_ros import LEAST_ROS_S, ROS_ROWS, ros_door
 from benchmarks.robot_stops import RETREAT_ROW, STATES_ROW, retreats, wrong_states
 from benchmarks.table import Asked, Part, Row, Setting
 from benchmarks.trials import Trial, column, sound
 from limber.robot.driver.link import RobotLink
-from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
 from limber.robot.virtual.launch import VirtualRobot
 
 _ADDRESS = "127.0.0.71"
@@ -50,7 +48,6 @@ _ADDRESS = "127.0.0.71"
 _STOP_SECONDS = {125: 0.012, 500: 0.006}
 """Required time [s], by the controller's rate [Hz]."""
 _FAULT_RUNS, _NAMED_SHARE = 5, 0.95
-_PATH = Asked("following a path at 30 mm/s: distance from it, worst", "1 mm")
 
 
 def _stop_asked(rate: int) -> tuple[Asked, ...]:
@@ -142,24 +139,6 @@ def _one_stop(robot: VirtualRobot, model: str, step: float) -> _Stop:
     return _Stop(stopped - acts, way, since, came + stopped - acts)
 
 
-def _path(setting: Setting, _voided: Voided) -> list[Row]:
-    collected: list[np.ndarray] = []
-    with new_robot(_ADDRESS, "ur5e", setting.seed) as robot:
-        start = np.array(robot.state["pose"])
-        corners = start + np.array([[0, 0, 0, 0, 0, 0], [0, 0.08, 0, 0, 0, 0],
-                                    [0, 0.08, 0.05, 0, 0.1, 0], [0.03, 0.02, 0.05, 0, 0, 0]])
-        poses = densely(corners, spacing=0.0005)
-        path = Trajectory(along(poses, 0.03, 0.2), poses, ExpectedWrench.nothing(poses))
-        with RobotLink(cell_for(_ADDRESS), collected.append) as link:
-            time.sleep(0.2)
-            link.tare()
-            link.follow(path)
-    samples = np.concatenate(collected)
-    distance = max(float(np.linalg.norm(poses[:, :3] - row, axis=1).min())
-                   for row in samples[:, 1:4])
-    return [Row(*_PATH, f"{1000 * distance:.2f} mm", distance < 1e-3)]
-
-
 def _faults(setting: Setting, voided: Voided, names: tuple[str, ...] = tuple(EVERY),
             ) -> list[Row]:
     runs: dict[str, list[Trial]] = {}
@@ -231,7 +210,6 @@ PARTS = {
     "stop-500": Part(_watched(partial(_stop_time, model="ur5e")), 15, _stop_asked(500),
                      grows=True),
     "stop-125": Part(_watched(partial(_stop_time, model="ur5")), 15, _stop_asked(125), grows=True),
-    "path": Part(_watched(_path), 20, (_PATH,)),
     "faults": Part(_watched(_faults), 150, _faults_asked(_faults_told(tuple(EVERY))),
                    grows=True),
     "wrong-states": Part(wrong_states, 30, (STATES_ROW,), grows=True),
@@ -240,7 +218,7 @@ PARTS = {
     "ros": Part(_watched(ros_door), LEAST_ROS_S, ROS_ROWS, grows=True),
     "branches": Part(_watched(partial(followed_paths, address=_ADDRESS)), 60, FOLLOWED_ROWS,
                      grows=True),
-    "lost": Part(_watched(partial(lost_branches, address=_ADDRESS)), 100, (LOST_ROW,), grows=True),
+    "guard": Part(guarded_paths, 300, GUARD_ROWS, grows=True),
     "loops": Part(_watched(partial(closed_loops, address=_ADDRESS)), 240, LOOP_ROWS, grows=True),
     "stream": Part(partial(recorded_stream, address=_ADDRESS), LEAST_STREAM_S, STREAM_ROWS,
                    grows=True)}

@@ -28,7 +28,7 @@ from limber.cell.cell_file import ApproachEntry
 from limber.cli.closed_loop.comparison import GOAL_TOLERANCE_M, comparison
 from limber.cli.closed_loop.loop import OPEN_FACTOR, ClosedLoop
 from limber.cli.terminal import table_lines
-from limber.core.errors import LimberError, SafetyStop
+from limber.core.errors import LimberError
 from limber.core.progress import Progress
 from limber.estimation.simulated_pull import PullSpec
 from limber.geometry.generated import generate_branch
@@ -156,103 +156,42 @@ def _followed(seed: int, address: str) -> tuple[dict, float]:
     return result, off
 
 
-def _executed(seed: int, address: str,
-              fault: Callable[[VirtualRobot], None] | None = None) -> tuple[dict, float]:
-    with tempfile.TemporaryDirectory() as place:
-        return _executed_in(Path(place), seed, address, fault)
-
-
-def _executed_in(folder: Path, seed: int, address: str,
-                 fault: Callable[[VirtualRobot], None] | None) -> tuple[dict, float]:
-    """Execute the path armed; ``fault`` acts on the robot once the force is up.
+def _executed(seed: int, address: str) -> tuple[dict, float]:
+    """Execute the path armed.
 
     Returns:
         Output of `execute`, and the extrapolation error of the virtual branch's force [N].
     """
-    branch, young = random_branch(folder / "random.branch", seed)
-    cell = standing_at(branch, address, fraction=FRACTION, back=ApproachEntry().distance_m,
-                       grip_seconds=4.0)
-    skeleton = load_skeleton(branch)
-    axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
-    settings = {"gripper_rotation": tuple(map(float, across(axis)[0])), "hold": 0.5}
-    path = cell_file(cell, folder)
-    dry = ExecutePlan(branch_folder=branch.folder, name="path", cell=path, **settings).run()
-    with robot_holding(branch, cell, folder, seed=seed, young=young) as robot:
-        robot.ask("stand", joints=list(map(float, dry["start_joints_rad"])))
-        largest = [0.0]
-        ended = threading.Event()
-        watcher = threading.Thread(target=_watch, args=(robot, largest, ended, fault))
-        watcher.start()
-        try:
-            result = ExecutePlan(branch_folder=branch.folder, name="path", cell=path, **settings,
-                                 arm=True, confirm="path", after_stop="hold").run()
-        finally:
-            ended.set()
-            watcher.join()
-    return result, largest[0]
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        branch, young = random_branch(folder / "random.branch", seed)
+        cell = standing_at(branch, address, fraction=FRACTION, back=ApproachEntry().distance_m,
+                           grip_seconds=4.0)
+        skeleton = load_skeleton(branch)
+        axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
+        executed = partial(
+            ExecutePlan, branch_folder=branch.folder, name="path", cell=cell_file(cell, folder),
+            hold=0.5, gripper_rotation=tuple(map(float, across(axis)[0])))
+        dry = executed().run()
+        with robot_holding(branch, cell, folder, seed=seed, young=young) as robot:
+            robot.ask("stand", joints=list(map(float, dry["start_joints_rad"])))
+            largest = [0.0]
+            ended = threading.Event()
+            watcher = threading.Thread(target=_watch, args=(robot, largest, ended))
+            watcher.start()
+            try:
+                result = executed(arm=True, confirm="path", after_stop="hold").run()
+            finally:
+                ended.set()
+                watcher.join()
+        return result, largest[0]
 
 
-def _watch(robot: VirtualRobot, largest: list[float], ended: threading.Event,
-           fault: Callable[[VirtualRobot], None] | None) -> None:
-    """Record the virtual branch's error; provoke the fault once the force is up."""
+def _watch(robot: VirtualRobot, largest: list[float], ended: threading.Event) -> None:
+    """Record the virtual branch's error."""
     while not ended.wait(0.2):
         state = robot.state
         largest[0] = max(largest[0], state.get("extrapolation_error_n", 0.0))
-        if fault is not None and np.linalg.norm(state.get("true_wrench", [0.0])[:3]) > 4.0:
-            fault(robot)
-            fault = None
-
-
-FAULTS_OF_BRANCHES: tuple[tuple[str, Callable[[VirtualRobot], None]], ...] = (
-    ("slips", lambda robot: robot.ask("slip", part=0.95) and None),
-    ("breaks", lambda robot: robot.ask("break") and None))
-LOST_ROW = Asked("branch slips, branch breaks while it is led: stop for the lost force, and a "
-                 "report", "every one")
-
-
-def lost_branches(setting: Setting, voided: Voided, address: str) -> list[Row]:
-    """The branch slips in the grip, or breaks, while it is moved: the arm stops and reports it."""
-    kinds = len(FAULTS_OF_BRANCHES)
-    trials = setting.trials("lost", setting.seeds(20 * kinds, kinds), partial(
-        _loss_trial, voided=voided, address=address), *_PACKAGES, catch=FAILURES)
-    names = {FAULTS_OF_BRANCHES[each.task % kinds][0] for each in trials}
-    stopped, count = len(sound(trials)), len(trials)
-    # A fault that was not run is not known to be noticed.
-    is_met = False if stopped < count else True if len(names) == kinds else None
-    return [Row(*LOST_ROW, f"{stopped} of {count} ({', '.join(sorted(names))}){voided}", is_met,
-                count)]
-
-
-def _loss_trial(task: int, voided: Voided, address: str) -> dict[str, Any]:
-    """One fault with one branch; faults take turns."""
-    seed, kind = divmod(task, len(FAULTS_OF_BRANCHES))
-    name, fault = FAULTS_OF_BRANCHES[kind]
-    told = _said(f"branch {name}, seed {seed}", voided, partial(
-        _stop_for_loss, seed, address, fault))
-    print(f"branch {name}: {told}", flush=True)
-    return {"told": told}
-
-
-def _stop_for_loss(seed: int, address: str, fault: Callable[[VirtualRobot], None]) -> str:
-    """Return the report of the stop.
-
-    Raises:
-        AssertionError: it did not stop.
-        LimberError: the reason is not the lost force, or came before it: the fault did not cause
-            the stop.
-    """
-    done = []
-
-    def noted(robot: VirtualRobot) -> None:
-        done.append(seed)
-        fault(robot)
-    try:
-        _executed(seed, address, noted)
-    except SafetyStop as stop:
-        if not done or "slipped, broke" not in str(stop):
-            raise
-        return str(stop)
-    raise AssertionError("it went on")
 
 
 # --- a recording for minutes, ended by kill -9 ---------------------------------------------------

@@ -5,6 +5,8 @@ import tempfile
 import threading
 import time
 from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from unittest.mock import patch
 
@@ -15,15 +17,13 @@ from benchmarks.robot_rosbridge import STEP, RosBridge
 from benchmarks.table import Asked, Row, Setting
 from limber.cell.cell_file import Cell
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
+from limber.robot.driver.link import RobotLink
 from limber.robot.driver.real_time import claim_real_time, keep_awake
 from limber.robot.motion.joint_path import joint_path
 from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
-from limber.robot.ros.bridge import Bridge
-from limber.robot.ros.guarded_robot import RosRobot, Topics
 
 LEAST_ROS_S = 30.0
-_ASKED_S, _STOP_S, _STOPS = 600.0, 0.1, 5
-_AROUND_S = 25.0
+_ASKED_S, _STOP_S, _STOPS, _AROUND_S = 600.0, 0.1, 5, 25.0
 ROS_ROWS = (Asked("a path through rosbridge at 125 Hz for 600 s, wrench in: samples lost", "0"),
             Asked("stop published in ROS until the arm stands, worst", "100 ms"))
 _CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
@@ -53,36 +53,41 @@ def ros_door(setting: Setting, voided: Voided) -> list[Row]:
 
 def _lost(seconds: float) -> tuple[int, int]:
     """Samples between the first and the last of a path that the guard did not see; and all."""
-    times: list[float] = []
+    rows: list[np.ndarray] = []
     with RosBridge(_HOME) as server:
-        # The server is another program in reality: a million objects that it keeps here would be
-        # searched by the guard's garbage collector.
         server.sent = deque(maxlen=0)
-        robot = RosRobot(_CELL, Bridge(server.url), Topics(),
-                         lambda clock, pose, wrench: times.append(clock))
-        robot.tare(0.25)
-        event = robot.follow(_path(seconds))
-        robot.close()
+        with _linked(server, rows.append) as link:
+            event = link.follow(_path(seconds))
     assert event["event"] == "reached", event["reason"]
-    steps = np.round(np.diff(times) / STEP).astype(int)
+    steps = np.round(np.diff(np.concatenate(rows)[:, 0]) / STEP).astype(int)
     return int((steps - 1).sum()), int(steps.sum()) + 1
 
 
 def _stopped() -> float:
     """Time from a stop on the topic until the arm stands [s]."""
-    with RosBridge(_HOME) as server:
-        robot = RosRobot(_CELL, Bridge(server.url), Topics())
-        robot.tare(0.25)
+    with RosBridge(_HOME) as server, _linked(server) as link:
         published: list[float] = []
 
         def publish() -> None:
             published.append(time.monotonic())
             server.publish("/limber/stop", {"data": True})
         threading.Timer(0.5, publish).start()
-        event = robot.follow(_path(5.0))
-        robot.close()
-        assert event["event"] == "stopped" and event["stands"], event
+        event = link.follow(_path(5.0))
+        assert event["event"] == "stopped", event
+        time.sleep(_STOP_S)
         return float(server.stood_at) - published[0]
+
+
+@contextmanager
+def _linked(server: RosBridge, taken: Callable[[np.ndarray], None] | None = None,
+            ) -> Iterator[RobotLink]:
+    """A tared link to the server's robot."""
+    cell = _CELL.model_copy(update={"robot": _CELL.robot.model_copy(
+        update={"address": server.url})})
+    with RobotLink(cell, taken) as link:
+        link.wait_for_samples()
+        link.tare(0.25)
+        yield link
 
 
 def _path(seconds: float) -> Trajectory:
@@ -92,10 +97,10 @@ def _path(seconds: float) -> Trajectory:
     out = densely(np.array([start, start + [0, 0.1, 0, 0, 0, 0]]))
     joints = joint_path(_CELL.arm, matrices(out) @ inverted(tool), start=_HOME).joints
     leg = along(out, 0.03, 0.3)
-    count = max(2, round(seconds / leg[-1]))
-    times = np.concatenate([number * (leg[-1] + 0.02) + (
-        leg if number % 2 == 0 else leg[-1] - leg[::-1]) for number in range(count)])
-    order = np.arange(len(out))
-    rows = np.concatenate([order if number % 2 == 0 else order[::-1] for number in range(count)])
-    poses = out[rows]
-    return Trajectory(times, poses, ExpectedWrench.nothing(poses), joints[rows])
+    there = Trajectory(leg, out, None, joints)
+    legs = [there, there.backwards()] * max(1, round(0.5 * seconds / leg[-1]))
+    poses = np.concatenate([each.poses for each in legs])
+    return Trajectory(np.concatenate([number * (leg[-1] + 0.02) + each.times
+                                      for number, each in enumerate(legs)]),
+                      poses, ExpectedWrench.nothing(poses), np.tile(
+                          np.concatenate([joints, joints[::-1]]), (len(legs) // 2, 1)))

@@ -4,7 +4,6 @@ import contextlib
 import json
 import threading
 import time
-from collections import deque
 
 import numpy as np
 
@@ -28,7 +27,6 @@ class RosBridge:
         wrench: What the sensor tells besides noise [N, N m], shape [6].
         wrench_topic: Where it tells it.
         load: Returns more of that, from the joints.
-        gripper_status: With which the gripper's action ends.
         stood_at: When the last goal ended, and the arm stood [s, monotonic].
         heard: Operations that came, each with its time.
         silent: Topics that send nothing.
@@ -41,6 +39,10 @@ class RosBridge:
         has_arm: Whether the arm's own are published there.
         sticks: The arm stands whatever its goal, and nothing reports why.
         accepts_after: Steps before the controller accepts a goal; until then a cancel is lost.
+        knows_actions: As old ones it answers to them with an error.
+        speed_noise: Of joint states [rad/s].
+        prefix: Of the names of its joints.
+        space: Name space of all but the joint states.
         blocks: A running goal blocks what a stepped client sends after it, as rosbridge does by
             default.
     """
@@ -49,18 +51,16 @@ class RosBridge:
         self.joints, self.speeds = np.array(joints, float), np.zeros(6)
         self.wrench, self.heard, self.silent = np.zeros(6), [], set()
         self.wrench_topic = "/force_torque_sensor_broadcaster/wrench"
-        self.followed, self.stood_at = [], None
-        self.load = lambda joints: np.zeros(6)
-        self.gripper_status = 4
+        self.followed, self.stood_at, self.load = [], None, lambda joints: np.zeros(6)
         self.drift, self.answers, self.sent = np.zeros(6), [], []
         self.status = {"/io_and_status_controller/safety_mode": {"mode": 1},
                        "/io_and_status_controller/robot_mode": {"mode": 7},
                        _PROGRAM: {"data": True}, _SCALING: {"data": 100.0}}
         self.others, self.has_arm, self.sticks = [], True, False
-        self.accepts_after, self.blocks = 0, False
+        self.accepts_after, self.blocks, self.knows_actions = 0, False, True
+        self.speed_noise, self.prefix, self.space = 0.0, "", ""
         self._subscribed, self._offering = {}, None
-        self._goal, self._open = None, []
-        self._age, self._lock = 0, threading.Lock()
+        self._goal, self._open, self._age, self._lock = None, [], 0, threading.Lock()
         self._rng = np.random.default_rng(0)
 
     def __enter__(self):
@@ -73,25 +73,9 @@ class RosBridge:
         return self
 
     def __exit__(self, *_exception):
-        self.hang_up()
-        self._server.shutdown()
-
-    def hang_up(self):
-        """Close all connections; the controller goes on with its goal."""
         for socket in self._open:
             socket.close()
-
-    def protective_stop(self):
-        """The arm stops, its goal waits: as the controller reports it, in its order."""
-        self.status[_SCALING] = {"data": 0.0}
-        self.status["/io_and_status_controller/safety_mode"] = {"mode": 3}
-        self.status[_PROGRAM] = {"data": False}
-
-    def release(self):
-        """A person releases the protective stop and starts the program again."""
-        self.status["/io_and_status_controller/safety_mode"] = {"mode": 1}
-        self.status[_PROGRAM] = {"data": True}
-        self.status[_SCALING] = {"data": 100.0}
+        self._server.shutdown()
 
     def _serve(self, socket):
         from websockets.exceptions import ConnectionClosed
@@ -103,13 +87,11 @@ class RosBridge:
         while listening.is_alive() and socket not in self._subscribed:
             time.sleep(STEP)
         began, count, told = time.monotonic(), 0, {}
-        try:
+        with contextlib.suppress(ConnectionClosed):
             while listening.is_alive():
                 count += 1
                 self.turn(socket, count, told)
                 time.sleep(max(began + count * STEP - time.monotonic(), 0.0))
-        except ConnectionClosed:
-            return
 
     def turn(self, socket, count, told):
         """Step the arm for the ``count``-th time, and send all that is published then.
@@ -121,32 +103,34 @@ class RosBridge:
             self._step(socket)
         self._send_status(socket, told)
         for other in self.others:
-            self._send(socket, "/joint_states", count, other, kept=False)
+            self._send(socket, "/joint_states", count, other)
         if self.has_arm:
             self._send(socket, "/joint_states", count, {
-                "name": _NAMES, "position": self.joints[_ORDER].tolist(),
-                "velocity": self.speeds[_ORDER].tolist(), "effort": []})
+                "name": [self.prefix + name for name in _NAMES],
+                "position": self.joints[_ORDER].tolist(), "effort": [],
+                "velocity": (self.speeds[_ORDER] + self.speed_noise
+                             * self._rng.standard_normal(6)).tolist()})
         felt = self.wrench + self.load(self.joints) + 0.02 * self._rng.standard_normal(6)
-        self._send(socket, self.wrench_topic, count, {"wrench": {
+        self._send(socket, self.space + self.wrench_topic, count, {"wrench": {
             kind: dict(zip("xyz", map(float, part), strict=True))
             for kind, part in (("force", felt[:3]), ("torque", felt[3:]))}})
 
-    def _send(self, socket, topic, count, message, *, kept=True):
+    def _send(self, socket, topic, count, message):
         if topic not in self.silent:
-            seconds = count * STEP
-            stamp = {"sec": int(seconds), "nanosec": round(1e9 * (seconds % 1))}
+            stamp = {"sec": int(count * STEP), "nanosec": round(1e9 * (count * STEP % 1))}
             message = {"header": {"stamp": stamp, "frame_id": ""}, **message}
-            if kept:
-                self.sent.append((seconds, topic, message))
+            self.sent.append((count * STEP, topic, message))
             socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
 
     def _send_status(self, socket, told):
         """Send what has changed since ``told``, and the scaling always."""
         for topic, message in self.status.items():
-            if topic in self._subscribed.get(socket, ()) and topic not in self.silent and (
+            if self.space + topic in self._subscribed.get(socket, ()) and (
+                    topic not in self.silent) and (
                     topic == _SCALING or told.get(topic) != message):
                 told[topic] = message
-                socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
+                socket.send(json.dumps({"op": "publish", "topic": self.space + topic,
+                                        "msg": message}))
 
     @property
     def is_busy(self):
@@ -204,20 +188,23 @@ class RosBridge:
         from websockets.exceptions import ConnectionClosed
 
         self.heard.append((time.monotonic(), order))
-        if order["op"] == "send_action_goal" and order["action_type"].endswith("GripperCommand"):
-            socket.send(json.dumps({
-                "op": "action_result", "id": order["id"], "action": order["action"],
-                "status": self.gripper_status, "result": True, "values": {
-                    "position": 0.31, "effort": 0.0, "stalled": True, "reached_goal": False}}))
-        elif order["op"] == "send_action_goal":
+        if order["op"] == "send_action_goal" and not self.knows_actions:
+            socket.send(json.dumps({"op": "status", "level": "error",
+                                    "msg": "Unknown operation: send_action_goal."}))
+        elif order["op"] == "send_action_goal" and order["action_type"].endswith("Trajectory"):
             points = order["args"]["trajectory"]["points"]
-            order_of = [order["args"]["trajectory"]["joint_names"].index(name) for name in _NAMES]
+            order_of = [order["args"]["trajectory"]["joint_names"].index(self.prefix + name)
+                        for name in _NAMES]
             ways, speeds = (np.array([point[kind] for point in points])[:, order_of][:, _ORDER]
                             for kind in ("positions", "velocities"))
             self._goal = (order, np.array([
                 point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"]
                 for point in points]), ways, speeds, 0.0)
             self._age = 0
+        elif order["op"] == "call_service":
+            socket.send(json.dumps({
+                "op": "service_response", "id": order["id"], "service": order["service"],
+                "values": {"success": True}, "result": True}))
         elif order["op"] == "publish":
             # Who publishes hears it too.
             for each, topics in list(self._subscribed.items()):
@@ -244,106 +231,3 @@ class RosBridge:
         """Publish a message to every client, as any node may."""
         for socket in self._open:
             socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
-
-
-class SteppedBridge:
-    """A client's connection to a server that takes a step whenever the client waits.
-
-    It stands for :class:`limber.robot.ros.bridge.Bridge`, and its time for the clock.
-
-    Args:
-        server: A :class:`RosBridge`, not entered.
-        plan: Called in each step with its number since the last goal came.
-
-    Attributes:
-        now: Time of the last step [s].
-    """
-
-    url = "stepped"
-
-    def __init__(self, server, plan=None):
-        self.plan, self.now = plan, 0.0
-        self._server, self._inbox = server, _Inbox()
-        self._count, self._told, self._since, self._held = 0, {}, None, []
-
-    def send(self, **order):
-        """Carry out an operation."""
-        if self._server.blocks and self._server.is_busy:
-            self._held.append(order)
-            return
-        self._server.obey(self._inbox, order)
-        if order["op"] == "send_action_goal":
-            self._since = 0
-
-    def receive(self, seconds):
-        """Return the next message, if any; before, where none waits, time passes."""
-        if not self._inbox.texts and seconds > 0.0:
-            self._step()
-        return json.loads(self._inbox.texts.popleft()) if self._inbox.texts else None
-
-    def _step(self):
-        self._count += 1
-        self.now += STEP
-        if self._since is not None:
-            self._since += 1
-            if self.plan is not None:
-                self.plan(self._since)
-        self._server.turn(self._inbox, self._count, self._told)
-        if not self._server.is_busy:
-            for order in self._held:
-                self._server.obey(self._inbox, order)
-            self._held.clear()
-
-    def end_goal(self, status, **values):
-        """Let the controller end the goal."""
-        self._server.end_goal(self._inbox, status, **values)
-
-    def subscribe(self, topic, kind):
-        """Subscribe to a topic."""
-        self.send(op="subscribe", topic=topic, type=kind)
-
-    def advertise(self, topic, kind):
-        """Advertise a topic."""
-        self.send(op="advertise", topic=topic, type=kind)
-
-    def close(self):
-        """Nothing is open."""
-
-
-class _Inbox:
-    """Keeps what a server sends."""
-
-    def __init__(self):
-        self.texts = deque()
-
-    def send(self, text):
-        self.texts.append(text)
-
-
-class ReplayedBridge(RosBridge):
-    """Sends recorded messages at their times to one client; its arm moves as it was recorded.
-
-    Args:
-        messages: Times [s], topics and contents, by time.
-    """
-
-    def __init__(self, messages):
-        super().__init__(np.zeros(6))
-        self._messages = messages
-
-    def _serve(self, socket):
-        from websockets.exceptions import ConnectionClosed
-
-        self._open.append(socket)
-        listening = threading.Thread(target=self._listen, args=(socket,), daemon=True)
-        listening.start()
-        begin, first = time.monotonic(), self._messages[0][0]
-        with contextlib.suppress(ConnectionClosed):
-            for topic, message in self.status.items():
-                socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
-            for seconds, topic, message in self._messages:
-                time.sleep(max(begin + seconds - first - time.monotonic(), 0.0))
-                socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
-            if self._goal is not None:
-                self.end_goal(socket, _SUCCEEDED, error_code=0)
-        listening.join()

@@ -49,7 +49,8 @@ _ENDING_SECONDS = 0.2  # of a driver's process: the controller's watchdog ends i
 _SOLVING_STEPS = 15  # of the arm, while the branch is solved
 _IN_ROBOTS_TIME = ("limber.robot.", "limber.stages.pulls.", "limber.stages.paths.",
                    "limber.cli.commands.robot.", "benchmarks.robot_faults")
-_LOADED_LATE = ("limber.robot.operator_decisions", "limber.stages.pulls.record",
+_LOADED_LATE = ("limber.robot.operator_decisions", "limber.robot.ros.ros_control",
+                "limber.stages.pulls.record",
                 "limber.stages.pulls.record_nudge", "limber.stages.paths.execute",
                 "limber.cli.commands.robot.moves", "limber.cli.commands.robot.weigh")
 
@@ -86,12 +87,12 @@ class Spring(Load):
     """
 
     def __init__(self, tool: np.ndarray, rest: np.ndarray, stiffness: np.ndarray):
-        self._tool, self._rest, self.stiffness = tool, rest, stiffness
+        self._tool, self.rest, self.stiffness = tool, rest, stiffness
         self.peak = self.now = 0.0
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
         tip = flange[:3, :3] @ self._tool + flange[:3, 3]
-        pull = self.stiffness @ (self._rest - tip)
+        pull = self.stiffness @ (self.rest - tip)
         self.now = float(np.linalg.norm(pull))
         self.peak = max(self.peak, self.now)
         force = flange[:3, :3].T @ pull

@@ -56,7 +56,8 @@ class RobotEntry(_Entry):
 
     model: str = Field(description=f"One of {NAMES}; or the URDF file of another arm, beside the "
                        "cell file.")
-    address: str = Field("127.0.0.1", min_length=1, description="Address of the controller.")
+    address: str = Field("127.0.0.1", min_length=1, description="Of the controller; ws:// of ROS.")
+    ros: dict[str, str] = Field({}, description="Namespace, prefix of joints, topics and actions.")
     version: str | None = Field(None, pattern=r"^\d+\.\d+(\.\d+)*$",
                                 description="Controller version at the calibration.")
     pose_sigma_m: float = Field(
@@ -105,9 +106,9 @@ class ToolEntry(_Entry):
     parts: tuple[CapsuleEntry, ...] = ()
     compliance_m_per_n: float = Field(
         5e-5, ge=0, le=1e-2, description="Compliance of arm, fingers and bark [m/N].")
-    gripper: Literal["none", "digital_output", "robotiq", "by_hand"] = Field(
+    gripper: Literal["none", "digital_output", "robotiq", "ros", "by_hand"] = Field(
         "by_hand", description="How it is driven. digital_output: by close_output. robotiq: by the "
-        "socket of Robotiq's URCap.")
+        "socket of Robotiq's URCap. ros: by its action.")
     grip_force: float = Field(0.2, ge=0, le=1, description="Share of a Robotiq gripper's greatest "
                                                            "force.")
     grip_seconds: float = Field(
@@ -142,7 +143,7 @@ class SensorEntry(_Entry):
         "address). ft300_usb: by Modbus on device.")
     device: str | None = Field(None, description="Serial line of kind = \"ft300_usb\".")
     topic: str | None = Field(None, min_length=1, description="Topic of its wrench in ROS "
-                              "(geometry_msgs/msg/WrenchStamped). `limber ros` takes that of the "
+                              "(geometry_msgs/msg/WrenchStamped). By default it is that of the "
                               "UR driver only for the own sensor of an e-Series arm.")
     pose: Pose = Field((0.0,) * 6, description="The sensor's frame in the flange's frame.")
     force_range_n: float = Field(100.0, gt=0)
@@ -168,9 +169,8 @@ class LimitsEntry(_Entry):
     hard_force_n: float = Field(20.0, gt=0, description="Motion stops.")
     hard_torque_nm: float = Field(3.0, gt=0)
     unexpected_force_n: float = Field(
-        3.0, gt=0, description="Largest difference between measured and predicted force [N]. With "
-        "the branch held the guard allows less: two fifths of the predicted force, and the "
-        "sensor's noise and drift.")
+        3.0, gt=0, description="By how much the force may rise during a return [N]. Differences "
+        "from a predicted force are judged by their likelihood.")
     singularity: float = Field(0.05, gt=0, le=0.5)
     joint_margin_rad: float = Field(0.05, ge=0, le=1)
     contact_n_per_m: float = Field(
@@ -545,10 +545,10 @@ _TEMPLATE_EXAMPLES: dict[str, Any] = {
     "tool": {"grasp_pose": [0.0, 0.0, 0.15, 0.0, 0.0, 0.0], "mass_kg": 0.9,
              "parts": [{"start_m": [0.0, 0.0, 0.0], "end_m": [0.0, 0.0, 0.12],
                         "radius_m": 0.04}]},
-    "robot": {"version": "5.11.6", "joint_limits_rad": [[-3.1, 3.1]] * 6},
+    "robot": {"version": "5.11.6", "joint_limits_rad": [[-3.1, 3.1]] * 6,
+              "ros": {"namespace": "left", "prefix": "left_"}},
     "base": {"residual_m": 0.001},
-    "sensor": {"file": "forces.csv", "device": "/dev/ttyUSB0",
-               "topic": "/ft300/wrench"},
+    "sensor": {"device": "/dev/ttyUSB0", "topic": "/ft300/wrench"},
     "camera": {"pose": [0.0, -1.0, 0.5, -1.57, 0.0, 0.0]},
     "second_arm": {"model": "ur5e", "base_pose": [0.6, 0.6, 0.0, 0.0, 0.0, 0.0]},
     "workspace": {"low_m": [-0.4, -0.4, 0.0], "high_m": [0.4, 0.4, 1.2]},
@@ -602,7 +602,7 @@ def _template_lines(kind: type[BaseModel], stated: dict[str, Any], examples: dic
     """The keys of a section; those that are not stated are examples, commented out."""
     for name, entry in kind.model_fields.items():
         value, mark = stated.get(name), ""
-        if value is None or value == [] or is_example:
+        if value in (None, [], {}) or is_example:
             value, mark = examples.get(name, entry.default), "# "
         if entry.description:
             yield f"# {entry.description}"
@@ -619,9 +619,9 @@ def _obstacle(entry: dict[str, Any], is_example: bool) -> str:
 
 
 def _written(value: Any) -> str:
-    return tomlkit.item(plain(value), _sort_keys=False).as_string() if not isinstance(
-        value, list | tuple) or not any(isinstance(each, dict) for each in value) else (
-        "[" + ", ".join(_inline(each) for each in value) + "]")
+    if isinstance(value, list | tuple) and any(isinstance(each, dict) for each in value):
+        return "[" + ", ".join(map(_written, value)) + "]"
+    return _inline(value) if isinstance(value, dict) else tomlkit.item(plain(value)).as_string()
 
 
 def _inline(entry: dict[str, Any]) -> str:

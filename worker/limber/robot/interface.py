@@ -12,9 +12,15 @@ in radians. ``n`` is the number of joints.
 import socket
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
+
+from limber.cell.cell_file import Cell
+from limber.core.errors import InputError
+
+if TYPE_CHECKING:
+    from limber.robot.motion.trajectory import Trajectory
 
 PLAYING = 2
 """A running program, as RTDE reports it."""
@@ -61,6 +67,16 @@ class Sample:
     def program_runs(self) -> bool:
         """Whether a program runs on the controller."""
         return self.runtime_state == PLAYING
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Wrench of the surroundings on the tool, flange axes, about the flange [N, N m], shape [6];
+    its age [s], and the numbers as the sensor sent them."""
+
+    wrench: np.ndarray
+    age: float
+    raw: np.ndarray
 
 
 class ArmControl(Protocol):
@@ -156,3 +172,35 @@ class ArmControl(Protocol):
     def close(self) -> None:
         """Release the robot."""
         ...
+
+
+@runtime_checkable
+class TrajectoryControl(ArmControl, Protocol):
+    """A controller that follows whole trajectories by itself; the loop judges where the arm is."""
+
+    def follow(self, trajectory: "Trajectory", since: float = 0.0) -> None:
+        """Follow a trajectory from its time ``since`` [s] on, until :meth:`end_motion`.
+
+        Raises:
+            SafetyStop: the arm moves already.
+        """
+        ...
+
+    def progress(self, sample: Sample) -> tuple[float, str | None]:
+        """Return the time along the trajectory where the arm is [s], and how it ended: "" at its
+        end, else why; None while it is followed."""
+        ...
+
+
+def require_sensor(cell: Cell) -> None:
+    """Refuse a cell without a force sensor that the guard can rely on: InputError if it names none,
+    or a CB3's own estimate."""
+    if cell.sensor.kind == "none":
+        raise InputError("The cell file names no force sensor.",
+                         "The guard does not move a branch that it cannot feel.",
+                         "Set sensor.kind to ft300 or controller.")
+    if cell.sensor.kind == "controller" and not cell.arm.measures_force:
+        raise InputError(f"The cell uses the force of the {cell.arm.name}'s own controller.",
+                         "A CB3 estimates it from motor currents, with drifting errors of several "
+                         "newtons.",
+                         "Mount a force-torque sensor and set sensor.kind to ft300.")

@@ -188,7 +188,6 @@ NUDGE_M, NUDGE_M_S, NUDGE_SECONDS = 0.004, 0.01, 1.0
 
 _NOISES = 4.0  # times the noise of a smoothed force; less is not significant
 _MOSTLY = 0.5  # cosine of the angle to the predicted force
-_AGREE = 10  # consecutive samples that agree
 _FROM_M = 0.002  # of travel; before that slack and the bark dominate
 _BACK_SHARE = 0.15  # fraction of the peak force that may remain when the gripper is back
 _SMOOTHED = 3  # fewest readings in a smoothed force
@@ -312,8 +311,8 @@ class _Growth:
     def whole(self) -> tuple[float, float] | None:
         """Return the growth per predicted newton since the start, and its deviation; None over too
         short a travel."""
-        # Slack of a millimetre counts little over such a travel.
-        if self._farthest < 3 * _FROM_M or not self._sums[0, 0]:
+        # Slack of a millimetre is then less than a factor two.
+        if self._farthest < 1.5 * _FROM_M or not self._sums[0, 0]:
             return None
         return self._whole(self._sums[1:].sum(axis=0))
 
@@ -394,7 +393,6 @@ class PullPlausibility:
         self._growth = _Growth(cell.sensor.force_sigma_n, float(predicted.travels[-1]))
         self._start: np.ndarray | None = None
         self._began = self._peak = 0.0
-        self._suspicion_streak = ("", 0)
         self.reason: str | None = None
 
     def take(self, samples: np.ndarray) -> str | None:
@@ -403,12 +401,8 @@ class PullPlausibility:
         if self._start is None:
             self._start, self._began = samples[0, 1:4].copy(), float(samples[0, 0])
         travels = np.linalg.norm(samples[:, 1:4] - self._start, axis=1)
-        for travel, force in zip(travels, samples[:, _COLUMNS], strict=True):
-            if not np.isfinite(force).all():
-                continue
-            self._peak = max(self._peak, float(np.linalg.norm(force)))
-            if self.reason is None and _FROM_M <= travel <= LOOKED_M:
-                self._agree(self._suspicion(float(travel), force))
+        sizes = np.linalg.norm(samples[:, _COLUMNS], axis=1)
+        self._peak = max(self._peak, float(sizes.max(initial=0.0, where=np.isfinite(sizes))))
         self._grow(samples, travels)
         if self.reason is None:
             self.reason = self._direction.suspicion() or self._slip() or self._scale()
@@ -426,14 +420,6 @@ class PullPlausibility:
                 f"{allowed:.2g} N are explained by noise, drift and the branch. The sensor "
                 "drifted, or the branch slipped in the gripper")
 
-    def _agree(self, suspected: str) -> None:
-        """Take a suspected error as certain when it is repeated."""
-        kind = suspected.split(":", maxsplit=1)[0]
-        self._suspicion_streak = (kind, self._suspicion_streak[1] + 1 if suspected
-                                  and kind == self._suspicion_streak[0] else 1)
-        if suspected and self._suspicion_streak[1] >= _AGREE:
-            self.reason = suspected
-
     def _grow(self, samples: np.ndarray, travels: np.ndarray) -> None:
         # Before it moves nothing is predicted, but the direction is known.
         predicted = self.predicted.at(np.maximum(travels, _MOVED_M)) @ self.predicted.certain
@@ -445,7 +431,7 @@ class PullPlausibility:
         self._growth.take(travels[good], sizes[good], along)
 
     def _scale(self) -> str | None:
-        """As :meth:`_suspicion`, for a soft branch, whose single readings are mostly noise."""
+        """Why the force cannot be that of the known moduli."""
         factor, whole = self.predicted.factor, self._growth.whole()
         if factor is None or whole is None:
             return None
@@ -463,17 +449,3 @@ class PullPlausibility:
         return ("the force no longer grows as it did before: the branch slips slowly in the "
                 f"gripper, or gives way (over the last {1000 * travel:.0f} mm it grew by "
                 f"{100 * max(share, 0.0):.0f} % of what came before)")
-
-    def _suspicion(self, travel: float, force: np.ndarray) -> str:
-        factor, certain = self.predicted.factor, self.predicted.certain
-        predicted, force = self.predicted.at(travel) @ certain, force @ certain
-        size = float(np.linalg.norm(predicted))
-        if size < 1e-9 or factor is None:
-            return ""
-        along = float(force @ predicted) / size
-        when = f"after {1000 * travel:.1f} mm"
-        if along > factor * size + self._noise:
-            return f"{_LARGER} ({along:.2g} N {when}, {size:.2g} N predicted)"
-        if along < size / factor - self._noise:
-            return f"{_SMALLER} ({along:.2g} N {when}, {size:.2g} N predicted)"
-        return ""

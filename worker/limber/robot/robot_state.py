@@ -17,33 +17,10 @@ from limber.robot.driver.controls import calibration_of, control_of
 from limber.robot.driver.force_samples import ForceTorqueSensor, open_sensor
 from limber.robot.interface import ArmControl, Sample
 from limber.robot.motion.retreat import log_path
+from limber.robot.ros.topics import is_ros
 from limber.robot.ur.factory_calibration import FactoryCalibration
 
-# A force sensor tested by the weight of the gripper: sign, unit, axes and stated mass.
-#
-# The gripper is tilted a little about two axes. The change of its weight is known from the stated
-# mass; a sensor with another sign, unit or other axes shows another change.
-
-GRAVITY = 9.81
-_LEAST_TILT = 0.03  # sine of the angle of gravity's change
-_MOST_TILT = 0.5  # rad
-_CHANGE_N = 2.0  # N of the weight; the guard stops at limits.unexpected_force_n, 3 N by default
-_SECOND_TILT = 0.4  # fraction of the first, about the second axis
-_ALIKE = 0.8  # cosine of the angle between measured and expected change
-_UNITS = {0.1019: "kilograms-force", 0.2248: "pounds-force", 0.001: "kilonewtons",
-          1000.0: "millinewtons"}
-_NEAR = 0.15  # relative
 _LOOPBACK = "127."
-
-
-@dataclass(frozen=True)
-class Weighing:
-    """A sensor's readings of a tilted gripper: the mass that explains the changes [kg], its
-    standard error, and errors of the sensor or the stated mass, in words."""
-
-    mass: float
-    sigma: float
-    faults: tuple[str, ...]
 
 
 def weighed_as(cell: Cell) -> dict[str, Any]:
@@ -64,7 +41,7 @@ def unweighed(cell: Cell) -> str | None:
         return (f"The gripper of {stated:g} kg was never weighed with this sensor, so a wrong "
                 "mass, unit, sign or axis would go unnoticed")
     mass = float(last.get("mass_kg", np.nan))
-    off = _mass_off(mass, float(last.get("mass_sigma_kg", 0.0)), stated)
+    off = mass_off(mass, float(last.get("mass_sigma_kg", 0.0)), stated)
     if off or not np.isfinite(mass):
         return (f"The sensor weighed {mass:.3f} kg at the last weighing, but tool.mass_kg is "
                 f"{stated:g}")
@@ -95,71 +72,7 @@ def _last_weighing(cell: Cell) -> dict[str, Any] | None:
     return found[-1] if found else None
 
 
-def tilted_joints(joints: np.ndarray, mass: float) -> np.ndarray:
-    """Return joint angles [6, n] from ``joints`` [n] and back, tilted by the two middle wrists so
-    little that the weight of ``mass`` [kg] changes by no more than the guard allows."""
-    tilt = min(_MOST_TILT, float(np.arcsin(min(1.0, _CHANGE_N / max(GRAVITY * mass, 1e-9)))))
-    offs = np.zeros((6, len(joints)))
-    offs[[1, 2], 3] = tilt, -tilt
-    offs[[3, 4], 4] = tilt, -tilt
-    return joints + offs
-
-
-def require_tilts(downs: np.ndarray, stated: float) -> np.ndarray:
-    """Return the axes [3, 3] along which directions of gravity [n, 3] differ, most first;
-    InputError for too few, about one axis only, or if no mass [kg] is stated."""
-    if not stated > 0.0:
-        raise InputError("The cell file states no tool.mass_kg above 0.", "Without a weight there "
-                         "is nothing to compare the sensor with.", "State the gripper's mass.")
-    _, sizes, axes = np.linalg.svd(downs - downs[0], full_matrices=False)
-    if len(downs) < 6 or sizes[1] < max(_LEAST_TILT, _SECOND_TILT * sizes[0]):
-        raise InputError("The gripper is not tilted about two axes.", "A wrong axis of the sensor "
-                         "would not show.", "Turn the wrist so that its joints 4 and 5 tilt the "
-                         "gripper against the vertical.")
-    return axes
-
-
-def weigh(downs: np.ndarray, forces: np.ndarray, times: np.ndarray, stated: float) -> Weighing:
-    """Compare mean readings [N], [n, 3], of the surroundings on the tool, flange axes, not
-    corrected for a payload, at some directions of gravity there [n, 3] and times [s], with the
-    weight of the stated mass [kg]; bias and a linear drift are fitted too. InputError for too few
-    tilts, about one axis only, or without a stated mass."""
-    axes = require_tilts(downs, stated)
-    away = downs - downs[0]
-    # Along gravity itself bias and weight are nearly indistinguishable: only the two tilts separate
-    # them.
-    tilts = away @ axes[:2].T
-    columns = np.column_stack([away @ axes.T, np.ones(len(downs)), times - times.mean()])
-    found, *_ = np.linalg.lstsq(columns, forces, rcond=None)
-    left = forces - columns @ found
-    free = max(left.size - found.size, 1)
-    spread = float(np.sqrt((left**2).sum() / free))
-    changes, regressors = found[:2] / GRAVITY, axes[:2]
-    along = float((changes * regressors).sum() / 2)
-    size = float(np.sqrt((changes**2).sum() / 2))
-    sigma = spread / GRAVITY / np.sqrt((tilts**2).sum())
-    return Weighing(along, sigma, tuple(_faults(along, size, sigma, stated)))
-
-
-def _faults(along: float, size: float, sigma: float, stated: float) -> list[str]:
-    message = f"the sensor shows {along:.3f} kg for {stated:.3f} kg"
-    if size < 4 * sigma or size < 0.02 * stated:
-        return [f"the sensor does not notice the gripper's weight ({message})"]
-    if along < -_ALIKE * size:
-        return [f"the sensor's sign is wrong ({message})"]
-    if along < _ALIKE * size:
-        return ["the sensor's axes are wrong: the weight changes it in another direction. Check "
-                f"sensor.pose ({message})"]
-    factor = along / stated
-    for unit, name in _UNITS.items():
-        if abs(factor / unit - 1.0) < _NEAR:
-            return [f"the sensor's unit seems to be {name} ({message})"]
-    if _mass_off(along, sigma, stated):
-        return [f"tool.mass_kg or the sensor's scale is wrong ({message})"]
-    return []
-
-
-def _mass_off(mass: float, sigma: float, stated: float) -> bool:
+def mass_off(mass: float, sigma: float, stated: float) -> bool:
     """Whether a weighed mass [kg], known to ``sigma``, is not the stated one."""
     return abs(mass - stated) > max(0.05, 0.1 * stated, 4 * sigma)
 
@@ -183,10 +96,9 @@ class Observed:
     differences: list[Difference]
     calibration: FactoryCalibration | None = None
 
-    @property
-    def program_runs(self) -> bool:
-        """Whether a program runs on the controller."""
-        return self.samples[-1].program_runs
+    def is_busy(self, cell: Cell) -> bool:
+        """Whether another program runs on the controller; ROS needs its own there."""
+        return self.samples[-1].program_runs and not is_ros(cell)
 
     def nominal_off(self, cell: Cell) -> float | None:
         """Return how far the controller's pose is from the nominal dimensions' [m], mostly by the
@@ -242,11 +154,11 @@ def observe(cell: Cell, seconds: float) -> Observed:
     or the arm cannot be moved now."""
     control = control_of(cell)
     try:
-        sensor = open_sensor(cell)
+        sensor = open_sensor(cell, control)
         try:
-            control.skip()
             # The first reading of a sensor with its own connection has not arrived yet.
             select.select(sensor.connections, [], [], _FIRST_READING_SECONDS)
+            control.skip()
             samples, readings = _read(control, sensor, seconds)
         finally:
             sensor.close()
@@ -264,7 +176,7 @@ def show_before_motion(cell: Cell, warn: Callable[[str], None]) -> None:
     """Report differences from the cell before anything is written or moves. LimberError as
     :func:`observe`; SafetyStop if a program runs, or the sensor is implausible."""
     seen = observe(cell, _BEFORE_MOTION_SECONDS)
-    if seen.program_runs:
+    if seen.is_busy(cell):
         raise SafetyStop("A program is running on the controller.",
                          "Limber's own program would end it, wherever it is.",
                          "Stop it on the pendant.")

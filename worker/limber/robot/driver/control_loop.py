@@ -28,7 +28,7 @@ from limber.robot.driver.force_samples import (
     open_sensor,
     rehearse,
 )
-from limber.robot.driver.guard import State
+from limber.robot.driver.guard import State, Verdict
 from limber.robot.driver.real_time import (
     CONNECT_SECONDS,
     RenewedDeadline,
@@ -38,7 +38,7 @@ from limber.robot.driver.real_time import (
     set_deadline,
     spare_what_is_loaded,
 )
-from limber.robot.interface import ArmControl, Sample
+from limber.robot.interface import ArmControl, Sample, TrajectoryControl
 from limber.robot.motion.retreat import RetreatPath, require_start
 from limber.robot.motion.trajectory import ExpectedWrench, Trajectory
 
@@ -60,8 +60,8 @@ class Driver:
     def __init__(self, cell: Cell, words: Words):
         self.cell, self.tell = cell, words.tell
         self._control = control_of(cell)
-        sensor = open_sensor(cell)
-        self.guard = guard_of(cell)
+        sensor = open_sensor(cell, self._control)
+        self.guard = guard_of(cell, self._control.rate)
         level = _warm_up(cell, self._control, sensor)
         # Now: if it has just compiled, this takes longer than the watchdog would wait.
         self.facts = self._control.facts | {
@@ -80,6 +80,7 @@ class Driver:
                               self._hold_ups, self.tell, level)
         self._command = np.zeros(6)
         self._last: Sample | None = None
+        self._ended: str | None = None
         self._heard = time.monotonic()
         self.ended = False
 
@@ -110,6 +111,7 @@ class Driver:
 
     def _look(self, samples: list[Sample]) -> None:
         for sample in samples:
+            self._ended = self._under_way.place(sample)
             self._senses.look(sample)
         self._last = samples[-1]
         # Readings that arrived during the judgement need not wait for the next target either.
@@ -164,12 +166,14 @@ class Driver:
         if name == "tare":
             self._senses.begin_tare(self._require_sample(), float(order.get("seconds", 0.5)))
         elif name == "follow":
-            self._begin(_ordered(order), None if order.get("start_joints") is None
-                        else np.array(order["start_joints"], float))
+            self._begin(_ordered(order))
         elif name == "stop":
             self._under_way.judge(self.guard.event("a stop was requested"))
         elif name == "resume":
             self.guard.resume()
+            following = self._under_way.following
+            if isinstance(self._control, TrajectoryControl) and following is not None:
+                self._control.follow(following.trajectory, following.time)
             self.tell(event="resumed")
         elif name == "acknowledge":
             self.guard.acknowledge()
@@ -186,16 +190,17 @@ class Driver:
 
     # Motion
 
-    def _begin(self, trajectory: Trajectory, start_joints: np.ndarray | None) -> None:
+    def _begin(self, trajectory: Trajectory) -> None:
         sample = self._require_sample()
         require_tool(self.cell, sample)
-        if sample.slider < 1.0:
+        if sample.slider < 1.0 and not isinstance(self._control, TrajectoryControl):
             raise SafetyStop(f"The speed slider is at {100 * sample.slider:.0f} %.", "The arm "
                              "would fall behind the targets that it is sent, and leave its path.",
                              "Raise it to 100 % on the pendant; a motion is slowed by its speed.")
         # Poses computed from joint angles have the arm's nominal dimensions, not its own.
         start = sample.pose if trajectory.by_joints else trajectory.poses[0]
-        require_start(sample.pose, sample.joints, start, start_joints, self.cell.arm.joint_names)
+        require_start(sample.pose, sample.joints, start, None if trajectory.joints is None
+                      else trajectory.joints[0], self.cell.arm.joint_names)
         self._require_program(sample)
         self.guard.begin(by_joints=trajectory.by_joints)
         self._senses.begin(sample, trajectory)
@@ -210,12 +215,21 @@ class Driver:
         self._set_off(trajectory)
 
     def _set_off(self, trajectory: Trajectory) -> None:
+        if isinstance(self._control, TrajectoryControl):
+            try:
+                self._control.follow(trajectory)
+            except LimberError:
+                self.guard.end()
+                raise
         self._under_way.begin(trajectory)
         self._command = self._require_sample().pose.copy()
         self._hold_ups.set_off()
         self.tell(event="started", seconds=trajectory.duration)
 
     def _require_program(self, sample: Sample) -> None:
+        if (decision := self.guard.modes(sample)).verdict == Verdict.STOP:
+            raise SafetyStop(f"The arm cannot be moved: {decision}.", "Limber releases no stop.",
+                             "Check the robot, and put it right at the pendant.")
         if sample.slider <= 0.0:
             raise SafetyStop("The speed slider is at 0.", "The robot would not move.",
                              "Raise it on the pendant.")
@@ -249,6 +263,12 @@ class Driver:
         following = self._under_way.following
         if following is None or self._last is None:
             self._under_way.stand(self._last)
+            return
+        if isinstance(self._control, TrajectoryControl):
+            if self._ended:
+                self._under_way.judge(self.guard.event(self._ended))
+            elif self._ended is not None:
+                self._finish(following)
             return
         end = following.trajectory.duration
         if self.guard.state == State.MOVING:
@@ -313,7 +333,7 @@ def _ordered(order: dict[str, Any]) -> Trajectory:
         np.array(order["times"], float), np.array(order["poses"], float),
         None if expected is None else ExpectedWrench(**{
             part: np.array(value, float) for part, value in expected.items()}),
-        None if joints is None else np.array(joints, float), by_joints=joints is not None)
+        None if joints is None else np.array(joints, float), by_joints=bool(order["by_joints"]))
 
 
 def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> np.ndarray | None:
@@ -326,8 +346,9 @@ def _warm_up(cell: Cell, control: ArmControl, sensor: ForceTorqueSensor) -> np.n
     for sample, reading in zip(samples, readings, strict=True):
         rehearse(cell, sample, reading)
     _walk_back(samples[0], RetreatPath(cell.arm.joint_names))
-    return None if cell.sensor.kind != "controller" else np.mean(list(map(
-        WrenchChain(cell).level, samples, readings)), axis=0)
+    if cell.sensor.kind != "controller" or isinstance(control, TrajectoryControl):
+        return None
+    return np.mean(list(map(WrenchChain(cell).level, samples, readings)), axis=0)
 
 
 def _walk_back(sample: Sample, retreat: RetreatPath) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from limber.cell.cell_file import Cell
 from limber.core.errors import Command, InputError, WorkError
 from limber.robot.interface import ArmControl
+from limber.robot.ros.topics import is_ros
 from limber.robot.ur.factory_calibration import FactoryCalibration, read_calibration
 from limber.robot.ur.rtde import Dashboard
 from limber.robot.ur.ur_control import UrControl
@@ -22,7 +23,20 @@ def _virtual(cell: Cell) -> ArmControl:
     return UrControl(cell)
 
 
-_CONTROLS: dict[str, Callable[[Cell], ArmControl]] = {"ur": UrControl, "virtual": _virtual}
+def _ros(cell: Cell) -> ArmControl:
+    """Open the robot behind a rosbridge."""
+    from limber.robot.ros.ros_control import RosControl
+
+    return RosControl(cell)
+
+
+_CONTROLS: dict[str, Callable[[Cell], ArmControl]] = {
+    "ur": UrControl, "virtual": _virtual, "ros": _ros}
+
+
+def _opened(cell: Cell) -> Callable[[Cell], ArmControl] | None:
+    """What opens the controller of a cell: of its arm, or the rosbridge at its address."""
+    return _CONTROLS.get("ros" if is_ros(cell) else cell.arm.controller)
 
 
 def register_control(kind: str, opened: Callable[[Cell], ArmControl]) -> None:
@@ -37,7 +51,7 @@ def register_control(kind: str, opened: Callable[[Cell], ArmControl]) -> None:
 def calibration_of(cell: Cell) -> FactoryCalibration | None:
     """Return the dimensions that a cell's controller reports of its arm; None if it reports none.
     """
-    if _CONTROLS.get(cell.arm.controller) not in (UrControl, _virtual):
+    if _opened(cell) not in (UrControl, _virtual):
         return None
     return read_calibration(cell.robot.address)
 
@@ -46,7 +60,7 @@ def stop_from_outside(cell: Cell, seconds: float) -> bool:
     """Stop an arm whose driver has ended by its controller's dashboard, connecting for at most
     ``seconds`` [s]; returns whether the stop was sent, as other controllers have no such
     channel."""
-    if _CONTROLS.get(cell.arm.controller) not in (UrControl, _virtual):
+    if _opened(cell) not in (UrControl, _virtual):
         return False
     try:
         dashboard = Dashboard(cell.robot.address, seconds)
@@ -63,7 +77,7 @@ def control_of(cell: Cell) -> ArmControl:
     """Open the controller of a cell's arm; nothing moves yet. InputError if no driver is registered
     for its kind, or the joints do not fit the columns of samples; LimberError if it does not
     answer, or its arm cannot be moved."""
-    opened = _CONTROLS.get(cell.arm.controller)
+    opened = _opened(cell)
     if opened is None:
         raise InputError(f"No driver is registered for controller {cell.arm.controller!r} of the "
                          f"arm {cell.arm.name}.",

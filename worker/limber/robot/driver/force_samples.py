@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from limber.cell.cell_file import Cell
-from limber.core.errors import InputError, SafetyStop, WorkError
+from limber.core.errors import SafetyStop, WorkError
 from limber.core.numerics.rigid_kernels import (
     frame_of,
     inverse_of,
@@ -21,7 +21,13 @@ from limber.core.numerics.rigid_kernels import (
     weight_wrench,
 )
 from limber.robot.driver.guard import Decision, Guard, GuardSettings, State, Verdict
-from limber.robot.interface import ArmControl, Sample
+from limber.robot.interface import (
+    ArmControl,
+    Reading,
+    Sample,
+    TrajectoryControl,
+    require_sensor,
+)
 from limber.robot.motion.retreat import FollowedPathFile, RetreatPath, read_followed_path
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.ur.ft300_modbus import Ft300Line
@@ -90,6 +96,15 @@ class UnderWay:
         """Follow a trajectory from now on."""
         self._stopped_at, self._was_stopped_at_once = None, False
         self.following = Following(trajectory)
+
+    def place(self, sample: Sample) -> str | None:
+        """Note where the arm is on a trajectory that its controller follows by itself; return how
+        that ended, as :meth:`.TrajectoryControl.progress`."""
+        if not isinstance(self._control, TrajectoryControl) or self.following is None or (
+                self._guard.state != State.MOVING):
+            return None
+        self.following.time, ended = self._control.progress(sample)
+        return ended
 
     def finish(self) -> None:
         """The end of the trajectory is reached."""
@@ -195,16 +210,6 @@ INDEPENDENT_READINGS = 2
 _MESSAGE = re.compile(r"\(([^()]*)\)")
 
 
-@dataclass(frozen=True)
-class Reading:
-    """Wrench of the surroundings on the tool, flange axes, about the flange [N, N m], shape [6];
-    its age [s], and the numbers as the sensor sent them."""
-
-    wrench: np.ndarray
-    age: float
-    raw: np.ndarray
-
-
 class ForceTorqueSensor(Protocol):
     """A source of readings; over its own ``connections`` they arrive between the robot's
     samples."""
@@ -307,24 +312,12 @@ class Ft300UsbSensor:
         self._line.close()
 
 
-def require_sensor(cell: Cell) -> None:
-    """Refuse a cell without a force sensor that the guard can rely on: InputError if it names none,
-    or a CB3's own estimate."""
-    if cell.sensor.kind == "none":
-        raise InputError("The cell file names no force sensor.",
-                         "The guard does not move a branch that it cannot feel.",
-                         "Set sensor.kind to ft300 or controller.")
-    if cell.sensor.kind == "controller" and not cell.arm.measures_force:
-        raise InputError(f"The cell uses the force of the {cell.arm.name}'s own controller.",
-                         "A CB3 estimates it from motor currents, with drifting errors of several "
-                         "newtons.",
-                         "Mount a force-torque sensor and set sensor.kind to ft300.")
-
-
-def open_sensor(cell: Cell) -> ForceTorqueSensor:
-    """Return the cell's sensor. InputError as :func:`require_sensor`; WorkError if it does not
-    answer."""
+def open_sensor(cell: Cell, control: ArmControl | None = None) -> ForceTorqueSensor:
+    """Return the cell's sensor, which a ``control`` may bring itself. InputError as
+    :func:`require_sensor`; WorkError if it does not answer."""
     require_sensor(cell)
+    if (own := getattr(control, "sensor", None)) is not None:
+        return own
     if cell.sensor.kind == "ft300_usb":
         return Ft300UsbSensor(cell)
     if cell.sensor.kind == "ft300":
@@ -429,14 +422,14 @@ class WrenchChain:
         return weight_wrench(tool.mass_kg or 0.0, np.array(tool.centre_of_mass_m), flange[:3, :3])
 
 
-def guard_of(cell: Cell, **others: float) -> Guard:
-    """Return the guard of a cell, with other settings than usual."""
-    return Guard(cell.arm, GuardSettings.of_cell(cell, cell.arm.rate, **others), cell.arm.rate)
+def guard_of(cell: Cell, rate: float) -> Guard:
+    """Return the guard of a cell whose controller sends ``rate`` samples a second."""
+    return Guard(cell.arm, GuardSettings.of_cell(cell), rate)
 
 
 def rehearse(cell: Cell, sample: Sample, reading: Reading) -> None:
     """Judge a sample once: compiling or loading must not delay a motion."""
-    guard = guard_of(cell)
+    guard = guard_of(cell, cell.arm.rate)
     guard.tared(np.zeros((3, 3)))
     guard.hold(np.zeros(3))
     guard.begin()
@@ -515,14 +508,9 @@ class Senses:
         if rest is None or self._held_for is None or np.abs(rest - self._held_for).max() > 0:
             # Here the gripper closed on the resting branch: displacements are measured from here.
             self._held_for, self._held_at = rest, sample.pose.copy()
-            self._hold(sample, trajectory)
-
-    def _hold(self, sample: Sample, trajectory: Trajectory) -> None:
-        expected = trajectory.expected
-        if expected is None or not expected.wrenches.any():
-            self._guard.hold(None)
-            return
-        self._guard.hold(self._standing - expected.wrenches[0, :3], sample.clock)
+            expected = trajectory.expected
+            self._guard.hold(None if expected is None or not expected.wrenches.any() else
+                             self._standing - expected.wrenches[0, :3])
 
     def look(self, sample: Sample) -> None:
         """Judge a sample and keep it for the next batch."""
@@ -537,7 +525,7 @@ class Senses:
         # First the part that must not wait for the rest.
         self._under_way.judge(self._guard.feel(now), sample)
         following = self._under_way.following
-        expected = uncertainty = sent = None
+        expected = uncertainty = places = sent = None
         if following is None and np.isfinite(now).all():
             self._standing = self._stood * self._standing + (1.0 - self._stood) * now[:3]
         if following is not None:
@@ -546,13 +534,13 @@ class Senses:
             behind = max(following.time - self._lookahead * following.rate, 0.0)
             planned = following.trajectory.pose(behind)
             sent = planned[:3]
-            expected, uncertainty = self._expected(
+            expected, uncertainty, places = self._expected(
                 following.trajectory, behind, planned, sample.pose
             )
         grasp = self._base @ frame_of(sample.pose)
         decision = self._guard.look(
             sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=expected,
-            uncertainty=uncertainty, grasp=grasp[:3, 3], sent=sent)
+            uncertainty=uncertainty, places=places, grasp=grasp[:3, 3], sent=sent)
         if (reading.age > _OLDEST_READING_SECONDS and decision.verdict != Verdict.STOP
                 and not self._hold_ups.has_just_woken):
             decision = self._guard.event(f"the force sensor has been silent for {reading.age:.3f} "
@@ -579,17 +567,18 @@ class Senses:
         self._under_way.judge(self._guard.feel(self._chain.between(sample, reading)), at_once=True)
 
     def _expected(self, trajectory: Trajectory, time: float, planned: np.ndarray,
-                  pose: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """The expected wrench at the gripper's actual position, a little off the target."""
+                  pose: np.ndarray) -> tuple[np.ndarray | None, ...]:
+        """The expected wrench at the gripper's actual position, a little off the target, its
+        covariance and places."""
         felt = trajectory.felt(time)
         if felt is None or trajectory.expected is None:
-            return None, None
-        wrench, slopes, covariance = felt
+            return None, None, None
+        wrench, slopes, *errors = felt
         rest = trajectory.expected.rest_pose
         off = np.concatenate((pose[:3] - planned[:3] - self._held_at[:3] + rest[:3],
                               turn_between(planned, pose) - turn_between(rest, self._held_at)))
         turn = self._base[:3, :3]
-        return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), covariance
+        return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), *errors
 
     @property
     def level(self) -> np.ndarray | None:
@@ -643,7 +632,7 @@ class Senses:
         self._is_tared, self._standing, self._level = True, np.zeros(3), None
         self.followed_file.tared(self._chain.bias)
         self._tell(event="tared", bias=self._chain.bias.tolist(), sigma=sigma.tolist(),
-                   delay_s=self._chain.delay(self._rate), noise_n=self._guard.noise)
+                   delay_s=self._chain.delay(self._rate), noise_n=self._guard.errors.noise)
 
     def send_batch(self) -> None:
         """Send the samples of the last hundredths of a second."""

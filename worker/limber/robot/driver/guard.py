@@ -18,131 +18,64 @@ import numpy as np
 from limber.cell.arm import Arm, within_ratings
 from limber.cell.cell_file import Cell, LimitsEntry, WorkspaceEntry
 from limber.core.errors import SafetyStop
-from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
+from limber.core.numerics.rigid_kernels import frame_of, length, pose_between, turn_between
 from limber.robot.controller_settings import SteadySettings
+from limber.robot.driver.force_test import BLOCK_SECONDS, Block, ForceErrors, ForceTest
 from limber.robot.interface import Sample
 
-DEVIATIONS = 2.0
-"""Standard deviations of a prediction that are allowed."""
-
-_MOSTLY = 0.8  # cosine of the angle to the predicted force that a difference opposes
-_MOSTLY_AT_ONCE = 0.5  # the same for a sudden change: a sliding piece pulls sideways
 NOISES = 7.0
 """Standard deviations of the filtered force that noise explains: in three directions, one in a
 million motions of a minute exceeds it."""
 LOST_SHARE = 0.4
 """Fraction of its force that a held branch loses when it slips or breaks."""
-FAULTS = {"an empty gripper, a branch that slipped or a broken one": 1.0,
-          "a sensor that reads a tenth": 0.9, "a branch three times softer": 2.0 / 3.0}
-"""Faults that the guard has to see during a path, and the fraction of the force lost with each."""
+DEVIATIONS = 3.0
+"""Standard deviations of a prediction that are allowed by the bounds that no likelihood widens."""
 
-_UNLIKE = "the force differs from the predicted one [N]"
-_SHORT = ("less force than predicted: the branch slipped, broke, was never held or is softer, or "
-          "the sensor reads too little [N]")
-_FELL = "the predicted force dropped suddenly: the branch slipped, broke or came loose [N]"
+_UNLIKE = "the force differs from the predicted one"
 
 
-def difference_name(off: np.ndarray, expected: np.ndarray, before: np.ndarray, least: float,
-                    ) -> str:
-    """Return the most probable name of a difference ``off`` [N] to the expected force, by the usual
-    one so far, shape [3] each; at an expected force up to ``least`` [N] it has no direction."""
-    expected_size, missing = length(expected), -float(off @ expected)
-    if expected_size <= least:
-        return _UNLIKE
-    size = length(off)
-    at_once = length(off - before) > 0.5 * size
-    if at_once and missing > _MOSTLY_AT_ONCE * expected_size * size:
-        return _FELL
-    return _SHORT if missing > _MOSTLY * expected_size * size else _UNLIKE
+_NOTHING = np.zeros(0)
 
 
 def allowed_difference(off: np.ndarray, covariance: np.ndarray, least: float, most: float,
                        ) -> float:
-    """Return the largest allowed difference in the direction of ``off`` [3], not 0: an ellipsoid,
+    """Return the largest allowed difference in the direction of ``off`` [3]: an ellipsoid,
     ``least`` widened by standard deviations of the prediction up to ``most``."""
     squares, axes = np.linalg.eigh(covariance)
     radii = least**2 + np.minimum(DEVIATIONS**2 * np.maximum(squares, 0.0), most**2)
-    along = axes.T @ (off / length(off))
-    return float(1.0 / np.sqrt((along**2 / radii).sum()))
+    along = axes.T @ (off / max(length(off), 1e-12))
+    return float(1.0 / np.sqrt(max((along**2 / radii).sum(), 1e-300)))
 
 
-@dataclass(frozen=True)
-class ForceErrors:
-    """Errors of a measured force that no branch causes: noise of the filtered force at rest per
-    axis [N], the sensor's drift [N/s], and the force that accelerates the gripper [N]."""
+class _Blocks:
+    """Averages forces over blocks, and tests these: of the branch held, or of an empty gripper
+    ``since`` some time after its tare [s]."""
 
-    noise: float
-    drift: float
-    inertia: float
+    def __init__(self, errors: ForceErrors, since: float | None):
+        self._test, self._is_held = ForceTest(errors, since=since or 0.0), since is None
+        self._rows: list[tuple[np.ndarray, ...]] = []
+        self._first = self._last = _NOTHING
 
-    @classmethod
-    def of_cell(cls, cell: "Cell", kept: float) -> "ForceErrors":
-        """Return the errors that a cell states, of a force whose filter keeps a fraction ``kept``
-        of its value each step."""
-        return cls(white_noise(cell.sensor.force_sigma_n, kept),
-                   cell.sensor.drift_n_per_minute / 60.0,
-                   (cell.tool.mass_kg or 0.0) * cell.limits.acceleration_m_s2)
-
-    def measured(self, noise: float | None) -> "ForceErrors":
-        """Return them with the noise measured at rest [N], if it was."""
-        return self if noise is None else replace(self, noise=noise)
-
-    def within(self, seconds: float | np.ndarray) -> np.ndarray:
-        """Return the force that they explain ``seconds`` after a reference [N]."""
-        return np.sqrt((NOISES * self.noise) ** 2 + (self.drift * np.asarray(seconds)) ** 2
-                       + self.inertia**2)
-
-
-def kept_share(step: float, filter_time: float) -> float:
-    """Return the fraction of its value that a filter keeps at each step [s]."""
-    return float(np.exp(-step / filter_time))
-
-
-def white_noise(sigma: float, kept: float) -> float:
-    """Return the filtered force's standard deviation for white noise ``sigma`` of a reading."""
-    return sigma * float(np.sqrt((1.0 - kept) / (1.0 + kept)))
-
-
-def noise_at_rest(forces: np.ndarray, kept: float) -> float:
-    """Return the filtered force's standard deviation, from forces at rest [N], shape [n, 3]:
-    repeated or smoothed readings are averaged less than white ones."""
-    off = forces - forces.mean(axis=0)
-    filtered, rows = np.zeros(3), np.empty_like(off)
-    for number, row in enumerate(off):
-        filtered = kept * filtered + (1.0 - kept) * row
-        rows[number] = filtered
-    return max(white_noise(float(off.std()), kept), float(rows.std()))
-
-
-def allowed_change(off: np.ndarray, covariance: np.ndarray, largest: float, within: float,
-                   most: float) -> float:
-    """Return the largest allowed change ``off`` [N], shape [3], of a difference since the branch
-    was held; ``largest``: predicted force so far [N], ``within``: what the sensor's errors explain
-    [N]."""
-    return allowed_difference(off, covariance, float(np.hypot(LOST_SHARE * largest, within)), most)
-
-
-def not_seen(times: np.ndarray, forces: np.ndarray, covariance: np.ndarray, errors: ForceErrors,
-             most: float) -> dict[str, float]:
-    """Return for each of the :data:`FAULTS` that the guard cannot see along a path the peak force
-    [N] from which it could: by times since the branch was held [s], shape [n], and predicted forces
-    [N], shape [n, 3], with covariance; ``most`` as of :func:`allowed_difference`."""
-    sizes = np.linalg.norm(forces, axis=1)
-    largest, within = np.maximum.accumulate(sizes), errors.within(times)
-    rows = np.flatnonzero(sizes > 0.0)
-    allowed = np.array([allowed_change(forces[k], covariance[k], float(largest[k]),
-                                       float(within[k]), most) for k in rows])
-    peak, found = float(sizes.max()), {}
-    for name, share in FAULTS.items():
-        if not len(rows):
-            found[name] = float("inf")
-        elif not np.any(share * sizes[rows] > allowed):
-            best = int(np.argmax(sizes[rows] / allowed))
-            # Of what is allowed there, the rest does not grow with the force.
-            rest = np.sqrt(max(allowed[best] ** 2 - (LOST_SHARE * largest[rows[best]]) ** 2, 0.0))
-            found[name] = float(rest / np.sqrt(share**2 - LOST_SHARE**2) * peak
-                                / sizes[rows[best]])
-    return found
+    def take(self, sample: Sample, off: np.ndarray, expected: np.ndarray, covariance: np.ndarray,
+             places: np.ndarray, base_turn: np.ndarray, count: int, *, is_beyond: bool,
+             ) -> str | None:
+        """Take a force change [N], shape [3], measured minus expected, with covariance [3, 3] and
+        places [3, 6]; ``count`` make a block. Return the alarm, or where the change ``is_beyond``
+        its bound what explains it best."""
+        now = np.r_[sample.pose[:3], sample.clock]
+        if not len(self._last):
+            self._first, self._last = expected if self._is_held else np.zeros(3), now
+        self._rows.append((off, expected - self._first, covariance, places))
+        step = now - self._last
+        if len(self._rows) < count and not (is_beyond and step[3] > 0.0):
+            return _UNLIKE if is_beyond else None
+        off, expected, covariance, places = (np.mean(each, axis=0)
+                                             for each in zip(*self._rows, strict=True))
+        self._last, self._rows = now, []
+        self._test.take(Block(off, expected, covariance, base_turn @ frame_of(sample.pose)[:3, :3],
+                              base_turn @ sample.speed[:3], length(step[:3]), float(step[3]),
+                              places))
+        return self._test.alarm(-np.inf) if is_beyond else self._test.alarm()
 
 
 class State(Enum):
@@ -190,10 +123,11 @@ class GuardSettings:
         longest_silence: Age at which data is lost [s].
         frozen_time: Longest time for which a wrench may repeat to the last digit [s]; a working
             sensor's noise never does.
-        filter_time: Time constant of the force that is compared with the predicted one [s]. The
+        filter_time: Time constant of the torque that is compared with the predicted one [s]. The
             hard limits apply to every single reading.
         off_path: Largest distance from the target [m].
         errors: Errors of the measured force; its noise until that is measured at rest.
+        base_turn: Rotation of the base in the branch's frame, shape [3, 3].
         loss_time: Time in which such a loss counts as sudden [s].
         largest_torque_error: Largest difference between the torque and the predicted one [N m].
         relief_distance: Path of a retreat over which a force above the soft limit falls by more
@@ -205,7 +139,8 @@ class GuardSettings:
     joint_limits: np.ndarray
     workspace: WorkspaceEntry | None = None
     errors: ForceErrors = field(
-        default_factory=lambda: ForceErrors(noise=0.05, drift=0.8 / 60.0, inertia=0.0))
+        default_factory=lambda: ForceErrors(noise=0.05, drift=0.8 / 60.0, mass=0.0))
+    base_turn: np.ndarray = field(default_factory=lambda: np.eye(3))
     longest_silence: float = 0.05
     frozen_time: float = 0.05
     filter_time: float = 0.01
@@ -216,11 +151,10 @@ class GuardSettings:
     relief_time: float = 10.0
 
     @classmethod
-    def of_cell(cls, cell: Cell, rate: float, **others: Any) -> "GuardSettings":
-        """Return the settings for a cell whose arm sends ``rate`` samples a second."""
-        kept = kept_share(1.0 / rate, cls.filter_time)
-        return cls(cell.limits, cell.joint_limits, cell.workspace, ForceErrors.of_cell(cell, kept),
-                   **others)
+    def of_cell(cls, cell: Cell, **others: Any) -> "GuardSettings":
+        """Return the settings for a cell."""
+        return cls(cell.limits, cell.joint_limits, cell.workspace, ForceErrors.of_cell(cell),
+                   frame_of(np.array(cell.base.pose))[:3, :3], **others)
 
 
 @dataclass
@@ -247,7 +181,6 @@ class GuardMemory:
     filtered: np.ndarray | None = None
     peak: float = 0.0
     largest_expected: float = 0.0
-    usual_off: np.ndarray | None = None
     grasp: np.ndarray | None = None
     travel: np.ndarray | None = None
     relief: Relief | None = None
@@ -265,13 +198,14 @@ SAFETY_MODES = {
 _RUNNING, _NORMAL = 7, 1
 _SAME = 1e-9  # N, N m
 _PLACE_SLACK = 0.01  # rad of a joint, or of the distance from a singularity, during a retreat
-_CERTAIN = np.zeros((6, 6))
+_TARE_SECONDS = 5.0  # that a tare and its motion take at most
+_CERTAIN, _NO_PLACES = np.zeros((6, 6)), np.zeros((3, 6))
 _RISES = "the {} rises during the return"
 
 
 class Guard:
     """Watches one robot: ``state`` is what it currently allows, ``reason`` that of its last stop or
-    pause."""
+    pause, ``errors`` those of its force sensor."""
 
     def __init__(self, arm: Arm, settings: GuardSettings, rate: float):
         self._arm, self._step = arm, 1.0 / rate
@@ -284,33 +218,29 @@ class Guard:
         self.reason = ""
         self._memory = GuardMemory()
         self._is_tared = False
-        self._kept = kept_share(self._step, settings.filter_time)
-        self._errors = settings.errors
+        self._kept = float(np.exp(-self._step / settings.filter_time))
+        self.errors = settings.errors
         self._held: np.ndarray | None = None
-        self._held_clock = 0.0
+        self._held_clock: float | None = None
+        self._block_count = int(np.ceil(BLOCK_SECONDS * rate))
+        self._forces: _Blocks | None = None
+        self._tared_clock: float | None = None
         self._set = SteadySettings(arm)
 
     # Actions of a person
 
-    @property
-    def noise(self) -> float:
-        """Standard deviation of the filtered force at rest, per axis [N]."""
-        return self._errors.noise
-
     def tared(self, forces: np.ndarray | None = None) -> None:
         """The force sensor has been tared: from now on its limits apply. ``forces``: readings at
         rest, which tell its noise [N], shape [n, 3]."""
-        self._is_tared = True
-        self._held = None
-        self._errors = self._settings.errors.measured(
-            None if forces is None else noise_at_rest(forces, self._kept))
+        self._is_tared, self._tared_clock = True, None
+        self.errors = self._settings.errors.measured(forces, self._block_count)
+        self.hold(None)
 
-    def hold(self, off: np.ndarray | None, clock: float = 0.0) -> None:
+    def hold(self, off: np.ndarray | None) -> None:
         """The gripper holds the resting branch: from here on its force follows the prediction.
         ``off``, measured minus predicted [N], shape [3], is what the fingers press aside and the
-        drift so far, and tells nothing of the branch; None: it holds nothing. ``clock``: the
-        controller's [s]."""
-        self._held, self._held_clock = off, clock
+        drift so far, and tells nothing of the branch; None: it holds nothing."""
+        self._held, self._held_clock, self._forces = off, None, None
 
     def begin(self, *, by_joints: bool = False) -> None:
         """Allow a motion; of one ``by_joints`` singularities are no limit. SafetyStop after a stop
@@ -357,7 +287,7 @@ class Guard:
     def acknowledge(self) -> None:
         """A person has seen the stop; a new motion may be requested."""
         if self.state in (State.STOPPED, State.PAUSED):
-            self.state = State.IDLE
+            self.state, self._forces = State.IDLE, None
 
     # Events
 
@@ -373,18 +303,19 @@ class Guard:
 
     def look(self, sample: Sample, *, wrench: np.ndarray, raw: np.ndarray,
              expected: np.ndarray | None = None, uncertainty: np.ndarray | None = None,
-             grasp: np.ndarray | None = None, sent: np.ndarray | None = None) -> Decision:
+             places: np.ndarray | None = None, grasp: np.ndarray | None = None,
+             sent: np.ndarray | None = None) -> Decision:
         """Judge a sample. ``wrench``: of the gripper on the branch, tared, branch frame [N, N m],
         shape [6]; ``raw``: as received and rotated to the flange's axes, [2, 6], as a frozen sensor
-        repeats one of them to the last digit; ``expected``: as predicted, with covariance [6, 6]
-        that widens the allowed difference by two deviations, up to the soft limit; ``grasp``:
-        branch frame [m], ``sent``: target, base frame [m]."""
+        repeats one of them to the last digit; ``expected``: as predicted, with covariance [6, 6],
+        of which ``places`` [3, 6] are the part that stays; ``grasp``: branch frame [m], ``sent``:
+        target, base frame [m]."""
         last, self._memory.grasp = self._memory.grasp, grasp
         self._memory.travel = None if last is None or grasp is None else grasp - last
         for check in (self._check_clock(sample), self.modes(sample),
                       self._check_wrench(sample, wrench, raw), self._check_settings(sample),
                       self._check_position(sample, grasp, sent),
-                      self._check_expected(sample, wrench, expected, uncertainty)):
+                      self._check_expected(sample, wrench, expected, uncertainty, places)):
             if check.verdict == Verdict.STOP:
                 return check
         if self._memory.relief is not None:
@@ -420,6 +351,8 @@ class Guard:
         last, self._memory.clock = self._memory.clock, sample.clock
         if not np.isfinite(sample.clock):
             return self._stop("the controller's clock gives no number")
+        if self._tared_clock is None:
+            self._tared_clock = sample.clock
         if last is None:
             return GO
         passed = sample.clock - last
@@ -492,7 +425,7 @@ class Guard:
     @property
     def _least_change(self) -> float:
         """Change of a force [N] that the noise of both its values does not explain."""
-        return float(np.sqrt(2.0)) * NOISES * self._errors.noise
+        return float(np.sqrt(2.0)) * NOISES * self.errors.noise
 
     def _relieved_torque(self, relief: Relief) -> float:
         return relief.torque + self._settings.largest_torque_error
@@ -567,7 +500,7 @@ class Guard:
         return GO
 
     def _check_expected(self, sample: Sample, wrench: np.ndarray, expected: np.ndarray | None,
-                        uncertainty: np.ndarray | None) -> Decision:
+                        uncertainty: np.ndarray | None, places: np.ndarray | None) -> Decision:
         if self.state not in (State.MOVING, State.PAUSED):
             return GO
         if self._memory.relief is not None:
@@ -580,24 +513,37 @@ class Guard:
         if expected is None:
             return self._check_drop(filtered)
         uncertainty = _CERTAIN if uncertainty is None else uncertainty
-        limits, off = self._settings.limits, filtered - expected
-        change = off[:3] if self._held is None else off[:3] - self._held
-        before = self._usual_off(change)
+        off, limits = filtered - expected, self._settings.limits
+        within = allowed_difference(off[3:], uncertainty[3:, 3:],
+                                    self._settings.largest_torque_error, limits.hard_torque_nm)
+        if length(off[3:]) > within:
+            return self._stop("the torque differs from the predicted one [N m]", length(off[3:]),
+                              within)
+        if self._forces is None:
+            since = sample.clock - (self._tared_clock or sample.clock) + _TARE_SECONDS
+            self._forces = _Blocks(self.errors, since if self._held is None else None)
+        held = np.zeros(3) if self._held is None else self._held
+        alarm = self._forces.take(
+            sample, wrench[:3] - expected[:3] - held, expected[:3], uncertainty[:3, :3],
+            _NO_PLACES if places is None else places, self._settings.base_turn, self._block_count,
+            is_beyond=self._is_beyond(sample.clock, off[:3], expected[:3], uncertainty[:3, :3]))
+        return GO if alarm is None else self._stop(alarm)
+
+    def _is_beyond(self, clock: float, off: np.ndarray, expected: np.ndarray,
+                   covariance: np.ndarray) -> bool:
+        """Whether a difference ``off`` [3] to the expected force is larger than is allowed against
+        the tare, or against the branch held at rest."""
+        memory, limits, errors = self._memory, self._settings.limits, self.errors
+        memory.largest_expected = max(memory.largest_expected, length(expected))
+        bounds = [(off, limits.unexpected_force_n)]
         if self._held is not None:
-            decision = self._check_held(sample, change, before, expected, uncertainty)
-            if decision.verdict == Verdict.STOP:
-                return decision
-        for name, part, allowed, most in (
-                (None, slice(0, 3), limits.unexpected_force_n, limits.soft_force_n),
-                ("the torque differs from the predicted one [N m]", slice(3, 6),
-                 self._settings.largest_torque_error, limits.hard_torque_nm)):
-            error = length(off[part])
-            if error > allowed:
-                within = allowed_difference(off[part], uncertainty[part, part], allowed, most)
-                if error > within:
-                    return self._stop(name or difference_name(
-                        change, expected[:3], before, allowed), error, within)
-        return GO
+            self._held_clock = clock if self._held_clock is None else self._held_clock
+            bounds += [(off - self._held, float(np.sqrt(
+                (LOST_SHARE * memory.largest_expected)**2 + (NOISES * errors.noise)**2
+                + (errors.drift * (clock - self._held_clock))**2
+                + (errors.mass * limits.acceleration_m_s2)**2)))]
+        return any(length(change) > least and length(change) > allowed_difference(
+            change, covariance, least, limits.soft_force_n) for change, least in bounds)
 
     def _check_drop(self, filtered: np.ndarray) -> Decision:
         """Judge a force [6] without a prediction, as while E is measured: a sudden loss still
@@ -612,29 +558,6 @@ class Guard:
             return self._stop("the force dropped suddenly: slip or break [N]", memory.peak - force,
                               allowed)
         return GO
-
-    def _check_held(self, sample: Sample, change: np.ndarray, before: np.ndarray,
-                    expected: np.ndarray, uncertainty: np.ndarray) -> Decision:
-        """Judge by how much the force on the held branch has changed otherwise than predicted."""
-        memory = self._memory
-        memory.largest_expected = max(memory.largest_expected, length(expected[:3]))
-        errors = float(self._errors.within(sample.clock - self._held_clock))
-        error, least = length(change), float(np.hypot(LOST_SHARE * memory.largest_expected, errors))
-        if error > least:
-            within = allowed_change(change, uncertainty[:3, :3], memory.largest_expected, errors,
-                                    self._settings.limits.soft_force_n)
-            if error > within:
-                return self._stop(difference_name(change, expected[:3], before, errors), error,
-                                  within)
-        return GO
-
-    def _usual_off(self, off: np.ndarray) -> np.ndarray:
-        """Return the usual difference to the expected force [3] so far; ``off`` then updates it."""
-        memory = self._memory
-        before = off if memory.usual_off is None else memory.usual_off
-        kept = np.exp(-self._step / self._settings.loss_time)
-        memory.usual_off = kept * before + (1 - kept) * off
-        return before
 
     def _stop(self, reason: str, value: float = 0.0, limit: float = 0.0) -> Decision:
         decision = Decision(Verdict.STOP, reason, value, limit)

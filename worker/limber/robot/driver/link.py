@@ -101,10 +101,8 @@ class RobotLink:
         expected = trajectory.expected
         self._order(order="follow", times=trajectory.times.tolist(),
                     poses=trajectory.poses.tolist(),
-                    start_joints=None if trajectory.joints is None
-                    else trajectory.joints[0].tolist(),
-                    joints=trajectory.joints.tolist()
-                    if trajectory.by_joints and trajectory.joints is not None else None,
+                    joints=None if trajectory.joints is None else trajectory.joints.tolist(),
+                    by_joints=trajectory.by_joints,
                     expected=None if expected is None else {
                         name: value.tolist() for name, value in vars(expected).items()})
         self.wait("started", seconds=5.0)

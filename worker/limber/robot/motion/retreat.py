@@ -245,13 +245,11 @@ class RetreatPath:
                                                                          _LEAST_SPEEDS)
         self._rest: np.ndarray | None = None
 
-    def begin(self, sample: Sample, trajectory: Trajectory, *, goes_on: bool = False) -> None:
+    def begin(self, sample: Sample, trajectory: Trajectory) -> None:
         """A trajectory is followed from ``sample`` on. Legs on which one branch is held, from one
-        rest pose, are one path; ``goes_on``: so is this with that of an earlier program."""
+        rest pose, are one path."""
         rest = None if trajectory.expected is None else trajectory.expected.rest_pose
-        goes_on = goes_on and bool(self._poses)
-        if not goes_on and (
-                rest is None or self._rest is None or np.abs(rest - self._rest).max() > 0):
+        if rest is None or self._rest is None or np.abs(rest - self._rest).max() > 0:
             self._poses, self._joints, self._speeds = [], [], _LEAST_SPEEDS
             if self._kept is not None:
                 self._kept.begin()

@@ -71,35 +71,45 @@ def speed_within(cell: Cell, speed: float, warn: Callable[[str], None] | None = 
 # planned pose plus the tangent stiffness times the displacement from there. Errors of that
 # displacement (the arm's own repeatability, a base that is rotated against its calibration) times
 # the stiffness are errors of the wrench. The covariance states them, and the guard and the report
-# allow for it.
+# allow for it. What is off by the same all along the path (the base, how the branch lies in the
+# jaws) stands by itself: it is one unknown, not one at each place.
+
+LAID_M = 2e-4
+"""Deviation of where a branch lies in the jaws: bark gives way, and readings are a little old."""
 
 @dataclass(frozen=True)
 class ExpectedWrench:
     """Wrenches expected of the gripper on the branch along a path, about its middle, branch frame
     [N, N m], [n, 6]; their derivative to position [m] and rotation [rad], [n, 6, 6], and
-    covariance; ``rest_pose``: where it closes on the resting branch, base frame [m, rad]."""
+    covariance; ``rest_pose``: where it closes on the resting branch, base frame [m, rad];
+    ``places``: change of the force by one deviation of the base's rotation and of where the branch
+    lies in the jaws, [n, 3, 6]; the covariance includes the former."""
 
     wrenches: np.ndarray
     slopes: np.ndarray
     covariance: np.ndarray
     rest_pose: np.ndarray
+    places: np.ndarray
 
     @classmethod
     def nothing(cls, poses: np.ndarray) -> "ExpectedWrench":
         """Return the wrenches of an empty gripper that passes through ``poses`` [n, 6]."""
         count = len(poses)
-        return cls(np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6)), poses[0])
+        return cls(np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6)),
+                   poses[0], np.zeros((count, 3, 6)))
 
     def reversed(self) -> "ExpectedWrench":
         """Return the same in reverse order."""
         return ExpectedWrench(self.wrenches[::-1], self.slopes[::-1], self.covariance[::-1],
-                              self.rest_pose)
+                              self.rest_pose, self.places[::-1])
 
-    def at(self, k: int, part: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return wrench [6], slopes [6, 6] and covariance [6, 6] between rows k and k + 1."""
+    def at(self, k: int, part: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return wrench [6], slopes [6, 6], covariance [6, 6] and places [3, 6] between rows k and
+        k + 1."""
         return ((1 - part) * self.wrenches[k] + part * self.wrenches[k + 1],
                 (1 - part) * self.slopes[k] + part * self.slopes[k + 1],
-                (1 - part) * self.covariance[k] + part * self.covariance[k + 1])
+                (1 - part) * self.covariance[k] + part * self.covariance[k + 1],
+                (1 - part) * self.places[k] + part * self.places[k + 1])
 
 
 @dataclass(frozen=True)
@@ -135,22 +145,22 @@ class Predicted:
         yielding[:, :, :3] += cell.tool.compliance_m_per_n * self.stiffness[:, :, :3]
         slopes = np.linalg.solve(yielding, self.stiffness)
         wrenches = np.linalg.solve(yielding, self.wrenches[..., None])[..., 0]
-        covariance = slopes @ self._path_covariance(cell) @ slopes.transpose(0, 2, 1)
+        own = np.r_[np.full(3, cell.robot.pose_sigma_m), np.full(3, cell.robot.pose_sigma_rad)]
+        base = cell.base.rotation_sigma_rad * slopes @ self._by_base
+        covariance = sum(each @ each.transpose(0, 2, 1) for each in (slopes * own, base))
         young = np.zeros((count, 6, 6))
         young[:, :3, :3] = self.young_covariance
         inverse = np.linalg.inv(yielding)
         covariance += inverse @ young @ inverse.transpose(0, 2, 1)
-        return ExpectedWrench(wrenches, slopes, covariance, rest_pose)
+        return ExpectedWrench(wrenches, slopes, covariance, rest_pose,
+                              np.concatenate([base, LAID_M * slopes[:, :, :3]], axis=2)[:, :3])
 
-    def _path_covariance(self, cell: Cell) -> np.ndarray:
-        """Covariance of the gripper's displacement since it closed, shape [n, 6, 6] in m and rad.
-        """
+    @property
+    def _by_base(self) -> np.ndarray:
+        """The gripper's displacement since it closed by the base's rotation, shape [n, 6, 3]."""
         offsets = self.poses[:, :3] - self.poses[0, :3]
         turns = turns_between(self.poses[0, 3:], self.poses[:, 3:])
-        by_base = np.concatenate([_crossing(offsets), _crossing(turns)], axis=1)
-        covariance = cell.base.rotation_sigma_rad**2 * by_base @ by_base.transpose(0, 2, 1)
-        own = np.r_[np.full(3, cell.robot.pose_sigma_m), np.full(3, cell.robot.pose_sigma_rad)]
-        return covariance + np.diag(own**2)
+        return np.concatenate([_crossing(offsets), _crossing(turns)], axis=1)
 
 
 def interpolated(predicted: Predicted, positions: np.ndarray, query: np.ndarray) -> Predicted:
@@ -201,7 +211,8 @@ class Trajectory:
         if self.expected is not None and (
                 self.expected.wrenches.shape != self.poses.shape
                 or not all(np.isfinite(part).all() for part in (
-                    self.expected.wrenches, self.expected.slopes, self.expected.covariance))):
+                    self.expected.wrenches, self.expected.slopes, self.expected.covariance,
+                    self.expected.places))):
             raise InputError("The expected wrenches do not match the poses.",
                              "Each pose needs a wrench of six numbers.", "Check the plan.")
         if self.by_joints and self.joints is None:
@@ -237,8 +248,9 @@ class Trajectory:
         k, part = self._segment_at(time)
         return (1.0 - part) * self.joints[k] + part * self.joints[k + 1]
 
-    def felt(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return expected wrench [6], its slopes [6, 6] and covariance [6, 6] at a time [s]."""
+    def felt(self, time: float,
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+        """Return expected wrench [6] at a time [s], and more, as :meth:`ExpectedWrench.at`."""
         return None if self.expected is None else self.expected.at(*self._segment_at(time))
 
     def backwards(self) -> "Trajectory":

@@ -85,60 +85,32 @@ _ACTION_SECONDS = 0.1
 _SUCCEEDED = 4  # action_msgs/msg/GoalStatus
 
 
-def drive(bridge: Bridge, action: str, position: float, effort: float, seconds: float,
-          ) -> dict[str, Any]:
-    """Move a gripper to a position as its controller counts it [m or rad], with at most ``effort``
-    [N] (0: its choice), and wait for ``position``, ``stalled`` (something stopped it) and
-    ``reached_goal``. WorkError without result in ``seconds`` [s], or a failed one; ConnectionError
-    if the connection was lost."""
+def send_gripper(bridge: Bridge, action: str, position: float, effort: float = 0.0) -> None:
+    """Send a gripper to a position as :func:`drive`, without waiting."""
     bridge.send(op="send_action_goal", id=_GOAL, action=action, action_type=_GRIPPER_COMMAND,
                 feedback=False, args={"command": {"position": position, "max_effort": effort}})
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        message = bridge.receive(_ACTION_SECONDS)
-        if message is None or message.get("op") != "action_result" or message.get("id") != _GOAL:
-            continue
-        values = message.get("values")
-        if not message.get("result") or message.get("status", _SUCCEEDED) != _SUCCEEDED or (
-                not isinstance(values, dict)):
-            raise WorkError(f"The gripper in ROS did not move ({values}).", "",
-                            "See its controller's log.")
-        return {name: values.get(name) for name in ("position", "stalled", "reached_goal")}
-    raise WorkError(f"The gripper in ROS gave no result within {seconds:g} s.",
-                    f"The action is {action}.",
-                    "Check its name with `ros2 action list`, or raise tool.grip_seconds.")
 
 
-_TRIGGER = "std_srvs/srv/Trigger"
-_SERVICE_SECONDS = 0.2
+_CALL = "limber-call"
 
 
-class TriggerService:
-    """Offers a service over a connection to rosbridge of its own until it is closed; a context
-    manager. ``act`` is called for each call and returns success and a message."""
+def call(bridge: Bridge, service: str, kind: str, take: Callable[[dict[str, Any]], None],
+         values: dict[str, Any]) -> None:
+    """Call a service and wait for its answer, while ``take`` gets all other messages; WorkError
+    without one within :data:`SECONDS`, or where it reports no success."""
+    bridge.send(op="call_service", id=_CALL, service=service, type=kind, args=values)
+    end = time.monotonic() + SECONDS
+    while (left := end - time.monotonic()) > 0.0:
+        message = bridge.receive(left)
+        if message is not None and message.get("op") == "service_response" and (
+                message.get("id") == _CALL):
+            answered = message.get("values")
+            if message.get("result") and isinstance(answered, dict) and answered.get("success"):
+                return
+            raise WorkError(f"{service} refused ({answered}).", "", "See the driver's log.")
+        if message is not None:
+            take(message)
+    raise WorkError(f"{service} gave no answer within {SECONDS:g} s.", "",
+                    "Check its name with `ros2 service list`.")
 
-    def __init__(self, bridge: Bridge, name: str, act: Callable[[], tuple[bool, str]]):
-        self._bridge, self._name, self._act = bridge, name, act
-        bridge.send(op="advertise_service", service=name, type=_TRIGGER)
 
-    def __enter__(self) -> "TriggerService":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        if not isinstance(exception[1], ConnectionError):
-            self._bridge.send(op="unadvertise_service", service=self._name)
-
-    def answer(self, seconds: float = _SERVICE_SECONDS) -> dict[str, Any] | None:
-        """Answer a call if one comes within ``seconds``; return the answer, or None.
-        ConnectionError if the connection was lost."""
-        message = self._bridge.receive(seconds)
-        if message is None or message.get("op") != "call_service" or (
-                message.get("service") != self._name):
-            return None
-        success, told = self._act()
-        values = {"success": success, "message": told}
-        answer = {"service": self._name, "values": values, "result": True}
-        if "id" in message:
-            answer["id"] = message["id"]
-        self._bridge.send(op="service_response", **answer)
-        return values

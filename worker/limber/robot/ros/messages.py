@@ -3,7 +3,6 @@
 import base64
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,12 @@ import numpy as np
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, WorkError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.robot.driver.force_samples import require_sensor
 from limber.robot.interface import PLAYING, Sample
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.ros.bridge import Bridge
+from limber.robot.ros.topics import Topics
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
-WRENCH = "geometry_msgs/msg/WrenchStamped"
 STOP = "std_msgs/msg/Bool"
 END = "std_msgs/msg/Empty"
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -30,6 +28,7 @@ RUNNING: dict[str, Any] = {"safety_mode": 1, "robot_mode": 7, "runtime_state": P
                            "slider": 1.0}
 """A controller in order: of an arm whose driver publishes nothing of it."""
 _PROGRAM_STOPPED = 1
+_SOFTLY_SECONDS = 0.3  # more than the path's own time, to set off after a pause
 _AXES = ("x", "y", "z")
 _SPLINE_RAD = 5e-5  # from a trajectory between two points of its goal; .05 mm at a reach of 1 m
 _FLOATS = {7: "f4", 8: "f8"}  # sensor_msgs/msg/PointField
@@ -46,8 +45,9 @@ class JointStates:
     joints' names in ROS, empty before its first message, ``others``: those of the last message not
     of it."""
 
-    def __init__(self, cell: Cell):
-        self._arm = cell.arm
+    def __init__(self, cell: Cell, prefix: str = ""):
+        self._arm, self.wanted = cell.arm, [prefix + name for name in cell.arm.ros_joints]
+        self._prefix = prefix
         self._tool = matrices(np.array(cell.tool.grasp_pose))
         self.ordered: list[str] = []
         self.others: list[str] = []
@@ -78,17 +78,18 @@ class JointStates:
         if self.ordered and set(self.ordered) <= set(names):
             return [names.index(name) for name in self.ordered]
         found = [[k for k, name in enumerate(names) if name == joint]
-                 or [k for k, name in enumerate(names) if joint in name]
-                 for joint in self._arm.ros_joints]
+                 or [k for k, name in enumerate(names)
+                     if joint in name and name.startswith(self._prefix)]
+                 for joint in self.wanted]
         if not all(found):
             return None
-        for number, (joint, places) in enumerate(zip(self._arm.ros_joints, found, strict=True)):
+        for number, (joint, places) in enumerate(zip(self.wanted, found, strict=True)):
             alike = self.ordered[number:number + 1] + [names[k] for k in places]
             if len(alike) != 1:
                 raise InputError(f"{len(alike)} joints of ROS are named like {joint}: "
                                  f"{', '.join(alike)}.", f"A {self._arm.name} has one.",
-                                 "Check robot.model in the cell file, and that only one such arm "
-                                 "publishes on the topic of the joint states.")
+                                 "State robot.ros.prefix in the cell file, the beginning of its "
+                                 "joints' names, where two arms publish on one topic.")
         self.ordered = [names[places[0]] for places in found]
         return [places[0] for places in found]
 
@@ -141,13 +142,18 @@ def cloud_of(message: dict[str, Any]) -> np.ndarray:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def goal_of(trajectory: Trajectory, names: list[str]) -> dict[str, Any]:
+def goal_of(trajectory: Trajectory, names: list[str], since: float = 0.0,
+            here: np.ndarray | None = None) -> dict[str, Any]:
     """Return the goal of FollowJointTrajectory, ``names`` in the arm's order, with only the points
     that the controller's interpolation needs: while a bridge reads a large message it sends no
-    samples."""
+    samples. Of the trajectory after a time ``since`` [s], if any, from the joints ``here`` on."""
     if trajectory.joints is None:
         raise InputError("The motion has no joint angles.", "ROS follows joint angles.", "")
     times, joints = trajectory.times, trajectory.joints
+    if since > 0.0:
+        left = times > since
+        times = np.r_[0.0, times[left] - since + _SOFTLY_SECONDS]
+        joints = np.vstack([joints[0] if here is None else here, joints[left]])
     speeds = np.gradient(joints, times, axis=0)
     stands = (np.diff(joints, axis=0) == 0.0).all(axis=1)
     speeds[np.r_[True, stands] | np.r_[stands, True]] = 0.0
@@ -195,49 +201,6 @@ def _knots(times: np.ndarray, joints: np.ndarray, speeds: np.ndarray) -> list[in
     return rows
 
 
-@dataclass(frozen=True)
-class Topics:
-    """Names of the robot's topics and actions, by default the UR driver's; ``safety_mode`` to
-    ``slider`` are what a UR arm's driver publishes of its controller."""
-
-    joint_states: str = "/joint_states"
-    wrench: str = "/force_torque_sensor_broadcaster/wrench"
-    stop: str = "/limber/stop"
-    end: str = "/limber/end"
-    trajectory: str = "/scaled_joint_trajectory_controller/follow_joint_trajectory"
-    safety_mode: str = "/io_and_status_controller/safety_mode"
-    robot_mode: str = "/io_and_status_controller/robot_mode"
-    runtime_state: str = "/io_and_status_controller/robot_program_running"
-    slider: str = "/speed_scaling_state_broadcaster/speed_scaling"
-
-
-_USUAL = Topics()
-
-
-def wrench_topic(cell: Cell, own: str = _USUAL.wrench) -> str:
-    """Return the topic of the cell's force sensor, ``own`` for the arm's; InputError if the cell
-    names none that is heard in ROS, or a CB3's own estimate."""
-    require_sensor(cell)
-    sensor = cell.sensor
-    if sensor.kind == "controller":
-        return sensor.topic or own
-    if sensor.topic is None:
-        raise InputError(f"sensor.kind is {sensor.kind}, but the cell file states no sensor.topic.",
-                         f"{own} is not that sensor: there the arm's driver publishes the "
-                         "controller's own force.",
-                         "Set sensor.topic to the topic on which the sensor's node publishes "
-                         f"{WRENCH}; `ros2 topic list -t` lists it.")
-    # Under a name space too.
-    if cell.arm.controller == "ur" and sensor.topic.split("/")[-2:] == own.split("/")[-2:]:
-        measures = cell.arm.measures_force
-        raise InputError(f"sensor.kind is {sensor.kind}, but sensor.topic is {sensor.topic}.",
-                         "There the UR driver publishes the controller's own force" + (
-                             "." if measures else ", which a CB3 estimates from motor currents."),
-                         "Set sensor.topic to the topic of the sensor's own node" + (
-                             ", or sensor.kind to controller." if measures else "."))
-    return sensor.topic
-
-
 _CLOUD_SECONDS = 10.0  # a cloud is megabytes of text
 _CLOUD_LISTEN_SECONDS = 0.5
 _STANDS_RAD_S = 1e-3
@@ -247,13 +210,14 @@ class CloudTopic:
     """A camera's clouds in its optical frame; where it looks from follows from the cell's [camera]
     and, on the flange, the arm's ``joint_states``. InputError if the cell has no camera."""
 
-    def __init__(self, cell: Cell, bridge: Bridge, topic: str, joint_states: str):
+    def __init__(self, cell: Cell, bridge: Bridge, topic: str):
         if cell.camera is None:
             raise InputError("The cell file has no [camera].", "The cloud would be in an unknown "
                              "frame.", "Add [camera] with pose and mount.")
         self._cell, self._bridge, self._topic = cell, bridge, topic
-        self._joint_states = joint_states
-        self._states = JointStates(cell)
+        topics = Topics.of_cell(cell)
+        self._joint_states = joint_states = topics.joint_states
+        self._states = JointStates(cell, topics.prefix)
         self._flange: np.ndarray | None = None
         self._moves = False
         bridge.subscribe(topic, CLOUD)

@@ -4,6 +4,7 @@
 import re
 import socket
 import time
+from contextlib import closing
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, WorkError
@@ -147,7 +148,7 @@ def switch_output(address: str, number: int, on: bool) -> None:
 
 def is_driven(cell: Cell) -> bool:
     """Whether Limber drives the gripper itself."""
-    return cell.tool.gripper in ("digital_output", "robotiq")
+    return cell.tool.gripper in ("digital_output", "robotiq", "ros")
 
 
 def drive_gripper(cell: Cell, close: bool) -> None:
@@ -159,6 +160,11 @@ def drive_gripper(cell: Cell, close: bool) -> None:
             gripper.drive(close, tool.grip_force)
     elif tool.gripper == "digital_output":
         switch_output(cell.robot.address, tool.close_output, close)
+    elif tool.gripper == "ros":
+        from limber.robot.ros.topics import Bridge, grip_by_action
+
+        with closing(Bridge(cell.robot.address)) as bridge:
+            grip_by_action(cell, bridge, close)
     else:
         raise InputError("Limber does not drive the cell's gripper.",
                          f"tool.gripper is {tool.gripper}.", "Close and open it by hand.")

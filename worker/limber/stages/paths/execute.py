@@ -21,6 +21,7 @@ from limber.robot.operator_decisions import AfterStop, grip, require_confirmatio
 from limber.stages.paths.execute_summary import (
     arm_line,
     execution_summary,
+    noticed_lines,
     outcome_line,
     write_preview,
 )
@@ -83,7 +84,8 @@ class ExecutePlan(BranchStage):
         reads=("plans/{name}.csv", "mesh.vtu", "skeleton.swc"),
         writes=("executions/{name}/samples.csv", "executions/{name}/report.json"),
         found=(outcome_line, "Predicted peak force {predicted_peak_force_n:N}, measured "
-               "{peak_force_n:N}; at most {path_error_m:m} off the path.", arm_line),
+               "{peak_force_n:N}; at most {path_error_m:m} off the path.", arm_line,
+               noticed_lines),
         then="limber report {branch_folder}", step="robot", label="Check With Robot",
         moves_robot="when armed")
     groups: ClassVar[Groups] = {"motion": ("speed", "hold", "gripper_rotation")}
@@ -140,6 +142,7 @@ class ExecutePlan(BranchStage):
             write_preview(planned.branch, self.name, planned.asked, planned.cell, planned.motion)
             return planned.result | {"armed": False, "reached": None, "stop_reason": None,
                                      "after_stop": None, "peak_force_n": None, "path_error_m": None}
+        progress.warn(noticed_lines(planned.result))
         require_confirmation(self.name, self.confirm, planned.cell, progress)
         return _armed(planned, progress)
 
@@ -205,7 +208,7 @@ def planned_motion(asked: ExecutePlan, progress: Progress, *, is_to_move: bool) 
         cell, clear.obstacles, motion, predicted.poses[:, :3], np.array(clear.surfaces),
         present(asked.hold, "time at the path's end"), progress)}
     require_within_limits(cell, predicted.poses, predicted.wrenches[:, :3])
-    require_watched(cell, motion.path, asked.unwatched, progress.warn)
+    result["noticed"] = require_watched(cell, motion.path, asked.unwatched, progress.warn)
     return PlannedMotion(branch, cell, asked, motion, across, result)
 
 

@@ -19,7 +19,7 @@ from limber.planning.cost import arc_lengths
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.recordings.recording import POSE_COLUMNS
 from limber.robot.driver.force_samples import INDEPENDENT_READINGS
-from limber.robot.driver.guard import GuardSettings, not_seen
+from limber.robot.driver.force_test import BLOCK_SECONDS, ForceErrors, noticed
 from limber.robot.motion.execution import Blocked, RobotMotion
 from limber.robot.motion.trajectory import Predicted, Trajectory
 from limber.stages.paths.plan_cell import KeptClear
@@ -144,31 +144,23 @@ def require_within_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> 
 
 
 def require_watched(cell: Cell, path: Trajectory, is_unwatched: bool, warn: Callable[[Text], None],
-                    noise: float | None = None) -> None:
-    """Refuse a path with forces so small that the guard cannot see that the branch is lost, or only
-    tell it if ``is_unwatched``; ``noise`` of the filtered force at rest per axis [N], if measured.
-    InputError with the peak force, what is explained otherwise, and what would be seen."""
-    expected = path.expected
-    assert expected is not None
-    settings = GuardSettings.of_cell(cell, cell.arm.rate)
-    errors = settings.errors.measured(noise)
-    forces = expected.wrenches[:, :3]
-    unseen = not_seen(path.times, forces, expected.covariance[:, :3, :3], errors,
-                      cell.limits.soft_force_n)
-    if not unseen:
-        return
-    from_force = max(unseen.values())
-    told = (f"The guard could not see {' or '.join(unseen)}: the force along the path is at most "
-            f"{np.linalg.norm(forces, axis=1).max():.2g} N, and "
-            f"{float(errors.within(path.duration)):.2g} N of it are explained by the sensor's "
-            f"noise ({'stated' if noise is None else 'measured'}: {errors.noise:.2g} N, filtered), "
-            "its drift and the gripper's inertia. "
-            + (f"From about {from_force:.2g} N on they would be seen" if np.isfinite(from_force)
-               else "No force is predicted at all"))
+                    noise: float | None = None) -> list[dict[str, Any]]:
+    """Return what the guard would notice on a path. Refuse one with forces so small that it would
+    not see an empty gripper, or only tell it if ``is_unwatched``; ``noise`` of a block at rest per
+    axis [N], if measured. InputError with the peak force and what explains as much."""
+    assert path.expected is not None
+    errors = ForceErrors.of_cell(cell, noise)
+    found = noticed(path, errors, matrices(np.array(cell.base.pose))[:3, :3])
+    if found[0]["after_m"] is not None:
+        return found
+    told = (f"The guard could not see an {found[0]['fault']}: the force along the path is at most "
+            f"{np.linalg.norm(path.expected.wrenches[:, :3], axis=1).max():.2g} N. The noise of "
+            f"the sensor ({'measured' if noise else 'stated'}: {errors.noise:.2g} N in "
+            f"{BLOCK_SECONDS:g} s), its drift and the prediction's own error explain as much")
     if is_unwatched:
         warn(Text(f"{told}. ", Command("execute"), " follows it only with ",
                   Option("unwatched", True), "."))
-        return
+        return found
     raise InputError(
         f"{told}.", "The arm would go on with nothing in the gripper, or with a broken branch.",
         "Plan a path that bends the branch further or hold it nearer to its root; state the sensor "

@@ -84,3 +84,11 @@ def arm_line(result: Mapping[str, Any]) -> str:
     remark = force_remark(max(result["predicted_peak_force_n"], result.get("peak_force_n") or 0.0),
                           result["robot"])
     return f"The peak force is {remark}." if remark else ""
+
+
+def noticed_lines(result: Mapping[str, Any]) -> str:
+    """Return the table of what the guard would notice on the path, and after how many mm."""
+    return "\n".join(["What the guard would notice on this path, after which way:", *(
+        f"  {each['fault'] + ', ' + each['begins']:<52}"
+        + ("not on this path" if each["after_m"] is None else f"{1e3 * each['after_m']:.1f} mm")
+        for each in result["noticed"])])

@@ -134,7 +134,7 @@ def _from_robot(cell: Cell, progress: Progress) -> dict[str, Any]:
     if cell.robot.version and version and cell.robot.version != version:
         progress.warn(f"The cell was calibrated with controller version {cell.robot.version}; "
                       f"the controller now has {version}.")
-    if seen.program_runs:
+    if seen.is_busy(cell):
         progress.warn("A program is running on the controller. It has to be stopped on the "
                       "pendant before a motion.")
     for each in seen.differences:

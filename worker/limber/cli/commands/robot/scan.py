@@ -42,8 +42,8 @@ class Scan(Tool):
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         from limber.cell.cell_file import read_cell
+        from limber.cli.virtual_camera import scanned, views_around
         from limber.geometry.cloud.cloud import Cloud
-        from limber.robot.virtual.launch import scanned, views_around
 
         count = self.views or (8 if self.realsense is None else 1)
         if self.realsense is not None:
