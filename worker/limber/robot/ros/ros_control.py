@@ -143,13 +143,12 @@ class RosControl:
                 f"ur_type:={arm.name} robot_ip:=ADDRESS. It starts io_and_status_controller and "
                 "speed_scaling_state_broadcaster. A driver that publishes the modes only when "
                 "they change is too old.")
-        states = self._topics.joint_states
         others = "" if self._recent or not self._states.others else (
             f" It has the joints {', '.join(self._states.others)}, not those of a {arm.name}: "
             f"{', '.join(self._states.wanted)}. Check robot.model and robot.ros.prefix.")
-        silent = states if self.sensor.is_heard else wrench
-        return WorkError(f"Too little came on {silent} within {SECONDS:g} s.{others}",
-                         "The guard needs joint states and wrenches.",
+        silent = self._topics.joint_states if self.sensor.is_heard else wrench
+        return WorkError(f"Too little came on {silent} within {SECONDS:g} s.{others}", "The guard "
+                         "needs joint states and wrenches.",
                          "Check the topic's name with `ros2 topic list`, and that its node runs.")
 
     # Messages
@@ -178,8 +177,8 @@ class RosControl:
         elif kind == "action_result" and message.get("id") == self._goal:
             self._take_result(message)
         elif kind == "status" and message.get("level") == "error" and self._goal is not None:
-            self._end(f"rosbridge reports: {message.get('msg')}. A rosbridge older than 2.0 knows "
-                      "no actions: update rosbridge_suite")
+            self._end(f"rosbridge reports: {message.get('msg')}. One without actions, as that "
+                      "of Humble (1.3), moves no arm: update rosbridge_suite")
 
     def _take_joints(self, message: dict[str, Any]) -> None:
         sample = self._states.sample(message, time.monotonic(), RUNNING | self._reported)
@@ -325,12 +324,13 @@ class RosControl:
     # The rest of a control
 
     def connect(self) -> None:
-        """Set the payload where the arm's driver can."""
+        """Set the payload where the arm's driver can; what it was is not reported, so it stays."""
         tool = self._cell.tool
         if self._cell.arm.controller == "ur" and self._cell.sensor.kind == "controller":
             call(self._bridge, self._topics.set_payload, _PAYLOAD, self._take, {
                 "mass": tool.mass_kg or 0.0, "center_of_gravity": dict(zip(
                     "xyz", tool.centre_of_mass_m, strict=True))})
+            self._warnings.append(f"the payload in the controller is {tool.mass_kg or 0:g} kg now")
 
     def watch(self) -> None:
         """The node beside the controller acts on silence by itself."""
