@@ -9,6 +9,8 @@ from limber.geometry.skeleton.radii.fit_kernels import (
     normal_blocks,
     reach_on_circle,
 )
+from limber.geometry.skeleton.radii.stations import station_sums
+from limber.geometry.skeleton.radii.visible_sides import flatness
 from limber.geometry.surface.surface import _distances, pierced
 from limber.geometry.warm_up import warm_up
 
@@ -18,5 +20,5 @@ def test_warm_up_compiles_the_loops():
     warm_up()
     for kernel in (pierced, _distances, nearest_of, normal_blocks, mean_on_circle,
                    reach_on_circle, priced, nearest_others, far_sides, _voted, _analysed,
-                   _factorised, _solved):
+                   _factorised, _solved, station_sums, flatness):
         assert len(kernel.signatures) == 1

@@ -121,7 +121,7 @@ def test_a_twig_that_no_point_shows_is_left_out():
     points = skin(0.004, 0.0005)
     nodes = np.vstack([rod().nodes, [[0.15, 0.0, 0.02], [0.15, 0.0, 0.05]]])
     first = Skeleton.from_edges(nodes, [*rod().parent, 10, 20], np.full(22, 0.004))
-    found, count = likeliest_tree(first, PointLikelihood.of(points), PointSpacing.of(points))
+    found, count, _ = likeliest_tree(first, PointLikelihood.of(points), PointSpacing.of(points))
     assert found.branch_count == count == 1
 
 

@@ -103,18 +103,13 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
             _before(_branch(twig=np.vstack([_twig(0.2, 1, 0.004) - [0, 0, 0.01],
                                             _twig(0.14, reach=0.018)]), at=39)),
             lambda now: abs(now.skeleton.nodes[now.skeleton.forks()[0], 2] - 0.14) < 0.011),
-        "drop bare ends": lambda: (_before(_branch(), _shell(0.05, 0.35)),
-                                   _ends(0.05, 0.35, 0.006)),
         "lengthen ends": lambda: (_before(_branch(ALONG[10:70])), _ends(0.0, 0.392)),
-        "prune spurs": lambda: (_before(_branch(twig=_twig(0.2, 4, 0.003))), _one_run),
         "drop duplicate axes": lambda: (_before(_branch(twig=ALONG[42:60] + [0.003, 0, 0])),
                                         _one_run),
         "limit radii": lambda: (_before(_branch(radius=0.3)),
                                 lambda now: bool((now.skeleton.radius == 0.05).all())),
         "fit finely": lambda: (_before(_aside()), _centred),
         "settle": lambda: (_before(_aside(), duplicates=1), _centred),
-        "draw ends back": lambda: (_before(_branch(np.vstack([
-            [0, 0, -0.012], ALONG[1:-1], [0, 0, 0.412]]))), _ends(0.0, 0.4)),
         "register stations": lambda: (_apart(), lambda now: abs(float(
             np.median(now.skeleton.radius)) - stations.RADIUS) < min(1.6e-4, 2 * now.common)),
         "find the likeliest axes and radii": lambda: (_before(blank, gap), _thick),
@@ -132,11 +127,10 @@ def test_each_pass_mends_its_own_case(each: Pass) -> None:
     assert mended(each.run(before))
 
 
-def test_passes_have_names_of_their_own_and_say_what_they_repair() -> None:
+def test_passes_have_names_of_their_own() -> None:
     """A name stands for one pass, even where that runs several times; work only goes on."""
     passes = list(dict.fromkeys(PASSES))
     assert len({each.name for each in passes}) == len(passes)
-    assert all(each.repairs.endswith(".") for each in passes)
     until = [each.until for each in PASSES if each.until is not None]
     assert until == sorted(until) and until[-1] == 1.0
 

@@ -32,9 +32,9 @@ _MOST = 0.5  # fraction of points that decides
 _ARC = np.sin(np.pi / 3) / (np.pi / 3)
 
 
-def without_leaves(prepared: Prepared, least: float = _LEAST, found: SkeletonResult | None = None,
+def without_leaves(prepared: Prepared, found: SkeletonResult | None = None,
                    supports: Sequence[Support] = ()) -> tuple[Prepared, list[Leaf]]:
-    """Return the wood of a scan, and the removed leaves: none if they have under ``least`` of the
+    """Return the wood of a scan, and the removed leaves: none if they have under 5 % of the
     points. ``supports``, and what is round by ``found``, the whole scan's skeleton, are no leaves.
     """
     points = prepared.cloud.points
@@ -42,7 +42,7 @@ def without_leaves(prepared: Prepared, least: float = _LEAST, found: SkeletonRes
     for support in supports:
         none[support.points] = True
     leaves = [leaf for leaf in _leaves_of(points) if none[leaf.points].mean() < _MOST]
-    if leaf_mask(leaves, len(points)).mean() < least:
+    if leaf_mask(leaves, len(points)).mean() < _LEAST:
         return prepared, []
     return cut_off(prepared, leaves)
 

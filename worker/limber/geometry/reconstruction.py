@@ -113,9 +113,6 @@ _OWN_COLUMNS = ("skeleton_node", "residual", "leaf")  # columns of cloud.ply tha
 # A twig is kept if, as seen by a depth camera, it reaches this many radii beyond its parent's axis.
 _SILHOUETTE_REACH = 1.5
 _LEAVES_ASKED = 0.2  # fraction of points on no round axis above which leaves are searched for
-# Fraction of flat points from which shape alone shows leaves. Bare branches seen from one side have
-# up to 0.11, leafy seedlings 0.6 and more.
-_MOSTLY = 0.3
 
 
 @dataclass(frozen=True)
@@ -259,16 +256,11 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
             show(classified(prepared, [], supports, apart=apart))
 
     found = _skeleton(prepared, settings, own, progress, show_apart)
-    if own is not None or settings.leaves == "keep":
+    # Of few points, trees of wood and of leaves were compared: that decides.
+    if own is not None or settings.leaves == "keep" or found.length_spread is not None or not (
+            _may_be_leafy(found, prepared, settings)):
         return found, prepared, []
-    if _may_be_leafy(found, prepared, settings):
-        wood, leaves = without_leaves(prepared, found=found, supports=supports)
-    elif prepared.view is None:
-        # A few fat rods may explain curled leaves of few points, so the shape of most of a scan
-        # decides.
-        wood, leaves = without_leaves(prepared, _MOSTLY, found, supports)
-    else:
-        return found, prepared, []
+    wood, leaves = without_leaves(prepared, found, supports)
     if settings.leaves == "ask":
         with shown_if_refused(show, prepared, leaves, supports):
             check_agreed(prepared, leaves)

@@ -9,6 +9,8 @@ from limber.geometry.skeleton.joining import join_pieces
 from limber.geometry.skeleton.likeliest_tree import State, grown, pruned
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
+from limber.geometry.skeleton.radii.stations import station_sums
+from limber.geometry.skeleton.radii.visible_sides import flatness
 from limber.geometry.skeleton.repair import PointSpacing
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.tree_likelihood import PointLikelihood
@@ -26,6 +28,9 @@ def warm_up(progress: Progress = SILENT) -> None:
     distance_to_surface(skeleton.nodes, surface)
     contract(surface.vertices)
     fit_axes(skeleton, surface.vertices, rounds=1, settled=True)
+    way, size = np.eye(3), np.ones(3)
+    station_sums(way, size, way, way, way, size, size[:2], 0.0, 1.0)  # by merged scans alone
+    flatness(way, way, way)  # by noisy scans alone
     grown(pruned(State.of(skeleton, PointLikelihood.of(surface.vertices))),
           PointSpacing.of(surface.vertices))  # used by thin scans alone
     line = np.array([[0, 0, 0.01 * k] for k in (*range(4), *range(6, 10))])

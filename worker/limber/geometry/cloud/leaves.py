@@ -94,7 +94,9 @@ def _trees() -> dict[str, np.ndarray]:
 
 _SMALLEST = 40  # fewest points of a leaf
 _NEAR = 3.0  # largest distance between connected points, in spacings
-_AROUND, _ROUNDS = 16, 2  # neighbours whose evidence counts for a point, and how often
+ALIKE = 16
+"""Neighbours whose evidence counts for a point, and once for all."""
+_ROUNDS = 2  # how often
 _MOST_ODDS = 4.0  # logarithm of the odds above which a single point is no more evidence
 # Mean of it from which a piece is a leaf: first by the training's fraction of leaf points, then by
 # the scan's own, which is at least and at most this.
@@ -122,7 +124,7 @@ def leaf_evidence(points: np.ndarray) -> np.ndarray:
     spacing, odds = point_spacing(own.coordinates), np.full(len(points), prior_log_odds())
     if len(points) >= _SMALLEST and spacing > 0:
         odds[own.order] = leaf_log_odds(surroundings(own.coordinates, spacing))
-    return np.clip(odds, -_MOST_ODDS, _MOST_ODDS) / _AROUND
+    return np.clip(odds, -_MOST_ODDS, _MOST_ODDS) / ALIKE
 
 
 def point_spacing(points: np.ndarray) -> float:
@@ -147,7 +149,7 @@ def leaves_by_odds(points: np.ndarray, odds: np.ndarray, spacing: float, prior: 
     the training. They move with the fraction on leaves in this scan, so a few flat clumps are none
     (Saerens, Latinne and Decaestecker 2002, doi:10.1162/089976602753284446)."""
     odds = np.clip(odds, -_MOST_ODDS, _MOST_ODDS)
-    near = cKDTree(points).query(points, k=min(_AROUND, len(points)))[1]
+    near = cKDTree(points).query(points, k=min(ALIKE, len(points)))[1]
     for _ in range(_ROUNDS):
         odds = odds[near].mean(axis=1)
     certain = [leaf for leaf in _pieces(points, odds > 0, _NEAR * spacing)

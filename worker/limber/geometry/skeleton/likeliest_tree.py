@@ -9,6 +9,7 @@ the noise, and a maximisation step moves axes and radii to fit (Dempster, Laird,
 """
 
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 import scipy.sparse as sparse
@@ -62,14 +63,15 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
                key=lambda one: one.score(known))
     around = [likeliest_tree(start, scan, apart, progress.part(part, part + 0.35))
               for part, start in ((0.0, first), (0.35, known))]
-    skeleton, count = max(around, key=lambda one: scan.score(one[0]))
+    skeleton, count, score = max(around, key=itemgetter(2))
     # Whether one sensor saw them is asked of whole searches: twigs that hang to one side of a
     # thick axis look so too, and a thin axis beside a branch's middle hides it.
     seen = scan.where_seen(skeleton)
     if seen.sight is not None:
-        other, more = likeliest_tree(skeleton, seen, apart, progress.part(0.7, 1.0))
-        if seen.score(other) > scan.score(skeleton):
+        other, more, sighted = likeliest_tree(skeleton, seen, apart, progress.part(0.7, 1.0))
+        if sighted > score:
             scan, skeleton, count = seen, other, count + more
+    skeleton = fitted(_spaced(skeleton, apart), scan, _LAST_STEPS)
     spaced, cost = _spaced(skeleton, apart), scan.twig_numbers
     few, many = (State.of(spaced, replace(scan, twig_numbers=each)) for each in (
         _DEARER * cost, cost / _DEARER))
@@ -82,12 +84,12 @@ def rival_tree(first: Skeleton, known: Skeleton, points: np.ndarray, view: View 
     found = assessed(skeleton.on_grid(), points, noise, rays=rays, view=view if rays else None)
     even, kinks = without_kinks(found)
     return doubted(even, points, noise) if kinks else found, noise, count, float(np.linalg.norm(
-        [_APART, unknown / 2, np.std([np.log(one.length) for one, _ in around])]))
+        [_APART, unknown / 2, np.std([np.log(one.length) for one, *_ in around])]))
 
 
 def likeliest_tree(first: Skeleton, scan: PointLikelihood, apart: PointSpacing,
-                   progress: Progress = SILENT) -> tuple[Skeleton, int]:
-    """The likeliest tree found from the ``first`` and the number of twigs left out."""
+                   progress: Progress = SILENT) -> tuple[Skeleton, int, float]:
+    """The likeliest tree found from the ``first``, the number of twigs left out, and the score."""
     skeleton, best, found, count = first, -np.inf, first, 0
     for number in range(_PASSES):
         progress(number / _PASSES, "comparing trees")
@@ -100,7 +102,7 @@ def likeliest_tree(first: Skeleton, scan: PointLikelihood, apart: PointSpacing,
         skeleton = after.skeleton
         if after is rest:
             break
-    return fitted(_spaced(found, apart), scan, _LAST_STEPS), count
+    return found, count, best
 
 
 def _spaced(skeleton: Skeleton, apart: PointSpacing) -> Skeleton:
@@ -426,18 +428,22 @@ def _raised(foot: np.ndarray, end: np.ndarray, radius: np.ndarray, table_of: np.
     densities ``wood`` [m] on a ``skin``. ``table`` [tables, facings, distances] holds logarithms of
     that on theirs, at 0 and at distances whose logarithms are evenly spaced."""
     rise = np.zeros(len(foot))
+    before = 1 / (wood / skin + elsewhere)
     for k in range(len(foot)):
         ax, ay, az = end[k, 0] - foot[k, 0], end[k, 1] - foot[k, 1], end[k, 2] - foot[k, 2]
         square = ax * ax + ay * ay + az * az
-        after = skin + radius[k]**power * np.sqrt(square)
+        inverse, after = 1 / square, 1 / (skin + radius[k]**power * np.sqrt(square))
+        # A logarithm takes longer than all else: one of the product of many ratios.
+        ratio = 1.0
         for i in range(len(points)):
             px, py, pz = (points[i, 0] - foot[k, 0], points[i, 1] - foot[k, 1],
                           points[i, 2] - foot[k, 2])
-            t = min(max((px * ax + py * ay + pz * az) / square, 0.0), 1.0)
+            t = min(max((px * ax + py * ay + pz * az) * inverse, 0.0), 1.0)
             dx, dy, dz = px - t * ax, py - t * ay, pz - t * az
-            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            distance, reach = dx * dx + dy * dy + dz * dz, residual[i] + radius[k]
             here = wood[i]
-            if distance - radius[k] < residual[i]:
+            if reach > 0.0 and distance < reach * reach:
+                distance = np.sqrt(distance)
                 place = max((np.log(max(distance, 1e-300)) - first[0]) / (first[1] - first[0]) + 1,
                             0.0)
                 low = min(int(place), table.shape[2] - 2)
@@ -458,5 +464,9 @@ def _raised(foot: np.ndarray, end: np.ndarray, radius: np.ndarray, table_of: np.
                     log += beside * ((1 - part) * table[table_of[k], row + 1, low] + part * table[
                         table_of[k], row + 1, low + 1] - log)
                 here = np.exp(log)
-            rise[k] += np.log((here / after + elsewhere) / (wood[i] / skin + elsewhere))
+            ratio *= (here * after + elsewhere) * before[i]
+            if not 1e-150 < ratio < 1e150:
+                rise[k] += np.log(ratio)
+                ratio = 1.0
+        rise[k] += np.log(ratio)
     return rise

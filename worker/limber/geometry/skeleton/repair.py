@@ -15,11 +15,9 @@ from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
 from limber.geometry.skeleton.radii.stations import registered
 from limber.geometry.skeleton.run_ends import (
-    ends_within,
     limited,
     steadied,
     with_full_tips,
-    without_bare_ends,
 )
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths, resample
@@ -365,11 +363,10 @@ class Repaired:
 
 @dataclass(frozen=True)
 class Pass:
-    """A repair, and the fault that it ``repairs``, a sentence. ``until`` is the fraction of all
-    passes' work that is done after it; None: it takes hardly any time."""
+    """A repair. ``until`` is the fraction of all passes' work that is done after it; None: it takes
+    hardly any time."""
 
     name: str
-    repairs: str
     run: Callable[[Repaired], Repaired]
     until: float | None = None
 
@@ -379,13 +376,6 @@ def _fit_coarsely(now: Repaired) -> Repaired:
     by_rays = fit_of_rays(after.last_fit, now.points, now.view is not None, now.view)
     return after if by_rays is None else replace(
         after, rays=True, fit=by_rays, skeleton=by_rays.skeleton)
-
-
-def _prune_spurs(now: Repaired) -> Repaired:
-    # Noise makes a carrier look thicker, and its outliers look like twigs.
-    reach = now.skeleton.radius + 2 * now.noise
-    keep, count = prune_spurs(now.skeleton.nodes, now.skeleton.parent, reach, SPUR_REACH)
-    return replace(now, skeleton=now.skeleton.subset(keep), pruned=now.pruned + count)
 
 
 def _drop_duplicate_axes(now: Repaired) -> Repaired:
@@ -416,48 +406,41 @@ def _mend_kinks(now: Repaired) -> Repaired:
     return now.of(doubted(skeleton, now.points, now.noise) if count else skeleton)
 
 
-STEADY = Pass("steady radii", "Where points are missing, a first radius is far too small.",
-              lambda now: now.of(steadied(now.skeleton, now.points)))
-DROP_BARE_ENDS = Pass("drop bare ends",
-                      "The contraction overshoots an end, beyond the last points.",
-                      lambda now: now.of(without_bare_ends(now.skeleton, now.points)))
-DROP_DUPLICATE_AXES = Pass("drop duplicate axes",
-                           "Where a scan has holes, one branch has two parallel axes.",
-                           _drop_duplicate_axes)
-LIMIT = Pass("limit radii", "A radius is outside the range for a cloud of this size.",
-             lambda now: now.of(limited(now.skeleton, *now.radius_limits)))
+# Where points are missing, a first radius is far too small.
+STEADY = Pass("steady radii", lambda now: now.of(steadied(now.skeleton, now.points)))
+# Where a scan has holes, one branch has two parallel axes.
+DROP_DUPLICATE_AXES = Pass("drop duplicate axes", _drop_duplicate_axes)
+# A radius is outside the range for a cloud of this size.
+LIMIT = Pass("limit radii", lambda now: now.of(limited(now.skeleton, *now.radius_limits)))
 
 PASSES = (
     STEADY,
-    Pass("fit coarsely", "The contracted axes lie beside the axes that the points show.",
-         _fit_coarsely, until=0.4),
-    Pass("attach twigs", "The contraction pulls a fork towards its twig.",
-         lambda now: now.of(attached(now.skeleton))),
-    Pass("lengthen ends", "The contraction shortens an end.",
+    # The contracted axes lie beside the axes that the points show.
+    Pass("fit coarsely", _fit_coarsely, until=0.4),
+    # The contraction pulls a fork towards its twig.
+    Pass("attach twigs", lambda now: now.of(attached(now.skeleton))),
+    # The contraction shortens an end.
+    Pass("lengthen ends",
          lambda now: now.of(with_full_tips(now.skeleton, now.points, now.noise))),
-    Pass("prune spurs", "A twig hardly extends beyond its parent and the noise.", _prune_spurs),
     DROP_DUPLICATE_AXES,
     STEADY,
     LIMIT,
-    Pass("fit finely",
-         "Axes and radii come from too few nodes, and from forks that have moved since.",
-         lambda now: now.fitted(now.sampled(now.skeleton), uncertainty=False), until=0.8),
+    # Axes and radii come from too few nodes, and from forks that have moved since.
+    Pass("fit finely", lambda now: now.fitted(now.sampled(now.skeleton), uncertainty=False),
+         until=0.8),
     DROP_DUPLICATE_AXES,
-    Pass("settle", "Noise, or a duplicate axis that was just dropped, leaves the fit unfinished.",
-         _settle, until=0.9),
-    Pass("register stations", "The stations of a merged scan are a little apart, so that all radii "
-         "are off together.", _register_stations, until=1.0),
-    DROP_BARE_ENDS,
-    Pass("draw ends back", "A fit moves an end along its axis beyond the points.",
-         lambda now: now.of(ends_within(now.skeleton, now.points))),
+    # Noise, or a duplicate axis that was just dropped, leaves the fit unfinished.
+    Pass("settle", _settle, until=0.9),
+    # The stations of a merged scan are a little apart, so that all radii are off together.
+    Pass("register stations", _register_stations, until=1.0),
     LIMIT,
-    Pass("find the likeliest axes and radii",
-         "A radius that few points, the spacing or the noise determine, or that no wood has, is "
-         "treated as measured.",
-         lambda now: now.of(assessed(
-             now.skeleton, now.points, now.noise, rays=now.rays,
-             one_sided=now.last_fit.seen.one_sided, view=now.view, common=now.common))),
-    Pass("mend kinks", "A branch turns more sharply than wood does.", _mend_kinks),
+    # A radius that few points, the spacing or the noise determine, or that no wood has, is treated
+    # as measured.
+    Pass("find the likeliest axes and radii", lambda now: now.of(assessed(
+        now.skeleton, now.points, now.noise, rays=now.rays,
+        one_sided=now.last_fit.seen.one_sided, view=now.view, common=now.common))),
+    # A branch turns more sharply than wood does.
+    Pass("mend kinks", _mend_kinks),
 )
 """In the order in which they run; some run again after a fit."""
 

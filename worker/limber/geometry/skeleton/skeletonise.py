@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from limber.core.errors import InputError, places_moved
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.cloud import OwnFrame, thinned
-from limber.geometry.cloud.leaves import leaf_evidence
+from limber.geometry.cloud.leaves import ALIKE, leaf_evidence
 from limber.geometry.cloud.single_view import View
 from limber.geometry.settings import OPEN, SkeletonSettings
 from limber.geometry.skeleton.confidence import assessed, likely
@@ -36,7 +36,7 @@ from limber.geometry.skeleton.tree_likelihood import PointLikelihood
 Apart = Callable[[np.ndarray], None]
 """Receives which points of a cloud belong to another plant or cluster, shape [n]."""
 
-FIT_POINT_LIMIT = 60_000
+FIT_POINT_LIMIT = 30_000
 """More points do not improve the fit; they only slow it down."""
 _BRIDGE_LIMIT = 0.15  # longest bridge over a gap, as a fraction of the cloud's diagonal
 _TWIG_PROBABILITY = 0.5  # twigs that are less probable are dropped
@@ -142,7 +142,8 @@ class _Search:
 
         if lead(scan) > 0:
             scan = scan.where_seen(wood)
-        return best if max(lead(scan), 0.0) + shape > 0 else None
+        # As in the shape, neighbours count once where they speak for wood.
+        return best if max(lead(scan), lead(scan) / ALIKE) + shape > 0 else None
 
     def _joining(self) -> dict[str, Any]:
         settings = self.settings

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from limber.core.numerics.compiled import compiled_exactly
 from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 
@@ -89,24 +90,10 @@ class _Stations:
         least = (1 + self.opposed) * self.shift.size * np.log(len(sections.radius)) / 2
         return bool((self.log - still.log) / _ALIKE > least)
 
-    def seen(self, sections: _Sections) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray],
-                                                 float]:
-        """Probability that each point is of each station at each place [m, k, places]; directions
-        beside and along the sight [m, k, 3]; how far off the place it is in these [m]; the log."""
-        axis = sections.axis
-        along = self.towards - (axis @ self.towards.T)[:, :, None] * axis[:, None]
-        along /= np.maximum(np.linalg.norm(along, axis=2), 1e-9)[:, :, None]
-        ways = [np.cross(axis[:, None], along), along]
-        offset = sections.offset[:, None] - self.shift
-        radius = np.maximum(sections.radius + self.wider, _SHARP * sections.radius)[:, None, None]
-        miss = [np.einsum("mkj,mkj->mk", offset, way)[:, :, None] - radius * place
-                for way, place in zip(ways, (_BESIDE, _RISE), strict=True)]
-        square = (miss[0] / self.noise[0])**2 + _RISE * (miss[1] / self.noise[1])**2
-        density = (1 - _STRAY) * self.share[:, None] * np.sqrt(_RISE) * np.exp(-0.5 * square) / (
-            2 * np.pi * self.noise.prod() * len(_RISE))
-        total = density.sum(axis=(1, 2)) + _STRAY / (
-            np.pi * (sections.radius + _FAR * self.fit)**2)
-        return density / total[:, None, None], ways, miss, float(np.log(total).sum())
+    def sums(self, sections: _Sections) -> tuple:
+        """:func:`station_sums` of what the points show."""
+        return station_sums(sections.offset, sections.radius, sections.axis, self.towards,
+                            self.shift, self.share, self.noise, self.wider, self.fit)
 
     def improved(self, sections: _Sections, rounds: int, free: bool = True) -> "_Stations":
         """The stations after ``rounds`` of expectation and maximisation; not ``free``: unshifted.
@@ -115,35 +102,72 @@ class _Stations:
         known = np.append(np.full(numbers, (_SHIFTS * self.fit)**-2),
                           (_WIDER * np.median(sections.radius))**-2)
         for _ in range(rounds):
-            weight, ways, misses, log = now.seen(sections)
-            # A grazing ray's error is larger, and hardly moves it off the surface.
-            weights, places = (weight, weight * _RISE), (_BESIDE, _RISE)
-            matrix, right = np.diag(known), -known * np.append(now.shift, now.wider)
-            for each, way, place, miss, noise in zip(
-                    weights, ways, places, misses, now.noise, strict=True):
-                firm = each / (_ALIKE * noise**2)
-                whole, pull, moment = firm.sum(axis=2), np.sum(firm * miss, axis=2), firm @ place
-                for k in range(len(now.shift)):
-                    own = slice(3 * k, 3 * k + 3)
-                    matrix[own, own] += (way[:, k] * whole[:, k, None]).T @ way[:, k]
-                    matrix[own, -1] += way[:, k].T @ moment[:, k]
-                    matrix[-1, own] = matrix[own, -1]
-                    right[own] += way[:, k].T @ pull[:, k]
-                matrix[-1, -1] += np.sum(firm @ place**2)
-                right[-1] += np.sum((firm * miss) @ place)
-            covariance = np.linalg.inv(matrix)
-            step = covariance @ right * free
-            count = weight.sum(axis=(0, 2)) + 1e-12
-            towards = np.sum([np.einsum("mk,mkj->kj", weight @ place, way) for place, way in zip(
-                places, ways, strict=True)], axis=0)
+            _, count, log, matrix, pull, towards, square = now.sums(sections)
+            covariance = np.linalg.inv(np.diag(known) + matrix)
+            step = covariance @ (pull - known * np.append(now.shift, now.wider)) * free
+            count += 1e-12
             now = replace(
                 now, shift=now.shift + step[:-1].reshape(-1, 3), wider=now.wider + float(step[-1]),
                 sigma=float(np.sqrt(covariance[-1, -1])), log=log, share=count / count.sum(),
-                noise=np.maximum([np.sqrt(np.sum(each * miss**2) / count.sum())
-                                  for each, miss in zip(weights, misses, strict=True)],
-                                 _SHARP * now.fit),
+                noise=np.maximum(np.sqrt(square / count.sum()), _SHARP * now.fit),
                 towards=towards / np.maximum(np.linalg.norm(towards, axis=1), 1e-300)[:, None])
         return now
+
+
+@compiled_exactly
+def station_sums(offset: np.ndarray, radius: np.ndarray, axis: np.ndarray, towards: np.ndarray,
+                 shift: np.ndarray, share: np.ndarray, noise: np.ndarray, wider: float, fit: float,
+                 ) -> tuple:
+    """The probability that each point is of each of k stations [m, k] and their sums [k]; the
+    log-likelihood; precision [3 k + 1, 3 k + 1] and pull [3 k + 1] of the shifts and the radii's
+    shared error; sums of the sights [k, 3], and of misses beside and along them [2] [m^2]."""
+    count, places, root = len(share), len(_BESIDE), np.sqrt(_RISE)
+    chance, number = np.zeros((len(radius), count)), np.zeros(count)
+    precision, pull = np.zeros((3 * count + 1, 3 * count + 1)), np.zeros(3 * count + 1)
+    facing, square, log = np.zeros((count, 3)), np.zeros(2), 0.0
+    weight, miss, ways = np.empty((count, places)), np.empty((2, count)), np.empty((2, count, 3))
+    level = (1 - _STRAY) * share / (2 * np.pi * noise[0] * noise[1] * places)
+    for i in range(len(radius)):
+        thick = max(radius[i] + wider, _SHARP * radius[i])
+        total = _STRAY / (np.pi * (radius[i] + _FAR * fit)**2)
+        for k in range(count):
+            along = towards[k] - (axis[i] * towards[k]).sum() * axis[i]
+            ways[1, k] = along / max(np.sqrt((along**2).sum()), 1e-9)
+            for j in range(3):
+                ways[0, k, j] = (axis[i, j - 2] * ways[1, k, j - 1]
+                                 - axis[i, j - 1] * ways[1, k, j - 2])
+            for d in range(2):
+                miss[d, k] = ((offset[i] - shift[k]) * ways[d, k]).sum()
+            for p in range(places):
+                weight[k, p] = level[k] * root[p] * np.exp(-0.5 * (
+                    ((miss[0, k] - thick * _BESIDE[p]) / noise[0])**2
+                    + _RISE[p] * ((miss[1, k] - thick * _RISE[p]) / noise[1])**2))
+                total += weight[k, p]
+        log += np.log(total)
+        for k in range(count):
+            chance[i, k] = weight[k].sum() / total
+            number[k] += chance[i, k]
+            for d in range(2):
+                # A grazing ray's error is larger, and hardly moves it off the surface.
+                whole = moved = first = second = crossed = 0.0
+                for p in range(places):
+                    own = weight[k, p] / total * (_RISE[p] if d else 1.0)
+                    place = _RISE[p] if d else _BESIDE[p]
+                    off = miss[d, k] - thick * place
+                    whole, first, second = whole + own, first + own * place, second + own * place**2
+                    moved, crossed = moved + own * off, crossed + own * off * place
+                    square[d] += own * off**2
+                    facing[k] += weight[k, p] / total * place * ways[d, k]
+                firm = 1 / (_ALIKE * noise[d]**2)
+                precision[-1, -1] += firm * second
+                pull[-1] += firm * crossed
+                for j in range(3):
+                    way = firm * ways[d, k, j]
+                    pull[3 * k + j] += way * moved
+                    precision[3 * k + j, -1] += way * first
+                    precision[3 * k + j, 3 * k:3 * k + 3] += way * whole * ways[d, k]
+    precision[-1, :-1] = precision[:-1, -1]
+    return chance, number, log, precision, pull, facing, square
 
 
 def registered(skeleton: Skeleton, points: np.ndarray, noise: float,
@@ -176,5 +200,5 @@ def registered(skeleton: Skeleton, points: np.ndarray, noise: float,
     odds = np.exp(scores - scores.max())
     other = odds @ np.array([one.wider - first.wider * shows for one in found])**2 / odds.sum()
     square = best.share @ np.sum(shift**2, axis=1)
-    return points - best.seen(every)[0].sum(axis=2) @ shift, float(
+    return points - best.sums(every)[0] @ shift, float(
         np.sqrt(best.sigma**2 + _ROUND**2 * square + other))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import i0e
 
+from limber.core.numerics.compiled import compiled_exactly
 from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.radii.fit_kernels import Match, reach_on_circle
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -123,24 +124,46 @@ def _flat_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: 
     thick = thick[::max(len(thick) // _SAMPLE, 1)]
     # In units of the noise: distance = sharpness / (radius / noise).
     offset = out[thick] * (sharpness[thick] / np.sqrt(stout[thick]))[:, None]
-    best, flat = None, 0.0
-    for view in _half_sphere():
-        side, cross = sides_of(axis[thick], view)
-        along, across = (np.einsum("mj,mj->m", offset, one) for one in (side, cross))
-        difference = across**2 - along**2
-        share = float(difference.mean() / (across**2 + along**2).mean())
-        if share > max(flat, _FLAT) and difference.mean() > _FLAT_SURE * difference.std() / np.sqrt(
-                len(thick)):
-            best, flat = (view, along, across), share
-    if best is None:
+    views = _half_sphere()
+    mean, sure, share = flatness(np.ascontiguousarray(axis[thick]), offset, views)
+    share[(share <= _FLAT) | (mean <= _FLAT_SURE * sure)] = 0.0
+    if not share.any():
         return None
-    view, along, across = best
+    view = views[int(np.argmax(share))]
+    along, across = (np.einsum("mj,mj->m", offset, one) for one in sides_of(axis[thick], view))
     # An arc's ends lie back from the viewer.
     bent = (along - along.mean()) * (across**2 - np.mean(across**2))
     least = _BENT_LEAST * _BENT * float(np.mean(stout[thick]**1.5))
     if abs(bent.mean()) + _BENT_SURE * bent.std() / np.sqrt(len(bent)) < least:
         return None
     return _one_side(view if bent.mean() < 0 else -view)
+
+
+@compiled_exactly
+def flatness(axis: np.ndarray, offset: np.ndarray, views: np.ndarray,
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """By how much the squares of offsets [m, 3] across their axes [m, 3] are larger across each of
+    k views [k, 3] than along it: their mean, its standard deviation, and its fraction, [k] each."""
+    mean, sure, share = np.zeros(len(views)), np.zeros(len(views)), np.zeros(len(views))
+    for k in range(len(views)):
+        difference = squares = total = 0.0
+        for i in range(len(axis)):
+            x, y, z = axis[i, 0], axis[i, 1], axis[i, 2]
+            a, b, c = views[k, 0], views[k, 1], views[k, 2]
+            on = a * x + b * y + c * z
+            a, b, c = a - on * x, b - on * y, c - on * z
+            size = max(a * a + b * b + c * c, 1e-12)
+            along = a * offset[i, 0] + b * offset[i, 1] + c * offset[i, 2]
+            across = ((y * c - z * b) * offset[i, 0] + (z * a - x * c) * offset[i, 1]
+                      + (x * b - y * a) * offset[i, 2])
+            more = (across * across - along * along) / size
+            difference += more
+            squares += more * more
+            total += (across * across + along * along) / size
+        mean[k] = difference / len(axis)
+        sure[k] = np.sqrt(max(squares / len(axis) - mean[k]**2, 0.0) / len(axis))
+        share[k] = difference / max(total, 1e-300)
+    return mean, sure, share
 
 
 def _half_sphere() -> np.ndarray:
