@@ -178,18 +178,18 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
     some = search.to_fit(graph, thin)
     fitted = repaired(first, some, settings.radius_limits(search.diagonal), view,
                       progress.part(0.65, 0.95))
-    segment, residual = nearest_cylinders(fitted.skeleton, points)
-    check_round(fitted.skeleton, points, segment, residual)
     wood, (skeleton, unlikely) = fitted.skeleton, likely(fitted.skeleton, twig_probability)
     noise, count, spread = fitted.noise, pruned + fitted.pruned, None
     if len(points) <= _SEARCHED:
         wood, noise, count, spread = rival_tree(search.unpruned(graph, start), skeleton, some, view,
                                                 progress.part(0.95, 1.0))
         skeleton, unlikely = wood, []
+    segment, residual = nearest_cylinders(wood, points)
+    check_round(wood, points, segment, residual)
     if leafy := (middle := search.through_leaves(first, fitted, wood, graph, start)) is not None:
         skeleton, unlikely = likely(middle, twig_probability)
         noise, count, spread = fitted.noise, pruned, None
-    if skeleton is not fitted.skeleton:
+    if skeleton is not wood:
         segment, residual = nearest_cylinders(skeleton, points)
     if len(ends) > 1 and ends[0]["probability"] < OPEN and not leafy:
         skeleton = _of_either_root(skeleton, fitted, ends)
