@@ -1,10 +1,13 @@
 """The guide builds without a warning, and explains every option and public name."""
 
 import datetime
+import importlib
 import json
+import math
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import click
@@ -12,6 +15,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 GUIDE = ROOT / "worker" / "docs"
+_UNITS = ("mm|cm|m|s|ms|N|kg|g|GPa|MPa|kPa|Pa|Hz|MB|GB|degrees|minutes|seconds|hours|trials|rad|J"
+          "|mJ|points|tetrahedra")
 
 
 @pytest.mark.slow
@@ -93,6 +98,43 @@ def test_data_of_accuracy_say_where_they_are_from(path):
     assert datetime.date.fromisoformat(record["date"]) and record["seed"] >= 0
     assert all(row["measure"] and row["measured"] for row in record["rows"] if row["count"])
     assert any(row["count"] for row in record["rows"])
+
+
+def _figures_of(path):
+    """The numbers with a unit in a page's own text: neither code nor what a bench's data write."""
+    text = re.sub(r"```.*?```|<!-- [^>]*writes this. -->.*?<!-- End. -->|`[^`]*`", "",
+                  path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    number = r"\d(?:[\d.,]| (?=000))*"
+    return {" ".join(each.rstrip(",. ").split()) for each in re.findall(
+        rf"(?<![\w.^]){number}(?: to {number})?(?: million)? ?(?:%|(?:{_UNITS})(?!\w))", text)}
+
+
+def _is_as_stated(figure, source):
+    """Whether a constant or a bench's row says the same; other sources are words."""
+    if constant := re.fullmatch(r"([\w.]+):(\w+)(?: x (\S+))?", source):
+        value = getattr(importlib.import_module(constant[1]), constant[2]) * float(
+            constant[3] or 1)
+        told = float(re.match(r"[\d., ]*\d", figure)[0].replace(",", "").replace(" ", ""))
+        return math.isclose(told, value)
+    if row := re.fullmatch(r"row (\w+): (.*)", source):
+        rows = json.loads((GUIDE / "data" / f"{row[1]}.json").read_text(encoding="utf-8"))["rows"]
+        number = re.match(r"[\d.]+", figure)[0]
+        return any(number in each["measured"] for each in rows if each["measure"] == row[2])
+    return source.partition(": ")[0] in ("measured", "cited", "example", "rule")
+
+
+def test_every_number_of_the_text_has_a_source():
+    """worker/docs/data/figures.toml names it: a new number goes in, a gone one out."""
+    sources = tomllib.loads((GUIDE / "data" / "figures.toml").read_text(encoding="utf-8"))
+    written = {"explanation/accuracy.md", "explanation/decide.md", "reference/stages.md"}
+    pages = {"README.md": GUIDE.parents[1] / "README.md"} | {
+        name: path for path in sorted(GUIDE.rglob("*.md"))
+        if (name := path.relative_to(GUIDE).as_posix()) not in written}
+    found = {name: figures for name, path in pages.items() if (figures := _figures_of(path))}
+    assert {name: sorted(each) for name, each in found.items()} == {
+        name: sorted(each) for name, each in sources.items()}
+    assert not [(name, figure, source) for name, each in sources.items()
+                for figure, source in each.items() if not _is_as_stated(figure, source)]
 
 
 def test_the_strains_of_species_are_those_of_the_code():
