@@ -79,7 +79,8 @@ def _draw() -> None:
         return
     size = context.preferences.system.ui_scale
     x, y = covered_width(context, "TOOLS") + _MARGIN * size, _GAP * size
-    for scale in shown_scales(surface):
+    scales = shown_scales(surface)
+    for scale in scales:
         places, colours, triangles = bar(scale["stops"], x, y, _WIDTH * size, _HEIGHT * size)
         shader = gpu.shader.from_builtin("SMOOTH_COLOR")
         gpu.state.blend_set("ALPHA")
@@ -87,6 +88,9 @@ def _draw() -> None:
                          indices=triangles).draw(shader)
         gpu.state.blend_set("NONE")
         x += _write(scale, x, y, size) + _BETWEEN * size
+    if scales:
+        y += (_HEIGHT + 26 + 16 * max(len(_title_lines(scale)) for scale in scales)) * size
+    x = covered_width(context, "TOOLS") + _MARGIN * size
     for number, kind in enumerate(reversed(shown_marks(surface))):
         _draw_key(kind, x, y + number * _KEY_LINE * size, size)
 
@@ -121,12 +125,16 @@ def _write(scale: dict, x: float, y: float, size: float) -> float:
         share = number / max(len(ticks) - 1, 1)
         blf.position(0, x + (_WIDTH + 6) * size, y + (share * _HEIGHT - 4) * size, 0)
         blf.draw(0, str(tick))
-    lines = textwrap.wrap(scale["title"] + (", log scale" if scale["log"] else ""), _LINE_LETTERS)
+    lines = _title_lines(scale)
     for number, line in enumerate(reversed(lines)):
         blf.position(0, x, y + (_HEIGHT + 10 + 16 * number) * size, 0)
         blf.draw(0, line)
     blf.disable(0, blf.SHADOW)
     return max(blf.dimensions(0, line)[0] for line in lines)
+
+
+def _title_lines(scale: dict) -> list[str]:
+    return textwrap.wrap(scale["title"] + (", log scale" if scale["log"] else ""), _LINE_LETTERS)
 
 
 def register() -> None:

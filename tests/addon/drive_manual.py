@@ -67,12 +67,29 @@ def replay():
     return True
 
 
+def render_wood():
+    """The picture that Set Up Picture makes, in wood, at the end of the motion."""
+    current = bpy.context.scene
+    current.limber.scene.motion = ""
+    with override():
+        bpy.ops.limber.open_result()
+        bpy.ops.limber.color_by(scalar="wood")
+        bpy.ops.limber.show(group="energy", hide=True)
+        bpy.ops.limber.set_up_picture()
+    current.frame_set(BENT)
+    current.render.resolution_percentage = 60
+    current.render.filepath = str(FOLDER / "wood.png")
+    bpy.ops.render.render(write_still=True)
+    return True
+
+
 def is_replayed():
     return bpy.data.objects.get("Measured point 1") is not None and not jobs().is_running() and (
         waited(1.5))
 
 
-drive([begin, is_tab_open, picture("start"), open_example, is_open, save,
+drive([begin, is_tab_open, open_example, is_open, save,
        see("energy", "stress_over_strength", BENT, "energy"), picture("stress"),
        see("young", "young", 1), picture("young"),
-       replay, is_replayed, see("force", "residual", MOST_PULLED), picture("pull")], longest=100)
+       replay, is_replayed, see("force", "residual", MOST_PULLED), picture("pull"),
+       render_wood], longest=100)
