@@ -1,5 +1,5 @@
 """What a cell with errors records of a pull, and what a virtual pull states of them."""
-
+import shutil
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from tests.stages.specified import SpecifiedPull
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import rotated
 from limber.estimation.settings import PullSpec, VirtualPullSettings
-from limber.estimation.simulated_pull import CellErrors
+from limber.estimation.simulated_pull import CellErrors, true_branch
 from limber.recordings.recording import (
     EXACT,
     CalibrationEntry,
@@ -18,7 +18,7 @@ from limber.recordings.recording import (
     PullEntry,
     read_pull,
 )
-from limber.stages.pulls.virtual_pull import VirtualPull, load_truth
+from limber.stages.pulls.virtual_pull import VirtualPull
 from limber.store import Branch
 
 POINT = (0.0, 0.0, 0.3)
@@ -86,17 +86,25 @@ def test_a_virtual_pull_states_what_was_drawn(branch_folder):
     assert other.calibration == EXACT and "cell_errors" not in other.truth
 
 
-def test_virtual_pulls_of_a_branch_share_shape_and_cell(branch_folder):
-    """A joint fit takes them as pulls of one branch in one cell; zero and points are each's own."""
-    truths, lengths = [], []
-    for seed in (3, 4):
+def test_each_branch_has_its_own_shape_and_cell(branch_folder, tmp_path, small, small_bench):
+    """A joint fit takes its pulls as of one branch in one cell, wherever the folder is and whatever
+    the seed, which draws zero and points."""
+    rng = np.random.default_rng(1)
+    scan = small_bench.mesh.nodes + 1e-3 * rng.standard_normal(small_bench.mesh.nodes.shape)
+    shapes, cells = [], []
+    for seed, source in ((3, "1f"), (4, "1f"), (3, "ab" * 32)):
         settings = PullSpec(frames=4, cell_errors="realistic", seed=seed)
-        lengths.append(load_truth(Branch.open(branch_folder), settings).skeleton.nodes)
-        SpecifiedPull.of(settings, branch_folder=branch_folder, name=f"of-{seed}").run()
-        truths.append(read_pull(branch_folder / "pulls" / f"of-{seed}").entry.truth["cell_errors"])
-    assert np.array_equal(*lengths)
-    first, second = truths
-    assert first.pop("point_shifts_m") != second.pop("point_shifts_m") and first == second
+        shapes.append(true_branch(small.skeleton, settings, scan=scan, source=source
+                                  ).skeleton.nodes)
+        folder = shutil.copytree(branch_folder, tmp_path / f"{len(cells)}.branch")
+        manifest = Branch.open(folder).manifest
+        manifest.source["sha256"] = source
+        (folder / "branch.json").write_text(manifest.text(), encoding="utf-8")
+        SpecifiedPull.of(settings, branch_folder=folder, name="other").run()
+        cells.append(read_pull(folder / "pulls" / "other").entry.truth["cell_errors"])
+    assert np.array_equal(*shapes[:2]) and not np.allclose(*shapes[1:])
+    shifts = [cell.pop("point_shifts_m") for cell in cells]
+    assert cells[0] == cells[1] != cells[2] and shifts[0] != shifts[1]
 
 
 def test_depth_images_have_no_such_errors(branch_folder):

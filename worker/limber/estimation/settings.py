@@ -163,6 +163,7 @@ class VirtualPullSettings(Settings):
         "errors of the cell": ("cell_errors",),
     }
     common = ("cell_errors", "seed", "young")
+    results_version = 2
 
     young: tuple[float, ...] = Field(
         (), description="True Young's modulus at the control points [Pa]. Default: that of a "
@@ -184,10 +185,11 @@ class VirtualPullSettings(Settings):
         False, description="Record depth images of a simulated D455 instead of points.")
     cell_errors: str = Field(
         "none", description="Errors of the cell that stay during the recording, those of frames "
-        "and gain the same in all pulls: none, realistic, or a TOML file whose table [calibration] "
-        "has their standard deviations, as pull.toml has. realistic: those of a cell that was set "
-        "up with care and not measured since (gripper 1 mm and 1 degree, force gain 2 %, zero and "
-        "drift 1 N, camera 1 mm, points 5 mm along the branch). The pull states them.")
+        "and gain the same in all pulls of a branch: none, realistic, or a TOML file whose table "
+        "[calibration] has their standard deviations, as pull.toml has. realistic: those of a cell "
+        "that was set up with care and not measured since (gripper 1 mm and 1 degree, force gain "
+        "2 %, zero and drift 1 N, camera 1 mm, points 5 mm along the branch). The pull states "
+        "them.")
     seed: int = Field(0, ge=0, description="Seed of all random numbers.")
 
     @property

@@ -136,7 +136,8 @@ _PULL_TURN = 2.0  # angle by which the direction of a pull turns [rad]: both ben
 @dataclass(frozen=True)
 class TrueBranch:
     """The branch of a virtual pull. ``is_weightless`` overrides settings; ``is_assumed``: moduli
-    are, as a scan has no pulls; ``is_meshed``: meshed directly, so perhaps not round."""
+    are, as a scan has no pulls; ``is_meshed``: meshed directly, so perhaps not round; ``source``:
+    digest [hex] of what the branch was made of, which draws its cell in every pull."""
 
     mesh: TetMesh
     skeleton: Skeleton
@@ -147,6 +148,7 @@ class TrueBranch:
     is_weightless: bool = False
     is_assumed: bool = False
     is_meshed: bool = False
+    source: str = ""
 
     def young_at(self, positions: np.ndarray) -> np.ndarray:
         """Return Young's modulus [Pa], shape [n], at positions [m], shape [n, 3]."""
@@ -159,7 +161,7 @@ def true_branch(skeleton: Skeleton, settings: PullSpec, *,
                 body: TetMesh | None = None, scan: np.ndarray | None = None,
                 fractions: tuple[float, ...] = FRACTIONS,
                 young: Sequence[float] = DEFAULT_YOUNG_PA,
-                gravity: tuple[float, float, float] = GRAVITY) -> TrueBranch:
+                gravity: tuple[float, float, float] = GRAVITY, source: str = "") -> TrueBranch:
     """Return the branch of true axes, on a mesh of its own; the settings' moduli take precedence.
 
     Args:
@@ -167,6 +169,7 @@ def true_branch(skeleton: Skeleton, settings: PullSpec, *,
             tetrahedron cut in eight if that stays small, instead of the round branch of its axes.
         scan: The points that the axes were fitted to [m], shape [n, 3]: the branch is then another
             one that fits them as well (:mod:`limber.geometry.shape_samples`).
+        source: Digest [hex] of what the branch was made of; it draws that other shape.
 
     Raises:
         InputError: not one modulus per control point. WorkError: no other shape can be meshed.
@@ -184,10 +187,15 @@ def true_branch(skeleton: Skeleton, settings: PullSpec, *,
         mesh = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_spacing=1.3)
                            ).mesh
     if scan is not None and body is None:
-        skeleton, mesh = _another(skeleton, mesh, scan, np.random.default_rng([0, 2]))
+        skeleton, mesh = _another(skeleton, mesh, scan, _drawing(source, 2))
     mesh = mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
     return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions,
-                      np.array(young, float), gravity, is_meshed=body is not None)
+                      np.array(young, float), gravity, is_meshed=body is not None, source=source)
+
+
+def _drawing(source: str, stream: int) -> np.random.Generator:
+    """A generator that is the same in all pulls of a branch, whenever and in any order."""
+    return np.random.default_rng([int(source or "0", 16), stream])
 
 
 def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random.Generator,
@@ -292,7 +300,7 @@ def _misread(exact: Pull, shifts: np.ndarray, settings: PullSpec, truth: TrueBra
                          "Depth images are rendered by a camera whose position is known.",
                          "Omit ", Option("camera"), ", or the errors of the cell.")
     # All pulls of a branch are recorded in one cell, as the fit takes it.
-    errors = CellErrors.drawn(settings.calibration, np.random.default_rng([0, 3]))
+    errors = CellErrors.drawn(settings.calibration, _drawing(truth.source, 3))
     errors.pivot = truth.skeleton.point_at(PullSpec().grasp_fraction)
     seen = errors.recorded(exact, np.random.default_rng([settings.seed, 5]))
     observed = present(seen.observations, "observed points")

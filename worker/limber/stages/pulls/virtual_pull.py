@@ -93,16 +93,16 @@ def load_truth(branch: Branch, settings: PullSpec) -> TrueBranch:
     from limber.geometry.io.skeletons import read_swc
     from limber.store.loading import load_mesh
 
-    known: dict[str, Any] = {}
+    known: dict[str, Any] = {"source": branch.manifest.source.get("sha256", "")}
     where = "skeleton.swc"
     if branch.has("truth/truth.json"):
         truth = read_truth(branch.path("truth/truth.json"))
-        known = {"fractions": tuple(truth["fractions"]), "young": truth["young_pa"]}
+        known |= {"fractions": tuple(truth["fractions"]), "young": truth["young_pa"]}
         where = "truth/skeleton.swc"
     body = load_mesh(branch) if _is_meshed_body(branch) else None
     found = true_branch(read_swc(branch.path(where)), settings, gravity=branch.gravity,
                         body=body, scan=_scan(branch, settings), **known)
-    return replace(found, is_assumed=not known)
+    return replace(found, is_assumed="young" not in known)
 
 
 def _scan(branch: Branch, settings: PullSpec) -> np.ndarray | None:
