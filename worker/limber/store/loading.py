@@ -238,9 +238,10 @@ def density_sigma(branch: Branch) -> float:
     return (branch.made.settings if branch.made else {}).get("density_sigma", DENSITY_SIGMA)
 
 
-def density_digest(branch: Branch) -> dict[str, str]:
-    """Return what a result depends on besides, where that deviation is another than usual."""
-    return {"density_sigma": repr(own)} if (own := density_sigma(branch)) != DENSITY_SIGMA else {}
+def wood_digest(branch: Branch) -> dict[str, str]:
+    """Return what a result depends on besides: the wood that the branch was made of, as stated."""
+    made = branch.made.settings if branch.made else {}
+    return {"wood": repr([made.get(name) for name in ("density", "density_sigma", "poisson")])}
 
 
 def fit_spec(branch: Branch, settings: EstimateSettings) -> FitSpec:
@@ -297,11 +298,9 @@ def pull_names(branch: Branch, settings: EstimateSettings) -> list[str]:
 
 def pulls_digest(branch: Branch, names: list[str]) -> str:
     """Return a sha256 of all files of these pulls."""
-    joined = hashlib.sha256()
-    for file in sorted(branch.manifest.files):
-        if any(file.startswith(f"pulls/{name}/") for name in names):
-            joined.update(f"{file} {branch.digest(file)}\n".encode())
-    return joined.hexdigest()
+    joined = "".join(f"{file} {branch.digest(file)}\n" for file in sorted(branch.manifest.files)
+                     if any(file.startswith(f"pulls/{name}/") for name in names))
+    return hashlib.sha256(joined.encode()).hexdigest()
 
 
 def load_pulls(branch: Branch, names: list[str], subject: Subject, settings: FitSpec,

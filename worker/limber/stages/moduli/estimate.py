@@ -201,19 +201,19 @@ def _estimate(branch: Branch, asked: EstimateYoung, progress: Progress) -> dict[
     from limber.recordings.slips import slips_of
     from limber.stages.moduli.other_skeletons import add_other_skeletons
     from limber.store.loading import (
-        density_digest,
         fit_spec,
         load_pulls,
         load_subject,
         pull_names,
         pulls_digest,
+        wood_digest,
     )
 
     names = pull_names(branch, asked)
     settings = fit_spec(branch, asked)
     subject = load_subject(branch, settings)
     digests = {"mesh geometry": subject.mesh.geometry_digest(),
-               "pulls": pulls_digest(branch, names)} | density_digest(branch)
+               "pulls": pulls_digest(branch, names)} | wood_digest(branch)
     if asked.is_kept(branch, digests=digests) and not (
             stored := branch.manifest.stages["estimate"].result).get("stopped"):
         return stored
@@ -298,7 +298,7 @@ def _with_supported_points(
             heard: list[str] = []
             try:
                 found = fit_branch(pulls, model, chosen, log=EvaluationLog(None, ""), quick=True,
-                                   near=support.start,
+                                   near=support.start, known=first.objective.forwards,
                                    progress=progress.part(0.7, 0.9).keeping(heard, silently=True))
                 told = heard
             except WorkError:

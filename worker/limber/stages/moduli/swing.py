@@ -91,14 +91,14 @@ class FitSwing(SwingSettings, KeptStage, BranchStage):
         from limber.estimation.forward.forward_model import under_its_weight
         from limber.estimation.vibration.free_swing import SwingSeen, fit_swing
         from limber.recordings.recording import grasp_on
-        from limber.store.loading import density_digest, density_sigma, load_subject, pulls_digest
+        from limber.store.loading import density_sigma, load_subject, pulls_digest, wood_digest
 
         branch = Branch.open(self.branch_folder)
         with branch.writing("limber swing"):
             pull = _pull(branch, self.pull)
             subject = load_subject(branch, FitSpec())
             digests = {"mesh geometry": subject.mesh.geometry_digest(),
-                       "pulls": pulls_digest(branch, [pull.name])} | density_digest(branch)
+                       "pulls": pulls_digest(branch, [pull.name])} | wood_digest(branch)
             if self.is_kept(branch, digests=digests):
                 return branch.manifest.stages["swing"].result
             about = present(pull.entry.swing, "record of the branch's release")

@@ -102,7 +102,7 @@ class FitVibration(KeptStage, BranchStage):
             WorkError: no modulus has such a frequency.
         """
         from limber.estimation.vibration.ringing import identify, read_record
-        from limber.store.loading import density_digest, density_sigma, load_branch, load_mesh
+        from limber.store.loading import density_sigma, load_branch, load_mesh, wood_digest
 
         if not self.record.is_file():
             raise InputError(f"There is no file {self.record}.",
@@ -114,7 +114,7 @@ class FitVibration(KeptStage, BranchStage):
         with branch.writing("limber vibration"):
             mesh = load_mesh(branch)
             digests = {"record": file_digest(self.record),
-                       "mesh geometry": mesh.geometry_digest()} | density_digest(branch)
+                       "mesh geometry": mesh.geometry_digest()} | wood_digest(branch)
             if self.is_kept(branch, digests=digests):
                 return branch.manifest.stages["vibration"].result
             seen = identify(rung.times, rung.values, self.start, rate_deviation=rung.rate_deviation)
