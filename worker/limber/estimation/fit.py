@@ -4,6 +4,7 @@
 :mod:`limber.estimation.estimate_file` selects the written values.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -41,6 +42,7 @@ from limber.estimation.fitting.initial_modulus import (
     standing_start,
     unexplained,
 )
+from limber.estimation.fitting.nuisances import NAMED
 from limber.estimation.fitting.objective import Evaluation, EvaluationLog, Objective, Stopped
 from limber.estimation.fitting.optimise import (
     EVALUATION_LIMIT,
@@ -50,7 +52,7 @@ from limber.estimation.fitting.optimise import (
     gauss_newton,
     nelder_mead,
 )
-from limber.estimation.forward.forward_model import under_its_weight
+from limber.estimation.forward.forward_model import Forward, under_its_weight
 from limber.estimation.forward.observed_path import is_path_observed
 from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import LINK_DEVIATION, Values, bump_deviations, hats, stations_of
@@ -74,9 +76,6 @@ from limber.geometry.skeleton.skeleton import FRACTIONS
 from limber.recordings.recording import Pull, calibration_of
 from limber.recordings.sensor_checks import force_unit_suspicion
 
-SOFTER = 0.5
-"""A fit begins without weight if a beam then leaves less than this part of what it leaves with it.
-"""
 FAR_FROM_FOLDING = 0.25
 """Factor on the moduli under which a branch still stands if its weight matters little. Chosen."""
 
@@ -86,13 +85,14 @@ class _ForceLeadsNowhereError(WorkError):
 
 
 def fit_branch(pulls: list[Pull], subject: Subject, settings: FitSpec, *,
-               log: EvaluationLog, near: Values | None = None, quick: bool = False,
-               progress: Progress = SILENT) -> Estimate:
+               log: EvaluationLog, near: Values | None = None, known: Sequence[Forward] = (),
+               quick: bool = False, progress: Progress = SILENT) -> Estimate:
     """Estimate Young's modulus of a branch from its pulls.
 
     Args:
         log: Stores the evaluations. Those of a stopped run are reused.
         near, quick: As for :func:`fit_pulls`.
+        known: The pulls as an earlier fit near there left them: it begins with their states.
 
     Raises:
         InputError: the pulls cannot determine Young's modulus.
@@ -101,7 +101,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: FitSpec, *,
     """
     if log.resumed_count:
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run are reused.")
-    found = _Strategy(pulls, subject, settings, near, progress).fitted(log)
+    found = _Strategy(pulls, subject, settings, near, known, progress).fitted(log)
     if not quick:
         complete(found, settings, progress)
     return found
@@ -116,6 +116,7 @@ class _Strategy:
     subject: Subject
     settings: FitSpec
     near: Values | None
+    known: Sequence[Forward]
     progress: Progress
 
     def fitted(self, log: EvaluationLog) -> Estimate:
@@ -123,14 +124,13 @@ class _Strategy:
         if not (self.subject.hangs and any(under_its_weight(
                 self.subject.model, pull.entry).prestress is not None for pull in self.pulls)):
             return self._driven(log)
-        if self._is_too_soft():
-            return self._weightless()
         heavy: Estimate | None = None
         failure: Exception | None = None
         try:
             heavy = self._driven(log)
-            sound = heavy.uncertainty.variance_factor < MISFIT_FACTOR
-            # A much softer branch would carry the weight too: then it is no cause of a misfit.
+            sound = (heavy.uncertainty.variance_factor < MISFIT_FACTOR
+                     and abs(heavy.density_off) < NAMED)
+            # A much softer branch would carry the weight too: then it is no cause of what is off.
             margin = 1.0 if sound else FAR_FROM_FOLDING
             if heavy.stopped or self.subject.carries_itself(
                     replace(heavy.values, young=margin * heavy.values.young)):
@@ -143,22 +143,14 @@ class _Strategy:
             if heavy is None:
                 raise
             return heavy
-        if self.subject.carries_itself(found.values):
+        if self.subject.carries_itself(found.values) or (
+                heavy is not None and heavy.fit.evaluation.objective
+                <= found.fit.evaluation.objective):
             # The weight was not the cause.
             if failure is not None:
                 raise failure
             return present(heavy, "estimate with the weight")
         return found
-
-    def _is_too_soft(self) -> bool:
-        """Whether beams without weight, too soft to carry it, explain the pulls far better."""
-        forwards = forwards_of(self.pulls, self.subject, self.settings)
-        heavy, light = (beams_of(forwards, weighs=weighs) for weighs in (True, False))
-        if len(light) < len(forwards):
-            return False
-        bare = beam_start(light, self.subject.start)
-        return not self.subject.carries_itself(bare.values) and 1 - bare.explained < SOFTER * (
-            1 - beam_start(heavy, self.subject.start).explained)
 
     def _weightless(self) -> Estimate:
         """The estimate without the weight, with a warning if it tells a scale."""
@@ -209,7 +201,7 @@ class _Strategy:
         """The fit with points where the branch shows that they are, if that is far from where they
         are stated: an error along a bent branch is not linear."""
         forwards = forwards_of(self.pulls, self.subject, self.settings)
-        start, near, shifts = None, self.near, {}
+        start, near, shifts, known = None, self.near, {}, self.known
         beams = [] if any(forward.is_dynamic for forward in forwards) else beams_of(forwards)
         if beams:
             begun = beam_start(beams, self.subject.start)
@@ -217,11 +209,15 @@ class _Strategy:
             if begun.explained < EXPLAINED:
                 self.progress.warn(unexplained(begun))
             shifts = far_from_stated(beams, begun)
+        if known:
+            shifts = {forward.name: np.asarray(forward.point_shifts) for forward in known
+                      if np.any(forward.point_shifts)}
         for rounds_left in reversed(range(ROUNDS)):
             if shifts:
                 forwards = forwards_of(self.pulls, self.subject, self.settings, shifts)
             for forward in filter(is_path_observed, forwards if beams else ()):
                 forward.begin_without(begun.zeros.get(forward.name, np.zeros(3)))
+            _begin_at(forwards, known)
             objective = Objective(
                 forwards, parameter_space(self.subject, forwards, self.settings), log=log,
                 force_sigma=[pull.entry.sensor.force_sigma_n for pull in self.pulls],
@@ -232,11 +228,20 @@ class _Strategy:
             far = far_points(found.cell_errors, shifts)
             if far is None or found.stopped or not rounds_left:
                 return found
-            shifts, near, log = far, found.values, EvaluationLog(None, "")
+            shifts, near, log, known = far, found.values, EvaluationLog(None, ""), forwards
         raise AssertionError("the last round looks for no far points")
 
     def _with(self, **changes: Any) -> "_Strategy":
         return replace(self, settings=self.settings.model_copy(update=changes))
+
+
+def _begin_at(forwards: Sequence[Forward], known: Sequence[Forward]) -> None:
+    """Begin simulations with frames, states and force of earlier ones on as many nodes."""
+    for forward, earlier in zip(forwards, known, strict=False):
+        if (isinstance(forward, QuasiStaticForward) and isinstance(earlier, QuasiStaticForward)
+                and forward.mesh.node_count == earlier.mesh.node_count):
+            forward.set_key_count(earlier.key_count)
+            forward.begin_at(earlier)
 
 
 def fit_pulls(objective: Objective, start: Values, settings: FitSpec,
@@ -375,7 +380,8 @@ def _refined(fit: Fit, objective: Objective, settings: FitSpec,
         if fresh.evaluate(fit.evaluation.free, jacobian=True) is None:
             for forward in coarse:  # the states between known ones lead nowhere: from rest
                 forward.hint(None)
-        fit = gauss_newton(fresh, fit.evaluation.free, evaluation_limit=EVALUATION_LIMIT)
+        fit = gauss_newton(fresh, fit.evaluation.free, evaluation_limit=EVALUATION_LIMIT,
+                           is_near=True)
         objective.forward_count = fresh.forward_count
     return fit
 

@@ -14,6 +14,7 @@ from limber.estimation.estimated_branch import Subject, forwards_of, neck
 from limber.estimation.fitting.initial_modulus import held_out, without
 from limber.estimation.fitting.nuisances import (
     CREEP,
+    NAMED,
     OTHER_CAUSES,
     in_words,
     nuisance_records,
@@ -176,6 +177,13 @@ class Estimate:
         return identifiability(self.fit.evaluation, self.objective.space).scale_deviation
 
     @property
+    def density_off(self) -> float:
+        """Deviations of the density from the stated one, 0 if it is no unknown or has no prior."""
+        space, free = self.objective.space, self.fit.evaluation.free
+        return next((float(free[space.names.index(name)] - middle) / sigma
+                     for name, middle, sigma in space.priors if name == "density"), 0.0)
+
+    @property
     def is_bad(self) -> str | None:
         """Reason why the fit gives no valid result; None if it does."""
         space = self.objective.space
@@ -235,6 +243,12 @@ def judge_fit(found: Estimate, progress: Progress) -> None:
             progress.warn(corrected)
         if (creep := found.creep) is not None:
             progress.warn(creep_sentence(creep))
+    if abs(found.density_off) > NAMED:
+        progress.warn(
+            f"The pulls fit with a density of {found.values.density:.3g} kg/m3. That is "
+            f"{abs(found.density_off):.0f} standard deviations from the stated one. Weigh a piece "
+            "of the branch, and check gravity, the unit of the force, and whether the branch hung "
+            "freely when it was scanned. Otherwise the moduli come out wrong.")
     named = outliers(found.fit.evaluation, found.objective)
     if named:
         worst = "; ".join(f"{entry['pull']} {entry['what']} at {entry['time_s']:.2f} s "

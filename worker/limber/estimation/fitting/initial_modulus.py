@@ -60,10 +60,10 @@ class Beam:
     with force and torque [k, 3] at ``place`` [k, 3]; ``seen`` [k, m + 1, 3] and ``rest`` are the
     observed points and, last, the grasp."""
 
-    def __init__(self, forward: QuasiStaticForward, *, weighs: bool = True):
+    def __init__(self, forward: QuasiStaticForward):
         self._forward, mesh = forward, forward.mesh
         self.name = forward.name
-        self._gravity = forward.model.gravity if weighs else np.zeros(3)
+        self._gravity = forward.model.gravity
         skeleton = present(forward.skeleton, "skeleton of a pulled branch")
         grasp = np.array(forward.entry.grasp.point_m)
         run = _run_to(skeleton, grasp)
@@ -289,9 +289,9 @@ def unexplained(begun: BeamStart) -> str:
             "its sign, the clocks, the grasp point, and the order of the markers.")
 
 
-def beams_of(forwards: Sequence[Forward], *, weighs: bool = True) -> list[Beam]:
-    """The slow pulls with a measured force as rods, with their weight or without."""
-    return [Beam(forward, weighs=weighs) for forward in forwards if forward.uses_force
+def beams_of(forwards: Sequence[Forward]) -> list[Beam]:
+    """The slow pulls with a measured force as rods."""
+    return [Beam(forward) for forward in forwards if forward.uses_force
             and isinstance(forward, QuasiStaticForward) and forward.skeleton is not None]
 
 

@@ -253,7 +253,6 @@ class _Settling:
         self.count = 0
         self._best = (np.inf, np.inf)
         self._course: list[float] = []
-        self._iterations = 0
         self._has_settled = False
 
     @property
@@ -277,7 +276,6 @@ class _Settling:
 
     def after_iteration(self, _free: np.ndarray) -> None:
         self._course.append(self._best[0])
-        self._iterations += 1
         if self.is_small_enough:
             raise StopIteration
         if len(self._course) > self._window:
@@ -293,24 +291,13 @@ class _Settling:
             return FitStatus.converged, f"{error} fell below {self._delta:.3g} m2"
         if not is_settled:
             return FitStatus.out_of_evaluations, (
-                Text(f"{limit} simulations were not enough: {error} is still falling. "
-                     f"{self._outlook()} Use ", Option("method", "gauss-newton")))
+                Text(f"{limit} simulations were not enough: {error} is still falling. Use ",
+                     Option("method", "gauss-newton")))
         if self._delta is None:
             return FitStatus.converged, f"{error} settled"
         return FitStatus.misfit, (
             Text(f"{error} settled above the requested {self._delta:.3g} m2 (", Option("delta_m2"),
                  "). The noise or the error of the model is larger"))
-
-    def _outlook(self) -> str:
-        """After how many simulations it would settle if its fall went on shrinking as it does."""
-        course, half = self._course, len(self._course) // 2
-        early, late = (course[0] - course[half], course[half] - course[-1]) if half else (0, 0)
-        if not 0 < late < early < np.inf:
-            return f"It would take more than {2 * self.count}."
-        negligible = min(SETTLED_FALL, 1e-3 * course[-1])
-        halves = max(np.log(negligible / late) / np.log(late / early), 1.0)
-        more = halves * half * self.count / self._iterations
-        return f"At this rate it would settle after about {float(f'{self.count + more:.2g}'):.0f}."
 
 
 def _required(objective: Objective, free: np.ndarray) -> Evaluation:

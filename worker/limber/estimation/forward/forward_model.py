@@ -8,17 +8,18 @@ import scipy
 from scipy import sparse
 
 from limber.core.numerics.rigid import rotation_matrix
-from limber.estimation.parameters import Values
+from limber.estimation.parameters import Values, YoungField
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.dynamics.motion import NewmarkSettings, subspace_round
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.loads.loaded_branch import is_stable
+from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import refined_solve
 from limber.mechanics.statics.solve import StaticSettings, solve_static
-from limber.recordings.recording import GraspEntry, PullEntry, calibration_of
+from limber.recordings.recording import GraspEntry, PullEntry, calibration_of, grasp_on
 from limber.recordings.synchronisation import Frames
 
 # Direction of the branch at its observed points, at rest and in a deformed state.
@@ -380,15 +381,6 @@ def under_its_weight(model: BranchModel, entry: PullEntry) -> BranchModel:
     return model.with_parameters(gravity=(0.0, 0.0, 0.0)) if entry.weightless else model
 
 
-def carries_its_weight(model: BranchModel) -> bool:
-    """Whether a branch is stable under its weight, in the scanned shape or sagging from it."""
-    if not model.gravity.any():
-        return True
-    if model.prestress is not None:
-        return is_stable(model)
-    return solve_static(model, settings=StaticSettings(snap=False)).converged
-
-
 class Forward(ABC):
     """Simulates one pull. ``uses_force``: measured in any frame, and compared there. ``response``:
     to errors of a measured force that drives, once derivatives were asked. ``grasp_tangent`` [f, 3]
@@ -408,7 +400,8 @@ class Forward(ABC):
     creep_time: float | None = None
     """Time constant of the branch's creep [s], if its share is an unknown of the fit."""
 
-    def __init__(self, name: str, entry: PullEntry, frames: Frames, rest_points: np.ndarray):
+    def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
+                 frames: Frames, rest_points: np.ndarray, field: YoungField | None):
         self.name, self.entry, self.frames = name, entry, frames
         self.rest_points = np.asarray(rest_points, float)
         self.uses_force = bool(np.isfinite(frames.wrenches[:, :3]).all(axis=1).any())
@@ -416,6 +409,18 @@ class Forward(ABC):
         self.uses_torque = False
         self.grasp_tangent: np.ndarray | None = None
         self.point_directions: np.ndarray | None = None
+        self.weights, self.field = weights, field or YoungField(weights)
+        self.grasp = grasp_on(model.mesh, entry.grasp)
+        self._model = under_its_weight(model, entry).gripped(self.grasp)
+        self._operator = point_operator(model.mesh, self.rest_points)
+        self._directions = (PointDirections.at(model.mesh, self.rest_points)
+                            if self.may_be_off_along else None)
+
+    def model_with(self, values: Values) -> BranchModel:
+        """Return the branch with these parameters."""
+        return self._model.with_parameters(
+            young=self.field.young(values), poisson=values.poisson, density=values.density,
+            damping=RayleighDamping(*values.damping))
 
     @abstractmethod
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
@@ -427,10 +432,6 @@ class Forward(ABC):
     def may_be_off_along(self) -> bool:
         """Whether observed points may be off along the branch."""
         return len(self.rest_points) > 0 and calibration_of(self.entry).point_sigma_m > 0
-
-    def _directions_on(self, mesh: TetMesh) -> PointDirections | None:
-        """Return the directions of the branch at the observed points, if they are needed."""
-        return PointDirections.at(mesh, self.rest_points) if self.may_be_off_along else None
 
     @property
     def drive(self) -> str:
@@ -472,8 +473,13 @@ class Forward(ABC):
         return simulated
 
     def stands(self, values: Values) -> bool:
-        """Whether the branch carries its own weight under these values."""
-        return True
+        """Whether the branch is stable under its weight with these values, in the scanned shape or
+        sagging from it."""
+        model = self.model_with(values)
+        if not model.gravity.any():
+            return True
+        return is_stable(model) if model.prestress is not None else solve_static(
+            model, settings=StaticSettings(snap=False)).converged
 
     def thinning_error(self, values: Values) -> float:
         """Largest distance [m] between simulated and interpolated frames."""

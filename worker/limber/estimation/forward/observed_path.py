@@ -301,7 +301,7 @@ class ObservedPathForward(QuasiStaticForward):
         known = self._drives_for
         if known is not None and not equal_values(known, values):
             # At the same positions the force is proportional to the stiffness.
-            factor = np.exp(np.mean(np.log(values.young) - np.log(known.young)))
+            factor = np.exp(np.mean(np.log(values.young)) - np.mean(np.log(known.young)))
             self._drives = [drive * factor for drive in self._drives]
             self.response = None
         self._drives_for = values
@@ -312,6 +312,7 @@ class ObservedPathForward(QuasiStaticForward):
         super().begin_at(other)
         if isinstance(other, ObservedPathForward):
             self._drives_for = other._drives_for
+            self.keep()
 
     def is_held_against_its_force(self, values: Values) -> bool:
         """Whether a clamp holds states that its force and torque alone would let go: a compressed
@@ -362,7 +363,14 @@ class ObservedPathForward(QuasiStaticForward):
 
     def foresee(self, change: np.ndarray, values: Values) -> None:
         """Move the force by an expected change, for the next simulation with these values."""
+        known = present(self._drives_for, "values of the known force")
+        stiffer = np.mean(np.log(values.young) - np.log(known.young))
+        before = self._drives
         self.shift_force(change)
+        # What a stiffer branch takes to stay where it is does not move it.
+        self._hints = [hint - np.tensordot(stiffer * drive, moved, axes=1) for hint, drive, moved
+                       in zip(present(self._hints, "states"), before, self._compliances,
+                              strict=True)]
         self._drives_for = values
 
     def under_readings(self, simulated: Simulated) -> Simulated:

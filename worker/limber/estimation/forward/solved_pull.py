@@ -15,7 +15,6 @@ from limber.estimation.forward.forward_model import (
     Forward,
     Response,
     Simulated,
-    carries_its_weight,
     compliance,
     course_of,
     key_frames,
@@ -23,7 +22,6 @@ from limber.estimation.forward.forward_model import (
     nodal_loads,
     response_of,
     travel,
-    under_its_weight,
     wrench_sigma,
 )
 from limber.estimation.parameters import Values, YoungField, equal_values, mechanics_names
@@ -31,12 +29,10 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.dynamics.integration import simulate_dynamics
 from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.materials.materials import RayleighDamping
 from limber.mechanics.model import BranchModel, CarriedWeight
-from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces, static_sensitivities
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
-from limber.recordings.recording import PullEntry, grasp_on, point_of, pose_on
+from limber.recordings.recording import PullEntry, point_of, pose_on
 from limber.recordings.synchronisation import Frames
 
 # The torque of a clamping gripper: whether it counts, and its derivatives.
@@ -113,7 +109,7 @@ class QuasiStaticForward(Forward):
     def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
                  frames: Frames, rest_points: np.ndarray, *, key_count: int = 12,
                  field: YoungField | None = None):
-        super().__init__(name, entry, frames, rest_points)
+        super().__init__(name, model, weights, entry, frames, rest_points, field)
         measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
         if self.drive == "force" and measured.sum() < 2:
             raise InputError(f"{name} has no measured force for a force-driven simulation.",
@@ -121,13 +117,7 @@ class QuasiStaticForward(Forward):
                              "Use ", Option("drive", "pose"), ", or record the force.")
         if self.drive == "force" and entry.grasp.mode == "rigid":
             require_torque(name, entry, frames)
-        self.weights = weights
-        self.field = field or YoungField(weights)
-        self.grasp = grasp_on(model.mesh, entry.grasp)
-        self._model = under_its_weight(model, entry).gripped(self.grasp)
         self.uses_torque = uses_torque(entry, frames)
-        self._operator = point_operator(model.mesh, self.rest_points)
-        self._directions = self._directions_on(model.mesh)
         self.spread = np.empty((len(frames), 0))
         self._memory: list[_Memory | None] = []
         self.iteration_count = 0
@@ -178,12 +168,6 @@ class QuasiStaticForward(Forward):
     def model(self) -> BranchModel:
         """The branch under its weight, with the initial values."""
         return self._model
-
-    def model_with(self, values: Values) -> BranchModel:
-        """Return the branch with these parameters."""
-        return self._model.with_parameters(
-            young=self.field.young(values), poisson=values.poisson, density=values.density,
-            damping=RayleighDamping(*values.damping))
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
@@ -350,9 +334,6 @@ class QuasiStaticForward(Forward):
         """Start the next simulation from these displacements [m] of the key frames; None: rest."""
         self._hints = displacements
 
-    def stands(self, values: Values) -> bool:
-        return carries_its_weight(self.model_with(values))
-
     def states(self) -> list[_Memory]:
         """The states of all key frames, all simulated, under the last parameters."""
         return [present(memory, "state of a key frame") for memory in self._memory]
@@ -448,7 +429,7 @@ class DynamicForward(Forward):
 
     def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
                  frames: Frames, rest_points: np.ndarray, *, field: YoungField | None = None):
-        super().__init__(name, entry, frames, rest_points)
+        super().__init__(name, model, weights, entry, frames, rest_points, field)
         measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
         if entry.drive == "force" and not measured.all():
             raise InputError(f"{name}: {np.sum(~measured)} frames have no force.",
@@ -463,12 +444,6 @@ class DynamicForward(Forward):
                 'mode = "point" under [grasp] in pull.toml.')
         self._forces = frames.wrenches[:, :3]
         self._arguments = (name, model, weights, entry)
-        self.weights = weights
-        self.field = field or YoungField(weights)
-        self.grasp = grasp_on(model.mesh, entry.grasp)
-        self._model = under_its_weight(model, entry).gripped(self.grasp)
-        self._operator = point_operator(model.mesh, self.rest_points)
-        self._directions = self._directions_on(model.mesh)
         # Only the nodes that determine the observed points need derivatives.
         self._nodes = np.unique(self._operator.indices // 3)
         columns = (3 * self._nodes[:, None] + np.arange(3)).ravel()
@@ -480,7 +455,7 @@ class DynamicForward(Forward):
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
-        model = self._model_with(values)
+        model = self.model_with(values)
         frames, by_pose = self.frames, self.drive == "pose"
         drive = ({"poses": np.array([pose_on(self.grasp, self.entry.grasp, pose)
                                      for pose in frames.poses])} if by_pose
@@ -513,14 +488,6 @@ class DynamicForward(Forward):
         d_positions = np.stack([(self._near @ frame).reshape(-1, 3, count) for frame in flat])
         d_forces = slopes.reaction_force if by_pose else np.zeros((len(frames), 3, count))
         return Simulated(positions, forces, d_positions * scale, d_forces * scale)
-
-    def _model_with(self, values: Values) -> BranchModel:
-        return self._model.with_parameters(
-            young=self.field.young(values), poisson=values.poisson, density=values.density,
-            damping=RayleighDamping(*values.damping))
-
-    def stands(self, values: Values) -> bool:
-        return carries_its_weight(self._model_with(values))
 
     def until(self, count: int) -> "DynamicForward":
         """Return the first frames, driven by force if known: on a prescribed path wrong moduli give
