@@ -8,9 +8,8 @@ import pytest
 from benchmarks import drawn_branches
 from benchmarks.mechanics_reduced import trained
 from benchmarks.paper_branches import measured
-from benchmarks.scan_loops import bending_row, width_row
 from benchmarks.table import Setting
-from benchmarks.trials import Budget, Trial
+from benchmarks.trials import Budget
 from benchmarks.truth import efficient
 from benchmarks.worlds.plants import Plant
 from limber.core.progress import SILENT
@@ -40,31 +39,6 @@ def test_a_known_form_leaves_less_open():
     as_fitted, of_known_form = drawn_branches.bounds(truth, objective, subject)
     assert np.all(np.linalg.eigvalsh(as_fitted - of_known_form) > -1e-9)
     assert np.all(np.diag(of_known_form) < 0.8 * np.diag(as_fitted))
-
-
-def _loop(seed: int, ratios: tuple[float, ...] = ()) -> Trial:
-    """Intervals of E I that are ``ratios`` times as wide as a bound of a tenth, errors of 2 %;
-    none: a refusal. Seed 0: one-sided, 1 mm; 1: round, 1 mm; 2: one-sided, 2 mm.
-    """
-    errors = np.resize([0.02, -0.02], len(ratios))
-    return Trial("loops", seed, "now", {
-        "errors": np.expm1(errors).tolist(), "covered": (np.abs(errors) < 0.1).tolist(),
-        "widths": [0.3] * len(ratios), "bending_covered": [True] * len(ratios),
-        "bending_widths": [0.1 * each for each in ratios], "bending_errors": [0.0] * len(ratios),
-        "bounds": [0.1] * len(ratios)} if ratios else {},
-        "" if ratios else "the scan is too sparse")
-
-
-def test_the_width_of_the_loops_is_that_of_their_fits():
-    """Median 1.4 of five ratios; by view and noise; a refused loop has none."""
-    loops = [_loop(1, (1.2, 1.4)), _loop(2, (1.3, 2.0, 3.0)), _loop(1)]
-    row = width_row(loops)
-    assert row.met and row.count == 3
-    assert row.measured == "1.40 (worst 3.0; round 1 mm 1.30; one-sided 2 mm 2.00)"
-    assert width_row([_loop(1, (1.6, 1.7))]).met is False
-    assert width_row(loops[2:]).measured == "no estimate"
-    assert bending_row(loops).measured == (
-        "100.0 % of 5 (median error 0 %, half width 14 %, of E 30 %)")
 
 
 def test_a_branch_is_the_longest_axis_with_short_limbs():

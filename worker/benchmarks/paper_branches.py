@@ -104,16 +104,15 @@ class PaperBranch:
                           np.array(self.young),
                           is_weightless=True)
 
-    def fitted(self, method: str, seed: int = 0, drive: str = "force",
-               also: tuple[str, ...] = ("poisson",)) -> Fitted:
+    def fitted(self, method: str, seed: int) -> Fitted:
         """Fit one noisy pull by ``nelder-mead`` or ``gauss-newton``, as the paper does: the
         measured force drives, E is interpolated by inverse distances, nu is one of the unknowns."""
         bench = Bench(self, slice_length=2.4, sides=6)
         pull = measured(exact_pull(self, 0, frames=30), seed)
-        pull = replace(pull, entry=pull.entry.model_copy(update={"drive": drive}))
+        pull = replace(pull, entry=pull.entry.model_copy(update={"drive": "force"}))
         began = time.process_time()
-        found = bench.fit([pull], FitSpec(hold_out=False, method=method, also=also, key_frames=6,
-                                          poisson=None if also else self.poisson))
+        found = bench.fit([pull], FitSpec(hold_out=False, method=method, also=("poisson",),
+                                          key_frames=6))
         fit = found.fit
         return Fitted(found.values.young, found.values.poisson, fit.evaluation.loss,
                       found.objective.forward_count, time.process_time() - began, fit.converged)

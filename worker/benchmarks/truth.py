@@ -18,7 +18,7 @@ from benchmarks.drawn_branches import (
     fitting_subject,
     recorded,
 )
-from benchmarks.paper_branches import BRANCHES, Bench, PaperBranch, exact_pull, measured
+from benchmarks.paper_branches import Bench, PaperBranch, exact_pull, measured
 from benchmarks.table import Asked, Part, Row, Setting, share_met
 from benchmarks.trials import column, joined, sound
 from limber.core.errors import LimberError
@@ -56,8 +56,6 @@ _START = Asked("truths of 0.3 MPa to 10 GPa that fall 1 to 30 fold, at 1 to 4 co
                "198 of 200")
 _ADVICE = Asked("interval expected after an action over that got by following it",
                 "within 20 %")
-_PAPER = Asked("the paper's branches, noisy: worst error; simulations and seconds, its method / "
-                  "ours", "6 %; 20 times fewer")
 _SETTINGS = FitSpec(hold_out=False, mesh_check=False)
 _PLAIN = _SETTINGS.model_copy(update={"field": "inverse_distance", "poisson": 0.35,
                                      "poisson_sigma": 0.0})
@@ -227,23 +225,6 @@ def _widths(interval: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
     return np.diff(np.log(interval), axis=1)[:, 0] / 2
 
 
-def _paper_row(setting: Setting) -> list[Row]:
-    """Fit the paper's branches from one noisy pull by Nelder-Mead and by Gauss-Newton."""
-    said, worst, ratios = [], 0.0, []
-    for number, branch in enumerate(BRANCHES):
-        setting.progress(number / len(BRANCHES), f"the paper's {branch.name} branch")
-        both = [branch.fitted(method, setting.seed, "pose", ()) for method in (
-            "nelder-mead", "gauss-newton")]
-        errors = [float(np.abs(each.young / branch.young - 1).max()) if each.converged else np.inf
-                  for each in both]
-        theirs, ours = both
-        worst, ratios = max(worst, *errors), [*ratios, theirs.count / ours.count]
-        said.append(f"{branch.name} {100 * errors[0]:.1f} / {100 * errors[1]:.1f} %, "
-                    f"{theirs.count} / {ours.count}, {theirs.seconds:.0f} / {ours.seconds:.1f} s")
-    return [Row(*_PAPER, "; ".join(said), bool(worst <= 0.06 and min(ratios) >= 20),
-                len(BRANCHES))]
-
-
 def _one_pull(setting: Setting) -> list[Row]:
     return _cell_rows(setting, _ONE_PULL, 1, setting.at_most(60, 4), CalibrationEntry(), 1)
 
@@ -258,7 +239,6 @@ PARTS = {
     "three-pulls": Part(_three_pulls, 150, _THREE_PULLS, grows=True),
     "starts": Part(_start_row, 20, (_START,), grows=True),
     "advice": Part(_advice_row, 30, (_ADVICE,), grows=True),
-    "paper": Part(_paper_row, 60, (_PAPER,)),
     "beam": Part(silicone_beam.beam_rows, 60, silicone_beam.BEAM_ROWS),
     "real-beam": Part(silicone_beam.real_row, 60, (silicone_beam.REAL_ROW,)),
     "second-pull": Part(lambda setting: estimation.speed_rows(setting)[3:], 120,
