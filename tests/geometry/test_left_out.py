@@ -82,9 +82,7 @@ def test_two_nodes_at_one_place_make_no_nan() -> None:
 COUNT = 150_000
 _RUN = """
 import json, resource, sys
-from limber.geometry.warm_up import warm_up
 from limber.stages.shape.reconstruct import Reconstruct
-warm_up()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 result = Reconstruct(cloud=sys.argv[1], output=sys.argv[2]).run()
 after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -18,8 +18,8 @@ from limber.mechanics import BranchModel
 from limber.mechanics.elements.forces import sparse_times
 
 SOURCES = Path(__file__).parents[2] / "worker" / "kernels"
-C_TYPES = {"float64": "double*", "int64": "int64_t*", "int32": "int32_t*", "int": "int64_t",
-           "float": "double"}
+C_TYPES = {"bool": "uint8_t*", "float64": "double*", "int64": "int64_t*", "int32": "int32_t*",
+           "int": "int64_t", "float": "double"}
 
 
 def test_declarations_are_the_functions():

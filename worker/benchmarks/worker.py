@@ -211,9 +211,7 @@ _PIECES, _PIECES_SECONDS = 2000, 20.0
 _AT_ONCE = 1_000_000
 _RUN = """
 import json, resource, sys
-from limber.geometry.warm_up import warm_up
 from limber.stages.shape.reconstruct import Reconstruct
-warm_up()
 before = resource.getrusage(resource.RUSAGE_SELF)
 result = Reconstruct(cloud=sys.argv[1], output=sys.argv[2]).run()
 after = resource.getrusage(resource.RUSAGE_SELF)

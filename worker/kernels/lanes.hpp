@@ -36,6 +36,16 @@ INLINE Lanes root(Lanes x) {
 
 template <class T> INLINE T lesser(T a, T b) { return b < a ? b : a; }
 template <class T> INLINE T greater(T a, T b) { return b > a ? b : a; }
+// As vectors, of which no compiler makes a branch, which would often be mispredicted.
+typedef double Alone __attribute__((vector_size(16)));
+template <> INLINE double lesser(double a, double b) {
+  const Alone one{a, 0.0}, two{b, 0.0};
+  return (two < one ? two : one)[0];
+}
+template <> INLINE double greater(double a, double b) {
+  const Alone one{a, 0.0}, two{b, 0.0};
+  return (two > one ? two : one)[0];
+}
 
 // Memory of a call, in whole cache lines; without content.
 template <class T>

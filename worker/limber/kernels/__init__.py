@@ -41,17 +41,16 @@ def library() -> ctypes.CDLL:
         runpy.run_path(str(_SOURCES / "build.py"))["build"](FOLDER)
     system, ending = _SYSTEMS.get(sys.platform, (sys.platform, "so"))
     machine = _MACHINES.get(platform.machine().lower(), platform.machine())
-    path = FOLDER / f"{system}-{machine}.{ending}"
     try:
-        plain = ctypes.CDLL(str(path))
+        plain = ctypes.CDLL(str(FOLDER / f"{system}-{machine}.{ending}"))
         if plain.has_wide_vectors() and os.environ.get("LIMBER_KERNELS") != "v2":
-            return ctypes.CDLL(str(path.with_stem(f"{path.stem}-v3")))
+            return ctypes.CDLL(str(FOLDER / f"{system}-{machine}-v3.{ending}"))
+        return plain
     except OSError as error:
         raise MissingDependencyError(
             f"Limber's compiled kernels do not load: {error}.",
             "Install Limber from its wheel, or on a machine with a C++ compiler (g++, clang++, or "
             "the package ziglang) from its sources.") from error
-    return plain
 
 
 class Kernel:
@@ -81,12 +80,15 @@ class Kernel:
         arrays = values[:self._count]
         shapes = tuple([array.shape for array in arrays] + [array.strides for array in arrays])
         sizes = self._known.get(shapes) or self._sizes(shapes, arrays)
-        if [array.dtype for array in arrays] != self._dtypes:
+        if [array.dtype for array in arrays] != self._dtypes or not all(
+                arrays[number].flags.writeable for number in self._written):
             raise self._misfit(arrays)
-        for number in self._written:
-            if not arrays[number].flags.writeable:
-                raise self._misfit(arrays)
         return self._function(*[_address(array) for array in arrays], *values[self._count:], *sizes)
+
+    def of(self, *values: Any) -> Any:
+        """As a call, with arrays to read in any order and of any type: they are converted."""
+        return self(*[values[k] if k in self._written else np.ascontiguousarray(values[k], dtype)
+                      for k, dtype in enumerate(self._dtypes)], *values[self._count:])
 
     def _sizes(self, shapes: tuple, arrays: tuple[np.ndarray, ...]) -> list[int]:
         """Return the sizes that the axes' names have, and know them at the next call."""

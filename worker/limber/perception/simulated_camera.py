@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from limber.core.numerics.compiled import compiled_exactly
 from limber.geometry.cloud.camera import Camera, project
+from limber.kernels import Kernel
 
 
 def render_depth(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -11,7 +11,7 @@ def render_depth(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> np.
     [height, width] [m] without noise; empty pixels are 0."""
     pixels, depth = project(camera, vertices)
     image = np.full((camera.height, camera.width), np.inf)
-    _rasterise(image, pixels, depth, np.ascontiguousarray(faces, np.int64))
+    _rasterise.of(image, pixels, depth, faces)
     image[~np.isfinite(image)] = 0.0
     return image
 
@@ -34,29 +34,6 @@ def with_noise(camera: Camera, depth: np.ndarray, rng: np.random.Generator, *,
     return np.round(noisy * camera.depth_scale) / camera.depth_scale
 
 
-@compiled_exactly
-def _rasterise(image: np.ndarray, pixels: np.ndarray, depth: np.ndarray, faces: np.ndarray) -> None:
-    height, width = image.shape
-    for face in range(len(faces)):
-        a, b, c = faces[face]
-        if depth[a] <= 1e-6 or depth[b] <= 1e-6 or depth[c] <= 1e-6:
-            continue
-        ax, ay = pixels[a]
-        bx, by = pixels[b]
-        cx, cy = pixels[c]
-        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-        if abs(area) < 1e-12:
-            continue
-        left, right = max(int(np.ceil(min(ax, bx, cx))), 0), min(int(max(ax, bx, cx)), width - 1)
-        low, high = max(int(np.ceil(min(ay, by, cy))), 0), min(int(max(ay, by, cy)), height - 1)
-        for row in range(low, high + 1):
-            for column in range(left, right + 1):
-                u = ((bx - column) * (cy - row) - (by - row) * (cx - column)) / area
-                v = ((cx - column) * (ay - row) - (cy - row) * (ax - column)) / area
-                w = 1.0 - u - v
-                if u < 0.0 or v < 0.0 or w < 0.0:
-                    continue
-                # Straight lines in space stay straight in 1/z, not in z.
-                z = 1.0 / (u / depth[a] + v / depth[b] + w / depth[c])
-                if z < image[row, column]:
-                    image[row, column] = z
+_rasterise = Kernel(
+    "rasterise", "out image float64[height, width]", "pixels float64[corners, 2]",
+    "depth float64[corners]", "faces int64[faces, 3]")

@@ -10,9 +10,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from limber.core.files.reading import read_arrays
-from limber.core.numerics.compiled import compiled_exactly
 from limber.geometry.cloud.cloud import OwnFrame
 from limber.geometry.cloud.preparation import voxel_thinned
+from limber.kernels import Kernel
 
 # Evidence that a point is on a leaf: boosted trees on the shape of its surroundings.
 #
@@ -61,25 +61,17 @@ def _variances(points: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray
 
 def leaf_log_odds(features: np.ndarray) -> np.ndarray:
     """Logarithm of the odds that each point is on a leaf, shape [n], from its surroundings."""
-    trees = _trees()
-    return _voted(features, float(trees["start"]), *(trees[name] for name in (
-        "first", "depth", "feature", "threshold", "low", "high", "value")))
-
-
-@compiled_exactly
-def _voted(features: np.ndarray, start: float, first: np.ndarray, depth: np.ndarray,
-           feature: np.ndarray, threshold: np.ndarray, low: np.ndarray, high: np.ndarray,
-           value: np.ndarray) -> np.ndarray:
-    total = np.full(len(features), start)
-    for row in range(len(features)):
-        for tree in range(len(first)):
-            node = first[tree]
-            for _ in range(depth[tree]):
-                # An end of the tree leads to itself.
-                is_low = features[row, feature[node]] <= threshold[node]
-                node = first[tree] + (low[node] if is_low else high[node])
-            total[row] += value[node]
+    trees, total = _trees(), np.empty(len(features))
+    _voted.of(features, *(trees[name] for name in (
+        "first", "depth", "feature", "threshold", "low", "high", "value")), total,
+        float(trees["start"]))
     return total
+
+
+_voted = Kernel(
+    "trees_voted", "features float64[rows, columns]", "first int64[trees]", "depth int64[trees]",
+    "feature int64[nodes]", "threshold float64[nodes]", "low int64[nodes]", "high int64[nodes]",
+    "value float64[nodes]", "out total float64[rows]", "start float")
 
 
 def prior_log_odds() -> float:

@@ -17,7 +17,6 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 from scipy.special import i0e, i1e
 
-from limber.core.numerics.compiled import compiled_exactly
 from limber.core.progress import SILENT, Progress
 from limber.geometry.cloud.single_view import View
 from limber.geometry.skeleton.confidence import assessed, doubted
@@ -29,6 +28,7 @@ from limber.geometry.skeleton.radii.wood import Bends, Wood, turn_cost, turn_var
 from limber.geometry.skeleton.repair import PointSpacing, resampled, without_kinks
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.tree_likelihood import PointLikelihood, Scatter
+from limber.kernels import Kernel
 
 _SPACING = 1.5  # radii between nodes
 _PASSES, _STEPS, _LAST_STEPS = 6, 6, 10  # rounds of proposals; steps of a fit between and after
@@ -419,7 +419,14 @@ class _Twigs:
         return Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent), np.concatenate(radius))
 
 
-@compiled_exactly
+_RAISED = Kernel(
+    "likelihood_raised", "foot float64[cylinders, 3]", "end float64[cylinders, 3]",
+    "radius float64[cylinders]", "table_of int64[cylinders]",
+    "table float64[tables, facings, distances]", "first float64[2]", "points float64[points, 3]",
+    "sight float64[sighted, 3]", "wood float64[points]", "residual float64[points]",
+    "out rise float64[cylinders]", "power float", "skin float", "elsewhere float")
+
+
 def _raised(foot: np.ndarray, end: np.ndarray, radius: np.ndarray, table_of: np.ndarray,
             power: float, table: np.ndarray, first: np.ndarray, points: np.ndarray,
             sight: np.ndarray, wood: np.ndarray, residual: np.ndarray, skin: float,
@@ -427,46 +434,7 @@ def _raised(foot: np.ndarray, end: np.ndarray, radius: np.ndarray, table_of: np.
     """By how much each of t cylinders raises the logarithm of the likelihood of points [m, 3] with
     densities ``wood`` [m] on a ``skin``. ``table`` [tables, facings, distances] holds logarithms of
     that on theirs, at 0 and at distances whose logarithms are evenly spaced."""
-    rise = np.zeros(len(foot))
-    before = 1 / (wood / skin + elsewhere)
-    for k in range(len(foot)):
-        ax, ay, az = end[k, 0] - foot[k, 0], end[k, 1] - foot[k, 1], end[k, 2] - foot[k, 2]
-        square = ax * ax + ay * ay + az * az
-        inverse, after = 1 / square, 1 / (skin + radius[k]**power * np.sqrt(square))
-        # A logarithm takes longer than all else: one of the product of many ratios.
-        ratio = 1.0
-        for i in range(len(points)):
-            px, py, pz = (points[i, 0] - foot[k, 0], points[i, 1] - foot[k, 1],
-                          points[i, 2] - foot[k, 2])
-            t = min(max((px * ax + py * ay + pz * az) * inverse, 0.0), 1.0)
-            dx, dy, dz = px - t * ax, py - t * ay, pz - t * az
-            distance, reach = dx * dx + dy * dy + dz * dz, residual[i] + radius[k]
-            here = wood[i]
-            if reach > 0.0 and distance < reach * reach:
-                distance = np.sqrt(distance)
-                place = max((np.log(max(distance, 1e-300)) - first[0]) / (first[1] - first[0]) + 1,
-                            0.0)
-                low = min(int(place), table.shape[2] - 2)
-                part = min(place - low, 1.0)
-                row, beside = 0, 0.0
-                if len(sight) > 0:
-                    x, y, z = sight[i, 0], sight[i, 1], sight[i, 2]
-                    on = (x * ax + y * ay + z * az) / square
-                    x, y, z = x - on * ax, y - on * ay, z - on * az
-                    open_ = max(np.sqrt(x * x + y * y + z * z), 0.2)
-                    cosine = (x * dx + y * dy + z * dz) / (open_ * max(distance, 1e-300))
-                    at = (min(max(cosine, -1.0), 1.0) + 1) / 2 * (table.shape[1] - 1)
-                    row = min(int(at), table.shape[1] - 2)
-                    beside = at - row
-                log = (1 - part) * table[table_of[k], row, low] + part * table[
-                    table_of[k], row, low + 1]
-                if beside > 0.0:
-                    log += beside * ((1 - part) * table[table_of[k], row + 1, low] + part * table[
-                        table_of[k], row + 1, low + 1] - log)
-                here = np.exp(log)
-            ratio *= (here * after + elsewhere) * before[i]
-            if not 1e-150 < ratio < 1e150:
-                rise[k] += np.log(ratio)
-                ratio = 1.0
-        rise[k] += np.log(ratio)
+    rise = np.empty(len(foot))
+    _RAISED.of(foot, end, radius, table_of, table, first[:2], points, sight.reshape(-1, 3), wood,
+               residual, rise, power, skin, elsewhere)
     return rise

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from limber.core.errors import Command, InputError, MeshingError
 from limber.core.files.reading import check_ply
 from limber.core.json_values import stored_lengths
-from limber.core.numerics.compiled import compiled_exactly
+from limber.kernels import Kernel
 
 
 @dataclass(frozen=True)
@@ -216,99 +216,41 @@ def position_text(point: np.ndarray) -> str:
 
 # Crossings of a surface's faces: a grid of cells, and Moeller and Trumbore's test within them.
 
-_EDGE = 1e-7  # touching is not crossing: faces of a union meet at rounding distance
+_by_cell = Kernel(
+    "cells_of_faces", "first int64[faces, 3]", "last int64[faces, 3]", "counts int64[3]",
+    "out keys int64[entries]", "out owner int64[entries]", returns="int")
+_pierced = Kernel(
+    "faces_pierced", "vertices float64[vertices, 3]", "faces int64[faces, 3]",
+    "low float64[faces, 3]", "high float64[faces, 3]", "first int64[faces, 3]", "counts int64[3]",
+    "keys int64[entries]", "owner int64[entries]", "out points float64[room, 3]", returns="int")
+_distances = Kernel(
+    "surface_distances", "points float64[points, 3]", "bound float64[points]",
+    "corner float64[faces, 3, 3]", "origin float64[3]", "counts int64[3]", "keys int64[entries]",
+    "owner int64[entries]", "out found float64[points]", "cell float")
 
 
-@compiled_exactly
 def by_cell(first: np.ndarray, last: np.ndarray, counts: np.ndarray,
             ) -> tuple[np.ndarray, np.ndarray]:
     """Numbers [k] of the grid cells that the faces' boxes, from cell ``first`` to ``last`` [n, 3],
     overlap, and the face in each [k]. ``counts`` [3] is the number of cells in each direction."""
-    total = 0
-    for f in range(len(first)):
-        total += ((last[f, 0] - first[f, 0] + 1) * (last[f, 1] - first[f, 1] + 1)
-                  * (last[f, 2] - first[f, 2] + 1))
-    keys, owner = np.empty(total, np.int64), np.empty(total, np.int64)
-    at = 0
-    for f in range(len(first)):
-        for i in range(first[f, 0], last[f, 0] + 1):
-            for j in range(first[f, 1], last[f, 1] + 1):
-                for k in range(first[f, 2], last[f, 2] + 1):
-                    keys[at] = (i * counts[1] + j) * counts[2] + k
-                    owner[at] = f
-                    at += 1
+    none = np.empty(0, np.int64)
+    total = _by_cell.of(first, last, counts, none, none)
+    keys, owner = np.empty((2, total), np.int64)
+    _by_cell.of(first, last, counts, keys, owner)
     return keys, owner
 
 
-@compiled_exactly
 def pierced(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.ndarray,
             first: np.ndarray, counts: np.ndarray, keys: np.ndarray, owner: np.ndarray,
             ) -> np.ndarray:
     """Points [m] where an edge of one face passes through another one, shape [c, 3]; see
     :func:`crossings`. Faces have boxes ``low`` to ``high`` [n, 3] [m] from the cell ``first``;
     ``keys`` [k] ascend, numbered by :func:`by_cell`, with the face ``owner`` in each."""
-    found = [(0.0, 0.0, 0.0) for _ in range(0)]
-    begin = 0
-    while begin < len(keys):
-        end = begin + 1
-        while end < len(keys) and keys[end] == keys[begin]:
-            end += 1
-        for i in range(begin, end):
-            for j in range(i + 1, end):
-                one, other = owner[i], owner[j]
-                near = True
-                for k in range(3):
-                    near &= low[one, k] <= high[other, k] and low[other, k] <= high[one, k]
-                # Of all cells that contain both, only the lowest compares them.
-                if near and keys[begin] == (
-                        (max(first[one, 0], first[other, 0]) * counts[1]
-                         + max(first[one, 1], first[other, 1])) * counts[2]
-                        + max(first[one, 2], first[other, 2])):
-                    _compare(vertices, faces, one, other, found)
-                    _compare(vertices, faces, other, one, found)
-        begin = end
-    points = np.empty((len(found), 3))
-    for k in range(len(found)):
-        points[k, 0], points[k, 1], points[k, 2] = found[k]
+    points = np.empty((0, 3))
+    while (count := _pierced.of(vertices, faces, low, high, first, counts, keys, owner,
+                                points)) > len(points):
+        points = np.empty((count, 3))
     return points
-
-
-@compiled_exactly
-def _compare(vertices: np.ndarray, faces: np.ndarray, one: int, other: int, found: list) -> None:
-    """Add the points where edges of ``one`` pass through ``other`` (Moeller and Trumbore 1997)."""
-    o, p, q = faces[other, 0], faces[other, 1], faces[other, 2]
-    common, number = 0, 0  # shared corners of ``one`` and ``other``, a bit each
-    for i in range(3):
-        corner = faces[one, i]
-        if corner == o or corner == p or corner == q:
-            common |= 1 << i
-            number += 1
-    if number > 1:
-        return
-    ox, oy, oz = vertices[o, 0], vertices[o, 1], vertices[o, 2]
-    sx, sy, sz = vertices[p, 0] - ox, vertices[p, 1] - oy, vertices[p, 2] - oz
-    ex, ey, ez = vertices[q, 0] - ox, vertices[q, 1] - oy, vertices[q, 2] - oz
-    for i in range(3):
-        after = (i + 1) % 3
-        if common & (1 << i | 1 << after):
-            continue
-        a, b = faces[one, i], faces[one, after]
-        ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
-        bx, by, bz = vertices[b, 0], vertices[b, 1], vertices[b, 2]
-        dx, dy, dz = bx - ax, by - ay, bz - az
-        cx, cy, cz = dy * ez - dz * ey, dz * ex - dx * ez, dx * ey - dy * ex
-        det = sx * cx + sy * cy + sz * cz
-        size = np.sqrt((sx * sx + sy * sy + sz * sz) * (dx * dx + dy * dy + dz * dz)
-                       * (ex * ex + ey * ey + ez * ez))
-        if abs(det) <= 1e-9 * size:
-            continue
-        fx, fy, fz = ax - ox, ay - oy, az - oz
-        u = (fx * cx + fy * cy + fz * cz) / det
-        tx, ty, tz = fy * sz - fz * sy, fz * sx - fx * sz, fx * sy - fy * sx
-        v = (dx * tx + dy * ty + dz * tz) / det
-        t = (ex * tx + ey * ty + ez * tz) / det
-        if u > _EDGE and v > _EDGE and u + v < 1 - _EDGE and _EDGE < t < 1 - _EDGE:
-            found.append((ax + t * dx, ay + t * dy, az + t * dz))
 
 
 # Distance of points from a triangle surface: exact, by a grid of cells.
@@ -319,65 +261,7 @@ def distance_to_surface(points: np.ndarray, surface: Surface) -> np.ndarray:
     low, _, cell, _, counts, keys, owner = _cells(surface)
     # No farther than the nearest vertex, so that few cells are searched.
     bound, _ = cKDTree(surface.vertices).query(points)
-    return _distances(np.ascontiguousarray(points, np.float64), bound,
-                      np.ascontiguousarray(surface.vertices[surface.faces]), low.min(axis=0), cell,
-                      counts, keys, owner)
-
-
-@compiled_exactly
-def _distances(points: np.ndarray, bound: np.ndarray, corner: np.ndarray, origin: np.ndarray,
-               cell: float, counts: np.ndarray, keys: np.ndarray, owner: np.ndarray) -> np.ndarray:
     found = np.empty(len(points))
-    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
-    for p in range(len(points)):
-        best = bound[p] * bound[p]
-        for k in range(3):
-            low[k] = max(int(np.floor((points[p, k] - bound[p] - origin[k]) / cell)), 0)
-            high[k] = min(int(np.floor((points[p, k] + bound[p] - origin[k]) / cell)),
-                          counts[k] - 1)
-        for i in range(low[0], high[0] + 1):
-            for j in range(low[1], high[1] + 1):
-                row = (i * counts[1] + j) * counts[2]
-                at = np.searchsorted(keys, row + low[2])
-                while at < len(keys) and keys[at] <= row + high[2]:
-                    best = min(best, _square(points[p], corner[owner[at]]))
-                    at += 1
-        found[p] = np.sqrt(best)
+    _distances.of(points, bound, surface.vertices[surface.faces], low.min(axis=0), counts, keys,
+                  owner, found, cell)
     return found
-
-
-@compiled_exactly
-def _square(p: np.ndarray, corner: np.ndarray) -> float:
-    """Square of the distance of a point from a triangle (Ericson, Real-Time Collision Detection,
-    5.1.5)."""
-    bx, by, bz = (corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1],
-                  corner[1, 2] - corner[0, 2])
-    cx, cy, cz = (corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1],
-                  corner[2, 2] - corner[0, 2])
-    px, py, pz = p[0] - corner[0, 0], p[1] - corner[0, 1], p[2] - corner[0, 2]
-    d1, d2 = bx * px + by * py + bz * pz, cx * px + cy * py + cz * pz
-    bb, cc = bx * bx + by * by + bz * bz, cx * cx + cy * cy + cz * cz
-    bc = bx * cx + by * cy + bz * cz
-    # The same products with the point seen from the other two corners.
-    d3, d4, d5, d6 = d1 - bb, d2 - bc, d1 - bc, d2 - cc
-    v, w = 0.0, 0.0
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    if d1 <= 0 and d2 <= 0:
-        v, w = 0.0, 0.0
-    elif d3 >= 0 and d4 <= d3:
-        v, w = 1.0, 0.0
-    elif d6 >= 0 and d5 <= d6:
-        v, w = 0.0, 1.0
-    elif vc <= 0 and d1 >= 0 and d3 <= 0:
-        v, w = (d1 / (d1 - d3) if d1 > d3 else 0.0), 0.0
-    elif vb <= 0 and d2 >= 0 and d6 <= 0:
-        v, w = 0.0, (d2 / (d2 - d6) if d2 > d6 else 0.0)
-    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
-        total = (d4 - d3) + (d5 - d6)
-        w = (d4 - d3) / total if total > 0 else 0.0
-        v = 1.0 - w
-    else:
-        total = va + vb + vc
-        v, w = (vb / total, vc / total) if total > 0 else (0.0, 0.0)
-    x, y, z = px - v * bx - w * cx, py - v * by - w * cy, pz - v * bz - w * cz
-    return x * x + y * y + z * z
