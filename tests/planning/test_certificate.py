@@ -368,6 +368,7 @@ def test_no_point_of_a_targets_goal_costs_more_than_the_slack(well_field):
     for _ in range(3):
         rates = lower_bound._terrain(problem, lower_bound._field_on_grid(problem, grid, cell), grid)
         goal_cells = about_goal(problem, grid, rates)
+        costs = subsolution(rates, goal_cells.known, goal_cells.cost, goal_cells.inside)
         spot = (points - grid.origin) @ grid.axes.T / grid.edges
         number = np.floor(spot).astype(int)
         is_open = rates.open_cells[tuple(number.T)]
@@ -378,9 +379,9 @@ def test_no_point_of_a_targets_goal_costs_more_than_the_slack(well_field):
         for offset in np.ndindex(3, 3, 3):
             where = tuple((number + offset - 1).T)
             assert goal_cells.known[where].all()
-            value += goal_cells.cost[where] * np.prod([
+            value += costs[where] * np.prod([
                 weights[step, :, axis] for axis, step in enumerate(offset)], axis=0)
-        assert value.max() <= goal_cells.slack
+        assert value.max() <= goal_cells.slack(costs)
         grid, cell = refined(grid, rates.open_cells, goal_cells.near, cell, 0.6)
 
 

@@ -65,7 +65,7 @@ _LIGHT = 1e-2  # fraction of the given weight of a metre: energy alone counts, n
 _HEAVY = 1e3  # the same: length alone counts
 _SHORTER = (0.99, 0.97)  # fractions of the allowed length, for the slope of energy over length
 _BINDS = 0.998  # fraction of the allowed length above which the length binds
-_ENOUGH = 0.03  # gap of the energy below which a finer grid is not worth its time
+_ENOUGH = 0.02  # gap of the energy below which a finer grid is not worth its time
 _UNUSED = 0.004  # fraction of the energy that the weight of an unused length may cost the bound
 _FINEST_GAP = 1e-3  # gap of the weighted cost that is asked for
 _LADDER = (1.0, 1.0 / 3.0, 3.0)
@@ -111,14 +111,16 @@ class DetourPath:
 
 
 def plan_detour(problem: GentleProblem, shortest: np.ndarray, longest: float,
-                others: list[np.ndarray], *, progress: Progress = SILENT) -> DetourPath:
+                others: list[np.ndarray], *, has_curve: bool = True, progress: Progress = SILENT,
+                ) -> DetourPath:
     """Return the gentlest path of at most ``longest`` [m]; ``shortest`` [n, 3] is one such path.
-    NoPathError if there is no path at all; states whether that is proven."""
+    ``has_curve``: bound the whole trade-off too. NoPathError if there is no path at all; states
+    whether that is proven."""
     least = float(arc_lengths(shortest)[-1])
     search = _Search(problem, shortest, longest)
     progress(0.0, "refining paths of the allowed length")
     search.begin(others)
-    weights = search.first_weights()
+    weights = search.first_weights()[:None if has_curve else 1]
     for number in range(_MOST_BOUNDS):
         part = progress.part(0.2 + 0.8 * number / _MOST_BOUNDS, 0.2 + 0.8 * (number + 1)
                              / _MOST_BOUNDS)
@@ -518,7 +520,8 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], tree: np.ndarray | 
     if tree is not None:  # as long as it is reported
         length = max(length, float(arc_lengths(resample(tree, STEP))[-1]))
     most = (1.0 + present(settings.max_detour, "largest detour") / 100.0) * length
-    return plan_detour(problem, shortest, most, rough, progress=progress.part(0.3, 1.0))
+    return plan_detour(problem, shortest, most, rough, has_curve=tree is None,
+                       progress=progress.part(0.3, 1.0))
 
 
 def _trees(problem: GentleProblem, goals: np.ndarray, settings: PlanSettings,

@@ -12,7 +12,7 @@ proves that no path exists.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import NamedTuple
 
@@ -26,6 +26,7 @@ from limber.planning.certificate.subsolution import (
     CURVATURE_FACTOR,
     RIM,
     Terrain,
+    around_box,
     corner_values,
     corners_of,
     least_between,
@@ -185,25 +186,34 @@ _FLAT = 0.5  # least fraction of that growth that its mean counts as
 @dataclass(frozen=True)
 class AboutGoal:
     """A signed cost to the goal, negative inside, where ``known``: each point of the goal is in a
-    cell with all coefficients there, and the cost's spline is at most ``slack``. ``meets``: an open
-    cell may have a point of the goal. ``near``: the next grid's queried cells."""
+    cell with all coefficients there, ``inside`` or at the ``border``. ``meets``: an open cell may
+    have a point of the goal. ``near``: the next grid's queried cells."""
 
     known: np.ndarray
     cost: np.ndarray
     inside: np.ndarray
-    slack: float
+    border: np.ndarray
     meets: bool
     near: np.ndarray
 
+    def slack(self, costs: np.ndarray) -> float:
+        """Return the largest value in the goal of a spline with ``costs`` as coefficients: it
+        differs from a function that they sample by ``h^2 / 8 sum_i max |second derivative|``."""
+        if not self.border.any():
+            return 0.0
+        box = around_box(self.border)
+        curved = sum(scipy.ndimage.maximum_filter(second, 3) for second in second_differences(
+            np.where(self.known[box] & (costs[box] < np.inf), costs[box], np.nan)))
+        return CURVATURE_FACTOR / 8.0 * float(curved[self.border[box]].max())
+
 
 def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal:
-    """Return the goal data. A spline with a function's values as coefficients differs from it by
-    ``h^2 / 8 sum_i max |second derivative|``."""
+    """Return the goal data."""
     edges, shape = ground.edges, ground.open_cells.shape
     cells = np.argwhere(ground.active & grid.about_goal)
     nothing = np.zeros(shape, bool)
     if len(cells) == 0:
-        return AboutGoal(nothing, np.zeros(shape), nothing, 0.0, False, nothing)
+        return AboutGoal(nothing, np.zeros(shape), nothing, nothing, False, nothing)
     goal = problem.bounded_goal
     away = (goal.distance(problem.energy_field, grid.points(cells + 0.5))
             - goal.tolerance)
@@ -218,13 +228,9 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     rate = np.where(ground.level[box], ground.floor,
                     corner_values(ground.rate[corners]).mean(axis=0))
     cost = _cost_left(distance / slope, goal.tolerance / slope, rate, edges)
-    curved = CURVATURE_FACTOR / 8.0 * sum(
-        scipy.ndimage.maximum_filter(second, 3) for second in second_differences(cost))
     half = 0.5 * float(np.linalg.norm(edges))
     touching = open_cells & (filled <= growth * half)
     inside = filled < -growth * half
-    border = touching & ~inside
-    slack = float(curved[border].max()) if border.any() else 0.0
 
     def whole(part: np.ndarray) -> np.ndarray:
         out = np.zeros(shape, part.dtype)
@@ -237,7 +243,7 @@ def about_goal(problem: GentleProblem, grid: Grid, ground: Terrain) -> AboutGoal
     # A cell of the next grid queries up to 4 of its edges away, 7 times half its diagonal; its
     # centre is within ``half`` of this one's.
     return AboutGoal(whole(known), whole(np.nan_to_num(cost)),
-                     whole(inside), slack, bool(touching.any()),
+                     whole(inside), whole(touching & ~inside), bool(touching.any()),
                      whole(filled <= growth * 8.0 * half))
 
 
@@ -553,8 +559,8 @@ def _bound(problem: GentleProblem, on_grid: _FieldOnGrid, grid: Grid, cell: np.n
     if problem.longest < np.inf:
         rates = rates._replace(
             open_cells=short_enough(problem, grid, rates.open_cells, goal.near, cell))
-    to_goal, factor = subsolution(rates, goal.known, goal.cost, goal.inside)
-    slack = factor * goal.slack
+    to_goal = subsolution(rates, goal.known, goal.cost, goal.inside)
+    slack = replace(goal, border=goal.border & rates.open_cells).slack(to_goal)
     lower = spline_value(to_goal, cell) - slack
     return _Bounds(max(lower, 0.0), rates, to_goal, cell, slack, descent(grid, to_goal, cell),
                    goal.near)
@@ -568,9 +574,8 @@ def _from_start(rates: Terrain, cell: np.ndarray) -> np.ndarray:
     away = np.sqrt(sum(offset**2 for offset in offsets))
     rounded = np.sqrt(away**2 + 4.0 * h**2) - 2.0 * h  # a cone with a rounded tip, without a kink
     nothing = np.zeros(rates.open_cells.shape, bool)
-    u, factor = subsolution(rates, away <= 3.0 * h, rounded, nothing, rounds=2)
-    # At the start, the spline exceeds the zero of its blunt tip by at most its error there.
-    return u - factor * CURVATURE_FACTOR * float((rates.edges**2).sum()) / (16.0 * h)
+    u = subsolution(rates, away <= 3.0 * h, rounded, nothing, rounds=2)
+    return u - spline_value(u, cell)
 
 
 def _surely_outside(problem: GentleProblem, grid: Grid) -> np.ndarray:

@@ -31,6 +31,7 @@ zero), the cost of length counts.
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from limber.core.numerics.compiled import compiled
 
@@ -339,7 +340,7 @@ def _off_zero(corners):
 RIM = 2  # closed cells around the open ones that have coefficients as well
 _ROUNDS, _CLOSE = 8, 1.0005  # local reweighting; ends when nothing exceeds by more than _CLOSE
 _IDLE, _WORTH = 2, 1.004  # rounds without gain that end it; the factor that counts as a gain
-_LARGE = 100_000  # a single round for so many cells: it takes a third of a second
+_EVEN = 7  # cells over which the factors on a known cost change from one to another
 
 
 class Terrain(NamedTuple):
@@ -463,26 +464,32 @@ def with_corner(nodes: np.ndarray) -> np.ndarray:
 
 
 def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells: np.ndarray,
-                rounds: int = _ROUNDS) -> tuple[np.ndarray, float]:
-    """Return coefficients of a ``u`` with |grad u| <= c in every open cell but ``free_cells``, and
-    a factor: ``factor * shape`` on ``known``, with ``shape`` a signed distance [m]; infinite where
+                rounds: int = _ROUNDS) -> np.ndarray:
+    """Return coefficients of a ``u`` with |grad u| <= c in every open cell but ``free_cells``; on
+    ``known`` nearly ``shape``, a signed cost, less where that is too steep; infinite where
     unreachable. Fewer local reweightings give a lower ``u``, never an invalid one."""
     active = rates.active
     around = known & active
     u = np.full(active.shape, np.inf)
     if not around.any():
-        return u, 0.0
+        return u
     numbers, indices, near = neighbours(active)
     bound = _middles(rates.rate, indices, active.shape)
     u[around] = shape[around]
-    steep = float(_excess(u, *rates, np.argwhere(around & rates.open_cells)).max(initial=0.0))
     asked = np.argwhere(rates.open_cells & ~free_cells)
     own = numbers[tuple(asked.T)]
     held, about = around.ravel()[indices], widened(around).ravel()[indices]
-    lengths = shape.ravel()[indices]
-    factor = 1.0 / steep if steep > 0.0 else float(bound[held].min())
-    rate, beside = bound, held
-    least, best, of_best, idle = np.inf, bound, factor, 0
+    beside = asked[around[tuple(asked.T)]]
+    # Where the cost is too steep it counts less there alone: one factor for all would be the least.
+    steep = np.ones(active.shape)
+    steep[tuple(beside.T)] = np.maximum(_excess(u, *rates, beside), 1.0)
+    within = around_box(around)
+    u[within] /= scipy.ndimage.uniform_filter(
+        scipy.ndimage.maximum_filter(steep[within], _EVEN), _EVEN)
+    lengths, most = u.ravel()[indices], float(_excess(u, *rates, beside).max(initial=0.0))
+    factor = 1.0 / most if most > 0.0 else float(bound[held].min())
+    rate, steepest = bound, held
+    least, best, idle = np.inf, bound, 0
     for _ in range(rounds):
         values = march(rate, near, held, factor * lengths, rates.edges)
         u.ravel()[indices] = values
@@ -491,17 +498,22 @@ def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells
         worst = float(over.max())
         idle = 0 if worst < least / _WORTH else idle + 1
         if worst < least:
-            least, best, of_best = worst, values, factor
-        if worst <= _CLOSE or idle == (_IDLE if len(asked) < _LARGE else 1):
+            least, best = worst, values
+        if worst <= _CLOSE or idle == _IDLE:
             break
-        factor /= float(over[beside].max())
-        beside = about
-        over[held] = 1.0
+        factor /= float(over[steepest].max())
+        steepest = about
         # The largest of the neighbours: cell by cell would cause a chequerboard pattern.
         rate = rate / _most_about(over, numbers, indices)
     # The rescaling makes it a proof; the rounds before only keep it small.
     u.ravel()[indices] = best / least
-    return u, of_best / least
+    return u
+
+
+def around_box(cells: np.ndarray) -> tuple[slice, ...]:
+    """Return the smallest box with ``cells`` and a layer around them, as far as there is one."""
+    numbers = np.argwhere(cells)
+    return tuple(map(slice, np.maximum(numbers.min(axis=0) - 1, 0), numbers.max(axis=0) + 2))
 
 
 @compiled
