@@ -169,8 +169,8 @@ class LimitsEntry(_Entry):
     hard_force_n: float = Field(20.0, gt=0, description="Motion stops.")
     hard_torque_nm: float = Field(3.0, gt=0)
     unexpected_force_n: float = Field(
-        3.0, gt=0, description="By how much the force may rise during a return [N]. Differences "
-        "from a predicted force are judged by their likelihood.")
+        3.0, gt=0, description="Most that a force differs from the predicted one [N], beside that "
+        "one's error; the likelihood stops earlier. And by how much it may rise in a return.")
     singularity: float = Field(0.05, gt=0, le=0.5)
     joint_margin_rad: float = Field(0.05, ge=0, le=1)
     contact_n_per_m: float = Field(
