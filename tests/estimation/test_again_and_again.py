@@ -15,8 +15,6 @@ from limber.stages.shape.reconstruct import Reconstruct
 
 QUICK = FitSpec(key_frames=4, mesh_check=False, shapes=0, hold_out=False, fractions=(0.3, 0.7))
 LENGTH = 0.4
-COARSE = 6.0
-"""Distance between cross-sections over the radius: what is shown needs no fine mesh."""
 
 
 @pytest.mark.slow
@@ -29,7 +27,7 @@ def test_ten_estimates_in_a_row(tmp_path, monkeypatch, seed=11):
     folder, scan, edits = (tmp_path / name for name in ("lab.branch", "scan", "edits.json"))
     Generate(folder=scan, length=LENGTH, fork_count=1, point_spacing=0.005, seed=seed).run()
     made = {"cloud": scan / "cloud.ply", "output": folder, "root": "auto",
-            "mesh_spacing": COARSE}
+            "mesh_spacing": 6.0}
     Reconstruct(**made).run()
 
     def pulled(name, reach=0.35):

@@ -153,8 +153,7 @@ class Cantilever:
         if len(nodes) < 4 or not sizes.all():
             return None
         along = steps / sizes[:, None]
-        radius = skeleton.radius[path]
-        second = np.pi / 4 * ((radius[1:] + radius[:-1]) / 2)**4
+        second = np.pi / 4 * np.convolve(skeleton.radius[path], [0.5, 0.5], "valid")**4
         # Twist: 1 / (G J) with J = 2 I and Poisson's ratio 0.35.
         sides = np.eye(3) + 0.35 * np.einsum("ni,nj->nij", along, along)
         return cls(grasp, (nodes[1:] + nodes[:-1]) / 2, sides * (sizes / second)[:, None, None])
@@ -167,6 +166,8 @@ class Cantilever:
         moments = np.cross(levers[None], ((positions - self.grasp) @ stiff.T)[:, None])
         turns = np.cumsum(np.einsum("nij,tnj->tni", self.flexibility, moments), axis=1)
         steps = np.cross(turns[:, :-1], np.diff(self.middles, axis=0)[None])
+        # A bent branch ends nearer to its base.
+        steps = steps + 0.5 * np.cross(turns[:, :-1], steps)
         return turns, np.cumsum(np.pad(steps, ((0, 0), (1, 0), (0, 0))), axis=1)
 
     def responses(self, levers: np.ndarray, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
