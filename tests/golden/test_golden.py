@@ -27,7 +27,7 @@ def differences(kept, found, tolerance: float, scale: float = 0.0, place: str = 
         return [line for number, (one, other) in enumerate(zip(kept, found, strict=True))
                 for line in differences(one, other, tolerance, scale, f"{place}/{number}")]
     if isinstance(kept, float | int) and isinstance(found, float | int):
-        scale = 100.0 if place.endswith("percent") else scale
+        scale = 100.0 if "percent" in place.rpartition("/")[2] else scale
         same = math.isclose(kept, found, rel_tol=tolerance, abs_tol=tolerance * scale + 1e-12)
     elif isinstance(kept, str) and isinstance(found, str):
         words = [" ".join(NUMBER.sub("#", text).split()) for text in (kept, found)]

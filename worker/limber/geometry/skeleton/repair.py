@@ -15,9 +15,11 @@ from limber.geometry.skeleton.radii.axis_fit import AxisFit, fit_axes
 from limber.geometry.skeleton.radii.sampling_evidence import fit_of_rays
 from limber.geometry.skeleton.radii.stations import registered
 from limber.geometry.skeleton.run_ends import (
+    ends_within,
     limited,
     steadied,
     with_full_tips,
+    without_bare_ends,
 )
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import arc_lengths, resample
@@ -433,6 +435,9 @@ PASSES = (
     Pass("settle", _settle, until=0.9),
     # The stations of a merged scan are a little apart, so that all radii are off together.
     Pass("register stations", _register_stations, until=1.0),
+    # A fit moves an end along its axis beyond the points; nodes without points go first.
+    Pass("draw ends back", lambda now: now.of(
+        ends_within(without_bare_ends(now.skeleton, now.points), now.points))),
     LIMIT,
     # A radius that few points, the spacing or the noise determine, or that no wood has, is treated
     # as measured.

@@ -13,6 +13,46 @@ from limber.geometry.skeleton.sweep import arc_lengths
 _REACHED = 0.98  # quantile of the points along an end at which it ends
 
 
+def without_bare_ends(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
+    """Drop end nodes that no point belongs to: the contraction can overshoot an end."""
+    count = point_counts(skeleton, points)
+    keep = np.ones(skeleton.node_count, bool)
+    for members in skeleton.runs():
+        if (skeleton.parent == members[-1]).any():
+            continue
+        own = list(members[1:])
+        while len(own) > 2 and count[own[-1]] == 0:
+            keep[own.pop()] = False
+    # The root end: a bare first segment belongs to its upper node.
+    children = skeleton.child_counts()
+    root, parent = 0, skeleton.parent.copy()
+    while children[root] == 1:
+        following = int(np.flatnonzero(parent == root)[0])
+        if count[following] > 0 or children[following] != 1:
+            break
+        keep[root], parent[following], root = False, -1, following
+    return skeleton.subset(keep, parent)
+
+
+def ends_within(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
+    """Shorten ends that slid along their axis beyond the points during a fit."""
+    nodes = skeleton.nodes.copy()
+    segment, _ = nearest_cylinders(skeleton, points)
+    inner = np.flatnonzero(skeleton.parent == 0)
+    ends = [(int(tip), int(skeleton.parent[tip])) for tip in skeleton.tips()]
+    for end, before in [*ends, *([(0, int(inner[0]))] if len(inner) == 1 else [])]:
+        step = nodes[end] - skeleton.nodes[before]
+        length = float(np.linalg.norm(step))
+        mine = points[np.isin(segment, [end, before] if end else [
+            before, *np.flatnonzero(skeleton.parent == before)])]
+        if length == 0 or len(mine) < 3:
+            continue
+        reach = float(np.quantile((mine - skeleton.nodes[before]) @ step / length, _REACHED))
+        if length > reach + 0.5 * skeleton.radius[end]:
+            nodes[end] = skeleton.nodes[before] + step * max(reach / length, 0.1)
+    return skeleton.moved(nodes)
+
+
 def with_full_tips(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
     """Lengthen ends that the contraction shortened, as far as there are points [m, 3] [m], whose
     standard deviation is ``noise`` [m]."""
