@@ -1,8 +1,8 @@
 """RRT* (Karaman and Frazzoli 2011) over grasp positions, by the requested planner.
 
 ``ompl`` is the Open Motion Planning Library's, kept as the widely known reference; ``own`` replaces
-it where OMPL has no wheel. Paths end with shortcuts that lower the cost, OMPL's other simplifiers
-ignore it, and with the refinement that every path has (:func:`~.refine.refine`).
+it where OMPL has no wheel. Paths end with shortcuts that lower the cost; OMPL's other simplifiers
+ignore it.
 """
 
 import math
@@ -14,7 +14,7 @@ from limber.core.errors import MissingDependencyError, NoPathError, Option
 from limber.core.optional import how_to_install
 from limber.core.progress import SILENT, Progress
 from limber.planning.cost import edge_cost, path_cost
-from limber.planning.planners.refine import refine, shortcut
+from limber.planning.planners.refine import polish, shortcut, slide_end
 from limber.planning.planners.rrt_star import (
     PathProblem,
     Search,
@@ -210,13 +210,16 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
     tree_cost = float(path_cost(raw, problem.limits, problem.weights))
     points = shortcut(raw, problem.limits, problem.weights, attempts=search.shortcuts,
                       seed=search.seed)
-    points = refine(points, problem)[0]
+    points = slide_end(points, problem.goals, problem.limits, problem.weights)
+    points = polish(points, problem.energy_field, problem.limits, problem.weights)
     return FoundPath(points, float(path_cost(points, problem.limits, problem.weights)), tree_cost,
                      found.history, engine, raw, found.tree)
 
 
 def found_again(found: FoundPath, problem: PathProblem) -> FoundPath | None:
     """Return a found path on a field with more samples; None if it is not allowed there."""
-    points = refine(found.points, problem)[0]
+    points = found.points
+    if problem.weights.energy > 0.0:
+        points = polish(points, problem.energy_field, problem.limits, problem.weights)
     cost = float(path_cost(points, problem.limits, problem.weights))
     return replace(found, points=points, cost=cost) if np.isfinite(cost) else None
