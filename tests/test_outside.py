@@ -144,9 +144,9 @@ def test_its_stage_is_in_the_add_on(package, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, addon.__name__, addon)
     (tmp_path / "stages.json").write_text(json.dumps(registry.all_schemas()))
     monkeypatch.setenv("LIMBER_STAGES", str(tmp_path / "stages.json"))
-    steps = importlib.import_module("addon_without_bpy.steps")
+    steps = importlib.import_module("addon_without_bpy.jobs.steps")
     for name in ("stages", "steps"):
-        monkeypatch.delitem(sys.modules, f"addon_without_bpy.{name}")
+        monkeypatch.delitem(sys.modules, f"addon_without_bpy.jobs.{name}")
     skeleton = next(step for step in steps.STEPS if step.name == "skeleton")
     assert [view.stage for view in skeleton.others] == ["skeleton", "count"]
     count = steps.stages()["count"]

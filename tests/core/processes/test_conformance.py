@@ -118,10 +118,10 @@ class InAddon:
         package = types.ModuleType("limber_addon_without_bpy")
         package.__path__ = [str(ROOT / "addon")]
         monkeypatch.setitem(sys.modules, package.__name__, package)
-        self.jobs = importlib.import_module(f"{package.__name__}.jobs")
+        self.jobs = importlib.import_module(f"{package.__name__}.jobs.jobs")
         monkeypatch.setattr(self.jobs, "_GRACE_SECONDS", 0.3)
         # The worker's own Python finds itself; that of the tests finds this tree.
-        started = importlib.import_module(f"{package.__name__}.worker_process")
+        started = importlib.import_module(f"{package.__name__}.jobs.worker_process")
         monkeypatch.setattr(started, "worker_environment", lambda: dict(os.environ))
 
     def run(self, behaviour: str, cancel_at: str = "", limits: Limits | None = None,
