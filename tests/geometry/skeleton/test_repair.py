@@ -110,6 +110,9 @@ def _of_pass(name: str) -> tuple[Repaired, Mended]:
                                 lambda now: bool((now.skeleton.radius == 0.05).all())),
         "fit finely": lambda: (_before(_aside()), _centred),
         "settle": lambda: (_before(_aside(), duplicates=1), _centred),
+        "draw ends back": lambda: (_before(_branch(np.vstack([
+            [0, 0, -0.012], ALONG[1:-1], [0, 0, 0.412]])), _shell(0.05, 0.4)),
+            _ends(0.05, 0.4, 0.006)),
         "register stations": lambda: (_apart(), lambda now: abs(float(
             np.median(now.skeleton.radius)) - stations.RADIUS) < min(1.6e-4, 2 * now.common)),
         "find the likeliest axes and radii": lambda: (_before(blank, gap), _thick),
