@@ -201,7 +201,8 @@ class AboutGoal:
         differs from a function that they sample by ``h^2 / 8 sum_i max |second derivative|``."""
         if not self.border.any():
             return 0.0
-        box = around_box(self.border)
+        # A cell's neighbours count, and their second differences reach one cell farther.
+        box = around_box(self.border, 2)
         curved = sum(scipy.ndimage.maximum_filter(second, 3) for second in second_differences(
             np.where(self.known[box] & (costs[box] < np.inf), costs[box], np.nan)))
         return CURVATURE_FACTOR / 8.0 * float(curved[self.border[box]].max())

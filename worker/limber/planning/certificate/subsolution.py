@@ -510,10 +510,11 @@ def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells
     return u
 
 
-def around_box(cells: np.ndarray) -> tuple[slice, ...]:
-    """Return the smallest box with ``cells`` and a layer around them, as far as there is one."""
+def around_box(cells: np.ndarray, layers: int = 1) -> tuple[slice, ...]:
+    """Return the smallest box with ``cells`` and ``layers`` around them, as far as there are."""
     numbers = np.argwhere(cells)
-    return tuple(map(slice, np.maximum(numbers.min(axis=0) - 1, 0), numbers.max(axis=0) + 2))
+    return tuple(map(slice, np.maximum(numbers.min(axis=0) - layers, 0),
+                     numbers.max(axis=0) + layers + 1))
 
 
 @compiled
