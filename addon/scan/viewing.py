@@ -54,7 +54,7 @@ def _frame(context: bpy.types.Context, area: bpy.types.Area, corners: list[Vecto
                                        for corner in corners), 1e-3)
     if view.view_perspective == "CAMERA":
         view.view_perspective = "PERSP"
-    # The second time the first is exact but for the perspective.
+    # By perspective one step is not exact: the next starts from where it ended.
     for _ in range(3):
         view.update()
         seen = [location_3d_to_region_2d(region, view, corner) for corner in corners]
