@@ -35,7 +35,8 @@ young = ["40 MPa", "22 MPa", "12 MPa", "3 MPa"]
 
 @pytest.mark.slow
 def test_two_workers_on_loopback_one_killed(tmp_path, branch_template, monkeypatch):
-    """Kill -9 of a worker at work costs a stage; the files are those of the stage run alone."""
+    """Kill -9 of a worker at work costs a stage at most: one that had just ended is up to date
+    at the next look. The files are those of the stage run alone."""
     pytest.importorskip("distributed")
     monkeypatch.setenv("LIMBER_CORES", "2")
     for name in ("one", "two"):
@@ -63,7 +64,8 @@ def test_two_workers_on_loopback_one_killed(tmp_path, branch_template, monkeypat
     assert process.returncode == 0, told.decode()
     jobs = read_jobs(path)
     records = Records(jobs)
-    assert [records.of(b, t).status for b in jobs.branches for t in b.tasks] == ["done", "done"]
+    ends = sorted(records.of(b, t).status for b in jobs.branches for t in b.tasks)
+    assert ends in (["done", "done"], ["done", "up to date"])
     task = jobs.branches[0].tasks[0]
     line = command_line(task.model_copy(update={"branch_folder": alone}))
     assert main.call([task.about.name, *line]) == 0
