@@ -1,10 +1,9 @@
-"""Rigid transforms: of arrays, and compiled ones of one pose at a time."""
+"""Rigid transforms of arrays."""
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from limber.core.numerics import rigid, rigid_kernels
+from limber.core.numerics import rigid
 
 
 def random_poses(count: int) -> np.ndarray:
@@ -65,18 +64,3 @@ def test_principal_axes_of_a_box():
     corners = np.array(np.meshgrid([-1, 1], [-3, 3], [-2, 2])).reshape(3, -1).T + [5.0, 0, 1]
     assert np.abs(rigid.principal_axes(corners)) == pytest.approx(np.eye(3)[[1, 2, 0]])
     assert rigid.spreads(corners) == pytest.approx([3, 2, 1])
-
-
-def test_compiled_transforms_are_those_of_arrays():
-    for pose, other in zip(*np.split(random_poses(600), 2), strict=True):
-        frame = rigid_kernels.frame_of(pose)
-        assert frame == pytest.approx(rigid.matrices(pose), abs=1e-14)
-        assert rigid_kernels.pose_of(frame) == pytest.approx(pose, abs=1e-9)
-        assert rigid_kernels.inverse_of(frame) @ frame == pytest.approx(np.eye(4), abs=1e-13)
-        middle = rigid_kernels.frame_of(rigid_kernels.pose_between(pose, other, 0.3))
-        assert middle == pytest.approx(
-            rigid.matrices(rigid.pose_between(pose, other, 0.3)), abs=1e-12)
-    for angle in (0.0, 1e-12, np.pi - 1e-9, np.pi):
-        turn = Rotation.from_rotvec(angle * np.array([0.6, 0.0, 0.8])).as_matrix()
-        back = rigid_kernels.rotation_vector(turn)
-        assert rigid.rotation_matrix(back) == pytest.approx(turn, abs=1e-9)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
+from limber.geometry.rigid_kernels import SMALL_KERNELS
 from limber.kernels import Kernel
 from limber.mechanics import BranchModel
 from limber.mechanics.elements.forces import sparse_times
@@ -37,6 +38,10 @@ def test_declarations_are_the_functions():
             defined[name] = kind, [re.match(r"(?:const )?(\w+\*?)", word.strip())[1]
                                    for word in words.split(",") if word]
     del defined["has_wide_vectors"]
+    importlib.import_module("limber.robot.virtual.step_kernels")
+    for name, arguments in SMALL_KERNELS.items():
+        wanted = ["char*" if "[" in part else "double" for part in arguments]
+        assert defined.pop(name) == ("bool", [*wanted, "char*", "int64_t"]), name
     assert set(kernels) == set(defined)
     for name, kernel in kernels.items():
         kind, found = defined[name]

@@ -56,7 +56,7 @@ def test_force_and_stiffness_are_the_energy_s_derivatives(heavy):
         w, v, a, b = half[:, :1], half[:, 1:], q[1:, :1], q[1:, 1:]
         q[1:] = np.hstack([w * a - (v * b).sum(axis=1)[:, None], w * b + a * v + np.cross(v, b)])
         grad, band = np.empty(size), np.empty((size, BAND))
-        energy = assembled(r, q, rod.arrays, True, grad, band, np.empty((len(r) - 1, 6)))
+        energy = assembled(r, q, *rod.arrays, grad, band, np.empty((len(r) - 1, 6)), True)
         return energy, grad, band
 
     _, grad, band = at(np.zeros(size))

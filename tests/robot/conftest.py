@@ -18,7 +18,7 @@ from benchmarks.robot_faults import new_robot, restored
 from benchmarks.robot_rosbridge import RosBridge
 from benchmarks.robot_stepped import SteppedRobot
 from limber.cell.cell_file import Cell
-from limber.core.numerics.rigid_kernels import pose_between
+from limber.geometry.rigid_kernels import pose_between
 from limber.mechanics.statics.result import Status
 from limber.robot.driver.link import RobotLink
 from limber.robot.driver.real_time import claim_real_time, may_use_two_processors

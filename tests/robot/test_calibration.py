@@ -14,7 +14,7 @@ from limber.cell.cell_file import Cell, read_cell, write_cell
 from limber.cell.ur_arms import ARMS
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.core.numerics.rigid_kernels import pose_of
+from limber.geometry.rigid_kernels import pose_of
 from limber.robot.calibration import fit_base, gripper_pose
 from limber.robot.controller_settings import differences
 from limber.robot.interface import Sample

@@ -1,6 +1,5 @@
 """Faults while the robot moves, with the real client and processes: standstill and a report."""
 
-import shutil
 import signal
 import threading
 import time
@@ -24,7 +23,6 @@ from benchmarks.robot_faults import (
 )
 from benchmarks.robot_stepped import SteppedRobot
 from limber.core.errors import LimberError, SafetyStop
-from limber.core.numerics.compiled import cache_folder
 from limber.core.progress import SILENT
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely
@@ -249,21 +247,6 @@ def test_a_computer_that_stands_still_is_no_silent_robot(e_series, held_up, ends
         assert any("delayed the robot's program" in each for each in link.warnings)
     else:
         assert "no data from the robot" in event["reason"]
-
-
-def test_a_first_run_compiles_before_the_watchdog_listens(e_series, tmp_path, monkeypatch):
-    """It had just compiled, and looked for what that left behind while its watchdog ran out."""
-    kernels = tmp_path / "kernels"
-    kernels.mkdir()
-    for file in cache_folder().iterdir():
-        if file.is_file() and not file.name.startswith("rigid_kernels.turned_wrench"):
-            shutil.copy(file, kernels)
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(kernels))
-    with RobotLink(cell_for(e_series.address)) as link:
-        assert any(kernels.glob("rigid_kernels.turned_wrench*.nbc"))
-        tared(link)
-        link.start(straight(e_series, (0.0, 0.02, 0.0)))
-        assert link.wait("reached", "stopped", seconds=10)["event"] == "reached"
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from limber.cell.cell_file import Cell
 from limber.core.errors import InputError, WorkError
 from limber.core.numerics.rigid import matrices
-from limber.core.numerics.rigid_kernels import turned_wrench, weight_wrench
+from limber.geometry.rigid_kernels import turned_wrench, weight_wrench
 from limber.robot.driver.force_samples import (
     FT300_PORT,
     ControllerSensor,

@@ -7,7 +7,7 @@ import pytest
 
 from limber.cell.cell_file import Cell
 from limber.core.numerics.rigid import matrices
-from limber.core.numerics.rigid_kernels import pose_of
+from limber.geometry.rigid_kernels import pose_of
 from limber.robot.controller_settings import differences
 from limber.robot.interface import Sample
 from limber.robot.robot_state import Observed

@@ -7,7 +7,7 @@ from limber.cell.cell_file import Cell
 from limber.cell.ur_arms import ARMS
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import matrices, pose_vectors
-from limber.core.numerics.rigid_kernels import pose_of
+from limber.geometry.rigid_kernels import pose_of
 from limber.robot.interface import Sample
 from limber.robot.motion.retreat import RetreatPath, require_start
 from limber.robot.motion.trajectory import ExpectedWrench, Trajectory, along, densely

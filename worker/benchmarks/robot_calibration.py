@@ -12,7 +12,7 @@ from benchmarks.trials import column
 from limber.cell.cell_file import CameraEntry, Cell
 from limber.cell.ur_arms import ARMS
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors, rotation_vector
-from limber.core.numerics.rigid_kernels import pose_of
+from limber.geometry.rigid_kernels import pose_of
 from limber.robot.calibration import CameraOn, View, fit_base, fit_pictures, gripper_pose
 from limber.robot.interface import Sample
 from limber.robot.ur.factory_calibration import one_arm

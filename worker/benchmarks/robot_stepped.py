@@ -25,7 +25,7 @@ import numpy as np
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import LimberError
-from limber.core.numerics.rigid_kernels import crossed
+from limber.geometry.rigid_kernels import crossed
 from limber.robot.driver import control_loop, link
 from limber.robot.ur.factory_calibration import PRIMARY_PORT, kinematics_message
 from limber.robot.ur.rtde import DASHBOARD_PORT, RTDE_PORT

@@ -16,7 +16,7 @@ from benchmarks.table import Asked, Row, Setting
 from benchmarks.trials import column, sound
 from limber.cell.cell_file import Cell
 from limber.core.errors import LimberError, SafetyStop, WorkError
-from limber.core.numerics.rigid_kernels import crossed
+from limber.geometry.rigid_kernels import crossed
 from limber.robot.driver.link import RobotLink
 from limber.robot.motion.trajectory import Trajectory, along, densely, speed_within
 from limber.robot.recorder import (

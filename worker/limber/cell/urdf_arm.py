@@ -2,9 +2,6 @@
 
 Of the file only the chain of revolute joints from base to flange and the links' simple shapes are
 needed, so Limber needs no robot parser. A document type is refused, and with it every entity.
-
-In the kernels ``origins`` [n + 1, 4, 4] are the joints' frames at angle 0, each in that of the
-previous joint, and the flange's in the last one's; ``axes`` [n, 3] are the joint axes.
 """
 
 import functools
@@ -19,8 +16,8 @@ import numpy as np
 from limber.cell.arm import Rods
 from limber.core.errors import InputError
 from limber.core.files.reading import read_text
-from limber.core.numerics.compiled import compiled, for_kernels
-from limber.core.numerics.rigid_kernels import inverse_of, rotation_vector
+from limber.geometry.rigid_kernels import inverse_of
+from limber.kernels import Kernel, for_kernels
 
 _BASE = "base"
 _FLANGES = ("tool0", "flange")
@@ -237,118 +234,14 @@ def _said(element: Element, key: str) -> str:
     return value
 
 
-_MOST_STEPS = 60
-_CLOSE = 1e-11  # m and rad: a solution
-_LARGEST_STEP = 0.5  # rad
-_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e3
-
-
-@compiled
-def _chained(origins: np.ndarray, axes: np.ndarray, joints: np.ndarray, frames: np.ndarray,
-             ) -> None:
-    """Fill the frames [n + 1, 4, 4] of the joints and the flange at one pose [n]."""
-    turned, turn = np.eye(4), np.eye(3)
-    for k in range(len(origins)):
-        if k < len(joints):
-            c, s = math.cos(joints[k]), math.sin(joints[k])
-            x, y, z = axes[k]
-            v = 1.0 - c
-            # Rodrigues.
-            turn[0, 0], turn[0, 1], turn[0, 2] = c + x * x * v, x * y * v - z * s, x * z * v + y * s
-            turn[1, 0], turn[1, 1], turn[1, 2] = y * x * v + z * s, c + y * y * v, y * z * v - x * s
-            turn[2, 0], turn[2, 1], turn[2, 2] = z * x * v - y * s, z * y * v + x * s, c + z * z * v
-        origin, before = origins[k], frames[max(k - 1, 0)]
-        for i in range(3):
-            for j in range(3):
-                turned[i, j] = origin[i, j] if k == len(joints) else (
-                    origin[i, 0] * turn[0, j] + origin[i, 1] * turn[1, j]
-                    + origin[i, 2] * turn[2, j])
-            turned[i, 3] = origin[i, 3]
-        if k == 0:
-            frames[0] = turned
-            continue
-        for i in range(3):
-            for j in range(4):
-                frames[k, i, j] = (before[i, 0] * turned[0, j] + before[i, 1] * turned[1, j]
-                                   + before[i, 2] * turned[2, j] + before[i, 3] * turned[3, j])
-        frames[k, 3] = turned[3]
-
-
-@compiled
-def _slopes(axes: np.ndarray, frames: np.ndarray, slopes: np.ndarray) -> None:
-    """Fill the flange's Jacobian [6, n] from the frames [n + 1, 4, 4] of one pose."""
-    count = len(axes)
-    for k in range(count):
-        for i in range(3):
-            slopes[3 + i, k] = (frames[k, i, 0] * axes[k, 0] + frames[k, i, 1] * axes[k, 1]
-                                + frames[k, i, 2] * axes[k, 2])
-        axis, lever = slopes[3:, k], frames[count, :3, 3] - frames[k, :3, 3]
-        slopes[0, k] = axis[1] * lever[2] - axis[2] * lever[1]
-        slopes[1, k] = axis[2] * lever[0] - axis[0] * lever[2]
-        slopes[2, k] = axis[0] * lever[1] - axis[1] * lever[0]
-
-
-@compiled
-def _off(frame: np.ndarray, flange: np.ndarray, off: np.ndarray) -> None:
-    """Fill the translation [m] and rotation [rad] from the flange to its target, shape [6]."""
-    off[:3] = frame[:3, 3] - flange[:3, 3]
-    off[3:] = rotation_vector(frame @ inverse_of(flange))
-
-
-@compiled
-def chain_frames(origins: np.ndarray, axes: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return the frames of the joints and the flange in the base's, shape [poses, n + 1, 4, 4]."""
-    frames = np.empty((len(joints), len(origins), 4, 4))
-    for pose in range(len(joints)):
-        _chained(origins, axes, joints[pose], frames[pose])
-    return frames
-
-
-@compiled
-def chain_jacobian(axes: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Return Jacobians of the flange [poses, 6, n] from frames [poses, n + 1, 4, 4]."""
-    slopes = np.empty((len(frames), 6, len(axes)))
-    for pose in range(len(frames)):
-        _slopes(axes, frames[pose], slopes[pose])
-    return slopes
-
-
-@compiled
-def solved(origins: np.ndarray, axes: np.ndarray, frames: np.ndarray, starts: np.ndarray,
-           is_path: bool) -> np.ndarray:
-    """Return the angles that bring the flange to ``frames`` [k, 4, 4] from ``starts``, shape [k,
-    n], by Gauss-Newton steps with Levenberg-Marquardt damping; NaN where they do not converge.
-    ``is_path``: search each from the one before; NaN from the first unreached one on."""
-    count = len(axes)
-    found = np.full((len(frames), count), np.nan)
-    chain, tried = np.empty((count + 1, 4, 4)), np.empty((count + 1, 4, 4))
-    slopes, off, off_tried = np.empty((6, count)), np.empty(6), np.empty(6)
-    for number in range(len(frames)):
-        is_later = is_path and number > 0
-        guess = found[number - 1].copy() if is_later else starts[number].copy()
-        if np.isnan(guess[0]):
-            continue
-        joints, damping, least = guess, 1e-3, np.inf
-        for _ in range(_MOST_STEPS):
-            _chained(origins, axes, guess, tried)
-            _off(frames[number], tried[count], off_tried)
-            square = (off_tried * off_tried).sum()
-            if square < least:
-                joints, least = guess, square
-                chain[:], off[:] = tried, off_tried
-                damping = max(0.1 * damping, _LEAST_DAMPING)
-                _slopes(axes, chain, slopes)
-            else:
-                damping *= 10.0
-            if not np.abs(off).max() > _CLOSE:
-                found[number] = joints
-                break
-            if not damping < _MOST_DAMPING:
-                break
-            step = slopes.T @ np.linalg.solve(slopes @ slopes.T + damping * np.eye(6), off)
-            guess = joints + step * min(1.0, _LARGEST_STEP / max(np.abs(step).max(), 1e-12))
-    return found
-
+_AXES = "axes float64[joints, 3]"
+_chain_frames = Kernel("chain_frames", "origins float64[links, 4, 4]", _AXES,
+                       "angles float64[poses, joints]", "out frames float64[poses, links, 4, 4]")
+_chain_jacobian = Kernel("chain_jacobian", _AXES, "frames float64[poses, links, 4, 4]",
+                         "out slopes float64[poses, 6, joints]")
+_chain_solved = Kernel(
+    "chain_solved", "origins float64[links, 4, 4]", _AXES, "frames float64[targets, 4, 4]",
+    "starts float64[starts, joints]", "out found float64[targets, joints]", "is_path int")
 
 _STARTS = 96
 _MOST = 8  # stored configurations
@@ -417,15 +310,19 @@ class UrdfArm:
 
     def link_frames(self, joints: np.ndarray) -> np.ndarray:
         """Return the frames of all joints and of the flange, shape [..., n + 1, 4, 4]."""
-        joints = np.asarray(joints, float)
+        joints = for_kernels(joints)
         count = joints.shape[-1]
-        frames = chain_frames(self._origins, self._axes, for_kernels(joints.reshape(-1, count)))
-        return frames.reshape(*joints.shape[:-1], count + 1, 4, 4)
+        frames = np.empty((*joints.shape[:-1], count + 1, 4, 4))
+        _chain_frames(self._origins, self._axes, joints.reshape(-1, count),
+                      frames.reshape(-1, count + 1, 4, 4))
+        return frames
 
     def jacobian(self, joints: np.ndarray) -> np.ndarray:
-        frames = self.link_frames(joints)
-        slopes = chain_jacobian(self._axes, for_kernels(frames.reshape(-1, *frames.shape[-3:])))
-        return slopes.reshape(*frames.shape[:-3], 6, len(self._axes))
+        frames, count = self.link_frames(joints), len(self._axes)
+        slopes = np.empty((*frames.shape[:-3], 6, count))
+        _chain_jacobian(self._axes, frames.reshape(-1, count + 1, 4, 4),
+                        slopes.reshape(-1, 6, count))
+        return slopes
 
     def inverse(self, frames: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """Return up to eight configurations for each of ``frames`` [..., 4, 4], or the one found
@@ -452,7 +349,13 @@ class UrdfArm:
 
     def _solved(self, frames: np.ndarray, starts: np.ndarray, *, is_path: bool = False,
                 ) -> np.ndarray:
-        return solved(self._origins, self._axes, for_kernels(frames), for_kernels(starts), is_path)
+        """Return the angles that bring the flange to ``frames`` [k, 4, 4] from ``starts``, [k, n];
+        NaN where none are found. ``is_path``: each is sought from the one before, the first from
+        the only start."""
+        found = np.empty((len(frames), len(self._axes)))
+        _chain_solved(self._origins, self._axes, for_kernels(frames), for_kernels(starts), found,
+                      is_path)
+        return found
 
     def singularity_distance(self, joints: np.ndarray) -> np.ndarray:
         """Return the ratio of the Jacobian's least to greatest singular value, lengths in reaches

@@ -5,7 +5,6 @@ import numpy as np
 from limber.core.progress import SILENT, Progress
 from limber.planning.baseline_and_plan import plan_pair
 from limber.planning.field.energy_field import fit_field
-from limber.planning.field.rod_kernels import known_at, newton
 from limber.planning.field.stored_states import GraspSamples
 from limber.planning.goals.goal_kinds import GraspGoal
 from limber.planning.settings import PlanSpec
@@ -13,11 +12,6 @@ from limber.planning.settings import PlanSpec
 
 def warm_up(progress: Progress = SILENT) -> None:
     """Plan once on an invented branch; the compiled code stays in the user's cache folder."""
-    nothing, turns = np.zeros((3, 3)), np.eye(4)[[0, 0, 0]]
-    places = np.arange(3.0)[:, None] * [0.0, 0.0, 1.0]
-    rod = np.diff(places, axis=0), np.stack([np.eye(6)] * 2), np.zeros((2, 6)), nothing, nothing
-    newton(places, turns, rod, places[-1].copy(), True)
-    known_at(places, turns, rod)
     generator = np.random.default_rng(0)
     points = generator.uniform(-1.0, 1.0, (40, 3))
     points[0] = 0.0

@@ -252,9 +252,9 @@ class ReducedModel:
         work = self._work
         dq = _NO_INCREMENT if increment is None else increment
         moving = _NO_INCREMENT if velocity is None else velocity
-        energy = evaluate_strain(self.linear, self.quadratic, q, dq, moving,
-                                 self.damping.stiffness, by_rate, work.strain, work.jacobian,
-                                 work.gradient, work.tangent)
+        energy = evaluate_strain(self.linear, self.quadratic, q, dq, moving, work.strain,
+                                 work.jacobian, work.gradient, work.tangent,
+                                 self.damping.stiffness, by_rate)
         lifted = self.weight_stiffness @ q
         work.gradient += lifted
         work.tangent += self._weight_lower

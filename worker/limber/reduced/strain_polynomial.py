@@ -20,7 +20,7 @@ import numpy as np
 
 from limber.core.errors import InputError
 from limber.core.not_none import present
-from limber.core.numerics.compiled import compiled
+from limber.kernels import Kernel
 from limber.mechanics.materials.materials import lame
 from limber.mechanics.model import BranchModel
 from limber.reduced.basis import (
@@ -76,89 +76,25 @@ class StrainPolynomial:
                 np.ascontiguousarray(root.T @ self.quadratic), root)
 
 
-@compiled
-def evaluate_strain(linear, quadratic, q, increment, velocity, damping, by_rate, strain, jacobian,
-                    gradient, tangent):
-    """Return the energy [J]; write whitened strain, J, force J^T e and tangent (lower triangle).
-    ``increment``: geometric part of mixed integration points. ``velocity``, changing by ``by_rate``
-    [1/s] with q: stress ``damping`` [s] times the strain's rate. Empty arrays: neither."""
-    count, size = linear.shape
-    gradient[:] = 0.0
-    tangent[:] = 0.0
-    energy = 0.0
-    for a in range(count):
-        row, form = jacobian[a], quadratic[a]
-        for i in range(size):
-            row[i] = 0.0
-        at = 0
-        for i in range(size):
-            qi = q[i]
-            total = form[at + i] * qi
-            for j in range(i):
-                total += form[at + j] * q[j]
-                row[j] += form[at + j] * qi
-            row[i] += total
-            at += i + 1
-        predicted = 0.0
-        at = 0
-        for i in range(len(increment)):
-            along = 0.0
-            for j in range(i):
-                along += form[at + j] * increment[j]
-            predicted += increment[i] * (2.0 * along + form[at + i] * increment[i])
-            at += i + 1
-        value = 0.0
-        for i in range(size):
-            value += (linear[a, i] + row[i]) * q[i]
-            row[i] = linear[a, i] + 2.0 * row[i]
-        strain[a] = value
-        energy += 0.5 * value * value
-        viscous, growth = 0.0, 1.0
-        if len(velocity):
-            growth += damping * by_rate
-            for i in range(size):
-                viscous += damping * row[i] * velocity[i]
-        geometric = 2.0 * (value + viscous - predicted)
-        at = 0
-        for i in range(size):
-            ri = row[i]
-            gradient[i] += ri * (value + viscous)
-            ri *= growth
-            for j in range(i + 1):
-                tangent[i, j] += ri * row[j] + geometric * form[at + j]
-            at += i + 1
-    return energy
+_WHITENED = ("linear float64[fields, size]", "quadratic float64[fields, terms]", "q float64[size]")
+evaluate_strain = Kernel(
+    "strain_evaluated", *_WHITENED, "increment float64[increments]", "velocity float64[velocities]",
+    "out strain float64[fields]", "out jacobian float64[fields, size]",
+    "out gradient float64[size]", "out tangent float64[size, size]", "damping float",
+    "by_rate float", returns="float")
+"""Return the energy [J]; write whitened strain, J, force J^T e and tangent (lower triangle).
+``increment``: geometric part of mixed integration points. ``velocity``, changing by ``by_rate``
+[1/s] with q: stress ``damping`` [s] times the strain's rate. Empty arrays: neither."""
 
+strain_only = Kernel("strain_alone", *_WHITENED, "out strain float64[fields]", returns="float")
+"""Write the whitened strain [m]; return the energy [J]."""
 
-@compiled
-def strain_only(linear, quadratic, q, strain):
-    """Write the whitened strain [m]; return the energy [J]."""
-    count, size = linear.shape
-    energy = 0.0
-    for a in range(count):
-        form = quadratic[a]
-        value = 0.0
-        at = 0
-        for i in range(size):
-            total = 0.0
-            for j in range(i):
-                total += form[at + j] * q[j]
-            value += q[i] * (linear[a, i] + 2.0 * total + form[at + i] * q[i])
-            at += i + 1
-        strain[a] = value
-        energy += 0.5 * value * value
-    return energy
-
-
-def compile_kernels() -> None:
-    """Call every kernel once; the compiled code stays in the user's cache folder."""
-    linear, quadratic, q, strain = np.eye(2), np.ones((2, 3)), np.ones(2), np.empty(2)
-    for increment in (np.empty(0), q):
-        evaluate_strain(linear, quadratic, q, increment, increment, 0.0, 0.0, strain,
-                        np.empty((2, 2)), np.empty(2), np.empty((2, 2)))
-    strain_only(linear, quadratic, q, strain)
-    gradient = np.zeros((1, 3, 3, 1))
-    _green_change(gradient, gradient, np.zeros(1, np.int64), np.ones(1), np.empty((1, 6, 1)))
+_green_change = Kernel(
+    "green_changed", "states float64[points, 3, 3, states]",
+    "changes float64[points, 3, 3, fields]", "owners int64[fields]", "scales float64[fields]",
+    "out strain float64[points, 6, fields]")
+"""Write the change of the strain (shear scaled) at states H by D. Field f belongs to state
+owners[f] and is scaled by scales[f]."""
 
 
 def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
@@ -232,22 +168,6 @@ def _green(H: np.ndarray) -> np.ndarray:
         for (i, j), scale in zip(_PAIRS, _SHEAR, strict=True)], axis=1)
 
 
-@compiled
-def _green_change(H, D, owners, scales, strain):
-    """Write the change of the strain (shear scaled) at states H [p, 3, 3, s] by D [p, 3, 3, f].
-    Field f belongs to state owners[f] and is scaled by scales[f]."""
-    root = np.sqrt(0.5)
-    for p in range(D.shape[0]):
-        for f in range(D.shape[3]):
-            s, scale = owners[f], scales[f]
-            for k in range(6):
-                i, j = _PAIRS[k, 0], _PAIRS[k, 1]
-                total = D[p, i, j, f] + D[p, j, i, f]
-                for c in range(3):
-                    total += H[p, c, i, s] * D[p, c, j, f] + D[p, c, i, f] * H[p, c, j, s]
-                strain[p, k, f] = scale * total * (0.5 if k < 3 else root)
-
-
 @dataclass(frozen=True)
 class _Sources:
     """States, and changes with the state that each belongs to, whose strains are true ones. The
@@ -265,7 +185,7 @@ class _Sources:
             if not len(fields):
                 continue
             strain = np.empty((len(H), 6, len(fields)))
-            _green_change(H, points.gradient(fields, chunk), owners, scales, strain)
+            _green_change.of(H, points.gradient(fields, chunk), owners, scales, strain)
             parts.append(strain)
         return np.concatenate(parts, axis=2)
 

@@ -8,7 +8,7 @@ from limber.cell.arm import Arm
 from limber.cell.cell_file import Cell
 from limber.core.errors import SafetyStop
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
-from limber.core.numerics.rigid_kernels import frame_of, inverse_of, length, pose_of, turn_between
+from limber.geometry.rigid_kernels import frame_of, inverse_of, length, pose_of, turn_between
 from limber.robot.interface import Sample
 from limber.robot.ur.factory_calibration import FactoryCalibration
 

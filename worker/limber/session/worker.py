@@ -99,7 +99,6 @@ from limber.mechanics.loads.load_effects import (
     with_peak,
 )
 from limber.mechanics.loads.outdoor import Outdoors
-from limber.reduced.strain_polynomial import compile_kernels
 from limber.session import protocol
 from limber.session.frame_buffer import FrameWriter
 from limber.session.model_choice import Answering, Checked, Learnt
@@ -500,10 +499,8 @@ def _outdoors(command: protocol.Weather) -> Outdoors:
 
 
 def _steady() -> None:
-    """Remove what would occasionally delay a frame: kernels are loaded before one needs them, a
-    waiting thread gets the interpreter within a millisecond, and garbage collection examines new
-    objects only."""
-    compile_kernels()
+    """Remove what would occasionally delay a frame: a waiting thread gets the interpreter within a
+    millisecond, and garbage collection examines new objects only."""
     sys.setswitchinterval(_SWITCH_SECONDS)
     gc.collect()
     gc.freeze()

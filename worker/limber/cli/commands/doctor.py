@@ -67,14 +67,9 @@ class Doctor(Tool):
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         if self.warm:
-            from limber.geometry.warm_up import warm_up as warm_geometry
-            from limber.planning.warm_up import warm_up as warm_planning
-            from limber.reduced.strain_polynomial import compile_kernels
+            from limber.planning.warm_up import warm_up
 
-            # First what a grab needs: someone may open the example and press on it.
-            compile_kernels()
-            warm_geometry()
-            warm_planning(progress.part(0.1, 1.0))
+            warm_up(progress)
         return report()
 
 

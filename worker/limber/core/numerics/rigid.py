@@ -2,7 +2,7 @@
 
 A rotation is a vector [3] in rad or a matrix [3, 3]; a pose [6] is a position in m and a rotation
 vector; a frame [4, 4] is its homogeneous matrix. Loops at a controller's rate use
-:mod:`limber.core.numerics.rigid_kernels`, which takes one at a time.
+:mod:`limber.geometry.rigid_kernels`, which takes one at a time.
 """
 
 import numpy as np

@@ -1,6 +1,5 @@
 """Around a fit: its initial moduli, errors too large for their squares, pulls it leaves out."""
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,9 +10,7 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import WorkError
 from limber.core.not_none import present
-from limber.core.numerics.compiled import compiled, for_kernels
 from limber.core.numerics.rigid import rotated
-from limber.core.numerics.rigid_kernels import crossed, frame_of
 from limber.estimation.fitting.objective import Evaluation, Objective, seen_in
 from limber.estimation.fitting.optimise import LONGEST_STEP, gauss_newton
 from limber.estimation.forward.forward_model import Forward, key_frames, smoothed, travel
@@ -21,6 +18,7 @@ from limber.estimation.forward.observed_path import AT_REST_M
 from limber.estimation.forward.solved_pull import QuasiStaticForward
 from limber.estimation.parameters import LINK_DEVIATION, YOUNG_BOUNDS_PA, Values
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.kernels import Kernel
 from limber.recordings.recording import Pull, calibration_of
 
 # Initial values of a fit: the moduli for which a beam answers the recorded force as recorded.
@@ -144,9 +142,9 @@ class Beam:
             shape = (len(values), len(self.force))
             places, turns = np.empty((*shape, SECTIONS + 1, 3)), np.empty(
                 (*shape, SECTIONS + 1, 3, 3))
-            bend_rods(*(for_kernels(each) for each in (
+            _bend_rods.of(
                 self.axis, *stiffness, force, self.torque, np.broadcast_to(grasp, (*shape, 3)),
-                weight, np.broadcast_to(hung, (*shape, SECTIONS + 1, 3)), held)), places, turns)
+                weight, np.broadcast_to(hung, (*shape, SECTIONS + 1, 3)), held, places, turns)
         found = turns[:, :, self._at]
         return places[:, :, self._at] + np.einsum(
             "bkmij,mj->bkmi", found, self.rest - self.axis[self._at]), found
@@ -197,75 +195,16 @@ def _from_end(values: np.ndarray) -> np.ndarray:
     return np.flip(np.cumsum(np.flip(values, axis=-2), axis=-2), axis=-2)
 
 
-@compiled
-def bend_rods(axis: np.ndarray, bending: np.ndarray, twist: np.ndarray, force: np.ndarray,
-              torque: np.ndarray, grasp: np.ndarray, weight: np.ndarray, hung: np.ndarray,
-              held: np.ndarray, places: np.ndarray, turns: np.ndarray) -> None:
-    """Fill places [b, k, S + 1, 3] and rotations of the sections, from the base on. Each turns by
-    the moment at its middle: of the gripper (``force`` [b, k, 3]) and of the ``weight`` from there
-    on, with moment ``hung`` about the origin, less that as scanned, ``held``. Stiffnesses are
-    [b, S] [N m^2]."""
-    inside, tangent, turn, at, middle = (np.empty(3), np.empty(3), np.empty(3), np.empty(3),
-                                         np.empty(3))
-    step, rotation, half, unit = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.eye(3)
-    for b in range(places.shape[0]):
-        for k in range(places.shape[1]):
-            places[b, k, 0], turns[b, k, 0] = axis[0], unit
-            for s in range(axis.shape[0] - 1):
-                length = 1e-18
-                for i in range(3):
-                    step[i] = axis[s + 1, i] - axis[s, i]
-                    length += step[i]**2
-                length = math.sqrt(length)
-                half[:] = turns[b, k, s]
-                at[:] = places[b, k, s]
-                for part in range(2):
-                    # The moment at the begin leads to the middle, and that there to the end.
-                    for i in range(3):
-                        middle[i] = axis[s, i] + 0.5 * part * step[i]
-                    pulled = crossed(grasp[b, k] - at, force[b, k])
-                    hanging, stood = crossed(at, weight[s + 1]), crossed(middle, weight[s + 1])
-                    for i in range(3):
-                        inside[i] = pulled[i] + torque[k, i] + hung[b, k, s + 1, i] - hanging[i]
-                        tangent[i] = 0.0
-                        for j in range(3):
-                            inside[i] -= half[i, j] * (held[s + 1, j] - stood[j])
-                            tangent[i] += half[i, j] * step[j] / length
-                    axial, size = 0.0, 0.0
-                    for i in range(3):
-                        axial += inside[i] * tangent[i]
-                    for i in range(3):
-                        along = axial * tangent[i]
-                        turn[i] = length * ((inside[i] - along) / bending[b, s]
-                                            + along / twist[b, s])
-                        size += turn[i]**2
-                    # A far too soft one curls up, by a radian in each section at most.
-                    shrink = 0.5 / max(math.sqrt(size), 1.0)
-                    for i in range(3):
-                        turn[i] *= shrink
-                    _turn_by(turn, turns[b, k, s], half)
-                    for i in range(3):
-                        at[i] = places[b, k, s, i]
-                        for j in range(3):
-                            at[i] += 0.5 * half[i, j] * step[j]
-                for i in range(3):
-                    turn[i] *= 2.0
-                    places[b, k, s + 1, i] = 2 * at[i] - places[b, k, s, i]
-                _turn_by(turn, turns[b, k, s], rotation)
-                turns[b, k, s + 1] = rotation
-
-
-@compiled
-def _turn_by(vector: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
-    """Fill a rotation [3, 3] turned by a vector [rad]."""
-    pose = np.zeros(6)
-    for i in range(3):
-        pose[3 + i] = vector[i]
-    frame = frame_of(pose)
-    for i in range(3):
-        for j in range(3):
-            after[i, j] = (frame[i, 0] * before[0, j] + frame[i, 1] * before[1, j]
-                           + frame[i, 2] * before[2, j])
+_bend_rods = Kernel(
+    "rods_bent", "axis float64[sections, 3]", "bending float64[beams, elements]",
+    "twist float64[beams, elements]", "force float64[beams, frames, 3]",
+    "torque float64[frames, 3]", "grasp float64[beams, frames, 3]", "weight float64[sections, 3]",
+    "hung float64[beams, frames, sections, 3]", "held float64[sections, 3]",
+    "out places float64[beams, frames, sections, 3]",
+    "out turns float64[beams, frames, sections, 3, 3]")
+"""Fill places and rotations of the sections, from the base on. Each turns by the moment at its
+middle: of the gripper (``force``) and of the ``weight`` from there on, with moment ``hung`` about
+the origin, less that as scanned, ``held``. Stiffnesses are in N m^2."""
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from scipy.spatial import cKDTree
 
 from limber.core.errors import Command, InputError, Option, Text
 from limber.core.files.tables import csv_records, read_columns, table_text
-from limber.core.numerics.compiled import compiled
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.kernels import Kernel
 from limber.mechanics.materials.materials import LEAST_YOUNG, SPECIES, STRENGTH_OVER_YOUNG
 from limber.mechanics.strain import strain_state
 from limber.planning.field.grasp_model import GraspModel
@@ -32,7 +32,6 @@ ASSUMED_SOURCE = "green wood, assumed"
 _FEWEST = 5  # break tests
 _DRAWS = 500
 _COLUMN = "strain_at_break"
-_STEPS = 60  # most steps of Newton's method
 _SPREAD = 0.27
 """Coefficient of variation of a species' strain at rupture: those of modulus of rupture, 16 %, and
 of elasticity, 22 %, combined (Wood Handbook, FPL-GTR-190, table 5-6).
@@ -144,25 +143,14 @@ def _variation(shape: float) -> float:
     return float(np.sqrt(second / first**2 - 1.0))
 
 
-@compiled
+_weibull_fitted = Kernel("weibull_fitted", "logs float64[draws, count]",
+                         "out shapes float64[draws]", "out scales float64[draws]")
+
+
 def _fitted(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return maximum-likelihood shapes and scales [d] for ``logs`` [d, n] of Weibull variables."""
     shapes, scales = np.empty(len(logs)), np.empty(len(logs))
-    for d in range(len(logs)):
-        row = logs[d]
-        top, mean = row.max(), row.mean()
-        shape = 1.2825 / max(row.std(), 1e-12)
-        for _ in range(_STEPS):
-            weights = np.exp(shape * (row - top))
-            total = weights.sum()
-            first, second = (weights * row).sum() / total, (weights * row**2).sum() / total
-            off = first - 1.0 / shape - mean
-            step = off / (second - first**2 + 1.0 / shape**2)
-            shape = max(shape - step, 0.5 * shape)
-            if abs(step) < 1e-12 * shape:
-                break
-        shapes[d] = shape
-        scales[d] = np.exp(top + np.log(np.exp(shape * (row - top)).mean()) / shape)
+    _weibull_fitted.of(logs, shapes, scales)
     return shapes, scales
 
 

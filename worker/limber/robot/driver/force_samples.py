@@ -12,7 +12,7 @@ import numpy as np
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import SafetyStop, WorkError
-from limber.core.numerics.rigid_kernels import (
+from limber.geometry.rigid_kernels import (
     frame_of,
     inverse_of,
     pose_of,

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from limber.core.constants import STANDARD_GRAVITY
-from limber.core.numerics.rigid_kernels import frame_of, length
+from limber.geometry.rigid_kernels import frame_of, length
 from limber.robot.motion.trajectory import LAID_M
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ import numpy as np
 from limber.cell.arm import Arm, within_ratings
 from limber.cell.cell_file import Cell, LimitsEntry, WorkspaceEntry
 from limber.core.errors import SafetyStop
-from limber.core.numerics.rigid_kernels import frame_of, length, pose_between, turn_between
+from limber.geometry.rigid_kernels import frame_of, length, pose_between, turn_between
 from limber.robot.controller_settings import SteadySettings
 from limber.robot.driver.force_test import BLOCK_SECONDS, Block, ForceErrors, ForceTest
 from limber.robot.interface import Sample

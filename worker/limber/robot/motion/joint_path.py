@@ -12,7 +12,7 @@ from limber.cell.cell_file import Cell
 from limber.cell.reach_and_collision import ArmSurroundings
 from limber.core.errors import InputError, NoPathError
 from limber.core.numerics.rigid import inverted, matrices, pose_vectors
-from limber.core.numerics.rigid_kernels import length, turn_between
+from limber.geometry.rigid_kernels import length, turn_between
 from limber.robot.motion.trajectory import (
     ExpectedWrench,
     Trajectory,

@@ -17,7 +17,7 @@ import platformdirs
 from limber.cell.cell_file import Cell
 from limber.core.errors import Command, InputError, SafetyStop, Text
 from limber.core.json_values import json_objects, plain
-from limber.core.numerics.rigid_kernels import length, turn_between
+from limber.geometry.rigid_kernels import length, turn_between
 from limber.robot.interface import Sample
 from limber.robot.motion.trajectory import Trajectory, along
 

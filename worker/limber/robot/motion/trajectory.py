@@ -10,7 +10,7 @@ from limber.cell.cell_file import Cell
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import angle_between, matrices, rotations_at
 from limber.core.numerics.rigid import turn_between as turns_between
-from limber.core.numerics.rigid_kernels import length, pose_between, turn_between
+from limber.geometry.rigid_kernels import length, pose_between, turn_between
 
 OVER_HARD = 1.1
 """Largest contact force as a multiple of the hard limit."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import LimberError, SafetyStop, WorkError
-from limber.core.numerics.rigid_kernels import frame_of, turned_wrench
+from limber.geometry.rigid_kernels import frame_of, turned_wrench
 from limber.robot.interface import Reading, Sample
 from limber.robot.motion.trajectory import Trajectory
 from limber.robot.ros.bridge import SECONDS, Bridge, call

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.numerics.rigid_kernels import frame_of, inverse_of, rotation_vector
+from limber.geometry.rigid_kernels import frame_of, inverse_of, rotation_vector
 from limber.robot.driver.real_time import claim_real_time, spare_what_is_loaded
 from limber.robot.virtual.step_kernels import steer
 

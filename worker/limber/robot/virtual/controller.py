@@ -17,7 +17,7 @@ from limber.cell.known_arms import arm_named
 from limber.cell.ur_arms import UrArm
 from limber.core.errors import InputError
 from limber.core.numerics.rigid import inverted, matrices
-from limber.core.numerics.rigid_kernels import crossed, frame_of, weight_wrench
+from limber.geometry.rigid_kernels import crossed, frame_of, weight_wrench
 from limber.robot.ur.factory_calibration import FactoryCalibration, one_arm
 from limber.robot.virtual.payload import (
     CB3_ESTIMATE,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from limber.core.errors import InputError
-from limber.core.numerics.rigid_kernels import crossed, frame_of, inverse_of, rotation_vector
+from limber.geometry.rigid_kernels import crossed, frame_of, inverse_of, rotation_vector
 from limber.robot.virtual.branch_solver import (
     NO_BENDS,
     SAME_PLACE,

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from limber.core.numerics.compiled import compiled_exactly
 from limber.geometry.skeleton.radii.fit_kernels import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.kernels import Kernel
 
 _MOST, _TURNS = 4, 4  # stations; directions to begin at
 _INWARD = (0.0, 2.0)  # noises by which all are shifted away from their side at first
@@ -22,7 +22,6 @@ _LEAST, _CLEAR = 300, 0.02  # points that tell; noise over radius that leaves no
 _FAR, _STOUT = 4.0, 2.0  # noises within which points count, around radii of so many noises
 _SHIFTS, _WIDER = 2.0, 0.3  # deviations: of a shift in noises, of the shared error in median radii
 _SHARP = 0.1  # least noise of the mixture, in noises of the fit
-_STRAY = 0.02  # fraction of points of something else
 _ALIKE = 2.0  # points whose errors are correlated, so that they count as one
 _NUMBERS = 5  # of a station: direction (2), shift; each costs half the logarithm of the points
 _FACING = -0.5  # cosine between the directions of two stations, below which they face each other
@@ -30,6 +29,15 @@ _ROUND = 0.1  # fraction of the shifts that sections which are not round leave i
 # Places on a section beside the sight, as even as rays are, and how far they rise towards it.
 _BESIDE = np.arange(-15, 16, 2) / 16
 _RISE = np.sqrt(1 - _BESIDE**2)
+
+_sums = Kernel(
+    "station_sums", "offset float64[points, 3]", "radius float64[points]",
+    "axis float64[points, 3]", "towards float64[stations, 3]", "shift float64[stations, 3]",
+    "share float64[stations]", "noise float64[2]", "beside float64[places]",
+    "rise float64[places]", "out chance float64[points, stations]", "out number float64[stations]",
+    "out precision float64[unknowns, unknowns]", "out pull float64[unknowns]",
+    "out facing float64[stations, 3]", "out square float64[2]", "wider float", "fit float",
+    returns="float")
 
 
 @dataclass(frozen=True)
@@ -114,60 +122,19 @@ class _Stations:
         return now
 
 
-@compiled_exactly
 def station_sums(offset: np.ndarray, radius: np.ndarray, axis: np.ndarray, towards: np.ndarray,
                  shift: np.ndarray, share: np.ndarray, noise: np.ndarray, wider: float, fit: float,
                  ) -> tuple:
     """The probability that each point is of each of k stations [m, k] and their sums [k]; the
     log-likelihood; precision [3 k + 1, 3 k + 1] and pull [3 k + 1] of the shifts and the radii's
     shared error; sums of the sights [k, 3], and of misses beside and along them [2] [m^2]."""
-    count, places, root = len(share), len(_BESIDE), np.sqrt(_RISE)
-    chance, number = np.zeros((len(radius), count)), np.zeros(count)
-    precision, pull = np.zeros((3 * count + 1, 3 * count + 1)), np.zeros(3 * count + 1)
-    facing, square, log = np.zeros((count, 3)), np.zeros(2), 0.0
-    weight, miss, ways = np.empty((count, places)), np.empty((2, count)), np.empty((2, count, 3))
-    level = (1 - _STRAY) * share / (2 * np.pi * noise[0] * noise[1] * places)
-    for i in range(len(radius)):
-        thick = max(radius[i] + wider, _SHARP * radius[i])
-        total = _STRAY / (np.pi * (radius[i] + _FAR * fit)**2)
-        for k in range(count):
-            along = towards[k] - (axis[i] * towards[k]).sum() * axis[i]
-            ways[1, k] = along / max(np.sqrt((along**2).sum()), 1e-9)
-            for j in range(3):
-                ways[0, k, j] = (axis[i, j - 2] * ways[1, k, j - 1]
-                                 - axis[i, j - 1] * ways[1, k, j - 2])
-            for d in range(2):
-                miss[d, k] = ((offset[i] - shift[k]) * ways[d, k]).sum()
-            for p in range(places):
-                weight[k, p] = level[k] * root[p] * np.exp(-0.5 * (
-                    ((miss[0, k] - thick * _BESIDE[p]) / noise[0])**2
-                    + _RISE[p] * ((miss[1, k] - thick * _RISE[p]) / noise[1])**2))
-                total += weight[k, p]
-        log += np.log(total)
-        for k in range(count):
-            chance[i, k] = weight[k].sum() / total
-            number[k] += chance[i, k]
-            for d in range(2):
-                # A grazing ray's error is larger, and hardly moves it off the surface.
-                whole = moved = first = second = crossed = 0.0
-                for p in range(places):
-                    own = weight[k, p] / total * (_RISE[p] if d else 1.0)
-                    place = _RISE[p] if d else _BESIDE[p]
-                    off = miss[d, k] - thick * place
-                    whole, first, second = whole + own, first + own * place, second + own * place**2
-                    moved, crossed = moved + own * off, crossed + own * off * place
-                    square[d] += own * off**2
-                    facing[k] += weight[k, p] / total * place * ways[d, k]
-                firm = 1 / (_ALIKE * noise[d]**2)
-                precision[-1, -1] += firm * second
-                pull[-1] += firm * crossed
-                for j in range(3):
-                    way = firm * ways[d, k, j]
-                    pull[3 * k + j] += way * moved
-                    precision[3 * k + j, -1] += way * first
-                    precision[3 * k + j, 3 * k:3 * k + 3] += way * whole * ways[d, k]
-    precision[-1, :-1] = precision[:-1, -1]
-    return chance, number, log, precision, pull, facing, square
+    count = len(share)
+    chance, number, *sums = (np.empty((len(radius), count)), np.empty(count),
+                             np.empty((3 * count + 1, 3 * count + 1)), np.empty(3 * count + 1),
+                             np.empty((count, 3)), np.empty(2))
+    log = _sums.of(offset, radius, axis, towards, shift, share, noise, _BESIDE, _RISE, chance,
+                   number, *sums, wider, fit)
+    return chance, number, log, *sums
 
 
 def registered(skeleton: Skeleton, points: np.ndarray, noise: float,

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import i0e
 
-from limber.core.numerics.compiled import compiled_exactly
 from limber.core.numerics.rigid import any_normal
 from limber.geometry.skeleton.radii.fit_kernels import Match, reach_on_circle
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.kernels import Kernel
 
 PLACES = 180  # positions on the circle, each with a weight
 _CLEAR = 12.0  # concentration from which a point shows the sides that were seen
@@ -125,7 +125,7 @@ def _flat_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: 
     # In units of the noise: distance = sharpness / (radius / noise).
     offset = out[thick] * (sharpness[thick] / np.sqrt(stout[thick]))[:, None]
     views = _half_sphere()
-    mean, sure, share = flatness(np.ascontiguousarray(axis[thick]), offset, views)
+    mean, sure, share = flatness(axis[thick], offset, views)
     share[(share <= _FLAT) | (mean <= _FLAT_SURE * sure)] = 0.0
     if not share.any():
         return None
@@ -139,31 +139,18 @@ def _flat_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: 
     return _one_side(view if bent.mean() < 0 else -view)
 
 
-@compiled_exactly
+_flatness = Kernel(
+    "flatness", "axis float64[points, 3]", "offset float64[points, 3]", "views float64[views, 3]",
+    "out mean float64[views]", "out sure float64[views]", "out share float64[views]")
+
+
 def flatness(axis: np.ndarray, offset: np.ndarray, views: np.ndarray,
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """By how much the squares of offsets [m, 3] across their axes [m, 3] are larger across each of
     k views [k, 3] than along it: their mean, its standard deviation, and its fraction, [k] each."""
-    mean, sure, share = np.zeros(len(views)), np.zeros(len(views)), np.zeros(len(views))
-    for k in range(len(views)):
-        difference = squares = total = 0.0
-        for i in range(len(axis)):
-            x, y, z = axis[i, 0], axis[i, 1], axis[i, 2]
-            a, b, c = views[k, 0], views[k, 1], views[k, 2]
-            on = a * x + b * y + c * z
-            a, b, c = a - on * x, b - on * y, c - on * z
-            size = max(a * a + b * b + c * c, 1e-12)
-            along = a * offset[i, 0] + b * offset[i, 1] + c * offset[i, 2]
-            across = ((y * c - z * b) * offset[i, 0] + (z * a - x * c) * offset[i, 1]
-                      + (x * b - y * a) * offset[i, 2])
-            more = (across * across - along * along) / size
-            difference += more
-            squares += more * more
-            total += (across * across + along * along) / size
-        mean[k] = difference / len(axis)
-        sure[k] = np.sqrt(max(squares / len(axis) - mean[k]**2, 0.0) / len(axis))
-        share[k] = difference / max(total, 1e-300)
-    return mean, sure, share
+    found = np.empty(len(views)), np.empty(len(views)), np.empty(len(views))
+    _flatness.of(axis, offset, views, *found)
+    return found
 
 
 def _half_sphere() -> np.ndarray:
