@@ -132,7 +132,7 @@ def test_no_proof_stands_against_a_path(bowing_field):
     path, cost = refine(line, enough)
     assert cost == enough.cost(path) < np.inf
     assert not judge(enough).proven
-    limited = enough.limits._replace(max_force=0.9 * np.linalg.norm(
+    limited = replace(enough.limits, max_force=0.9 * np.linalg.norm(
         bowing_field.force(enough.start[None])))
     assert judge(replace(enough, limits=limited, beyond=limited)).proven
     assert not judge(replace(enough, limits=limited)).proven, "nothing is known of its error"

@@ -136,8 +136,8 @@ def test_goal_behind_a_wall(ridge_field):
     """A cap that parts the start from the goal ends in NoPathError and not in a path."""
     problem = make_problem(ridge_field, deformation=0.0, distance=1.0)
     wall = np.random.default_rng(0).uniform([-0.03, -0.2, -0.2], [0.03, 0.2, 0.2], (2000, 3))
-    start_and_goal_only = ridge_field.limited(max_energy=1.0)._replace(
-        region=replace(ridge_field.region, rejected=wall).arrays)
+    start_and_goal_only = replace(ridge_field.limited(max_energy=1.0),
+                                  region=replace(ridge_field.region, rejected=wall).numbers)
     walled = replace(problem, limits=start_and_goal_only)
     with pytest.raises(NoPathError, match="500 iterations"):
         plan_path(walled, Search(iterations=500))

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from limber.core.numerics.compiled import compiled
 from limber.geometry.skeleton.sweep import arc_lengths
-from limber.planning.field.energy_field import EnergyField, allowed_at, energy_at
+from limber.kernels import Kernel, for_kernels
+from limber.planning.field.energy_field import EnergyField, FieldArrays
 
 STEP = 0.005
 """Longest distance between evaluation points of an edge [m]; also the paper-like spacing."""
@@ -93,31 +93,17 @@ def resample(path: np.ndarray, spacing: float) -> np.ndarray:
     return np.stack([np.interp(spots, along, path[:, k]) for k in range(path.shape[1])], axis=1)
 
 
-@compiled
-def edge_cost(start, stop, field, weights):
+_PATH_COST = Kernel("path_cost", "path float64[points, 3]", "field float64[field]",
+                    "energy float", "length float", "step float", returns="float")
+
+
+def edge_cost(start: np.ndarray, stop: np.ndarray, field: FieldArrays,
+              weights: EdgeWeights) -> float:
     """Return the cost of the straight edge; infinite if any of it is not allowed. Midpoint rule at
     ``weights.step`` or finer; ``stop`` is checked, ``start`` is assumed checked."""
-    length = np.sqrt(np.sum((stop - start) ** 2))
-    pieces = max(int(np.ceil(length / weights.step)), 1)
-    total = 0.0
-    for i in range(pieces):
-        point = start + (stop - start) * ((i + 0.5) / pieces)
-        energy = 0.0
-        if weights.energy > 0.0 or field.max_energy < np.inf:
-            energy = energy_at(point, field)
-        if not allowed_at(point, energy, field):
-            return np.inf
-        total += energy
-    energy = energy_at(stop, field) if field.max_energy < np.inf else 0.0
-    if not allowed_at(stop, energy, field):
-        return np.inf
-    return length * (weights.energy * total / pieces + weights.length)
+    return _PATH_COST(np.array((start, stop)), field.numbers, *weights)
 
 
-@compiled
-def path_cost(path, field, weights):
+def path_cost(path: np.ndarray, field: FieldArrays, weights: EdgeWeights) -> float:
     """Return the summed cost of a polyline's edges."""
-    total = 0.0
-    for i in range(len(path) - 1):
-        total += edge_cost(path[i], path[i + 1], field, weights)
-    return total
+    return _PATH_COST(for_kernels(path), field.numbers, *weights)

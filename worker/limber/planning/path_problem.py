@@ -1,7 +1,7 @@
 """One planning problem: start, goal, cost per metre and limits."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -75,8 +75,8 @@ class GentleProblem:
         """The limits ``beyond`` which a pose is surely not allowed; infinite if unknown."""
         if self.beyond is not None:
             return self.beyond
-        return self.limits._replace(max_energy=np.inf, max_force=np.inf,
-                                    max_loads=np.full_like(self.limits.max_loads, np.inf))
+        return replace(self.limits, max_energy=np.inf, max_force=np.inf,
+                       max_loads=np.full_like(self.limits.max_loads, np.inf))
 
     def cost(self, path: np.ndarray) -> float:
         """Return the cost of a polyline [n, 3]; infinite over a limit, too long or off the goal.

@@ -33,157 +33,53 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from limber.core.numerics.compiled import compiled
+from limber.kernels import Kernel
 
-# Fast marching on a masked grid: arrival costs from a set of nodes, second order where possible.
-#
-# Solves |grad u| = rate on the nodes of a regular grid (Sethian 1999, "Fast marching methods",
-# SIAM Review 41, sections 5 and 6). The result is only a candidate:
-# the subsolution below checks what a proof needs, however the candidate
-# was found.
+_CELLS, _CORNERS = "cells bool[nx, ny, nz]", "values float64[cx, cy, cz]"
+_SLOPES, _FOUND = "slopes float64[cx, cy, cz, 3]", "out found float64[nx, ny, nz]"
+_numbered = Kernel("cells_numbered", "cells int64[count]", "out numbers int32[nx, ny, nz]",
+                   "out near int32[count, 6]")
+_marched = Kernel("fast_marching", "rate float64[count]", "near int32[count, 6]",
+                  "known bool[count]", "values float64[count]", "edges float64[3]",
+                  "out u float64[count]")
+_turned = Kernel("turns_between", _SLOPES, _CELLS, "out found float64[3, nx, ny, nz]")
+_least_between = Kernel("least_between", _CORNERS, _SLOPES, _CELLS, _FOUND, "curvature float")
+_least_size = Kernel("least_size", "vectors float64[cx, cy, cz, 3]", _CELLS, _FOUND,
+                     "curvature float")
+_off_zero = Kernel("hulls_off_zero", "corners float64[hulls, 8, 3]", "out found float64[hulls]")
+_bent = Kernel("bends_between", _CORNERS, _CELLS, "out found float64[3, nx, ny, nz]",
+               "curvature float")
+_middle = Kernel("means_of_corners", _CORNERS, "cells int64[count]", "out means float64[count]")
+_most = Kernel("most_about", "values float64[count]", "numbers int32[nx, ny, nz]",
+               "cells int64[count]", "out most float64[count]")
+_least = Kernel("least_in_cells", "u float64[nx, ny, nz]", _CELLS, _FOUND)
+_steepness = Kernel(
+    "spline_excess", "u float64[nx, ny, nz]", "edges float64[3]", "open_cells bool[nx, ny, nz]",
+    "rate float64[cx, cy, cz]", "bends float64[3, nx, ny, nz]", "level bool[nx, ny, nz]",
+    "asked int64[asked, 3]", "out over float64[asked]", "floor float")
 
-@compiled
-def neighbours(active):
+
+def neighbours(active: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return numbers of the nodes ``active`` [nx, ny, nz], -1 elsewhere, their indices in the flat
     grid [n], and the numbers of their neighbours below and above along each axis [n, 6]."""
-    shape = np.array(active.shape)
-    steps = np.array([shape[1] * shape[2], shape[2], 1])
-    flat = active.ravel()
-    numbers = np.full(flat.size, -1, np.int32)
-    indices = np.flatnonzero(flat)
-    for k in range(len(indices)):
-        numbers[indices[k]] = k
-    near = np.full((len(indices), 6), -1, np.int32)
-    for k in range(len(indices)):
-        for axis in range(3):
-            at = indices[k] // steps[axis] % shape[axis]
-            if at > 0:
-                near[k, 2 * axis] = numbers[indices[k] - steps[axis]]
-            if at + 1 < shape[axis]:
-                near[k, 2 * axis + 1] = numbers[indices[k] + steps[axis]]
-    return numbers.reshape(active.shape), indices, near
+    indices = np.flatnonzero(active)
+    numbers, near = np.empty(active.shape, np.int32), np.empty((len(indices), 6), np.int32)
+    _numbered(indices, numbers, near)
+    return numbers, indices, near
 
 
-@compiled
-def march(rate, near, known, values, edges):
-    """Return arrival costs [n], infinite where unreachable, from cost per metre [n], neighbours [n,
-    6], values [n] at ``known`` nodes, and the grid's edges [3] [m]."""
-    count = len(rate)
-    u = np.full(count, np.inf)
-    done = np.zeros(count, np.bool_)
-    heap = np.empty(count, np.int32)
-    heap_index = np.full(count, -1, np.int32)
-    used = np.empty((4, 3))
-    size = 0
-    for node in range(count):
-        if known[node]:
-            u[node] = values[node]
-            size = _push(heap, heap_index, u, size, node)
-    while size > 0:
-        node = heap[0]
-        size = _pop(heap, heap_index, u, size)
-        done[node] = True
-        for side in range(6):
-            other = near[node, side]
-            if other < 0 or done[other] or known[other]:
-                continue
-            cost = _arrival(other, u, done, rate[other], edges, near, used)
-            if cost < u[other]:
-                u[other] = cost
-                if heap_index[other] < 0:
-                    size = _push(heap, heap_index, u, size, other)
-                else:
-                    _rise(heap, heap_index, u, heap_index[other])
-    return u
+def march(rate: np.ndarray, near: np.ndarray, known: np.ndarray, values: np.ndarray,
+          edges: np.ndarray) -> np.ndarray:
+    """Fast marching on a masked grid: solve |grad u| = rate on its nodes, second order where
+    possible (Sethian 1999, "Fast marching methods", SIAM Review 41, sections 5 and 6).
 
-
-@compiled
-def _arrival(node, u, done, rate, edges, near, used):
-    """Solve sum_i w_i (u - t_i)^2 = rate^2 over the axes whose upwind neighbour is done. ``used``
-    [4, 3] is room for t, w, the neighbour's value and the edge of each axis."""
-    count = 0
-    for axis in range(3):
-        best, value = -1, np.inf
-        for side in (2 * axis, 2 * axis + 1):
-            other = near[node, side]
-            if other >= 0 and done[other] and u[other] < value:
-                best, value = side, u[other]
-        if best < 0:
-            continue
-        weight = 1.0 / (edges[axis] * edges[axis])
-        used[0, count], used[1, count], used[2, count] = value, weight, value
-        used[3, count] = edges[axis]
-        far = near[near[node, best], best]
-        if far >= 0 and done[far] and u[far] <= value:
-            used[0, count], used[1, count] = (4.0 * value - u[far]) / 3.0, 2.25 * weight
-        count += 1
-    # Drop the axis with the highest neighbour until the solution exceeds all used neighbours.
-    while count > 0:
-        a, b, c, top = 0.0, 0.0, -rate * rate, -np.inf
-        last = 0
-        for i in range(count):
-            t, w = used[0, i], used[1, i]
-            a += w
-            b += w * t
-            c += w * t * t
-            if used[2, i] > top:
-                top, last = used[2, i], i
-        root = b * b - a * c
-        if root >= 0.0:
-            solution = (b + np.sqrt(root)) / a
-            if solution >= top:
-                return solution
-        if count == 1:
-            return used[2, 0] + rate * used[3, 0]
-        count -= 1
-        for k in range(4):
-            used[k, last] = used[k, count]
-    return np.inf
-
-
-@compiled
-def _push(heap, heap_index, u, size, node):
-    heap[size] = node
-    heap_index[node] = size
-    _rise(heap, heap_index, u, size)
-    return size + 1
-
-
-@compiled
-def _rise(heap, heap_index, u, index):
-    node = heap[index]
-    while index > 0:
-        parent = (index - 1) // 2
-        if u[heap[parent]] <= u[node]:
-            break
-        heap[index] = heap[parent]
-        heap_index[heap[index]] = index
-        index = parent
-    heap[index] = node
-    heap_index[node] = index
-
-
-@compiled
-def _pop(heap, heap_index, u, size):
-    size -= 1
-    heap_index[heap[0]] = -2
-    node = heap[size]
-    index = 0
-    while True:
-        child = 2 * index + 1
-        if child >= size:
-            break
-        if child + 1 < size and u[heap[child + 1]] < u[heap[child]]:
-            child += 1
-        if u[node] <= u[heap[child]]:
-            break
-        heap[index] = heap[child]
-        heap_index[heap[index]] = index
-        index = child
-    if size > 0:
-        heap[index] = node
-        heap_index[node] = index
-    return size
+    Return arrival costs [n], infinite where unreachable, from cost per metre [n], neighbours [n,
+    6], values [n] at ``known`` nodes, and the grid's edges [3] [m]. They are only a candidate: the
+    subsolution below checks what a proof needs, however the candidate was found.
+    """
+    out = np.empty(len(rate))
+    _marched(rate, near, known, values, edges, out)
+    return out
 
 
 # Lower bounds of a function in a cell, from its values and slopes at the corners.
@@ -206,135 +102,37 @@ def _pop(heap, heap_index, u, size):
 CURVATURE_FACTOR = 2.0
 """Factor on second differences at a cell's corners that bounds derivatives inside."""
 
-_NEARER = 12  # steps towards the point of a hull nearest to zero
 
-
-@compiled
-def turns(slopes, cells):
+def turns(slopes: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Return ``M_i h^2`` of convex functions [3, *shape of cells] from slopes at corners [nx + 1,
     ny + 1, nz + 1, 3] times h; nan counts as no turn."""
-    out = np.zeros((3,) + cells.shape)
-    for i in range(cells.shape[0]):
-        for j in range(cells.shape[1]):
-            for k in range(cells.shape[2]):
-                if not cells[i, j, k]:
-                    continue
-                for p in range(2):
-                    for q in range(2):
-                        x = slopes[i + 1, j + p, k + q, 0] - slopes[i, j + p, k + q, 0]
-                        y = slopes[i + p, j + 1, k + q, 1] - slopes[i + p, j, k + q, 1]
-                        z = slopes[i + p, j + q, k + 1, 2] - slopes[i + p, j + q, k, 2]
-                        out[0, i, j, k] = max(out[0, i, j, k], 2.0 * x)
-                        out[1, i, j, k] = max(out[1, i, j, k], 2.0 * y)
-                        out[2, i, j, k] = max(out[2, i, j, k], 2.0 * z)
+    out = np.empty((3, *cells.shape))
+    _turned(slopes, cells, out)
     return out
 
 
-@compiled
-def least_between(values, slopes, cells):
+def least_between(values: np.ndarray, slopes: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Lower bounds in cells [nx, ny, nz] from values [nx + 1, ny + 1, nz + 1] and slopes as in
     :func:`turns`, -inf where unknown. Second differences with a nan count as 0."""
-    out = np.full(cells.shape, -np.inf)
-    turned = turns(slopes, cells)
-    indices = np.argwhere(cells)
-    curved = np.empty(3)
-    for n in range(len(indices)):
-        i, j, k = indices[n, 0], indices[n, 1], indices[n, 2]
-        least = np.inf
-        curved[:] = 0.0
-        for p in range(i, i + 2):
-            for q in range(j, j + 2):
-                for r in range(k, k + 2):
-                    here = values[p, q, r]
-                    least = here if np.isnan(here) else min(least, here)
-                    x = abs(values[p - 1, q, r] - 2.0 * here + values[p + 1, q, r])
-                    y = abs(values[p, q - 1, r] - 2.0 * here + values[p, q + 1, r])
-                    z = abs(values[p, q, r - 1] - 2.0 * here + values[p, q, r + 1])
-                    curved[0] = x if x > curved[0] else curved[0]
-                    curved[1] = y if y > curved[1] else curved[1]
-                    curved[2] = z if z > curved[2] else curved[2]
-        if not np.isnan(least):
-            for axis in range(3):
-                least -= max(CURVATURE_FACTOR * curved[axis], turned[axis, i, j, k]) / 8.0
-            out[i, j, k] = least
+    out = np.empty(cells.shape)
+    _least_between(values, slopes, cells, out, CURVATURE_FACTOR)
     return out
 
 
-@compiled
-def least_size(vectors, cells):
+def least_size(vectors: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Return the least length in ``cells`` [nx, ny, nz] of a vector with values ``vectors`` [nx +
     1, ny + 1, nz + 1, 3] at the corners; 0 where not known."""
-    out = np.zeros(cells.shape)
-    indices = np.argwhere(cells)
-    corners, curved, step = np.empty((8, 3)), np.empty(3), np.empty(3, np.int64)
-    for n in range(len(indices)):
-        i, j, k = indices[n, 0], indices[n, 1], indices[n, 2]
-        curved[:] = 0.0
-        number = 0
-        for p in range(i, i + 2):
-            for q in range(j, j + 2):
-                for r in range(k, k + 2):
-                    corners[number] = vectors[p, q, r]
-                    number += 1
-                    for axis in range(3):
-                        step[:] = 0
-                        step[axis] = 1
-                        bend = 0.0
-                        for c in range(3):
-                            second = (vectors[p - step[0], q - step[1], r - step[2], c]
-                                      - 2.0 * vectors[p, q, r, c]
-                                      + vectors[p + step[0], q + step[1], r + step[2], c])
-                            bend += second * second
-                        if bend > curved[axis]:
-                            curved[axis] = bend
-        if not np.isnan(corners).any():
-            bends = np.sqrt(curved[0]) + np.sqrt(curved[1]) + np.sqrt(curved[2])
-            out[i, j, k] = max(_off_zero(corners) - CURVATURE_FACTOR / 8.0 * bends, 0.0)
+    out = np.empty(cells.shape)
+    _least_size(vectors, cells, out, CURVATURE_FACTOR)
     return out
 
 
-@compiled
-def off_zero(corners):
+def off_zero(corners: np.ndarray) -> np.ndarray:
     """Return a lower bound of the distances of zero from the convex hulls of ``corners``
     [n, 8, 3], shape [n]."""
     out = np.empty(len(corners))
-    for n in range(len(corners)):
-        out[n] = _off_zero(corners[n])
+    _off_zero.of(corners, out)
     return out
-
-
-@compiled
-def _off_zero(corners):
-    """Gilbert's steps: along any direction, the hull is beyond its least corner."""
-    best, least = np.zeros(3), np.inf
-    for n in range(len(corners)):
-        size = corners[n, 0]**2 + corners[n, 1]**2 + corners[n, 2]**2
-        if size < least:
-            least = size
-            best[:] = corners[n]
-    found = 0.0
-    for _ in range(_NEARER):
-        size = np.sqrt(best[0]**2 + best[1]**2 + best[2]**2)
-        if size <= 0.0:
-            return 0.0
-        nearest, at = np.inf, 0
-        for n in range(len(corners)):
-            along = (corners[n, 0] * best[0] + corners[n, 1] * best[1]
-                     + corners[n, 2] * best[2]) / size
-            if along < nearest:
-                nearest, at = along, n
-        found = max(found, nearest)
-        if size - nearest <= 1e-3 * size:
-            break
-        part, whole = 0.0, 0.0
-        for c in range(3):
-            component = corners[at, c] - best[c]
-            part -= component * best[c]
-            whole += component * component
-        share = min(max(part / whole, 0.0), 1.0)
-        for c in range(3):
-            best[c] += share * (corners[at, c] - best[c])
-    return found
 
 
 RIM = 2  # closed cells around the open ones that have coefficients as well
@@ -386,41 +184,11 @@ def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cel
     return Terrain(edges, open_cells, np.nan_to_num(rate, nan=floor), bends, level, floor)
 
 
-@compiled
-def _bends(values, cells):
+def _bends(values: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Return ``M_i h^2 / 4`` of the module's text in ``cells``, shape [3, *shape of cells].
     ``values`` at the corners; a second difference with one that is not known (nan) counts as 0."""
-    out = np.zeros((3,) + cells.shape)
-    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
-    at, step = np.empty(3, np.int64), np.empty(3, np.int64)
-    for i in range(cells.shape[0]):
-        for j in range(cells.shape[1]):
-            for k in range(cells.shape[2]):
-                if not cells[i, j, k]:
-                    continue
-                for axis in range(3):
-                    first[0], first[1], first[2] = i, j, k
-                    last[:] = first + 1
-                    step[:] = 0
-                    step[axis] = 1
-                    most, least, size = -np.inf, np.inf, 0.0
-                    first[axis] = max(first[axis] - 1, 1)
-                    last[axis] = min(last[axis] + 1, values.shape[axis] - 2)
-                    for p in range(first[0], last[0] + 1):
-                        for q in range(first[1], last[1] + 1):
-                            for r in range(first[2], last[2] + 1):
-                                at[0], at[1], at[2] = p, q, r
-                                second = (values[p - step[0], q - step[1], r - step[2]]
-                                          - 2.0 * values[p, q, r]
-                                          + values[p + step[0], q + step[1], r + step[2]])
-                                if np.isnan(second):
-                                    second = 0.0
-                                most, least = max(most, second), min(least, second)
-                                index = i if axis == 0 else (j if axis == 1 else k)
-                                if index <= at[axis] <= index + 1:
-                                    size = max(size, abs(second))
-                    bend = min(2.0 * most - least, CURVATURE_FACTOR * size)
-                    out[axis, i, j, k] = 0.25 * max(bend, 0.0)
+    out = np.empty((3, *cells.shape))
+    _bent(values, cells, out, CURVATURE_FACTOR)
     return out
 
 
@@ -474,7 +242,7 @@ def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells
     if not around.any():
         return u
     numbers, indices, near = neighbours(active)
-    bound = _middles(rates.rate, indices, active.shape)
+    bound = _middles(rates.rate, indices)
     u[around] = shape[around]
     asked = np.argwhere(rates.open_cells & ~free_cells)
     own = numbers[tuple(asked.T)]
@@ -482,11 +250,11 @@ def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells
     beside = asked[around[tuple(asked.T)]]
     # Where the cost is too steep it counts less there alone: one factor for all would be the least.
     steep = np.ones(active.shape)
-    steep[tuple(beside.T)] = np.maximum(_excess(u, *rates, beside), 1.0)
+    steep[tuple(beside.T)] = np.maximum(_excess(u, rates, beside), 1.0)
     within = around_box(around)
     u[within] /= scipy.ndimage.uniform_filter(
         scipy.ndimage.maximum_filter(steep[within], _EVEN), _EVEN)
-    lengths, most = u.ravel()[indices], float(_excess(u, *rates, beside).max(initial=0.0))
+    lengths, most = u.ravel()[indices], float(_excess(u, rates, beside).max(initial=0.0))
     factor = 1.0 / most if most > 0.0 else float(bound[held].min())
     rate, steepest = bound, held
     least, best, idle = np.inf, bound, 0
@@ -494,7 +262,7 @@ def subsolution(rates: Terrain, known: np.ndarray, shape: np.ndarray, free_cells
         values = march(rate, near, held, factor * lengths, rates.edges)
         u.ravel()[indices] = values
         over = np.ones(len(indices))
-        over[own] = np.maximum(_excess(u, *rates, asked), 1.0)
+        over[own] = np.maximum(_excess(u, rates, asked), 1.0)
         worst = float(over.max())
         idle = 0 if worst < least / _WORTH else idle + 1
         if worst < least:
@@ -517,33 +285,17 @@ def around_box(cells: np.ndarray, layers: int = 1) -> tuple[slice, ...]:
                      numbers.max(axis=0) + layers + 1))
 
 
-@compiled
-def _middles(values, indices, shape):
-    """Return the mean of the values at the corners of the cells ``indices`` [n] of a grid."""
+def _middles(values: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Return the means of the values at the corners of the cells ``indices`` [n] of a grid."""
     out = np.empty(len(indices))
-    for n in range(len(indices)):
-        i, j, k = indices[n] // (shape[1] * shape[2]), indices[n] // shape[2] % shape[1], (
-            indices[n] % shape[2])
-        out[n] = values[i:i + 2, j:j + 2, k:k + 2].sum() / 8.0
+    _middle(values, indices, out)
     return out
 
 
-@compiled
-def _most_about(values, numbers, places):
+def _most_about(values: np.ndarray, numbers: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Return the largest of each cell's value [n] and those of the cells that touch it."""
-    out = np.empty(len(places))
-    shape = numbers.shape
-    for n in range(len(places)):
-        i, j, k = places[n] // (shape[1] * shape[2]), places[n] // shape[2] % shape[1], (
-            places[n] % shape[2])
-        most = values[n]
-        for p in range(max(i - 1, 0), min(i + 2, shape[0])):
-            for q in range(max(j - 1, 0), min(j + 2, shape[1])):
-                for r in range(max(k - 1, 0), min(k + 2, shape[2])):
-                    other = numbers[p, q, r]
-                    if other >= 0 and values[other] > most:
-                        most = values[other]
-        out[n] = most
+    out = np.empty(len(indices))
+    _most(values, numbers, indices, out)
     return out
 
 
@@ -554,135 +306,17 @@ def spline_value(u: np.ndarray, cell: np.ndarray) -> float:
     return float(np.einsum("ijk,i,j,k", block, weights, weights, weights))
 
 
-@compiled
-def least_in_cells(u, cells):
+def least_in_cells(u: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Return a lower bound of the spline in each of ``cells``: its least Bernstein coefficient."""
-    out = np.full(u.shape, np.inf)
-    one, two, three = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))
-    indices = np.argwhere(cells)
-    for n in range(len(indices)):
-        i, j, k = indices[n, 0], indices[n, 1], indices[n, 2]
-        _along_last(u[i - 1:i + 2, j - 1:j + 2, k - 1:k + 2], one)
-        _along_middle(one, two)
-        _along_first(two, three)
-        out[i, j, k] = three.min()
+    out = np.empty(u.shape)
+    _least(u, cells, out)
     return out
 
 
-# Bernstein coefficients along one axis of a spline from 3 of its own, in all 9 lines along it.
-
-
-@compiled
-def _along_last(source, out):
-    for p in range(3):
-        for q in range(3):
-            a, b, c = source[p, q, 0], source[p, q, 1], source[p, q, 2]
-            out[p, q, 0], out[p, q, 1], out[p, q, 2] = 0.5 * (a + b), b, 0.5 * (b + c)
-
-
-@compiled
-def _along_middle(source, out):
-    for p in range(3):
-        for q in range(3):
-            a, b, c = source[p, 0, q], source[p, 1, q], source[p, 2, q]
-            out[p, 0, q], out[p, 1, q], out[p, 2, q] = 0.5 * (a + b), b, 0.5 * (b + c)
-
-
-@compiled
-def _along_first(source, out):
-    for p in range(3):
-        for q in range(3):
-            a, b, c = source[0, p, q], source[1, p, q], source[2, p, q]
-            out[0, p, q], out[1, p, q], out[2, p, q] = 0.5 * (a + b), b, 0.5 * (b + c)
-
-
-# Those of its slope along the axis.
-
-
-@compiled
-def _slope_last(source, out):
-    for p in range(3):
-        for q in range(3):
-            a, b, c = source[p, q, 0], source[p, q, 1], source[p, q, 2]
-            out[p, q, 0], out[p, q, 1], out[p, q, 2] = b - a, 0.5 * (c - a), c - b
-
-
-@compiled
-def _slope_middle(source, out):
-    for p in range(3):
-        for q in range(3):
-            a, b, c = source[p, 0, q], source[p, 1, q], source[p, 2, q]
-            out[p, 0, q], out[p, 1, q], out[p, 2, q] = b - a, 0.5 * (c - a), c - b
-
-
-@compiled
-def _slope_first(source, out):
-    for p in range(3):
-        for q in range(3):
-            a, b, c = source[0, p, q], source[1, p, q], source[2, p, q]
-            out[0, p, q], out[1, p, q], out[2, p, q] = b - a, 0.5 * (c - a), c - b
-
-
-@compiled
-def _excess(u, edges, open_cells, rate, bends, level, floor, asked):
+def _excess(u: np.ndarray, rates: Terrain, asked: np.ndarray) -> np.ndarray:
     """Return for each of the open cells ``asked`` [n, 3] the largest |grad u| relative to the
     allowed value there, else 0."""
-    over = np.zeros(len(asked))
-    along, down = np.empty((3, 3, 3)), np.empty((3, 3, 3))
-    one, two, three = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))
-    allowed = np.empty((3, 3, 3))
-    for n in range(len(asked)):
-        i, j, k = asked[n, 0], asked[n, 1], asked[n, 2]
-        block = u[i - 1:i + 2, j - 1:j + 2, k - 1:k + 2]
-        if not (open_cells[i, j, k] and block.max() < np.inf):
-            continue
-        _along_last(block, along)
-        _slope_last(block, down)
-        _along_middle(along, one)
-        _slope_first(one, two)
-        _slope_middle(along, one)
-        _along_first(one, three)
-        _along_middle(down, one)
-        _along_first(one, along)
-        for p in range(3):
-            for q in range(3):
-                for r in range(3):
-                    one[p, q, r] = np.sqrt((two[p, q, r] / edges[0])**2
-                                           + (three[p, q, r] / edges[1])**2
-                                           + (along[p, q, r] / edges[2])**2)
-        worst = one.max() / floor
-        if level[i, j, k]:
-            over[n] = worst
-            continue
-        _between(rate, i, j, k, allowed)
-        x, y, z = bends[0, i, j, k], bends[1, i, j, k], bends[2, i, j, k]
-        uneven, even, whole = 0.0, 0.0, 0.5 * (x + y + z)
-        for p in range(3):
-            for q in range(3):
-                for r in range(3):
-                    most = allowed[p, q, r]
-                    even = max(even, _over(one[p, q, r], most - whole))
-                    most -= (x if p == 1 else 0.0) + (y if q == 1 else 0.0) + (
-                        z if r == 1 else 0.0)
-                    uneven = max(uneven, _over(one[p, q, r], most))
-        over[n] = min(worst, even, uneven)
-    return over
-
-
-@compiled
-def _over(steep, allowed):
-    return steep / allowed if allowed > 0.0 else np.inf
-
-
-@compiled
-def _between(values, i, j, k, out):
-    """Write the trilinear interpolation at the 27 points ``(p, q, r) / 2`` in a cell."""
-    for p in range(0, 3, 2):
-        for q in range(0, 3, 2):
-            first, last = values[i + p // 2, j + q // 2, k], values[i + p // 2, j + q // 2, k + 1]
-            out[p, q, 0], out[p, q, 1], out[p, q, 2] = first, 0.5 * (first + last), last
-        for r in range(3):
-            out[p, 1, r] = 0.5 * (out[p, 0, r] + out[p, 2, r])
-    for q in range(3):
-        for r in range(3):
-            out[1, q, r] = 0.5 * (out[0, q, r] + out[2, q, r])
+    out = np.empty(len(asked))
+    _steepness.of(u, rates.edges, rates.open_cells, rates.rate, rates.bends, rates.level, asked,
+                  out, rates.floor)
+    return out

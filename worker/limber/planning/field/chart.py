@@ -15,11 +15,29 @@ itself.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from limber.core.numerics.compiled import compiled
 from limber.core.numerics.rigid import any_normal
+from limber.kernels import Kernel, for_kernels
+
+_mapped = Kernel("chart_mapped", "points float64[points, 3]", "chart float64[15]",
+                 "out flat float64[points, 3]")
+_turned = Kernel("gradients_turned", "points float64[points, 3]", "gradients float64[points, 3]",
+                 "chart float64[15]", "out turned float64[points, 3]", "forward int")
+_LANES = 4  # samples that the kernels take at once
+FAR = 1e60
+"""The last coordinate of points that pad others for the kernels: never nearest, without weight."""
+
+
+def by_column(rows: np.ndarray, beyond: float) -> np.ndarray:
+    """Return ``rows`` [n, k] by columns, [k, padded n], as the kernels of a field have them: padded
+    by rows of 0 whose last number is ``beyond``."""
+    out = np.zeros((rows.shape[1], -(-len(rows) // _LANES) * _LANES))
+    out[:, :len(rows)] = rows.T
+    out[-1, len(rows):] = beyond
+    return out
 
 
 @dataclass(frozen=True)
@@ -49,14 +67,17 @@ class Chart:
         """The same without stretch: lengths along and off the shell are unchanged."""
         return replace(self, stretch=1.0, depth=np.inf)
 
-    @property
-    def arrays(self) -> tuple[np.ndarray, float, np.ndarray, float, float]:
-        """Arguments of the compiled functions after the point."""
-        return self.pivot, self.radius, self.axes, float(self.stretch), float(self.depth)
+    @cached_property
+    def numbers(self) -> np.ndarray:
+        """What the kernels read, shape [15]."""
+        return np.hstack([self.pivot, self.radius, self.axes.ravel(), self.stretch, self.depth])
 
     def map(self, points: np.ndarray) -> np.ndarray:
         """Return chart coordinates [n, 3] of ``points`` [n, 3]."""
-        return _mapped(np.ascontiguousarray(points, float).reshape(-1, 3), *self.arrays)
+        points = for_kernels(points).reshape(-1, 3)
+        flat = np.empty_like(points)
+        _mapped(points, self.numbers, flat)
+        return flat
 
     def curved(self, flat: np.ndarray) -> np.ndarray:
         """Return the points [n, 3] of coordinates [n, 3] of the plain chart."""
@@ -78,8 +99,9 @@ class Chart:
     def _turned(self, points: np.ndarray, gradients: np.ndarray, forward: bool) -> np.ndarray:
         if self.radius == 0.0:
             return gradients
-        return _turned(np.ascontiguousarray(points, float),
-                       np.ascontiguousarray(gradients, float), forward, *self.arrays)
+        turned = np.empty(gradients.shape)
+        _turned.of(points, gradients, self.numbers, turned, forward)
+        return turned
 
     def growth(self, points: np.ndarray, reach: float) -> np.ndarray:
         """Return the largest change [n] of plain coordinates per metre within ``reach`` [m],
@@ -123,93 +145,3 @@ class Chart:
         angle = np.arctan2(np.linalg.norm(local[:, :2], axis=1), local[:, 2])
         angle = np.minimum(angle + np.arcsin(np.minimum(reach / (safe + reach), 1.0)), np.pi)
         return safe, np.where((least <= 0.0) | (angle > 0.95 * np.pi), np.nan, angle)
-
-
-@compiled
-def mapped(point, pivot, radius, axes, stretch, depth):
-    """Return the chart coordinates of one point [3]."""
-    if radius == 0.0:
-        return point.copy()
-    out = np.empty(3)
-    for k in range(3):
-        out[k] = 0.0
-        for j in range(3):
-            out[k] += axes[k, j] * (point[j] - pivot[j])
-    rho = np.sqrt(out[0] * out[0] + out[1] * out[1])
-    off = np.sqrt(rho * rho + out[2] * out[2]) - radius
-    part = radius / out[2] if rho < 1e-12 else radius * np.arctan2(rho, out[2]) / rho
-    out[0] *= part
-    out[1] *= part
-    out[2] = stretch * off / np.sqrt(np.sqrt(1.0 + (off / depth) ** 2))
-    return out
-
-
-@compiled
-def _mapped(points, pivot, radius, axes, stretch, depth):
-    out = np.empty_like(points)
-    for i in range(len(points)):
-        out[i] = mapped(points[i], pivot, radius, axes, stretch, depth)
-    return out
-
-
-@compiled
-def _turned(points, gradients, forward, pivot, radius, axes, stretch, depth):
-    out = np.zeros_like(gradients)
-    local, own, other = np.empty(3), np.empty(3), np.empty(3)
-    for n in range(len(points)):
-        for k in range(3):
-            local[k] = 0.0
-            own[k] = gradients[n, k]
-            for j in range(3):
-                local[k] += axes[k, j] * (points[n, j] - pivot[j])
-        if forward:
-            for k in range(3):
-                own[k] = 0.0
-                for j in range(3):
-                    own[k] += axes[k, j] * gradients[n, j]
-        rho = max(np.sqrt(local[0] * local[0] + local[1] * local[1]), 1e-12)
-        r = np.sqrt(rho * rho + local[2] * local[2])
-        x, y, sine, cosine = local[0] / rho, local[1] / rho, rho / r, local[2] / r
-        square = ((r - radius) / depth) ** 2
-        meridian, parallel = radius / r, radius * np.arctan2(rho, local[2]) / rho
-        outward = stretch * (1.0 + 0.5 * square) / (1.0 + square) ** 1.25
-        # Components along the meridian, along the parallel and outward, at both ends.
-        across = x * own[0] + y * own[1]
-        aside = x * own[1] - y * own[0]
-        if forward:
-            along = (cosine * across - sine * own[2]) / meridian
-            aside /= parallel
-            other[2] = (sine * across + cosine * own[2]) / outward
-            other[0], other[1] = x * along - y * aside, y * along + x * aside
-            for k in range(3):
-                out[n, k] = other[k]
-            continue
-        along, aside, off = across * meridian, aside * parallel, own[2] * outward
-        out_across = cosine * along + sine * off
-        other[0], other[1] = x * out_across - y * aside, y * out_across + x * aside
-        other[2] = cosine * off - sine * along
-        for k in range(3):
-            for j in range(3):
-                out[n, k] += axes[j, k] * other[j]
-    return out
-
-
-@compiled
-def pulled_back_size(point, gradient, pivot, radius, axes, stretch, depth):
-    """Return the magnitude of one gradient [3] taken back to the point's coordinates."""
-    whole = np.sum(gradient * gradient)
-    if radius == 0.0:
-        return np.sqrt(whole)
-    local = np.empty(3)
-    for k in range(3):
-        local[k] = 0.0
-        for j in range(3):
-            local[k] += axes[k, j] * (point[j] - pivot[j])
-    rho = max(np.sqrt(local[0] * local[0] + local[1] * local[1]), 1e-12)
-    r = np.sqrt(rho * rho + local[2] * local[2])
-    square = ((r - radius) / depth) ** 2
-    along = gradient[2] * stretch * (1.0 + 0.5 * square) / (1.0 + square) ** 1.25
-    meridian = (gradient[0] * local[0] + gradient[1] * local[1]) / rho
-    side = max(whole - gradient[2] * gradient[2] - meridian * meridian, 0.0)
-    turn = radius * np.arctan2(rho, local[2]) / rho
-    return np.sqrt(along * along + (meridian * radius / r) ** 2 + side * turn * turn)

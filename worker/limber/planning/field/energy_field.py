@@ -12,27 +12,23 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from limber.core.errors import Command, InputError, Option, Text, WorkError
 from limber.core.files.reading import read_arrays, require_shapes
-from limber.core.numerics.compiled import compiled
 from limber.core.progress import SILENT, Progress
-from limber.planning.field.chart import Chart, mapped, pulled_back_size
+from limber.planning.field.chart import Chart
 from limber.planning.field.radial import (
     KERNELS,
     LocalError,
     RadialInterpolant,
     Slack,
-    gradient_at,
-    slack_at,
     slack_of,
-    value_at,
 )
 from limber.planning.field.stored_states import GraspSamples
-from limber.planning.field.valid_region import TrustRegion, trusted_at
+from limber.planning.field.valid_region import TrustRegion
 
 # The kernel and the charts of a field's fit, chosen by cross-validation.
 
@@ -207,19 +203,26 @@ _OPTIONAL_SHAPES = {
 _CHOSEN = ("energy_fit", "shape_fit")  # whose kernels and charts are in it
 
 
-class FieldArrays(NamedTuple):
-    """A field and its limits as arrays for the compiled loops; see :meth:`EnergyField.limited`."""
+@dataclass(frozen=True)
+class FieldArrays:
+    """A field and its limits as arrays for the kernels; see :meth:`EnergyField.limited`."""
 
-    chart: tuple
-    energy: tuple
-    region: tuple
-    loads: tuple
+    field: np.ndarray
+    region: np.ndarray
+    loads: np.ndarray
     max_energy: float
     max_force: float
     max_loads: np.ndarray
     low: np.ndarray
     high: np.ndarray
     slack: Slack
+
+    @cached_property
+    def numbers(self) -> np.ndarray:
+        """What the kernels read, shape [n]."""
+        return np.hstack([self.max_energy, self.max_force, len(self.max_loads), self.max_loads,
+                          self.low, self.high, self.field, self.region, self.loads,
+                          self.slack.numbers])
 
 
 @dataclass(frozen=True)
@@ -343,12 +346,13 @@ class EnergyField:
     def limited(self, max_energy: float = np.inf, max_force: float = np.inf, *,
                 low: np.ndarray | None = None, high: np.ndarray | None = None,
                 slack: Slack | None = None, **max_loads: float) -> FieldArrays:
-        """Return the arrays for compiled loops, with limits on energy [J], force [N], the box from
+        """Return the arrays for the kernels, with limits on energy [J], force [N], the box from
         ``low`` to ``high`` [m] that the grasp stays in, and on loads by name (magnitudes);
         ``slack`` tightens them by position, in the order energy, force, loads.
         """
-        return FieldArrays(self.chart.arrays, self.energy_fit.arrays, self.region.arrays,
-                           (self.shape_chart.arrays, self.load_fit.arrays),
+        return FieldArrays(np.hstack([self.chart.numbers, self.energy_fit.numbers]),
+                           self.region.numbers,
+                           np.hstack([self.shape_chart.numbers, self.load_fit.numbers]),
                            float(max_energy), float(max_force),
                            np.array([max_loads.get(name, np.inf) for name in self.load_names]),
                            np.full(3, -np.inf) if low is None else np.asarray(low, float),
@@ -479,45 +483,6 @@ def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: T
 
 def _rows(points: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(points, float).reshape(-1, 3)
-
-
-@compiled
-def energy_at(point: np.ndarray, field: Any) -> float:
-    """Return the energy [J], cut off at 0, at ``point`` [3]."""
-    return max(value_at(mapped(point, *field.chart), 0, *field.energy), 0.0)
-
-
-@compiled
-def allowed_at(point: np.ndarray, energy: float, field: Any) -> bool:
-    """Return whether ``point``, whose energy is known, is trusted and within the limits."""
-    # The slack's chart is the plain one, which is the region's.
-    if energy > field.max_energy - _slack(point, 0, field):
-        return False
-    for k in range(3):
-        if not field.low[k] <= point[k] <= field.high[k]:
-            return False
-    if not trusted_at(point, field.region):
-        return False
-    chart, fit = field.loads
-    for k in range(len(field.max_loads)):
-        if field.max_loads[k] < np.inf and (
-                np.abs(value_at(mapped(point, *chart), k, *fit))
-                > field.max_loads[k] - _slack(point, 2 + k, field)):
-            return False
-    if field.max_force == np.inf:
-        return True
-    slope = np.empty(len(point))
-    gradient_at(mapped(point, *field.chart), 0, *field.energy, slope)
-    return pulled_back_size(point, slope, *field.chart) <= (
-        field.max_force - _slack(point, 1, field))
-
-
-@compiled
-def _slack(point: np.ndarray, row: int, field: Any) -> float:
-    """Return by how much a limit is tighter at ``point`` [3]."""
-    if field.slack.factors[row] == 0.0:
-        return 0.0
-    return slack_at(mapped(point, *field.region[0]), row, field.slack)
 
 
 # The limited quantities of the field, one by one.

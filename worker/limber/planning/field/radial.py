@@ -8,23 +8,37 @@ gives, besides the energy, the force, which is the energy's gradient. The second
 ``1 + dimension`` times as much data.
 
 The fit is dense linear algebra. Values and gradients, in three coordinates, are evaluated by
-compiled loops that the planner calls some million times, each over all samples. Their arrays hold
-one coordinate each in the order of the loop, so that the processor vectorises.
+native loops that the planner calls some million times, each over all samples
+(``worker/kernels/planning/field.hpp``).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations_with_replacement
-from typing import NamedTuple
 
 import numpy as np
 
 from limber.core.errors import WorkError
-from limber.core.numerics.compiled import compiled
+from limber.kernels import Kernel, for_kernels
+from limber.planning.field.chart import FAR, by_column
 
 KERNELS = {"cubic": 0, "quintic": 1, "multiquadric": 2, "gaussian": 3}
-"""Kernel name to its number in the compiled loops."""
+"""Kernel name to its number in the native loops."""
+
+_POINTS, _CHANNELS = "points float64[points, 3]", "channels int64[channels]"
+_system = Kernel("radial_system", "centres float64[count, 3]", "out matrix float64[size, size]",
+                 "shape float", "kernel int")
+_values = Kernel("radial_values", _POINTS, _CHANNELS, "interpolant float64[interpolant]",
+                 "out values float64[points, channels]")
+_gradients = Kernel("radial_gradients", _POINTS, _CHANNELS, "interpolant float64[interpolant]",
+                    "out gradients float64[points, 3, channels]")
+_slacks = Kernel("slacks_at", _POINTS, "slack float64[slack]", "out found float64[points]",
+                 "row int")
+_slopes = Kernel("slack_slopes", _POINTS, "slack float64[slack]", "out found float64[points, 3]",
+                 "row int")
+_about = Kernel("means_about", _POINTS, "samples float64[samples, 3]", "squares float64[samples]",
+                "out means float64[points]", "near float", "is_left_out int")
 
 # The polynomial that a kernel needs to be conditionally definite, or one degree more.
 _DEGREE = {"cubic": 1, "quintic": 2, "multiquadric": 1, "gaussian": 1}
@@ -105,22 +119,31 @@ class RadialInterpolant:
 
     def value(self, points: np.ndarray, channels: slice = slice(None)) -> np.ndarray:
         """Return ``channels`` of the field at ``points`` [n, 3], shape [n, channels]."""
-        return _values(np.ascontiguousarray(points, float), self._asked(channels), *self.arrays)
+        asked = self._asked(channels)
+        values = np.empty((len(points), len(asked)))
+        _values(for_kernels(points), asked, self.numbers, values)
+        return values
 
     def gradient(self, points: np.ndarray, channels: slice = slice(None)) -> np.ndarray:
         """Return their gradients, shape [n, 3, channels]."""
-        return _gradients(np.ascontiguousarray(points, float), self._asked(channels), *self.arrays)
+        asked = self._asked(channels)
+        gradients = np.empty((len(points), 3, len(asked)))
+        _gradients(for_kernels(points), asked, self.numbers, gradients)
+        return gradients
 
     def _asked(self, channels: slice) -> np.ndarray:
         return np.arange(self.value_weights.shape[1])[channels]
 
     @cached_property
-    def arrays(self) -> tuple:
-        """Arguments of the compiled loops after the point; samples along the last axis."""
-        return (KERNELS[self.kernel], self.shape, self.scale, self.shift,
-                np.ascontiguousarray(self.centres.T), np.ascontiguousarray(self.value_weights.T),
-                np.ascontiguousarray(self.gradient_weights.transpose(2, 1, 0)), self.polynomial,
-                self.powers)
+    def numbers(self) -> np.ndarray:
+        """What the kernels read, shape [n]; samples along the last axes."""
+        slopes = self.gradient_weights.transpose(0, 2, 1)
+        parts = [by_column(part.reshape(len(part), -1), 0.0) for part in (
+            self.centres, self.value_weights, slopes) if len(part)]
+        return np.hstack([
+            KERNELS[self.kernel], self.shape, self.scale, self.shift, parts[0].shape[1],
+            *self.polynomial.shape[::-1], len(slopes) > 0, *(part.ravel() for part in parts),
+            self.polynomial.ravel(), self.powers.ravel()])
 
 
 def _frame(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -132,7 +155,9 @@ def _frame(points: np.ndarray) -> tuple[np.ndarray, float]:
 def _bordered(centres: np.ndarray, powers: np.ndarray, kernel: str, shape: float, smoothing: float,
               with_gradients: bool) -> np.ndarray:
     """Return the system with the polynomial's rows and columns beside it."""
-    system = _system(centres, KERNELS[kernel], shape, with_gradients)
+    size = len(centres) * (1 + centres.shape[1] * with_gradients)
+    system = np.empty((size, size))
+    _system(centres, system, shape, KERNELS[kernel])
     system[np.diag_indices(len(system))] += smoothing
     basis = _polynomial_rows(centres, powers, with_gradients)
     terms = basis.shape[1]
@@ -175,177 +200,6 @@ def _polynomial_rows(centres: np.ndarray, powers: np.ndarray, with_gradients: bo
         lowered[:, axis] = np.maximum(lowered[:, axis] - 1, 0)
         slopes[:, axis] = powers[:, axis] * np.prod(centres[:, None, :] ** lowered, axis=2)
     return np.concatenate([rows, slopes.reshape(count * dimension, -1)])
-
-
-@compiled
-def radial_terms(kernel, shape, squared):
-    """Return ``phi``, ``a``, ``b`` at squared distance: grad phi = a d, Hessian = a I + b d d^T."""
-    if kernel == 0:
-        r = np.sqrt(squared)
-        return r * squared, 3.0 * r, 3.0 / r if r > 0.0 else 0.0
-    if kernel == 1:
-        r = np.sqrt(squared)
-        return -r * squared * squared, -5.0 * r * squared, -15.0 * r
-    square = shape * shape
-    if kernel == 2:
-        s = np.sqrt(1.0 + square * squared)
-        return -s, -square / s, square * square / (s * s * s)
-    phi = np.exp(-square * squared)
-    return phi, -2.0 * square * phi, 4.0 * square * square * phi
-
-
-@compiled
-def _system(centres, kernel, shape, with_gradients):
-    count, dimension = centres.shape
-    size = count * (1 + dimension) if with_gradients else count
-    matrix = np.zeros((size, size))
-    offset = np.empty(dimension)
-    for i in range(count):
-        for j in range(count):
-            squared = 0.0
-            for k in range(dimension):
-                offset[k] = centres[i, k] - centres[j, k]
-                squared += offset[k] * offset[k]
-            phi, a, b = radial_terms(kernel, shape, squared)
-            matrix[i, j] = phi
-            if not with_gradients:
-                continue
-            for k in range(dimension):
-                row = count + i * dimension + k
-                matrix[i, count + j * dimension + k] = -a * offset[k]
-                matrix[row, j] = a * offset[k]
-                for m in range(dimension):
-                    matrix[row, count + j * dimension + m] = -b * offset[k] * offset[m]
-                matrix[row, count + j * dimension + k] -= a
-    return matrix
-
-
-@compiled
-def value_at(point, channel, kernel, shape, scale, shift, centres, value_weights,
-             gradient_weights, polynomial, powers):
-    """Return one channel of the field at ``point`` [3]; arrays as ``RadialInterpolant.arrays``."""
-    scaled = _scaled(point, shift, scale)
-    weights, slopes = value_weights[channel], gradient_weights[channel]
-    # With the kernel's number written out, the choice is made outside the loop, as required.
-    if kernel == 0:
-        total = _value_sum(0, scaled, shape, centres, weights, slopes)
-    elif kernel == 1:
-        total = _value_sum(1, scaled, shape, centres, weights, slopes)
-    elif kernel == 2:
-        total = _value_sum(2, scaled, shape, centres, weights, slopes)
-    else:
-        total = _value_sum(3, scaled, shape, centres, weights, slopes)
-    x, y, z = scaled
-    for t in range(len(powers)):
-        total += polynomial[t, channel] * (
-            _power(x, powers[t, 0]) * _power(y, powers[t, 1]) * _power(z, powers[t, 2]))
-    return total
-
-
-@compiled
-def _value_sum(kernel, scaled, shape, centres, weights, slopes):
-    x, y, z = scaled
-    first, second, third = centres[0], centres[1], centres[2]
-    along_x, along_y, along_z = slopes[0], slopes[1], slopes[2]
-    total = 0.0
-    if len(along_x) > 0:
-        for j in range(len(weights)):
-            dx, dy, dz = x - first[j], y - second[j], z - third[j]
-            phi, a, _b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
-            total += weights[j] * phi - a * (dx * along_x[j] + dy * along_y[j] + dz * along_z[j])
-        return total
-    for j in range(len(weights)):
-        dx, dy, dz = x - first[j], y - second[j], z - third[j]
-        phi, _a, _b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
-        total += weights[j] * phi
-    return total
-
-
-@compiled
-def gradient_at(point, channel, kernel, shape, scale, shift, centres, value_weights,
-                gradient_weights, polynomial, powers, out):
-    """Write the gradient of one channel at ``point`` [3] into ``out`` [3]."""
-    scaled = _scaled(point, shift, scale)
-    weights, slopes = value_weights[channel], gradient_weights[channel]
-    if kernel == 0:
-        total = _slope_sum(0, scaled, shape, centres, weights, slopes)
-    elif kernel == 1:
-        total = _slope_sum(1, scaled, shape, centres, weights, slopes)
-    elif kernel == 2:
-        total = _slope_sum(2, scaled, shape, centres, weights, slopes)
-    else:
-        total = _slope_sum(3, scaled, shape, centres, weights, slopes)
-    (x, y, z), (along_x, along_y, along_z) = scaled, total
-    for t in range(len(powers)):
-        p, q, r = powers[t, 0], powers[t, 1], powers[t, 2]
-        term = polynomial[t, channel]
-        along_x += term * p * _power(x, p - 1) * _power(y, q) * _power(z, r)
-        along_y += term * q * _power(x, p) * _power(y, q - 1) * _power(z, r)
-        along_z += term * r * _power(x, p) * _power(y, q) * _power(z, r - 1)
-    out[0], out[1], out[2] = along_x / scale, along_y / scale, along_z / scale
-
-
-@compiled
-def _slope_sum(kernel, scaled, shape, centres, weights, slopes):
-    x, y, z = scaled
-    first, second, third = centres[0], centres[1], centres[2]
-    along_x, along_y, along_z = slopes[0], slopes[1], slopes[2]
-    sum_x, sum_y, sum_z = 0.0, 0.0, 0.0
-    if len(along_x) > 0:
-        for j in range(len(weights)):
-            dx, dy, dz = x - first[j], y - second[j], z - third[j]
-            _phi, a, b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
-            radial = weights[j] * a - b * (
-                dx * along_x[j] + dy * along_y[j] + dz * along_z[j])
-            sum_x += radial * dx - a * along_x[j]
-            sum_y += radial * dy - a * along_y[j]
-            sum_z += radial * dz - a * along_z[j]
-        return sum_x, sum_y, sum_z
-    for j in range(len(weights)):
-        dx, dy, dz = x - first[j], y - second[j], z - third[j]
-        _phi, a, _b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
-        sum_x += weights[j] * a * dx
-        sum_y += weights[j] * a * dy
-        sum_z += weights[j] * a * dz
-    return sum_x, sum_y, sum_z
-
-
-@compiled
-def _scaled(point, shift, scale):
-    return ((point[0] - shift[0]) / scale, (point[1] - shift[1]) / scale,
-            (point[2] - shift[2]) / scale)
-
-
-@compiled
-def _power(x, exponent):
-    out = 1.0
-    for _ in range(exponent):
-        out *= x
-    return out
-
-
-@compiled
-def _values(points, channels, kernel, shape, scale, shift, centres, value_weights,
-            gradient_weights, polynomial, powers):
-    out = np.empty((len(points), len(channels)))
-    for i in range(len(points)):
-        for c in range(len(channels)):
-            out[i, c] = value_at(points[i], channels[c], kernel, shape, scale, shift, centres,
-                                 value_weights, gradient_weights, polynomial, powers)
-    return out
-
-
-@compiled
-def _gradients(points, channels, kernel, shape, scale, shift, centres, value_weights,
-               gradient_weights, polynomial, powers):
-    out = np.empty((len(points), 3, len(channels)))
-    slope = np.empty(3)
-    for i in range(len(points)):
-        for c in range(len(channels)):
-            gradient_at(points[i], channels[c], kernel, shape, scale, shift, centres,
-                        value_weights, gradient_weights, polynomial, powers, slope)
-            out[i, :, c] = slope
-    return out
 
 
 # Error bound of a field, as a function of the position.
@@ -405,15 +259,23 @@ class LocalError:
         return np.minimum(self.factor * np.sqrt(means), self.most)
 
 
-class Slack(NamedTuple):
-    """Tightening of limits by position for compiled loops, below 0 an extension; see
-    :func:`slack_at`. As :class:`LocalError`, a row a limit [limits, m]; factor 0: no tighter."""
+@dataclass(frozen=True)
+class Slack:
+    """Tightening of limits by position, below 0 an extension; see :func:`slacks_at`. As
+    :class:`LocalError`, a row a limit [limits, m]; factor 0: no tighter."""
 
     points: np.ndarray
     squares: np.ndarray
     factors: np.ndarray
     most: np.ndarray
     near: float
+
+    @cached_property
+    def numbers(self) -> np.ndarray:
+        """What the kernels read, shape [n]."""
+        points, squares = by_column(self.points, FAR), by_column(self.squares.T, 0.0)
+        return np.hstack([len(self.factors), points.shape[1], self.near, self.factors, self.most,
+                          points.ravel(), squares.ravel()])
 
 
 def slack_of(names: Sequence[str], errors: Mapping[str, LocalError], share: float) -> Slack:
@@ -433,60 +295,17 @@ def slack_of(names: Sequence[str], errors: Mapping[str, LocalError], share: floa
                  1.0 if first is None else first.near)
 
 
-@compiled
-def slack_at(point: np.ndarray, row: int, slack: Slack) -> float:
-    """Return the tightening of the limit of a ``row`` at ``point`` [3] of the chart."""
-    factor = slack.factors[row]
-    if factor == 0.0 or factor == np.inf:
-        return slack.most[row] if factor == np.inf else 0.0
-    total, weights = 0.0, 0.0
-    for i in range(len(slack.points)):
-        distance = slack.near
-        for k in range(3):
-            distance += (point[k] - slack.points[i, k]) ** 2
-        weight = 1.0 / (distance * distance * distance)
-        total += weight * slack.squares[row, i]
-        weights += weight
-    tighter = factor * np.sqrt(total / weights)
-    return min(tighter, slack.most[row]) if factor > 0.0 else max(tighter, slack.most[row])
-
-
-@compiled
 def slacks_at(points: np.ndarray, row: int, slack: Slack) -> np.ndarray:
-    """Return the same at ``points`` [n, 3], shape [n]."""
+    """Return the tightening of the limit of a ``row`` at ``points`` [n, 3] of the chart, [n]."""
     out = np.empty(len(points))
-    for n in range(len(points)):
-        out[n] = slack_at(points[n], row, slack)
+    _slacks.of(points, slack.numbers, out, row)
     return out
 
 
-@compiled
 def slack_slopes(points: np.ndarray, row: int, slack: Slack) -> np.ndarray:
     """Return its gradients at ``points`` [n, 3] of the chart, shape [n, 3]."""
-    out = np.zeros((len(points), 3))
-    factor = slack.factors[row]
-    if factor == 0.0 or factor == np.inf:
-        return out
-    along, of_weights = np.empty(3), np.empty(3)
-    for n in range(len(points)):
-        total, weights = 0.0, 0.0
-        along[:], of_weights[:] = 0.0, 0.0
-        for i in range(len(slack.points)):
-            distance = slack.near
-            for k in range(3):
-                distance += (points[n, k] - slack.points[i, k]) ** 2
-            weight = 1.0 / (distance * distance * distance)
-            total += weight * slack.squares[row, i]
-            weights += weight
-            for k in range(3):
-                change = -6.0 * weight / distance * (points[n, k] - slack.points[i, k])
-                along[k] += change * slack.squares[row, i]
-                of_weights[k] += change
-        mean = total / weights
-        if abs(factor * np.sqrt(mean)) < abs(slack.most[row]):
-            for k in range(3):
-                out[n, k] = 0.5 * factor / np.sqrt(mean) * (
-                    along[k] - mean * of_weights[k]) / weights
+    out = np.empty((len(points), 3))
+    _slopes.of(points, slack.numbers, out, row)
     return out
 
 
@@ -497,22 +316,10 @@ def _away(points: np.ndarray, count: int) -> np.ndarray:
     return cKDTree(points).query(points, k=count + 1)[0][:, count]
 
 
-@compiled
 def _means(points: np.ndarray, samples: np.ndarray, squares: np.ndarray, near: float,
            is_left_out: bool) -> np.ndarray:
     """Return means [n] of ``squares`` [m] of ``samples`` [m, 3] at ``points`` [n, 3]; if
     ``is_left_out``, without the sample of the same number."""
     out = np.empty(len(points))
-    for n in range(len(points)):
-        total, weights = 0.0, 0.0
-        for i in range(len(samples)):
-            if is_left_out and i == n:
-                continue
-            distance = near
-            for k in range(3):
-                distance += (points[n, k] - samples[i, k]) ** 2
-            weight = 1.0 / (distance * distance * distance)
-            total += weight * squares[i]
-            weights += weight
-        out[n] = total / weights
+    _about.of(points, samples, squares, out, near, is_left_out)
     return out

@@ -8,13 +8,24 @@ take: the hull is taken in coordinates that flatten it
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from limber.core.errors import WorkError
-from limber.core.numerics.compiled import compiled
-from limber.planning.field.chart import Chart, mapped
+from limber.kernels import Kernel, for_kernels
+from limber.planning.field.chart import FAR, Chart, by_column
+
+_POINTS = "points float64[points, 3]"
+_trusted = Kernel("points_trusted", _POINTS, "region float64[region]", "out trusted bool[points]")
+_above = Kernel("heights_above", _POINTS, "planes float64[planes, 4]",
+                "out heights float64[points]", "out top int64[points]")
+_nearest = Kernel("nearest_others_of", _POINTS, "others float64[others, 3]",
+                  "out distance float64[points]", "out away float64[points, 3]")
+_refused = Kernel("boxes_refused", "centres float64[boxes, 3]", "halves float64[3, 3]",
+                  "accepted float64[accepted, 3]", "rejected float64[rejected, 3]",
+                  "out refused bool[boxes]")
 
 _EDGE = 1e-9  # [m] a sample on the hull belongs to it despite rounding
 _OUTLINE = 24  # points per side of the grid that outlines the region
@@ -53,14 +64,20 @@ class TrustRegion:
         return cls(np.ascontiguousarray(planes), accepted, rejected, chart,
                    outline.min(axis=0), outline.max(axis=0), outline)
 
-    @property
-    def arrays(self) -> tuple:
-        """Arguments of :func:`trusted_at` after the point."""
-        return self.chart.arrays, self.planes, self.accepted, self.rejected
+    @cached_property
+    def numbers(self) -> np.ndarray:
+        """What the kernels read, shape [n]."""
+        planes, *sets = by_column(self.planes, -np.inf), *(
+            by_column(one, FAR) for one in (self.accepted, self.rejected))
+        return np.hstack([self.chart.numbers, _EDGE, *(each.shape[1] for each in (planes, *sets)),
+                          *(each.ravel() for each in (planes, *sets))])
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return whether each of ``points`` [n, 3] is trusted, bool [n]."""
-        return _contain(_rows(points), self.arrays)
+        points = _rows(points)
+        trusted = np.empty(len(points), bool)
+        _trusted(points, self.numbers, trusted)
+        return trusted
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Return how far ``points`` [n, 3] are above the hull's highest plane [m], [n]. In
@@ -76,7 +93,9 @@ class TrustRegion:
         least = heights - np.abs(slopes @ halves.T).sum(axis=1)
         outside = least - 0.5 * reach**2 * self.chart.bend(centres, reach) > _EDGE
         if len(self.rejected):
-            outside |= _surely_refused(centres, halves, self.accepted, self.rejected)
+            refused = np.empty(len(centres), bool)
+            _refused.of(centres, halves, self.accepted, self.rejected, refused)
+            outside |= refused
         return outside
 
     def plane_least(self, middles: np.ndarray, halves: np.ndarray) -> np.ndarray:
@@ -123,99 +142,19 @@ def _outline(flat: np.ndarray, planes: np.ndarray, chart: Chart) -> np.ndarray:
 
 
 def _rows(points: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(points, float).reshape(-1, 3)
+    return for_kernels(points).reshape(-1, 3)
 
 
-@compiled
-def trusted_at(point, region):
-    """Return whether ``point`` [3] is in the region; see :attr:`TrustRegion.arrays`."""
-    chart, planes, accepted, rejected = region
-    flat = mapped(point, *chart)
-    for i in range(len(planes)):
-        height = planes[i, 3]
-        for k in range(3):
-            height += planes[i, k] * flat[k]
-        if height > _EDGE:
-            return False
-    if len(rejected) == 0:
-        return True
-    return _nearest(point, accepted) <= _nearest(point, rejected)
-
-
-@compiled
-def _nearest(point, others):
-    return np.sum((point - others[_nearest_number(point, others)]) ** 2)
-
-
-@compiled
-def nearest_of(points, others):
+def nearest_of(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance of ``points`` [n, 3] to the nearest of ``others`` [m, 3], shape [n], and
     the unit vectors from it, shape [n, 3]."""
-    distance, away = np.empty(len(points)), np.empty_like(points)
-    for n in range(len(points)):
-        number = _nearest_number(points[n], others)
-        distance[n] = np.sqrt(np.sum((points[n] - others[number]) ** 2))
-        away[n] = (points[n] - others[number]) / max(distance[n], 1e-12)
+    distance, away = np.empty(len(points)), np.empty((len(points), 3))
+    _nearest.of(points, others, distance, away)
     return distance, away
 
 
-@compiled
-def _surely_refused(centres, halves, accepted, rejected):
-    """Return which boxes are nearer to one refused pose than to any accepted one."""
-    found = np.zeros(len(centres), np.bool_)
-    for n in range(len(centres)):
-        refused = _nearest_number(centres[n], rejected)
-        whole = True
-        for i in range(len(accepted)):
-            # |x - a|^2 - |x - r|^2 is linear in x: least at a corner.
-            ahead = 0.0
-            for axis in range(3):
-                along = 0.0
-                for k in range(3):
-                    normal = 2.0 * (rejected[refused, k] - accepted[i, k])
-                    along += normal * halves[axis, k]
-                ahead -= np.abs(along)
-                middle = 0.5 * (rejected[refused, axis] + accepted[i, axis])
-                ahead += 2.0 * (rejected[refused, axis] - accepted[i, axis]) * (
-                    centres[n, axis] - middle)
-            if ahead <= 0.0:
-                whole = False
-                break
-        found[n] = whole
-    return found
-
-
-@compiled
-def _nearest_number(point, others):
-    best, number = np.inf, 0
-    for i in range(len(others)):
-        squared = 0.0
-        for k in range(len(point)):
-            squared += (point[k] - others[i, k]) ** 2
-        if squared < best:
-            best, number = squared, i
-    return number
-
-
-@compiled
-def _heights(points, planes):
+def _heights(points: np.ndarray, planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the height of ``points`` above the plane highest there, and which plane that is."""
-    dimension = points.shape[1]
-    out = np.full(len(points), -np.inf)
-    top = np.zeros(len(points), np.int64)
-    for n in range(len(points)):
-        for i in range(len(planes)):
-            height = planes[i, dimension]
-            for k in range(dimension):
-                height += planes[i, k] * points[n, k]
-            if height > out[n]:
-                out[n], top[n] = height, i
-    return out, top
-
-
-@compiled
-def _contain(points, region):
-    inside = np.empty(len(points), np.bool_)
-    for i in range(len(points)):
-        inside[i] = trusted_at(points[i], region)
-    return inside
+    heights, top = np.empty(len(points)), np.empty(len(points), np.int64)
+    _above.of(points, planes, heights, top)
+    return heights, top

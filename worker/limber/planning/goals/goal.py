@@ -10,12 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from limber.core.errors import Command, NoPathError, Option, Text
-from limber.core.numerics.compiled import compiled
+from limber.kernels import Kernel, for_kernels
 from limber.planning.field.energy_field import (
     EnergyField,
     FieldArrays,
-    allowed_at,
-    energy_at,
     limited,
 )
 from limber.planning.field.grasp_model import GraspModel
@@ -375,12 +373,14 @@ def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> 
     return " and ".join(exceeded) or "every pose breaks at least one of them"
 
 
-@compiled
+_ALLOWED = Kernel("points_allowed", "points float64[points, 3]", "field float64[field]",
+                  "out allowed bool[points]")
+
+
 def allowed_points(points: np.ndarray, limits: FieldArrays) -> np.ndarray:
     """Return whether each of ``points`` [n, 3] is trusted and within the limits, bool [n]."""
-    allowed = np.empty(len(points), np.bool_)
-    for i in range(len(points)):
-        allowed[i] = allowed_at(points[i], energy_at(points[i], limits), limits)
+    allowed = np.empty(len(points), bool)
+    _ALLOWED(for_kernels(points), limits.numbers, allowed)
     return allowed
 
 

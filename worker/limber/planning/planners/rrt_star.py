@@ -1,4 +1,4 @@
-"""RRT* over grasp positions, compiled here."""
+"""RRT* over grasp positions, native here."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -6,9 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from limber.core.numerics.compiled import compiled
 from limber.core.progress import Progress
-from limber.planning.cost import edge_cost
+from limber.kernels import Kernel
 from limber.planning.path_problem import GentleProblem
 
 # Interface of a sampling planner: its problem and its result.
@@ -130,6 +129,11 @@ class Planner(Protocol):
         ...
 
 
+_grown = Kernel(
+    "tree_grown", "samples float64[samples, 3]", "field float64[field]",
+    "out nodes float64[capacity, 3]", "out cost float64[capacity]", "out parent int64[capacity]",
+    "out first_child int64[capacity]", "out next_sibling int64[capacity]", "count int",
+    "reach float", "energy float", "length float", "step float", returns="int")
 _CHUNK = 250  # iterations between progress reports, at which it can be cancelled
 
 
@@ -141,18 +145,18 @@ class OwnRrtStar:
 
     def search(self, problem: PathProblem, search: Search, progress: Progress) -> Searched:
         generator = np.random.default_rng([search.seed, 0])
-        dimension = len(problem.start)
-        tree = _Tree(search.iterations + 1, dimension)
+        tree = _Tree(search.iterations + 1)
         tree.nodes[0] = problem.start
         count = 1
         reach = search.reach * problem.diagonal
         history: list[dict[str, float]] = []
         for done in range(0, search.iterations, _CHUNK):
             size = min(_CHUNK, search.iterations - done)
-            samples = generator.uniform(problem.low, problem.high, (size, dimension))
+            samples = generator.uniform(problem.low, problem.high, (size, 3))
             aimed = generator.uniform(size=size) < search.goal_bias
             samples[aimed] = problem.goals[generator.integers(len(problem.goals), size=aimed.sum())]
-            count = _grow(samples, count, *tree.arrays, reach, problem.limits, problem.weights)
+            count = _grown(samples, problem.limits.numbers, *tree.arrays, count, reach,
+                           *problem.weights)
             best = tree.best(count, problem.in_goal)
             numbers = {} if best is None else {"cost": float(tree.cost[best])}
             if best is not None:
@@ -166,8 +170,8 @@ class OwnRrtStar:
 class _Tree:
     """Nodes with their parent and cost; children as linked lists, so that costs can follow."""
 
-    def __init__(self, capacity: int, dimension: int):
-        self.nodes = np.zeros((capacity, dimension))
+    def __init__(self, capacity: int):
+        self.nodes = np.zeros((capacity, 3))
         self.cost = np.zeros(capacity)
         self.parent = np.full(capacity, -1, np.int64)
         self.first_child = np.full(capacity, -1, np.int64)
@@ -187,116 +191,3 @@ class _Tree:
         while self.parent[chain[-1]] >= 0:
             chain.append(int(self.parent[chain[-1]]))
         return self.nodes[chain[::-1]].copy()
-
-
-@compiled
-def _grow(samples, count, nodes, cost, parent, first_child, next_sibling, reach, field, weights):
-    """Add a node for each sample that can be reached; returns the new node count."""
-    dimension = nodes.shape[1]
-    distance = np.empty(len(nodes))
-    for s in range(len(samples)):
-        nearest = _distances(samples[s], nodes, count, distance)
-        gap = np.sqrt(distance[nearest])
-        if gap < 1e-9:
-            continue
-        step = min(1.0, reach / gap)
-        new = nodes[nearest] + (samples[s] - nodes[nearest]) * step
-        _distances(new, nodes, count, distance)
-        # k = e (1 + 1/d) log n keeps RRT* asymptotically optimal (Karaman and Frazzoli, 2011).
-        neighbour_count = int(np.ceil(np.e * (1.0 + 1.0 / dimension) * np.log(count + 1.0)))
-        near = _smallest(distance, count, neighbour_count)
-        edges = np.empty(len(near))
-        best, best_cost, best_slot = -1, np.inf, -1
-        for i in range(len(near)):
-            j = near[i]
-            edges[i] = np.inf
-            length = np.sqrt(distance[j])
-            if length > reach or cost[j] + weights.length * length >= best_cost:
-                continue  # cannot be the parent: its length alone costs too much
-            edges[i] = edge_cost(nodes[j], new, field, weights)
-            if cost[j] + edges[i] < best_cost:
-                best, best_cost, best_slot = j, cost[j] + edges[i], i
-        if best < 0:
-            continue
-        nodes[count] = new
-        cost[count] = best_cost
-        _attach(count, best, parent, first_child, next_sibling)
-        for i in range(len(near)):
-            j = near[i]
-            length = np.sqrt(distance[j])
-            if i == best_slot or length > reach:
-                continue
-            if best_cost + weights.length * length >= cost[j]:
-                continue
-            saving = cost[j] - best_cost - edge_cost(new, nodes[j], field, weights)
-            if saving > 1e-12:
-                _detach(j, parent, first_child, next_sibling)
-                _attach(j, count, parent, first_child, next_sibling)
-                _lower(j, saving, cost, first_child, next_sibling)
-        count += 1
-    return count
-
-
-@compiled
-def _distances(point, nodes, count, distance):
-    """Write squared distances to all nodes; returns the nearest node."""
-    nearest = 0
-    for i in range(count):
-        squared = 0.0
-        for k in range(nodes.shape[1]):
-            squared += (nodes[i, k] - point[k]) ** 2
-        distance[i] = squared
-        if squared < distance[nearest]:
-            nearest = i
-    return nearest
-
-
-@compiled
-def _smallest(distance, count, most):
-    """Return the indices of the ``most`` smallest of ``distance[:count]``, in ascending order."""
-    most = min(most, count)
-    kept = np.empty(most, np.int64)
-    size = 0
-    for i in range(count):
-        if size == most and distance[i] >= distance[kept[size - 1]]:
-            continue
-        slot = size if size < most else most - 1
-        while slot > 0 and distance[kept[slot - 1]] > distance[i]:
-            if slot < most:
-                kept[slot] = kept[slot - 1]
-            slot -= 1
-        kept[slot] = i
-        size = min(size + 1, most)
-    return kept
-
-
-@compiled
-def _attach(node, to, parent, first_child, next_sibling):
-    parent[node] = to
-    next_sibling[node] = first_child[to]
-    first_child[to] = node
-
-
-@compiled
-def _detach(node, parent, first_child, next_sibling):
-    above = parent[node]
-    if first_child[above] == node:
-        first_child[above] = next_sibling[node]
-        return
-    child = first_child[above]
-    while next_sibling[child] != node:
-        child = next_sibling[child]
-    next_sibling[child] = next_sibling[node]
-
-
-@compiled
-def _lower(node, saving, cost, first_child, next_sibling):
-    """Subtract ``saving`` from the cost of ``node`` and of all its descendants."""
-    stack = [node]
-    while len(stack) > 0:
-        current = stack.pop()
-        cost[current] -= saving
-        child = first_child[current]
-        while child >= 0:
-            stack.append(child)
-            child = next_sibling[child]
