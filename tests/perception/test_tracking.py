@@ -118,10 +118,10 @@ def test_curve_keeps_its_length_and_its_derivative_is_exact(scene):
     """Turning segments never stretches the curve; the Jacobian equals central differences."""
     rest = RestCurve.of(scene.skeleton)
     rng = np.random.default_rng(0)
-    curve = rest.start().turned(0.3 * rng.standard_normal((rest.knot_count, 3)))
+    curve = rest.start().turned(0.3 * rng.standard_normal((rest.hats.shape[1], 3)))
     steps = np.linalg.norm(np.diff(curve.nodes, axis=0), axis=1)
     assert np.allclose(steps, np.linalg.norm(np.diff(rest.nodes, axis=0), axis=1), atol=1e-14)
-    direction = rng.standard_normal((rest.knot_count, 3))
+    direction = rng.standard_normal((rest.hats.shape[1], 3))
     ahead, behind = (curve.turned(sign * 1e-6 * direction).nodes for sign in (1, -1))
     expected = np.einsum("nika,ka->ni", curve.jacobian(), direction)
     assert np.allclose((ahead - behind) / 2e-6, expected, atol=1e-8)

@@ -46,10 +46,6 @@ class RestCurve:
     def length(self) -> float:
         return float(self.arc[-1])
 
-    @property
-    def knot_count(self) -> int:
-        return self.hats.shape[1]
-
     @classmethod
     def of(cls, skeleton: Skeleton, *, node_count: int = 81, knot_count: int = 8) -> "RestCurve":
         """Resample a skeleton's main path; what hangs beside it is carried along."""
@@ -71,7 +67,7 @@ class RestCurve:
     def start(self) -> "BentCurve":
         """Return the curve at rest."""
         turns = np.broadcast_to(np.eye(3), (len(self.nodes) - 1, 3, 3)).copy()
-        return BentCurve(self, turns, np.zeros((self.knot_count, 3)))
+        return BentCurve(self, turns, np.zeros((self.hats.shape[1], 3)))
 
 
 @dataclass(frozen=True)
@@ -171,8 +167,15 @@ class CurveTracker:
                  point_limit: int = 2500, seed: int = 0):
         self.rest = RestCurve.of(skeleton)
         self.arcs = np.array(fractions) * self.rest.length
-        self._point_limit = point_limit
-        self._rng = np.random.default_rng(seed)
+        self._point_limit, self._rng = point_limit, np.random.default_rng(seed)
+        self.roughness = 0.0
+
+    def learn_surface(self, cloud: SeenCloud) -> None:
+        """Take from a cloud of the branch at rest how far bark stands off a round tube, besides the
+        camera's noise [m]. Taken for noise alone, half of a rough branch's points were outliers."""
+        match = _match(self.rest.start(), cloud, 0.0)
+        off, noise = np.abs(match.residuals[0]), np.median(cloud.sigma[match.rows])
+        self.roughness = float(np.sqrt(max((1.4826 * np.median(off))**2 - noise**2, 0.0)))
 
     def track(self, cloud: SeenCloud, before: BentCurve | None = None,
               anchor: Anchor | None = None) -> TrackedFrame:
@@ -180,6 +183,7 @@ class CurveTracker:
         than 10 points the curve stays where it was, with nothing visible."""
         curve = before or self.rest.start()
         cloud = self.thinned(cloud)
+        cloud = replace(cloud, sigma=np.hypot(cloud.sigma, self.roughness))
         if anchor is not None:
             curve = _settle(curve, anchor)
         if len(cloud.points) < 10:
@@ -192,8 +196,8 @@ class CurveTracker:
             curve = curve.turned(step)
             if reach == 0.0 and np.abs(step).max() < 1e-5:
                 break
-        share = len(arcs) / len(cloud.points)
-        return self._result(curve, _spread(curve, cloud, anchor), arcs, share)
+        return self._result(curve, _spread(curve, cloud, anchor), arcs,
+                            len(arcs) / len(cloud.points))
 
     def arc_near(self, point: np.ndarray) -> float:
         """Return the arc length [m] of the point at rest that is nearest to ``point``."""
@@ -224,8 +228,7 @@ def rest_offset(tracker: CurveTracker, cloud: SeenCloud) -> tuple[np.ndarray, np
     centre = curve.nodes.mean(axis=0)
     rotation, shift = np.eye(3), np.zeros(3)
     cloud = tracker.thinned(cloud)
-    lever = tracker.rest.length / 2
-    scale = np.r_[np.full(3, 1 / lever), np.ones(3)]
+    scale = np.r_[np.full(3, 2 / tracker.rest.length), np.ones(3)]
     for reach in (0.2, 0.1, 0.05, 0.05, *([0.0] * 8)):
         moved = SeenCloud((cloud.points - centre) @ rotation.T + centre + shift,
                           cloud.sigma, cloud.view @ rotation.T)
@@ -323,9 +326,8 @@ def _match(curve: BentCurve, cloud: SeenCloud, reach: float) -> _Match:
 
 def _feet(curve: BentCurve, cloud: SeenCloud, reach: float,
           ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    nodes = curve.nodes
+    nodes, spacing = curve.nodes, curve.rest.arc[1]
     distance, nearest = cKDTree(np.vstack([nodes, curve.side_nodes])).query(cloud.points)
-    spacing = curve.rest.arc[1]
     radius = np.interp(np.minimum(nearest, len(nodes) - 1), np.arange(len(nodes)),
                        curve.rest.radius)
     mine = (nearest < len(nodes)) & (
@@ -364,7 +366,7 @@ def _interpolated(curve: BentCurve, arcs: np.ndarray) -> np.ndarray:
 
 
 def _prior(curve: BentCurve) -> tuple[np.ndarray, np.ndarray]:
-    count = curve.rest.knot_count
+    count = curve.rest.hats.shape[1]
     # The first knot's neighbour is the base, which does not turn.
     first = np.eye(count) - np.eye(count, k=-1)
     second = np.diff(first, axis=0)
@@ -409,9 +411,9 @@ def observe(folder: Path, pull: Pull, skeleton: Skeleton, fractions: tuple[float
     load = _loader(folder, pull.entry.observation)
     tracker = CurveTracker(skeleton, fractions)
     notes, curve, correction, sight = _Notes(), None, None, None
-    count, points = len(frames), len(fractions)
-    positions = np.full((count, points, 3), np.nan)
-    covariance = np.broadcast_to(np.eye(3), (count, points, 3, 3)).copy()
+    count = len(frames)
+    positions = np.full((count, len(fractions), 3), np.nan)
+    covariance = np.broadcast_to(np.eye(3), (*positions.shape, 3)).copy()
     times = np.array([time for time, _ in frames])
     poses = poses_at(pull.times, pull.poses,
                      np.clip(times + pull.entry.time_offset_s, pull.times[0], pull.times[-1]))
@@ -427,8 +429,7 @@ def observe(folder: Path, pull: Pull, skeleton: Skeleton, fractions: tuple[float
             cloud = replace(cloud, view=np.broadcast_to(sight, cloud.points.shape).copy())
         if correction is None:
             correction = _camera_correction(tracker, cloud, poses[index], poses[0], notes)
-        turn, shift = correction
-        cloud = SeenCloud(cloud.points @ turn.T + shift, cloud.sigma, cloud.view @ turn.T)
+        cloud = _moved(cloud, *correction)
         tracked = tracker.track(cloud, curve, _anchor(tracker, pull, poses[index]))
         curve = tracked.curve
         notes.hidden += int(np.sum(~tracked.visible))
@@ -501,11 +502,13 @@ def _read_cloud(path: Path, camera: Camera | None) -> SeenCloud:
 
 def _line_of_sight(cloud: SeenCloud, skeleton: Skeleton) -> np.ndarray:
     """Guess it where no camera is known: from the seen side towards the axis, shape [3]."""
-    from scipy.spatial import cKDTree
-
-    nearest = cKDTree(skeleton.nodes).query(cloud.points)[1]
-    inward = np.median(skeleton.nodes[nearest] - cloud.points, axis=0)
+    inward = np.median(skeleton.nodes[cKDTree(skeleton.nodes).query(cloud.points)[1]]
+                       - cloud.points, axis=0)
     return inward / max(np.linalg.norm(inward), 1e-12)
+
+
+def _moved(cloud: SeenCloud, turn: np.ndarray, shift: np.ndarray) -> SeenCloud:
+    return SeenCloud(cloud.points @ turn.T + shift, cloud.sigma, cloud.view @ turn.T)
 
 
 def _camera_correction(tracker: CurveTracker, cloud: SeenCloud, pose: np.ndarray,
@@ -516,6 +519,7 @@ def _camera_correction(tracker: CurveTracker, cloud: SeenCloud, pose: np.ndarray
                               "camera's pose could not be checked.")
         return nothing
     turn, shift = rest_offset(tracker, cloud)
+    tracker.learn_surface(_moved(cloud, turn, shift))
     moved = np.linalg.norm(tracker.rest.nodes @ turn.T + shift - tracker.rest.nodes, axis=1)
     if moved.max() <= CAMERA_OFFSET_M:
         return nothing
@@ -531,8 +535,7 @@ def _anchor(tracker: CurveTracker, pull: Pull, pose: np.ndarray) -> Anchor:
     held = np.array(pull.entry.grasp.point_m)
     arc = tracker.arc_near(held)
     arm = tracker.rest.start().at(np.array([arc]))[0] - held
-    turn = rotation_matrix(pose[3:])
-    return Anchor(arc, pose[:3] + turn @ arm)
+    return Anchor(arc, pose[:3] + rotation_matrix(pose[3:]) @ arm)
 
 
 def _sentences(name: str, notes: _Notes, count: int) -> list[str]:
