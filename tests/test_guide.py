@@ -112,8 +112,7 @@ def _figures_of(path):
 def _is_as_stated(figure, source):
     """Whether a constant or a bench's row says the same; other sources are words."""
     if constant := re.fullmatch(r"([\w.]+):(\w+)(?: x (\S+))?", source):
-        value = getattr(importlib.import_module(constant[1]), constant[2]) * float(
-            constant[3] or 1)
+        value = getattr(importlib.import_module(constant[1]), constant[2]) * float(constant[3] or 1)
         told = float(re.match(r"[\d., ]*\d", figure)[0].replace(",", "").replace(" ", ""))
         return math.isclose(told, value)
     if row := re.fullmatch(r"row (\w+): (.*)", source):

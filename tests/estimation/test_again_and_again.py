@@ -26,8 +26,7 @@ def test_ten_estimates_in_a_row(tmp_path, monkeypatch, seed=11):
     monkeypatch.setattr(next_pull, "_GOOD", 1)
     folder, scan, edits = (tmp_path / name for name in ("lab.branch", "scan", "edits.json"))
     Generate(folder=scan, length=LENGTH, fork_count=1, point_spacing=0.005, seed=seed).run()
-    made = {"cloud": scan / "cloud.ply", "output": folder, "root": "auto",
-            "mesh_spacing": 6.0}
+    made = {"cloud": scan / "cloud.ply", "output": folder, "root": "auto", "mesh_spacing": 6.0}
     Reconstruct(**made).run()
 
     def pulled(name, reach=0.35):

@@ -40,8 +40,7 @@ def test_what_is_wrong_costs_its_own_score(folder, tmp_path):
         skeleton.write_swc(tmp_path / "found.swc", unit="m")
         return score.compared(truth, tmp_path / "found.swc")
     main = whole.branch == 0
-    stem = of(Skeleton.from_edges(whole.nodes[main], np.arange(main.sum()) - 1,
-                                  whole.radius[main]))
+    stem = of(Skeleton.from_edges(whole.nodes[main], np.arange(main.sum()) - 1, whole.radius[main]))
     assert stem["own"] == 1 and stem["found"] < 0.9 and stem["length"] < 0.9
     thick = of(Skeleton.from_edges(whole.nodes, whole.parent, 2 * whole.radius))
     assert thick["radius"] == pytest.approx(1, abs=0.02)

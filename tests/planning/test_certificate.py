@@ -457,8 +457,7 @@ def test_costs_of_two_seeds_compare(ridge_field):
         "D-RRT*, not smoothed"}
 
 
-def test_bounds_together_are_those_of_each_alone_and_ask_the_field_once(
-        ridge_field, monkeypatch):
+def test_bounds_together_are_those_of_each_alone_and_ask_the_field_once(ridge_field, monkeypatch):
     """Two weights of length on common grids: each bound is below its path, as close as was asked,
     and no corner is evaluated twice on a grid."""
     one = problem_on(ridge_field)

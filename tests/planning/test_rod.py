@@ -129,8 +129,7 @@ def test_a_strut_yields_at_euler_s_load():
         u = np.sqrt(part * euler / bending)
         state = rod.pulled(rod.rest, np.array([0.0, 0.0, -part * euler]))
         asked = part * euler * u / (np.tan(u * length) - u * length)
-        assert np.linalg.eigvalsh(rod.held(state)[1])[0] == pytest.approx(
-            asked, abs=0.02 * across)
+        assert np.linalg.eigvalsh(rod.held(state)[1])[0] == pytest.approx(asked, abs=0.02 * across)
     ends = [rod.pulled(rod.rest, np.array([0.0, 0.0, -part * euler])) for part in (0.95, 1.02)]
     aside = [np.linalg.norm(state.places[-1, :2]) for state in ends]
     assert aside[0] < 0.02 * length < 0.1 * length < aside[1]
@@ -160,8 +159,7 @@ def test_a_field_is_the_full_model_s_at_any_number_of_processes(monkeypatch):
     same samples, bit for bit."""
     monkeypatch.setenv("LIMBER_CORES", "2")
     model = blade(1.3)
-    alone, together = (sample_field(model, EnergySettings(samples=110), workers=n)
-                       for n in (1, 2))
+    alone, together = (sample_field(model, EnergySettings(samples=110), workers=n) for n in (1, 2))
     samples = alone.samples
     for name in {entry.name for entry in fields(samples)} - {"added"}:
         assert getattr(samples, name).tobytes() == getattr(together.samples, name).tobytes()

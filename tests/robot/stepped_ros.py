@@ -1,17 +1,19 @@
-"""A robot in ROS and its driver in the test's process, in the server's time; and a replay."""
+"""A robot in ROS and its driver in this process, in the server's time."""
 
 import contextlib
 import json
+import runpy
 from collections import deque
+from pathlib import Path
 from unittest.mock import patch
 
-import numpy as np
-
 from benchmarks import robot_rosbridge
-from benchmarks.robot_rosbridge import STEP, RosBridge
+from benchmarks.robot_rosbridge import STEP
 from benchmarks.robot_stepped import SteppedRobot
 from limber.robot.ros import ros_control
 from limber.robot.ros.bridge import Bridge
+
+_NODE = Path(__file__).parents[2] / "scripts/examples/ros2/limber_stop/limber_stop/watch.py"
 
 
 class SteppedRos(SteppedRobot):
@@ -20,13 +22,16 @@ class SteppedRos(SteppedRobot):
     Args:
         server: A :class:`RosBridge`, not entered.
         plan: Called in each step with its number since the last goal came.
+        has_node: Whether the example's node runs beside the controller.
     """
 
-    def __init__(self, server, plan=None):
+    def __init__(self, server, plan=None, *, has_node=False):
         self.server, self.plan, self.now = server, plan, 0.0
         self.address, self.each_step = "ws://stepped", lambda: None
         self.drivers, self.is_driven, self._seen_before = [], False, ()
         self.bridge, self._count, self.since, self._told = None, 0, None, {}
+        self._watch = runpy.run_path(str(_NODE))["Watch"]() if has_node else None
+        self._heard = 0
         server.transports = set()
 
     def step(self):
@@ -40,6 +45,19 @@ class SteppedRos(SteppedRobot):
         if self.bridge is not None:
             self.server.turn(self.bridge, self._count, self._told)
             self.bridge.send_held()
+        if self._watch is not None:
+            self._look_after_it()
+
+    def _look_after_it(self):
+        """What the node beside the controller does."""
+        heard, self._heard = self.server.heard[self._heard:], len(self.server.heard)
+        words = [order for _, order in heard if order["op"] == "publish"]
+        stops = [self._watch.heard(order["msg"]["data"], self.now)
+                 for order in words if order["topic"].endswith("/stop")]
+        if any(order["topic"].endswith("/end") for order in words):
+            self._watch.ended()
+        if (any(stops) or self._watch.is_silent(self.now)) and self.server.is_busy:
+            self.end_goal(5)
 
     @contextlib.contextmanager
     def here(self):
@@ -62,13 +80,14 @@ class SteppedBridge(Bridge):
     stands for :class:`limber.robot.ros.bridge.Bridge`."""
 
     def __init__(self, robot):
-        self._robot, self.texts, self._held = robot, deque(), []
+        self._robot, self.texts, self._held, self.is_lost = robot, deque(), [], False
 
     def send(self, order=None, **content):
         """Carry out an operation; of the server: take what it sends."""
         if isinstance(order, str):
             self.texts.append(order)
             return
+        self._require_connection()
         if self._robot.server.blocks and self._robot.server.is_busy:
             self._held.append(content)
             return
@@ -83,27 +102,14 @@ class SteppedBridge(Bridge):
 
     def receive(self, seconds):
         """Return the next message, if any; before, where none waits, time passes."""
+        self._require_connection()
         if not self.texts and seconds > 0.0:
             self._robot.step()
         return json.loads(self.texts.popleft()) if self.texts else None
 
+    def _require_connection(self):
+        if self.is_lost:
+            raise ConnectionError("the connection to rosbridge was lost")
+
     def close(self):
         """Nothing is open."""
-
-
-class ReplayedBridge(RosBridge):
-    """Sends recorded messages at their times; its arm moves as it was recorded.
-
-    Args:
-        messages: Times [s], topics and contents, by time.
-    """
-
-    def __init__(self, messages):
-        super().__init__(np.zeros(6))
-        self._messages = deque(messages)
-
-    def turn(self, socket, count, told):
-        self._send_status(socket, told)
-        while self._messages and self._messages[0][0] < (count + 0.5) * STEP:
-            _, topic, message = self._messages.popleft()
-            socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))

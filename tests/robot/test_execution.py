@@ -295,11 +295,15 @@ def cell_before(folder, address, **limits) -> Cell:
     return cell.model_copy(update={"approach": APPROACH})
 
 
-@pytest.fixture(scope="module")
-def motion_settings(planned_template):
-    skeleton = load_skeleton(Branch.open(planned_template))
+def motion_settings_at(folder) -> dict:
+    skeleton = load_skeleton(Branch.open(folder))
     axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
     return {"gripper_rotation": tuple(map(float, across(axis)[0])), "speed": 0.05, "hold": 0.2}
+
+
+@pytest.fixture(scope="module")
+def motion_settings(planned_template):
+    return motion_settings_at(planned_template)
 
 
 @pytest.fixture(scope="module")

@@ -73,8 +73,7 @@ def test_every_fault_is_noticed_by_a_stepped_driver(request, name):
 
 @pytest.mark.parametrize("moving", [True, False])
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_a_connection_that_carries_one_way_stops_it_within_two_seconds(e_series, direction,
-                                                                       moving):
+def test_a_connection_that_carries_one_way_stops_it_within_two_seconds(e_series, direction, moving):
     """Told at once; then nothing that is asked of the driver takes longer either."""
     address = f"127.0.0.{int(e_series.address.split('.')[-1]) + 20}"
     with Cable(address, e_series.address) as cable, RobotLink(cell_for(address)) as link:

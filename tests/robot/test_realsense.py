@@ -11,11 +11,13 @@ from tests.subjects.commands import robot_answer
 from limber.cell.cell_file import Cell, write_cell
 from limber.core.numerics.rigid import matrices
 from limber.core.progress import Progress
+from limber.geometry.cloud.camera import Camera
 from limber.geometry.io.clouds import read_cloud
 from limber.robot.depth_camera import RealSense, camera_differences, look, seen_points
 from limber.stages.paths.plan_cell import cell_positions
 
 WIDTH, HEIGHT, SCALE = 12, 8, 0.001
+SMALL = Camera(width=WIDTH, height=HEIGHT, fx=10.0, fy=10.0, cx=6.0, cy=4.0)
 CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0.5, 0.1, 0, 0, 0, 1.2)},
             camera={"pose": (0.05, 0, 0.02, 0, 0, 0.1), "range_m": (0.2, 0.9)})
 
@@ -33,7 +35,8 @@ class Library:
     timestamp_domain = SimpleNamespace(global_time="global", system_time="system",
                                        hardware_clock="hardware")
 
-    def __init__(self):
+    def __init__(self, camera: Camera = SMALL, scale: float = SCALE):
+        self.seen, self.scale = camera, scale
         row = np.full((HEIGHT, WIDTH), 500, np.uint16)
         row[0, 0], row[0, 1] = 0, 1500
         self.frames, self.count, self.stopped = [row], 0, False
@@ -49,9 +52,9 @@ class Library:
     def start(self, config):
         if "start" in self.fails:
             raise RuntimeError(self.fails["start"])
-        seen = SimpleNamespace(width=WIDTH, height=HEIGHT, fx=10.0, fy=10.0, ppx=6.0, ppy=4.0)
+        seen = SimpleNamespace(**vars(self.seen), ppx=self.seen.cx, ppy=self.seen.cy)
         video = SimpleNamespace(get_intrinsics=lambda: seen)
-        sensor = SimpleNamespace(get_depth_scale=lambda: SCALE)
+        sensor = SimpleNamespace(get_depth_scale=lambda: self.scale)
         return SimpleNamespace(
             get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
             get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video))
@@ -60,9 +63,12 @@ class Library:
         if "wait" in self.fails:
             raise RuntimeError(self.fails["wait"])
         self.count += 1
-        image = self.frames[self.count % len(self.frames)]
+        return self.frame(self.frames[self.count % len(self.frames)],
+                          1e3 * (time.time() - self.age))
+
+    def frame(self, image, stamp):
         return SimpleNamespace(get_depth_frame=lambda: SimpleNamespace(
-            get_data=lambda: image, get_timestamp=lambda: 1e3 * (time.time() - self.age),
+            get_data=lambda: image, get_timestamp=lambda: stamp,
             get_frame_timestamp_domain=lambda: self.domain))
 
     def stop(self):

@@ -8,11 +8,11 @@ import sys
 import time
 from contextlib import contextmanager
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.robot.test_realsense import Library
 
 from benchmarks.robot_cells import (
     cell_file,
@@ -415,19 +415,33 @@ def test_what_a_cell_leaves_open_of_a_recording():
     assert known.torque_bias_sigma_nm == 0.02 and known.pose_sigma_m == 4e-4
 
 
-def test_a_tracker_on_the_base_is_turned_into_the_branchs_frame():
-    base = np.array([0.5, 0.1, -0.2, 0, 0, np.pi / 2])
+@contextmanager
+def _tracker(lines: list[str], base=(0.0,) * 6):
+    """A stream of markers on which ``lines`` have come."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         stream = MarkerStream("127.0.0.1", server.getsockname()[1], base)
         theirs, _ = server.accept()
         with theirs:
-            theirs.sendall(b'{"t_s": 1.0, "frame": "base", "points_m": [[0.1, 0, 0]]}\n'
-                           b'{"t_s": 1.1, "points_m": [[0.1, 0, 0]]}\n')
-            frames = stream.read(1.0)
+            theirs.sendall("".join(f"{line}\n" for line in lines).encode())
+            yield stream
         stream.close()
+
+
+def test_a_tracker_on_the_base_is_turned_into_the_branchs_frame():
+    with _tracker(['{"t_s": 1.0, "frame": "base", "points_m": [[0.1, 0, 0]]}',
+                   '{"t_s": 1.1, "points_m": [[0.1, 0, 0]]}'],
+                  (0.5, 0.1, -0.2, 0, 0, np.pi / 2)) as stream:
+        frames = stream.read(1.0)
     assert [time for time, _ in frames] == [1.0, 1.1]
     assert frames[0][1] == pytest.approx(np.array([[0.5, 0.2, -0.2]]))
     assert frames[1][1] == pytest.approx(np.array([[0.1, 0, 0]]))
+
+
+def _resting(*frames):
+    """What a tracker's resting points and their noise are told as that sends ``frames``."""
+    with _tracker([json.dumps({"t_s": number / 30, "points_m": points})
+                   for number, points in enumerate(frames)]) as stream:
+        return stream.at_rest()
 
 
 def test_resting_points_tell_their_noise():
@@ -436,37 +450,15 @@ def test_resting_points_tell_their_noise():
     place = np.array([[0.1, 0.2, 0.3], [0.2, 0.1, 0.4]])
     for count, sigma, told in ((200, 3e-4, pytest.approx(3e-4, rel=0.1)), (200, 1e-6, 1e-4),
                                (5, 3e-4, None)):
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            stream = MarkerStream("127.0.0.1", server.getsockname()[1], np.zeros(6))
-            theirs, _ = server.accept()
-            with theirs:
-                for number in range(count):
-                    points = place + sigma * rng.standard_normal(place.shape)
-                    theirs.sendall(json.dumps({"t_s": number / 30, "points_m": points.tolist()}
-                                              ).encode() + b"\n")
-                points, noise = stream.at_rest()
-            stream.close()
+        noisy = place + sigma * rng.standard_normal((count, *place.shape))
+        points, noise = _resting(*noisy.tolist())
         assert points == pytest.approx(place, abs=4 * sigma / np.sqrt(count))
         assert noise == told
 
 
-def _resting(*frames):
-    """What a tracker's resting points are told as that sends ``frames``."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        stream = MarkerStream("127.0.0.1", server.getsockname()[1], np.zeros(6))
-        theirs, _ = server.accept()
-        with theirs:
-            theirs.sendall(b"".join(json.dumps({"t_s": number / 30, "points_m": points}).encode()
-                                    + b"\n" for number, points in enumerate(frames)))
-            try:
-                return stream.at_rest()[0]
-            finally:
-                stream.close()
-
-
 def test_a_point_that_is_hidden_now_and_then_still_rests_somewhere():
     here, there = [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]
-    points = _resting([here, there], [None, there], [here, [None, None, None]])
+    points, _ = _resting([here, there], [None, there], [here, [None, None, None]])
     assert points == pytest.approx(np.array([here, there]))
 
 
@@ -484,39 +476,20 @@ def test_its_schema_is_plain(capsys):
     assert json.dumps(stage_schema("record"))
 
 
-class VirtualRealSense:
+class VirtualRealSense(Library):
     """pyrealsense2 as :class:`.RealSense` uses it, with images of the virtual robot's branch."""
 
-    stream = SimpleNamespace(depth="depth")
-    timestamp_domain = SimpleNamespace(global_time="global", system_time="system")
-
     def __init__(self, address: str, pose: np.ndarray):
+        super().__init__(D455, 1e-4)
         self._eye = VirtualCamera(address)
         self._camera = D455.model_copy(update={"pose": tuple(map(float, pose))})
         self.longest = 0.0
-
-    def config(self):
-        return SimpleNamespace(enable_stream=lambda kind: None)
-
-    def pipeline(self):
-        return self
-
-    def start(self, config):
-        seen = SimpleNamespace(width=D455.width, height=D455.height, fx=D455.fx, fy=D455.fy,
-                               ppx=D455.cx, ppy=D455.cy)
-        video = SimpleNamespace(get_intrinsics=lambda: seen)
-        sensor = SimpleNamespace(get_depth_scale=lambda: 1e-4)
-        return SimpleNamespace(
-            get_device=lambda: SimpleNamespace(first_depth_sensor=lambda: sensor),
-            get_stream=lambda kind: SimpleNamespace(as_video_stream_profile=lambda: video))
 
     def wait_for_frames(self, milliseconds):
         stamp = 1e3 * time.time()
         steps = np.round(1e4 * self._eye.depth(self._camera)).astype(np.uint16)
         self.longest = max(self.longest, time.time() - 1e-3 * stamp)
-        return SimpleNamespace(get_depth_frame=lambda: SimpleNamespace(
-            get_data=lambda: steps, get_timestamp=lambda: stamp,
-            get_frame_timestamp_domain=lambda: "global"))
+        return self.frame(steps, stamp)
 
     def stop(self):
         self._eye.__exit__()

@@ -100,16 +100,6 @@ def test_after_a_stop_it_goes_back_along_its_way_until_no_force_is_left(monkeypa
     assert robot.server.joints == pytest.approx(HOME, abs=2e-3)
 
 
-@pytest.mark.parametrize("fault, told", [
-    (lambda server: server.silent.add("/joint_states"), "no data from the robot"),
-    (lambda server: server.silent.add("/force_torque_sensor_broadcaster/wrench"),
-     "the force sensor is frozen")])
-def test_silence_stops_it(stepped_ros, fault, told):
-    robot, link = stepped_ros(lambda robot, step: fault(robot.server) if step == 25 else None)
-    event = link.follow(line(0.1))
-    assert event["event"] == "stopped" and told in event["reason"]
-    assert any(order["op"] == "cancel_action_goal" for _, order in robot.server.heard)
-
 
 def test_an_arm_elsewhere_is_refused_and_nobody_there_is_told_soon(stepped_ros):
     robot, link = stepped_ros(joints=HOME + [0, 0, 0, 0, 0, 0.8])

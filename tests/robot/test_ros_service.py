@@ -1,14 +1,16 @@
 """The retreat as a service of ROS, other commands, and a run that is replayed to the guard."""
 
+import json
 import threading
+from collections import deque
 
 import numpy as np
 import pytest
-from tests.robot.stepped_ros import ReplayedBridge, SteppedRos
+from tests.robot.stepped_ros import SteppedRos
 from tests.robot.test_ros import CELL, HOME, line, linked
 from tests.subjects.commands import answer
 
-from benchmarks.robot_rosbridge import RosBridge
+from benchmarks.robot_rosbridge import STEP, RosBridge
 from limber.cell.cell_file import write_cell
 from limber.robot.driver.link import RobotLink
 
@@ -49,6 +51,24 @@ def test_a_service_that_may_move_needs_a_confirmation(tmp_path):
     write_cell(tmp_path / "cell.toml", CELL)
     code, told = answer("ros", "serve", tmp_path / "cell.toml", "--arm")
     assert code == 2 and "Nobody confirmed" in told["error"]
+
+
+class ReplayedBridge(RosBridge):
+    """Sends recorded messages at their times; its arm moves as it was recorded.
+
+    Args:
+        messages: Times [s], topics and contents, by time.
+    """
+
+    def __init__(self, messages):
+        super().__init__(np.zeros(6))
+        self._messages = deque(messages)
+
+    def turn(self, socket, count, told):
+        self._send_status(socket, told)
+        while self._messages and self._messages[0][0] < (count + 0.5) * STEP:
+            _, topic, message = self._messages.popleft()
+            socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
 
 
 def test_a_replayed_run_is_judged_as_the_robot_was():

@@ -1,20 +1,21 @@
 """Whatever ends a goal in ROS cancels it and publishes a stop; no clock runs in most of these."""
 
+import json
+import re
+
 import numpy as np
 import pytest
 from tests.robot.stepped_ros import SteppedRos
-from tests.robot.test_ros import CELL, HOME, ROOT, line
+from tests.robot.test_ros import CELL, HOME, line
 from tests.subjects.commands import answer
 
 from benchmarks.robot_rosbridge import STEP, RosBridge
 from limber.cell.cell_file import Cell, write_cell
-from limber.core.errors import InputError, SafetyStop, WorkError
+from limber.core.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.robot.driver.controls import control_of
-from limber.robot.motion.trajectory import Trajectory
+from limber.robot.driver.link import RobotLink
+from limber.robot.motion.trajectory import ExpectedWrench, Trajectory
 from limber.robot.ros.topics import Topics, wrench_topic
-
-GRIPPER = {"name": ["finger_joint", "other_finger_joint"], "position": [0.4, 0.4],
-           "velocity": [0.0, 0.0]}
 
 
 @pytest.fixture(autouse=True)
@@ -22,9 +23,118 @@ def own_state(monkeypatch, tmp_path):
     monkeypatch.setenv("LIMBER_STATE", str(tmp_path / "state"))
 
 
-def at(step: int, act):
-    """A plan that acts once on the server."""
-    return lambda robot, now: act(robot.server) if now == step else None
+_MOST_M = 0.02  # of way until it stands: at 30 mm/s 0.6 s, the node beside the controller takes 0.3
+SAFETY, MODE, PROGRAM, SCALING = RosBridge(HOME).status
+
+
+def _told(topic: str, **message):
+    return lambda robot, link: robot.server.status.update({topic: message})
+
+
+def _set(**values):
+    return lambda robot, link: vars(robot.server).update(values)
+
+
+def _ended(status: int, **values):
+    return lambda robot, link: robot.end_goal(status, **values)
+
+
+def _released(steps: int):
+    def fault(robot, link):
+        before = dict(robot.server.status)
+        robot.server.status |= {SAFETY: {"mode": 3}, SCALING: {"data": 0.0}}
+        robot.rest(steps * STEP)
+        robot.server.status |= before
+    return fault
+
+
+def _states(value: float | None, prefix: str, names=CELL.arm.ros_joints) -> dict:
+    return {"name": [f"{prefix}{name}_joint" for name in names],
+            "position": [value] * len(names), "velocity": [value] * len(names)}
+
+
+GRIPPER = [_states(0.4, "", ["finger", "other_finger"])]
+FAULTS = {
+    "exception in the program": ("has ended", lambda robot, link: link.abandon()),
+    "link closed": ("has ended", lambda robot, link: link.close()),
+    "Ctrl-C": ("a stop was requested", lambda robot, link: link.stop()),
+    "kill -9": ("driver has ended", lambda robot, link: link.process.kill()),
+    "protective stop": ("protective stop", _told(SAFETY, mode=3)),
+    "protective stop, released at once": ("protective stop", _released(1)),
+    "protective stop, released later": ("protective stop", _released(200)),
+    "safeguard stop": ("safeguard stop", _told(SAFETY, mode=5)),
+    "its automatic mode's": ("of the automatic mode", _told(SAFETY, mode=12)),
+    "emergency stop": ("emergency stop", _told(SAFETY, mode=7)),
+    "reduced mode": ("reduced mode", _told(SAFETY, mode=2)),
+    "arm switched off": ("robot mode 5", _told(MODE, mode=5)),
+    "paused on the pendant": ("program", _told(PROGRAM, data=False)),
+    "slider at 0": ("scales the speed to 0", _told(SCALING, data=0.0)),
+    "slider without a number": ("scales the speed to 0", _told(SCALING, data=None)),
+    "slider at a fifth": ("", _told(SCALING, data=20.0)),
+    "a gripper's joint states beside": ("", _set(others=GRIPPER)),
+    "a gripper's joint states alone": ("no data", _set(others=GRIPPER, has_arm=False)),
+    "second arm on the topic": ("2 joints of ROS are named like", _set(
+        others=[_states(0.0, "second_")])),
+    "joint states without numbers": ("no number", _set(others=[_states(None, "")])),
+    "joint states silent": ("no data from the robot", _set(silent={"/joint_states"})),
+    "wrench silent": ("sensor is frozen", _set(
+        silent={"/force_torque_sensor_broadcaster/wrench"})),
+    "stop topic not passed on": ("passes on nothing", _set(silent={"/limber/stop"})),
+    "connection to rosbridge lost": (
+        "connection .* was lost", lambda robot, link: setattr(robot.bridge, "is_lost", True)),
+    "goal aborted": ("path tolerance", _ended(6, error_code=-4, error_string="path tolerance")),
+    "goal cancelled by another": ("no reason was given", _ended(5)),
+    "goal missed": ("goal tolerance", _ended(4, error_code=-5, error_string="goal tolerance")),
+    "goal called reached early": ("calls its goal reached", _ended(4, error_code=0)),
+    "rosbridge without actions": ("update rosbridge_suite", lambda robot, link: robot.bridge.send(
+        json.dumps({"op": "status", "level": "error", "msg": "Unknown operation"}))),
+    "arm stands under its goal": ("stood still for 2", _set(sticks=True)),
+    "clock jumps ahead": ("clock jumped", _set(clock_ahead=7.0)),
+    "clock jumps back": ("clock ran backwards", _set(clock_ahead=-1.0)),
+    "stop of another node": ("a stop was published", lambda robot, link: robot.server.obey(
+        None, {"op": "publish", "topic": "/limber/stop", "msg": {"data": True}})),
+    "push of 30 N": ("force", _set(wrench=np.array([0, 0, 30.0, 0, 0, 0])))}
+"""Each with what the report must contain, as a regular expression; "": it is no fault, and the goal
+is reached."""
+_FOR_THE_NODE = ("kill -9", "connection to rosbridge lost")  # Limber can give no more orders
+
+
+def there_and_back(out: Trajectory, rest: float) -> Trajectory:
+    poses, joints = np.r_[out.poses, out.poses[::-1]], np.r_[out.joints, out.joints[::-1]]
+    return Trajectory(np.r_[out.times, out.duration + rest + out.times], poses,
+                      ExpectedWrench.nothing(poses), joints)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_stopped_and_named_and_nothing_moves_after_its_release(name):
+    told, fault = FAULTS[name]
+    robot = SteppedRos(RosBridge(HOME), has_node=not told or name in _FOR_THE_NODE)
+    server, well = robot.server, dict(robot.server.status)
+    with robot.here(), RobotLink(CELL) as link:
+        link.wait_for_samples()
+        link.tare(0.25)
+        link.start(there_and_back(line(0.07, 0.03), 0.02))
+        robot.rest(50 * STEP)
+        began = server.joints
+        fault(robot, link)
+        try:
+            event = link.wait("reached", "stopped", "paused", seconds=60.0)
+            report = event.get("reason", "reached")
+        except LimberError as error:
+            report = str(error)
+        robot.rest(1.0)
+        stood = server.joints
+        server.status |= well
+        vars(server).update(others=[], has_arm=True, sticks=False, silent=set())
+        robot.rest(1.0)
+    assert re.search(told or "reached", report) is not None, report
+    assert not server.is_busy and np.array_equal(server.joints, stood)
+    way = CELL.arm.forward(np.array([began, stood]))[:, :3, 3]
+    assert not told or np.linalg.norm(way[1] - way[0]) < _MOST_M
+
+
+def with_names(**names: str) -> Cell:
+    return CELL.model_copy(update={"robot": CELL.robot.model_copy(update={"ros": names})})
 
 
 def said(robot: SteppedRos) -> list[str]:
@@ -37,58 +147,12 @@ def said(robot: SteppedRos) -> list[str]:
     return list(dict.fromkeys(told))
 
 
-STOPPED = ["beat", "goal", "stop", "cancel"]
-WAY_M = 0.013  # at most, of 30 steps at 50 mm/s
-
-
-def require_stopped(robot: SteppedRos) -> None:
-    """All was said, and the arm stands near its start however long one waits."""
-    robot.rest(0.3)
-    assert said(robot)[:3] == STOPPED[:3] and not robot.server.is_busy
-    stood = robot.server.joints.copy()
-    robot.rest(1.0)
-    assert robot.server.joints == pytest.approx(stood, abs=0)
-    moved = CELL.arm.forward(stood)[:3, 3] - CELL.arm.forward(HOME)[:3, 3]
-    assert np.linalg.norm(moved) < WAY_M
-
-
-@pytest.mark.parametrize("end", ["abandon", "stop", "close"])
-def test_who_gives_orders_and_ends_stops_the_arm(stepped_ros, end):
-    """A killed program, Ctrl-C, and an error that closes the link."""
-    robot, link = stepped_ros()
-    link.start(line(0.1))
-    robot.rest(30 * STEP)
-    getattr(link, end)()
-    robot.rest(0.5)
-    require_stopped(robot)
-
-
-def test_after_a_stop_only_a_person_lets_it_move(stepped_ros):
-    robot, link = stepped_ros()
-    link.start(line(0.1))
-    robot.rest(15 * STEP)
-    link.stop()
-    assert link.wait("stopped", seconds=1.0)["moving"]
-    robot.rest(0.5)
-    with pytest.raises(SafetyStop, match="Choose"):
-        link.follow(line(0.1))
-
-
-def test_the_joint_states_of_a_second_arm_stop_it(stepped_ros):
-    def second(server):
-        server.others = [{"name": [f"second_{name}_joint" for name in CELL.arm.ros_joints],
-                          "position": [0.0] * 6, "velocity": [0.0] * 6}]
-    robot, link = stepped_ros(at(30, second))
-    with pytest.raises(InputError, match="2 joints of ROS are named like"):
-        link.follow(line(0.1))
-    require_stopped(robot)
-
-
 def test_a_cancel_is_said_again_until_the_goal_has_ended(stepped_ros):
     """rosbridge drops that of a goal which the controller has not accepted yet."""
     robot, link = stepped_ros(lambda robot, now: now == 2 and link.stop(), accepts_after=20)
     assert link.follow(line(0.1))["event"] == "stopped"
-    require_stopped(robot)
+    robot.rest(0.5)
+    assert said(robot)[:3] == ["beat", "goal", "stop"] and not robot.server.is_busy
     assert sum(order["op"] == "cancel_action_goal" for _, order in robot.server.heard) > 1
 
 
@@ -96,8 +160,8 @@ def test_a_pause_cancels_and_a_person_lets_the_rest_be_followed(stepped_ros):
     """The soft limit; the rest begins where the arm stands, and ends at the path's end."""
     path = line(0.05)
     unpredicted = Trajectory(path.times, path.poses, None, path.joints)
-    robot, link = stepped_ros(at(60, lambda server: setattr(
-        server, "wrench", np.array([12.0, 0, 0, 0, 0, 0]))))
+    robot, link = stepped_ros(lambda robot, step: step == 60 and setattr(
+        robot.server, "wrench", np.array([12.0, 0, 0, 0, 0, 0])))
     assert link.follow(unpredicted)["event"] == "paused"
     robot.plan, robot.server.wrench[0] = None, 9.5
     robot.rest(0.5)
@@ -106,57 +170,13 @@ def test_a_pause_cancels_and_a_person_lets_the_rest_be_followed(stepped_ros):
     assert robot.server.joints == pytest.approx(path.joints[-1], abs=1e-4)
 
 
-SAFETY, MODE, PROGRAM, SCALING = WELL = RosBridge(HOME).status
-PROTECTED = {SCALING: {"data": 0.0}, SAFETY: {"mode": 3}, PROGRAM: {"data": False}}
-
-
-@pytest.mark.parametrize("topic, message, told", [
-    (SAFETY, {"mode": 3}, "protective stop"), (SAFETY, {"mode": 5}, "safeguard stop"),
-    (SAFETY, {"mode": 7}, "emergency stop"), (SAFETY, {"mode": 2}, "reduced mode"),
-    (SAFETY, {"mode": 12}, "safeguard stop of the automatic mode"),
-    (MODE, {"mode": 5}, "robot mode 5"),
-    (PROGRAM, {"data": False}, "the program on the controller was stopped"),
-    (SCALING, {"data": 0.0}, "scales the speed to 0"),
-    (SCALING, {"data": None}, "scales the speed to 0")])
-def test_what_the_controller_reports_cancels_at_once(stepped_ros, topic, message, told):
-    robot, link = stepped_ros(at(30, lambda server: server.status.update({topic: message})))
-    event = link.follow(line(0.1))
-    assert event["event"] == "stopped" and told in event["reason"]
-    robot.rest(0.3)
-    assert len(robot.server.followed) <= 33
-    robot.server.status |= {SCALING: {"data": 100.0}, PROGRAM: {"data": True}}
-    require_stopped(robot)
-
-
-@pytest.mark.parametrize("pause", [1, 200])
-def test_after_a_released_protective_stop_nothing_moves_and_nothing_is_reached(stepped_ros, pause):
-    def plan(robot, step):
-        if step == 30:
-            robot.server.status |= PROTECTED
-        elif step == 30 + pause:
-            robot.server.status |= WELL
-    robot, link = stepped_ros(plan)
-    event = link.follow(line(0.1))
-    assert event["event"] == "stopped" and "protective stop" in event["reason"]
-    robot.rest(STEP * pause)
-    require_stopped(robot)
-
-
 def test_a_robot_in_a_protective_stop_is_sent_no_goal(stepped_ros):
     robot, link = stepped_ros()
-    robot.server.status |= PROTECTED
+    robot.server.status |= {SCALING: {"data": 0.0}, SAFETY: {"mode": 3}, PROGRAM: {"data": False}}
     robot.rest(2 * STEP)
     with pytest.raises(SafetyStop, match="cannot be moved: protective stop"):
         link.follow(line(0.02))
     assert said(robot) == []
-
-
-def test_standstill_under_a_goal_is_stopped_and_named(stepped_ros):
-    robot, link = stepped_ros(at(30, lambda server: setattr(server, "sticks", True)))
-    event = link.follow(line(0.1))
-    assert event["event"] == "stopped" and "stood still for 2.0 s" in event["reason"]
-    robot.server.sticks = False
-    require_stopped(robot)
 
 
 def test_a_goal_that_is_never_accepted_is_stopped(stepped_ros):
@@ -170,37 +190,15 @@ def test_a_goal_that_is_never_accepted_is_stopped(stepped_ros):
 
 @pytest.mark.parametrize("scaling", [100.0, 50.0])
 def test_a_rest_of_the_path_and_a_slow_controller_are_no_standstill(stepped_ros, scaling):
-    out = line(0.001, 0.02)
-    path = Trajectory(np.r_[out.times, out.duration + 3.0 + out.times],
-                      np.concatenate([out.poses, out.poses[::-1]]), None,
-                      np.concatenate([out.joints, out.joints[::-1]]))
     robot, link = stepped_ros()
     robot.server.status[SCALING] = {"data": scaling}
-    event = link.follow(path)
+    event = link.follow(there_and_back(line(0.001, 0.02), 3.0))
     assert event["event"] == "reached", event
-
-
-def test_another_nodes_joint_states_do_not_disturb_a_motion(stepped_ros):
-    robot, link = stepped_ros(at(5, lambda server: server.others.append(GRIPPER)))
-    path = line(0.02)
-    assert link.follow(path)["event"] == "reached"
-    assert robot.server.joints == pytest.approx(path.joints[-1])
-
-
-def test_another_nodes_joint_states_are_no_sign_of_life(stepped_ros):
-    def only_the_gripper(server):
-        server.others.append(GRIPPER)
-        server.has_arm = False
-    robot, link = stepped_ros(at(30, only_the_gripper))
-    event = link.follow(line(0.1))
-    assert "no data from the robot" in event["reason"]
-    robot.server.has_arm = True
-    require_stopped(robot)
 
 
 def test_a_robot_whose_joint_states_are_of_another_node_alone_is_refused(stepped_ros):
     with pytest.raises(WorkError, match="It has the joints finger_joint, other_finger_joint, not"):
-        stepped_ros(others=[GRIPPER], has_arm=False)
+        stepped_ros(others=GRIPPER, has_arm=False)
 
 
 @pytest.mark.parametrize("topic", [SAFETY, MODE, PROGRAM, SCALING])
@@ -210,53 +208,10 @@ def test_a_ur_arm_is_not_moved_without_what_its_driver_publishes(stepped_ros, to
         stepped_ros(silent={topic})
 
 
-@pytest.mark.parametrize("status, values, told", [
-    (6, {"error_code": -4, "error_string": "path tolerance violated"}, "path tolerance violated"),
-    (5, {}, "no reason was given"),
-    (4, {"error_code": -5, "error_string": "goal tolerance"}, "goal tolerance"),
-    (4, {"error_code": 0}, "calls its goal reached, but the arm is")])
-def test_a_goal_that_the_controller_ends_early_is_not_reached(stepped_ros, status, values, told):
-    robot, link = stepped_ros()
-    robot.plan = lambda step: robot.end_goal(status, **values) if step == 30 else None
-    event = link.follow(line(0.1))
-    assert event["event"] == "stopped" and told in event["reason"]
-    require_stopped(robot)
-
-
-def test_a_stop_of_another_node_is_obeyed(stepped_ros):
-    robot, link = stepped_ros()
-    robot.plan = lambda step: step == 30 and robot.server.obey(
-        None, {"op": "publish", "topic": "/limber/stop", "msg": {"data": True}})
-    assert link.follow(line(0.1))["reason"] == "a stop was published"
-    require_stopped(robot)
-
-
-def test_a_leg_to_its_end_gives_the_node_an_end_word_and_no_stop(stepped_ros, monkeypatch):
-    """The example's node, which hears these words, reports no silence after the leg."""
-    monkeypatch.syspath_prepend(str(ROOT / "scripts" / "examples" / "ros2" / "limber_stop"))
-    from limber_stop.watch import Watch
-
+def test_a_leg_to_its_end_gives_the_node_an_end_word_and_no_stop(stepped_ros):
     robot, link = stepped_ros()
     assert link.follow(line(0.02))["event"] == "reached"
     assert said(robot) == ["beat", "goal", "end"] and link.warnings == []
-    watch = Watch()
-    for when, order in robot.server.heard:
-        assert not watch.is_silent(when)
-        if order["op"] == "publish" and order["topic"] == "/limber/stop":
-            assert not watch.heard(order["msg"]["data"], when)
-        elif order["op"] == "publish":
-            watch.ended()
-    assert not watch.is_silent(when + 1.0)
-
-
-def test_joint_states_without_numbers_stop_it(stepped_ros):
-    names = [f"{name}_joint" for name in CELL.arm.ros_joints]
-    lost = {"name": names, "position": [None] * 6, "velocity": [None] * 6}
-    robot, link = stepped_ros(at(30, lambda server: server.others.append(lost)))
-    event = link.follow(line(0.1))
-    assert event["event"] == "stopped" and "gives no number" in event["reason"]
-    robot.server.others = []
-    require_stopped(robot)
 
 
 def test_a_bridge_that_a_goal_blocks_is_noticed(stepped_ros):
@@ -265,14 +220,6 @@ def test_a_bridge_that_a_goal_blocks_is_noticed(stepped_ros):
     event = link.follow(line(0.1, 0.01))
     assert event["event"] == "stopped"
     assert "send_action_goals_in_new_thread:=true" in event["reason"]
-
-
-def test_a_bridge_that_knows_no_actions_is_named(stepped_ros):
-    """As that of Humble: it answers with an error, and nothing moves."""
-    robot, link = stepped_ros(knows_actions=False)
-    event = link.follow(line(0.02))
-    assert event["event"] == "stopped" and "update rosbridge_suite" in event["reason"]
-    assert robot.server.followed == []
 
 
 def test_the_noise_of_joint_speeds_is_no_motion(stepped_ros):
@@ -284,11 +231,9 @@ def test_the_noise_of_joint_speeds_is_no_motion(stepped_ros):
 
 def test_a_name_space_and_a_prefix_choose_one_of_two_arms(stepped_ros):
     """Both publish on one topic; the goal is of this one's joints."""
-    two = CELL.model_copy(update={"robot": CELL.robot.model_copy(update={
-        "ros": {"namespace": "cell", "prefix": "left_", "joint_states": "/joint_states"}})})
-    names = [f"right_{name}_joint" for name in CELL.arm.ros_joints]
-    right = {"name": names, "position": [0.0] * 6, "velocity": [0.0] * 6}
-    robot, link = stepped_ros(cell=two, prefix="left_", space="/cell", others=[right])
+    two = with_names(namespace="cell", prefix="left_", joint_states="/joint_states")
+    robot, link = stepped_ros(cell=two, prefix="left_", space="/cell",
+                              others=[_states(0.0, "right_")])
     assert link.follow(line(0.02))["event"] == "reached"
     [goal] = [order for _, order in robot.server.heard if order["op"] == "send_action_goal"]
     assert goal["action"] == "/cell/scaled_joint_trajectory_controller/follow_joint_trajectory"
@@ -297,15 +242,13 @@ def test_a_name_space_and_a_prefix_choose_one_of_two_arms(stepped_ros):
 
 def test_a_name_that_is_none_is_refused(stepped_ros):
     with pytest.raises(InputError, match=r"states joint_state.*Known are namespace, prefix"):
-        stepped_ros(cell=CELL.model_copy(update={"robot": CELL.robot.model_copy(update={
-            "ros": {"joint_state": "/x"}})}))
+        stepped_ros(cell=with_names(joint_state="/x"))
 
 
 def test_the_gripper_moves_by_its_action(stepped_ros):
-    held = CELL.model_copy(update={"tool": CELL.tool.model_copy(update={"gripper": "ros"}),
-                                   "robot": CELL.robot.model_copy(update={
-                                       "ros": {"gripper_closed": "0.7"}})})
-    robot, link = stepped_ros(cell=held)
+    held = with_names(gripper_closed="0.7")
+    robot, link = stepped_ros(cell=held.model_copy(update={
+        "tool": CELL.tool.model_copy(update={"gripper": "ros"})}))
     link.gripper(close=True)
     assert robot.server.heard[-1][1]["args"] == {"command": {"position": 0.7, "max_effort": 0.0}}
 

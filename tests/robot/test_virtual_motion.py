@@ -143,6 +143,14 @@ def test_a_command_that_is_not_there_ends_the_program_and_says_so(registers):
     assert "virtual controller has no command" in registers.controller.log[-1]
 
 
+def mean_force(controller: Controller) -> np.ndarray:
+    readings = []
+    for _ in range(400):
+        controller.step()
+        readings.append(controller.outputs()["actual_TCP_force"])
+    return np.mean(readings, axis=0)
+
+
 def test_the_gripper_weighs_what_the_payload_does_not_say():
     """A 0.8 kg gripper with payload 0.8 weighs nothing, with payload 0 it weighs 7.85 N."""
     controller = Controller("ur5e", mass=0.8, centre=(0, 0, 0.06))
@@ -150,17 +158,11 @@ def test_the_gripper_weighs_what_the_payload_does_not_say():
     traits = controller.sensor.traits
     controller.sensor._bias[:] = 0
 
-    def mean_force() -> np.ndarray:
-        readings = []
-        for _ in range(400):
-            controller.step()
-            readings.append(controller.outputs()["actual_TCP_force"])
-        return np.mean(readings, axis=0)
     noise = 5 * traits.force_sigma / np.sqrt(400) + 0.02
     told = -0.8 * 9.80665 * controller.sensor.gain
-    assert mean_force()[:3] == pytest.approx([0, 0, told], abs=noise)
+    assert mean_force(controller)[:3] == pytest.approx([0, 0, told], abs=noise)
     registers.run(PAYLOAD, 0.8, 0, 0, 0.06)
-    assert mean_force()[:3] == pytest.approx([0, 0, 0], abs=noise)
+    assert mean_force(controller)[:3] == pytest.approx([0, 0, 0], abs=noise)
 
 
 def test_force_is_reported_in_the_bases_axes_about_the_tools_centre():
@@ -172,13 +174,9 @@ def test_force_is_reported_in_the_bases_axes_about_the_tools_centre():
     controller = Controller("ur5e", load=Pull())
     controller.set_tool(np.array([0, 0, 0.1, 0, 0, 0]))
     controller.sensor._bias[:] = 0
-    readings = []
-    for _ in range(400):
-        controller.step()
-        readings.append(controller.outputs()["actual_TCP_force"])
     lever = -(controller.flange[:3, :3] @ [0, 0, 0.1])
     expected = controller.sensor.gain * np.r_[10.0, 0, 0, np.cross(lever, [10.0, 0, 0])]
-    assert np.mean(readings, axis=0) == pytest.approx(expected, abs=0.04)
+    assert mean_force(controller) == pytest.approx(expected, abs=0.04)
 
 
 def test_a_sensors_gain_is_off_by_some_hundredths_and_stays():

@@ -70,8 +70,7 @@ def stating(stiffness: float) -> Cell:
 @pytest.mark.parametrize("predicted", [True, False])
 @pytest.mark.parametrize("stiffness", [5e3, *(pytest.param(stiffness, marks=pytest.mark.slow)
                                               for stiffness in (1e5, None))])
-def test_at_the_speed_that_is_chosen_a_contact_stays_below_the_hard_limit(
-        stiffness, predicted):
+def test_at_the_speed_that_is_chosen_a_contact_stays_below_the_hard_limit(stiffness, predicted):
     """A soft one needs no less than the cell's speed; a rigid one, the default, is met slowly."""
     cell, told = CELL if stiffness is None else stating(stiffness), []
     speed = speed_within(cell, 0.05, told.append)

@@ -85,8 +85,7 @@ def _stop_time(setting: Setting, voided: Voided, model: str) -> list[Row]:
     stops, late, runs = [], [], setting.at_most(20, 2)
     with new_robot(_ADDRESS, model, setting.seed) as robot:
         for _ in setting.budget.seeds(0, 2 * runs):
-            stop = voided.again(partial(_one_stop, robot, model, 1.0 / rate),
-                                f"stop at {rate} Hz")
+            stop = voided.again(partial(_one_stop, robot, model, 1.0 / rate), f"stop at {rate} Hz")
             over = stop.latency - asked
             if over > 1e-6 and len(late) < runs and voided.explains(
                     stop.since, stop.until, over, f"stop at {rate} Hz"):
@@ -139,8 +138,7 @@ def _one_stop(robot: VirtualRobot, model: str, step: float) -> _Stop:
     return _Stop(stopped - acts, way, since, came + stopped - acts)
 
 
-def _faults(setting: Setting, voided: Voided, names: tuple[str, ...] = tuple(EVERY),
-            ) -> list[Row]:
+def _faults(setting: Setting, voided: Voided, names: tuple[str, ...] = tuple(EVERY)) -> list[Row]:
     runs: dict[str, list[Trial]] = {}
     for name, budget in setting.budget.shares(list(names)):
         setting.progress(len(runs) / len(names), name)

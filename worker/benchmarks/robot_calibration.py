@@ -24,8 +24,7 @@ _COUNT, _HOLDS, _LEVEL = 120, (0.90, 0.99), 0.95
 _CAMERA = CameraEntry(pose=(0,) * 6, width=1280, height=960, focal_px=(1100.0, 1100.0),
                       centre_px=(640.0, 480.0))
 _LENS = np.array([[1100.0, 0, 640], [0, 1100.0, 480], [0, 0, 1]])
-_CORNERS = np.array([[0.03 * (i - 2.5), 0.03 * (j - 1.5), 0.0]
-                     for j in range(4) for i in range(6)])
+_CORNERS = np.array([[0.03 * (i - 2.5), 0.03 * (j - 1.5), 0.0] for j in range(4) for i in range(6)])
 _CELL = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
              tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0), "mass_kg": 0.0})
 

@@ -54,7 +54,7 @@ def sideways(branch: Branch, fraction: float = 0.92) -> np.ndarray:
     return np.linalg.svd(line - line.mean(axis=0))[2][2]
 
 
-def _true_branch(branch: Branch, cell: Cell, folder: Path, young: tuple[float, ...] = (),
+def true_branch(branch: Branch, cell: Cell, folder: Path, young: tuple[float, ...] = (),
                  ) -> BranchSetting:
     truth = load_truth(branch, PullSpec(young=young))
     return BranchSetting.of_truth(truth, cell, folder / "truth.vtu")
@@ -62,14 +62,14 @@ def _true_branch(branch: Branch, cell: Cell, folder: Path, young: tuple[float, .
 
 def stepped_robot_holding(branch: Branch, cell: Cell, folder: Path) -> SteppedRobot:
     """Return the robot of :func:`robot_holding` without its process, in its own time."""
-    load = BranchHere(_true_branch(branch, cell, folder))
+    load = BranchHere(true_branch(branch, cell, folder))
     return SteppedRobot(Controller(cell.robot.model, load=load), cell.robot.address)
 
 
 def robot_holding(branch: Branch, cell: Cell, folder: Path, *, seed: int = 0,
                   young: tuple[float, ...] = ()) -> VirtualRobot:
     """Return a virtual robot with the true branch of a folder in its gripper."""
-    setting = _true_branch(branch, cell, folder, young)
+    setting = true_branch(branch, cell, folder, young)
     path = folder / "setting.json"
     path.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}), encoding="utf-8")
     options = ["--branch", path, "--seed", seed]

@@ -245,6 +245,5 @@ def restored(robot: VirtualRobot) -> None:
 
 def new_robot(address: str, model: str, seed: int) -> VirtualRobot:
     """Return a virtual robot; a CB3 has an FT300."""
-    options = ["--seed", str(seed)] + (
-        [] if arm_named(model).measures_force else ["--ft300"])
+    options = ["--seed", str(seed)] + ([] if arm_named(model).measures_force else ["--ft300"])
     return VirtualRobot(model, address, options)

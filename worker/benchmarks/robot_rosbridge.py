@@ -27,6 +27,9 @@ class RosBridge:
         wrench: What the sensor tells besides noise [N, N m], shape [6].
         wrench_topic: Where it tells it.
         load: Returns more of that, from the joints.
+        gripped: Called with the position that a gripper is sent to.
+        payload: Set in the controller [kg].
+        clock_ahead: Of the stamps [s].
         stood_at: When the last goal ended, and the arm stood [s, monotonic].
         heard: Operations that came, each with its time.
         silent: Topics that send nothing.
@@ -39,7 +42,6 @@ class RosBridge:
         has_arm: Whether the arm's own are published there.
         sticks: The arm stands whatever its goal, and nothing reports why.
         accepts_after: Steps before the controller accepts a goal; until then a cancel is lost.
-        knows_actions: As old ones it answers to them with an error.
         speed_noise: Of joint states [rad/s].
         prefix: Of the names of its joints.
         space: Name space of all but the joint states.
@@ -57,8 +59,9 @@ class RosBridge:
                        "/io_and_status_controller/robot_mode": {"mode": 7},
                        _PROGRAM: {"data": True}, _SCALING: {"data": 100.0}}
         self.others, self.has_arm, self.sticks = [], True, False
-        self.accepts_after, self.blocks, self.knows_actions = 0, False, True
+        self.accepts_after, self.blocks = 0, False
         self.speed_noise, self.prefix, self.space = 0.0, "", ""
+        self.gripped, self.payload, self.clock_ahead = lambda position: None, 0.0, 0.0
         self._subscribed, self._offering = {}, None
         self._goal, self._open, self._age, self._lock = None, [], 0, threading.Lock()
         self._rng = np.random.default_rng(0)
@@ -117,7 +120,8 @@ class RosBridge:
 
     def _send(self, socket, topic, count, message):
         if topic not in self.silent:
-            stamp = {"sec": int(count * STEP), "nanosec": round(1e9 * (count * STEP % 1))}
+            now = count * STEP + self.clock_ahead
+            stamp = {"sec": int(now), "nanosec": round(1e9 * (now % 1))}
             message = {"header": {"stamp": stamp, "frame_id": ""}, **message}
             self.sent.append((count * STEP, topic, message))
             socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
@@ -188,10 +192,7 @@ class RosBridge:
         from websockets.exceptions import ConnectionClosed
 
         self.heard.append((time.monotonic(), order))
-        if order["op"] == "send_action_goal" and not self.knows_actions:
-            socket.send(json.dumps({"op": "status", "level": "error",
-                                    "msg": "Unknown operation: send_action_goal."}))
-        elif order["op"] == "send_action_goal" and order["action_type"].endswith("Trajectory"):
+        if order["op"] == "send_action_goal" and order["action_type"].endswith("Trajectory"):
             points = order["args"]["trajectory"]["points"]
             order_of = [order["args"]["trajectory"]["joint_names"].index(self.prefix + name)
                         for name in _NAMES]
@@ -201,7 +202,10 @@ class RosBridge:
                 point["time_from_start"]["sec"] + 1e-9 * point["time_from_start"]["nanosec"]
                 for point in points]), ways, speeds, 0.0)
             self._age = 0
+        elif order["op"] == "send_action_goal":
+            self.gripped(order["args"]["command"]["position"])
         elif order["op"] == "call_service":
+            self.payload = order["args"]["mass"]
             socket.send(json.dumps({
                 "op": "service_response", "id": order["id"], "service": order["service"],
                 "values": {"success": True}, "result": True}))

@@ -21,8 +21,7 @@ _FOLDER = Path(__file__).parent / "commands"
 @cache
 def others() -> dict[str, Found]:
     """Return the commands beside the stages by name, in alphabetical order."""
-    return {found.name: found
-            for found in sorted(found_in(_FOLDER, f"{__package__}.commands"))}
+    return {found.name: found for found in sorted(found_in(_FOLDER, f"{__package__}.commands"))}
 
 
 def command_class(name: str) -> "type[Stage]":

@@ -454,8 +454,7 @@ def _corners(cv2: Any, picture: np.ndarray, board: Board) -> tuple[np.ndarray, n
         if seen is None or len(seen) < _FEWEST_CORNERS:
             return nothing
         corners, pixels = printed.matchImagePoints(seen, numbers)
-        return (np.asarray(corners, float).reshape(-1, 3),
-                np.asarray(pixels, float).reshape(-1, 2))
+        return (np.asarray(corners, float).reshape(-1, 3), np.asarray(pixels, float).reshape(-1, 2))
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     tags, _, _ = cv2.aruco.ArucoDetector(dictionary, settings).detectMarkers(picture)

@@ -113,8 +113,7 @@ def write_touched(path: Path, base: np.ndarray, moved: np.ndarray, axis_points: 
                 ((name, *point, *pose) for name, point, pose in rows), digits=7)
 
 
-def grasp_of(skeleton: Skeleton, fraction: float = GRASP_FRACTION,
-             ) -> tuple[np.ndarray, np.ndarray]:
+def grasp_of(skeleton: Skeleton, fraction: float = GRASP_FRACTION) -> tuple[np.ndarray, np.ndarray]:
     """A position on the main path [m] and the branch's axis there, shape [3] each."""
     point = skeleton.point_at(fraction)
     axis = point - skeleton.point_at(fraction - 0.05)

@@ -238,8 +238,7 @@ class ClosedLoop:
     def _planned(self, goal: np.ndarray | None = None) -> Planned:
         """Estimate, sample the field, plan the flower's path to a position [3], or one that suits
         the branch."""
-        estimated = self._part("estimate", "Young's modulus from the pull", "estimate",
-                               self.branch)
+        estimated = self._part("estimate", "Young's modulus from the pull", "estimate", self.branch)
         branch = Branch.open(self.branch)
         point, _axis = grasp_of(load_skeleton(branch))
         # A target position for the flower: where a pull to the other side takes it.

@@ -19,8 +19,7 @@ class Cache(Tool):
     limit: float | None = option(
         "Remove the least recently used entries until the total is at most this, such as 2 GB "
         "[MB].", ge=0)
-    clear: bool = option("Remove everything. It is computed again when needed.", False,
-                         switch=True)
+    clear: bool = option("Remove everything. It is computed again when needed.", False, switch=True)
 
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         folder, freed = caches.cache_folder(), 0

@@ -1,6 +1,7 @@
 """The registry of drivers: one function that opens each kind of controller."""
 
 from collections.abc import Callable
+from contextlib import closing
 
 from limber.cell.cell_file import Cell
 from limber.core.errors import Command, InputError, WorkError
@@ -71,6 +72,14 @@ def stop_from_outside(cell: Cell, seconds: float) -> bool:
     except (WorkError, OSError):
         return False
     return True
+
+
+def set_payload(cell: Cell) -> None:
+    """Set a cell's payload where no driver can put back what it was before, as in ROS, which does
+    not report it. LimberError as :func:`control_of`."""
+    if is_ros(cell):
+        with closing(control_of(cell)) as control:
+            control.connect()
 
 
 def control_of(cell: Cell) -> ArmControl:

@@ -199,8 +199,7 @@ class ForceTest:
             # Old ones may be farther apart: the one whose neighbours are nearest for its age goes.
             ages = self._time - self._onsets[:, 1]
             kept = np.delete(kept, 1 + int(np.argmin((ages[:-2] - ages[2:]) / ages[1:-1])))
-        rows = np.r_[:_FIXED, (_FIXED + _PER_ONSET * kept[:, None]
-                               + np.arange(_PER_ONSET)).ravel()]
+        rows = np.r_[:_FIXED, (_FIXED + _PER_ONSET * kept[:, None] + np.arange(_PER_ONSET)).ravel()]
         self._sums = [_extended(each[rows], _PER_ONSET) for each in self._sums]
         self._slipped = _extended(self._slipped[kept], 1)
         self._onsets = np.vstack([self._onsets[kept], [self._travel, self._time, unknown]])

@@ -37,8 +37,7 @@ _UNLIKE = "the force differs from the predicted one"
 _NOTHING = np.zeros(0)
 
 
-def allowed_difference(off: np.ndarray, covariance: np.ndarray, least: float, most: float,
-                       ) -> float:
+def allowed_difference(off: np.ndarray, covariance: np.ndarray, least: float, most: float) -> float:
     """Return the largest allowed difference in the direction of ``off`` [3]: an ellipsoid,
     ``least`` widened by standard deviations of the prediction up to ``most``."""
     squares, axes = np.linalg.eigh(covariance)

@@ -242,8 +242,7 @@ class TurnCost:
 
     def energy(self, offsets: np.ndarray) -> np.ndarray:
         """Return the energy of ``offsets`` [k, 3] [J], shape [k]."""
-        torque = self.wrenches[:, 3:] + 0.5 * np.einsum(
-            "kij,kj->ki", self.slopes[:, 3:], offsets)
+        torque = self.wrenches[:, 3:] + 0.5 * np.einsum("kij,kj->ki", self.slopes[:, 3:], offsets)
         return np.einsum("ki,ki->k", torque, offsets)
 
 

@@ -250,8 +250,7 @@ def _connected(tree: _Tree, target: np.ndarray, free: Free) -> int | None:
     return None
 
 
-def _shortened(corners: list[np.ndarray], free: Free, rng: np.random.Generator,
-               ) -> list[np.ndarray]:
+def _shortened(corners: list[np.ndarray], free: Free, rng: np.random.Generator) -> list[np.ndarray]:
     """Remove corners between two that are connected by a free path."""
     for _ in range(_SHORTCUTS):
         if len(corners) < 3:

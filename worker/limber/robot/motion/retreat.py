@@ -294,8 +294,7 @@ class RetreatPath:
             raise SafetyStop(f"The arm is {1000 * away:.1f} mm and {turn:.1f} degrees away from "
                              "its path.", "Something has moved it.",
                              "Free the branch by hand.")
-        if difference := different_joints(sample.joints, self._joints[nearest],
-                                          self._names):
+        if difference := different_joints(sample.joints, self._joints[nearest], self._names):
             raise SafetyStop("The arm is not in the configuration in which it arrived: "
                              f"{'; '.join(difference)}.",
                              "Something has moved it.", "Free the branch by hand.")

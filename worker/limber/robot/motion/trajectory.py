@@ -248,8 +248,7 @@ class Trajectory:
         k, part = self._segment_at(time)
         return (1.0 - part) * self.joints[k] + part * self.joints[k + 1]
 
-    def felt(self, time: float,
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    def felt(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
         """Return expected wrench [6] at a time [s], and more, as :meth:`ExpectedWrench.at`."""
         return None if self.expected is None else self.expected.at(*self._segment_at(time))
 

@@ -81,8 +81,6 @@ class Bridge:
 
 _GRIPPER_COMMAND = "control_msgs/action/GripperCommand"
 _GOAL = "limber-gripper"
-_ACTION_SECONDS = 0.1
-_SUCCEEDED = 4  # action_msgs/msg/GoalStatus
 
 
 def send_gripper(bridge: Bridge, action: str, position: float, effort: float = 0.0) -> None:

@@ -181,8 +181,7 @@ def _roll_pitch_yaw(turn: np.ndarray) -> np.ndarray:
     if level < _UPRIGHT:
         # Only one of the two other angles is determined.
         return np.array([0.0, pitch, np.arctan2(-turn[0, 1], turn[1, 1])])
-    return np.array([np.arctan2(turn[2, 1], turn[2, 2]), pitch,
-                     np.arctan2(turn[1, 0], turn[0, 0])])
+    return np.array([np.arctan2(turn[2, 1], turn[2, 2]), pitch, np.arctan2(turn[1, 0], turn[0, 0])])
 
 
 def _shifted(place: np.ndarray) -> np.ndarray:

@@ -244,8 +244,7 @@ class CloudTopic:
     def _is_placed(self) -> bool:
         """Whether it is known where the camera is: a moving arm leaves that open."""
         assert self._cell.camera is not None
-        return self._cell.camera.mount == "branch" or (
-            self._flange is not None and not self._moves)
+        return self._cell.camera.mount == "branch" or (self._flange is not None and not self._moves)
 
     def _follow(self, message: dict) -> None:
         sample = self._states.sample(message, time.monotonic())

@@ -97,7 +97,7 @@ class RosControl:
         self._cancels_until: float | None = None
         self._trajectory: Trajectory | None = None
         self._outcome: str | None = None
-        self._place, self._is_echoed, self._may_stand = 0, False, 0.0
+        self._place, self._is_echoed, self._may_stand, self._ended_at = 0, False, 0.0, -np.inf
         self._stood, self._stood_at, self._rests = (0.0, 0.0), np.zeros(0), np.zeros(0)
         self._takes = {self._topics.joint_states: self._take_joints,
                        wrench: self.sensor.take, self._topics.stop: self._take_stop}
@@ -209,9 +209,10 @@ class RosControl:
     def follow(self, trajectory: Trajectory, since: float = 0.0) -> None:
         """Follow a trajectory from its time ``since`` [s] on. SafetyStop if the arm moves."""
         last = self._recent[-1]
-        # By the way, not by the speed, whose noise is no motion.
-        if not max(np.abs(each.joints - last.joints).max() for each in self._recent
-                   if last.clock - each.clock < _REST_SECONDS) <= _STILL_RAD:
+        # By the way, not by the speed, whose noise is no motion; our own may just have ended.
+        rest = max(last.clock - _REST_SECONDS, self._ended_at)
+        if not max((np.abs(each.joints - last.joints).max() for each in self._recent
+                   if each.clock >= rest), default=0.0) <= _STILL_RAD:
             raise SafetyStop("The arm moves already.", "Something else drives it.",
                              "Stop it, and begin again.")
         self._goals += 1
@@ -235,10 +236,11 @@ class RosControl:
         parts = np.clip((off * steps).sum(axis=1) / np.maximum((steps**2).sum(axis=1), 1e-18), 0, 1)
         row = int(np.abs(off - parts[:, None] * steps).max(axis=1).argmin())
         if self._outcome == "":
-            off = float(np.linalg.norm(sample.pose[:3] - trajectory.poses[-1, :3]))
-            if not off <= _OFF_END_M:
+            # All that is left, as a way back ends where it began.
+            left = trajectory.poses[self._place:, :3] - sample.pose[:3]
+            if not (off := float(np.linalg.norm(left, axis=1).max())) <= _OFF_END_M:
                 self._outcome = ("the controller in ROS calls its goal reached, but the arm is "
-                                 f"{1000 * off:.0f} mm away from its end")
+                                 f"{1000 * off:.0f} mm away from what is left of its way")
         elif self._outcome is None:
             self._outcome = self._fault(sample)
         return float(times[row] + parts[row] * (times[row + 1] - times[row])), self._outcome
@@ -308,6 +310,7 @@ class RosControl:
         if is_over:
             # The node beside the controller expects no more beats.
             self._bridge.send(op="publish", topic=self._topics.end, msg={})
+            self._ended_at = self._recent[-1].clock
         else:
             self._cancels_until, self._beat = time.monotonic() + SECONDS, time.monotonic()
             self._cancel()

@@ -51,8 +51,7 @@ class Check(CellTool):
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         from limber.robot.robot_state import unweighed
 
-        if ((self.branch or self.plan) and not self.offline) or (
-                self.plan and self.branch is None):
+        if ((self.branch or self.plan) and not self.offline) or (self.plan and self.branch is None):
             raise InputError(
                 Text(Option("branch"), " and ", Option("plan"), " are checked from files."),
                 "A plan belongs to a branch.", "Give ", Option("offline", True), " ",

@@ -40,6 +40,7 @@ class Weigh(ArmedTool):
     def run(self, progress: Progress = SILENT) -> dict[str, Any]:
         from limber.cell.obstacles import cell_obstacles
         from limber.cell.reach_and_collision import ArmSurroundings
+        from limber.robot.driver.controls import set_payload
         from limber.robot.driver.link import RobotLink
         from limber.robot.motion.joint_path import to_joints
         from limber.robot.operator_decisions import require_confirmation
@@ -59,8 +60,11 @@ class Weigh(ArmedTool):
             return result
         require_confirmation("weigh", self.confirm, cell, progress)
         rows: list[np.ndarray] = []
-        with RobotLink(weightless(cell), rows.append) as link:
-            found = weighed(cell, link, moves, rows)
+        try:
+            with RobotLink(weightless(cell), rows.append) as link:
+                found = weighed(cell, link, moves, rows)
+        finally:
+            set_payload(cell)
         result |= {"mass_kg": found.mass, "mass_sigma_kg": found.sigma,
                    "faults": list(found.faults)}
         log_move(self, result | weighed_as(cell))
